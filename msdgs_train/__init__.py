@@ -1,0 +1,1 @@
+"""Fit multi-step deformable 3D Gaussians to photographs of a moving scene (torch)."""

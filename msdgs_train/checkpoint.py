@@ -1,0 +1,133 @@
+"""Files of a training: `model.pt`, which export reads, and the trainer's own to resume from.
+
+Every file is written beside its place and moved over it, so that a reader finds the old one or the new one whole.
+"""
+
+import os
+import pickle
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from msdgs_serve import __version__
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.model import DynamicGaussians, ModelConfig
+
+FORMAT = "msdgs-model/1"
+
+
+class CheckpointInvalid(MsdgsError):
+    """A checkpoint can't be read, or holds what no model can use."""
+
+    def __init__(self, file: str | Path, problem: str) -> None:
+        super().__init__(f"{file}: {problem}")
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """What a model's scene is, besides its Gaussians; plain values only."""
+
+    time_range: tuple[float, float] = (0.0, 1.0)
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sRGB in [0, 1], as trained
+    bounds: list[list[float]] = field(default_factory=lambda: [[-1.0] * 3, [1.0] * 3])  # corners, scene units
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    """Each: name, fx, fy, cx, cy (pixels), width, height, camera_to_world (4×4 nested lists, OpenCV), t."""
+
+
+class LoadedModel(NamedTuple):
+    """What `model.pt` holds."""
+
+    model: DynamicGaussians
+    scene: SceneInfo
+    step: int
+
+
+def save_model(path: str | Path, model: DynamicGaussians, scene: SceneInfo, step: int) -> None:
+    """Write `model.pt`, atomically."""
+    contents = {
+        "format": FORMAT,
+        "package_version": __version__,
+        "config": asdict(model.config),
+        "scene": asdict(scene),
+        "step": step,
+        "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
+    }
+    save_atomic(path, contents)
+
+
+def load_model(path: str | Path) -> LoadedModel:
+    """Read `model.pt` onto the CPU. Raises `CheckpointInvalid` for any file that isn't a whole, finite model."""
+    contents = load(path)
+    if not isinstance(contents, dict) or contents.get("format") != FORMAT:
+        found = contents.get("format") if isinstance(contents, dict) else type(contents).__name__
+        raise CheckpointInvalid(path, f"isn't a model of format {FORMAT} (found {found!r})")
+    try:
+        state = contents["state"]
+        _refuse_not_finite(path, state)
+        model = _build(ModelConfig(**contents["config"]), state)
+        scene = SceneInfo(**contents["scene"])
+        return LoadedModel(model, scene, int(contents["step"]))
+    except (InvalidInput, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise CheckpointInvalid(path, f"isn't a complete model: {error}") from error
+
+
+def save_atomic(path: str | Path, obj: Any) -> None:
+    """`torch.save` into a new file in the same folder, flushed to the disk, then moved over `path`."""
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            torch.save(obj, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load(path: str | Path) -> Any:
+    """`torch.load` of tensors and plain values onto the CPU; no code in the file is run."""
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if size == 0:
+            raise CheckpointInvalid(path, "is empty")
+        if not zipfile.is_zipfile(path):
+            raise CheckpointInvalid(path, f"isn't a torch checkpoint, or is cut off after {size:,} bytes")
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise CheckpointInvalid(path, "no such file") from error
+    except OSError as error:
+        raise CheckpointInvalid(path, f"can't be read: {error.strerror or error}") from error
+    except (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, EOFError, ValueError, KeyError) as error:
+        raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
+
+
+def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
+    """A model of this configuration and these tensors; RuntimeError names what is missing or too much."""
+    prefix = "gaussians."
+    gaussians = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
+    model = DynamicGaussians(config, CanonicalGaussians(**gaussians))
+    model.load_state_dict(state)
+    return model
+
+
+def _refuse_not_finite(path: str | Path, state: dict[str, Tensor]) -> None:
+    bad = [f"{name} ({count:,} of {total:,})" for name, count, total in _not_finite(state)]
+    if bad:
+        raise CheckpointInvalid(path, f"holds values that are NaN or infinite: {', '.join(bad)}")
+
+
+def _not_finite(state: dict[str, Tensor]) -> Iterator[tuple[str, int, int]]:
+    for name, tensor in state.items():
+        count = int((~torch.isfinite(tensor)).sum())
+        if count:
+            yield name, count, tensor.numel()

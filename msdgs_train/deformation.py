@@ -1,0 +1,38 @@
+"""The multi-step deformation: layers in a chain, each with a learned weight (paper, section 3.2)."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+
+class Deltas(NamedTuple):
+    """Weighted sums over the layers of what each Gaussian changes by at one time (equation 9)."""
+
+    means: Tensor  # [N, 3] scene units
+    log_scales: Tensor  # [N, 3] before modulation
+    quats: Tensor  # [N, 4] wxyz, added to the normalised canonical quaternion
+
+
+class MultiStepDeformation(nn.Module):
+    """K layers; layer k sees the means as the layers before it have moved them. K = 0 moves nothing."""
+
+    def __init__(self, layers: Iterable[nn.Module]) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(layers)
+
+    def __len__(self) -> int:
+        return len(self.layers)
+
+    def forward(self, means: Tensor, t: Tensor, steps: int | None = None) -> Deltas:
+        """Deltas of canonical means, [N, 3], at time `t`, a scalar tensor; after the first `steps` layers if given."""
+        deltas = Deltas(torch.zeros_like(means), torch.zeros_like(means), means.new_zeros(len(means), 4))
+        for layer in self.layers[:steps]:
+            step = layer(means + deltas.means, t)  # equations 7 and 8
+            deltas = Deltas(
+                torch.addcmul(deltas.means, step.weight, step.delta_means),
+                torch.addcmul(deltas.log_scales, step.weight, step.delta_log_scales),
+                torch.addcmul(deltas.quats, step.weight, step.delta_quats),
+            )
+        return deltas

@@ -1,0 +1,103 @@
+"""The canonical Gaussians: what training stores for each Gaussian, before any deformation or activation."""
+
+import math
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
+
+INITIAL_OPACITY = 0.1
+MIN_NEIGHBOUR_DISTANCE = 1e-7  # scene units; two points in one place still get a scale above 0
+
+
+class CanonicalGaussians(nn.Module):
+    """N Gaussians in storage space: logarithms of scales, logits of opacities, quaternions of any length."""
+
+    means: nn.Parameter  # [N, 3] scene units
+    log_scales: nn.Parameter  # [N, 3] natural logarithm of standard deviations
+    raw_quats: nn.Parameter  # [N, 4] wxyz, not unit
+    raw_opacities: nn.Parameter  # [N] logits
+    sh_dc: nn.Parameter  # [N, 1, 3]
+    sh_rest: nn.Parameter  # [N, (degree + 1)² - 1, 3]
+    embeddings: nn.Parameter | None  # [N, embedding_size]; None without scale modulation
+
+    def __init__(
+        self,
+        means: Tensor,
+        log_scales: Tensor,
+        raw_quats: Tensor,
+        raw_opacities: Tensor,
+        sh_dc: Tensor,
+        sh_rest: Tensor,
+        embeddings: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.means = nn.Parameter(means)
+        self.log_scales = nn.Parameter(log_scales)
+        self.raw_quats = nn.Parameter(raw_quats)
+        self.raw_opacities = nn.Parameter(raw_opacities)
+        self.sh_dc = nn.Parameter(sh_dc)
+        self.sh_rest = nn.Parameter(sh_rest)
+        self.embeddings = None if embeddings is None else nn.Parameter(embeddings)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @classmethod
+    def from_points(
+        cls, points: Tensor, colours: Tensor, sh_degree: int, embedding_size: int, generator: torch.Generator
+    ) -> Self:
+        """One Gaussian a point, [N, 3], of colours in [0, 1], [N, 3]: round, opacity 0.1, as large as its neighbours
+        are near. `embedding_size` 0 means no modulation."""
+        n = len(points)
+        log_scales = neighbour_distances(points).clamp_min(MIN_NEIGHBOUR_DISTANCE).log()
+        embeddings = 0.1 * torch.randn(n, embedding_size, generator=generator) if embedding_size else None
+        return cls(
+            means=points,
+            log_scales=log_scales[:, None].repeat(1, 3),
+            raw_quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            raw_opacities=torch.full((n,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+            sh_dc=((colours - 0.5) / SH_C0)[:, None],
+            sh_rest=torch.zeros(n, sh_coefficients(sh_degree) - 1, 3),
+            embeddings=embeddings,
+        )
+
+    @classmethod
+    def random_in_cube(cls, count: int, half_extent: float, sh_degree: int, embedding_size: int, seed: int) -> Self:
+        """`count` Gaussians of random colours, uniform in the cube [-half_extent, half_extent]³."""
+        generator = torch.Generator().manual_seed(seed)
+        points = (2 * torch.rand(count, 3, generator=generator) - 1) * half_extent
+        colours = torch.rand(count, 3, generator=generator)
+        return cls.from_points(points, colours, sh_degree, embedding_size, generator)
+
+
+def neighbour_distances(points: Tensor, neighbours: int = 3, chunk: int = 512) -> Tensor:
+    """[N] mean distance of each point, [N, 3], to its nearest `neighbours`; 1 where there is no other point.
+
+    Points are walked in order of x: a chunk is compared with a window of it, which widens until no point outside
+    could be nearer (30,000 uniform points on two cores: 1.4 s, all pairs 7.3 s).
+    """
+    n = len(points)
+    k = min(neighbours, n - 1)
+    if k < 1:
+        return torch.ones(n)
+    order = points[:, 0].argsort()
+    ordered = points[order].contiguous()
+    x = ordered[:, 0].contiguous()
+    distances = torch.empty(n)
+    for start in range(0, n, chunk):
+        stop = min(start + chunk, n)
+        margin = chunk
+        while True:
+            low, high = max(start - margin, 0), min(stop + margin, n)
+            nearest = torch.cdist(
+                ordered[start:stop], ordered[low:high], compute_mode="donot_use_mm_for_euclid_dist"
+            ).topk(k + 1, largest=False)[0]
+            reach = nearest[:, -1].max()
+            if (low == 0 or x[start] - x[low] >= reach) and (high == n or x[high - 1] - x[stop - 1] >= reach):
+                break
+            margin *= 2
+        distances[order[start:stop]] = nearest[:, 1:].mean(dim=1)
+    return distances

@@ -1,0 +1,129 @@
+"""The whole model: canonical Gaussians, their deformation in time, and the modulation of its scaling."""
+
+from dataclasses import dataclass, fields
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_serve.scene.spherical_harmonics import sh_coefficients
+from msdgs_train.deformation import MultiStepDeformation
+from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.layers import MLPLayer
+from msdgs_train.modulation import ScaleModulation
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes of a model. The defaults are the paper's, with K = 2 layers; K = 0 is a static scene."""
+
+    sh_degree: int = 3
+    layers: int = 2
+    width: int = 256
+    depth: int = 4
+    xyz_frequencies: int = 10
+    time_frequencies: int = 6
+    time_width: int = 256
+    time_features: int = 30
+    embedding_size: int = 32
+    """0: no modulation."""
+    delta_space: Literal["raw"] = "raw"
+    """Where deltas are added: to log_scales and quaternions before exp and normalisation."""
+    detach_means: bool = True
+    """Photometric gradients through the positional encoding don't reach the canonical means, as in DeformGS."""
+
+    def __post_init__(self) -> None:
+        least = {"width": 1, "depth": 1, "time_width": 1, "time_features": 1}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type is int and not (type(value) is int and value >= least.get(field.name, 0)):
+                raise InvalidInput(f"model.{field.name}", f"an integer of {least.get(field.name, 0)} or more", value)
+        if self.sh_degree > 3:
+            raise InvalidInput("model.sh_degree", "0, 1, 2 or 3", self.sh_degree)
+        if self.delta_space != "raw":
+            raise InvalidInput("model.delta_space", '"raw"', self.delta_space)
+
+
+class PosedGaussians(NamedTuple):
+    """N Gaussians at one time, activated: what a rasterizer takes."""
+
+    means: Tensor  # [N, 3] scene units
+    quats: Tensor  # [N, 4] wxyz, unit
+    scales: Tensor  # [N, 3] standard deviations, scene units
+    opacities: Tensor  # [N] in (0, 1)
+    sh: Tensor  # [N, (degree + 1)², 3]
+
+
+class DynamicGaussians(nn.Module):
+    """Gaussians that move: `pose(t)` gives them at any time."""
+
+    def __init__(self, config: ModelConfig, gaussians: CanonicalGaussians) -> None:
+        super().__init__()
+        _check_shapes(config, gaussians)
+        self.config = config
+        self.gaussians = gaussians
+        self.deformation = MultiStepDeformation(
+            MLPLayer(
+                config.width,
+                config.depth,
+                config.xyz_frequencies,
+                config.time_frequencies,
+                config.time_width,
+                config.time_features,
+            )
+            for _ in range(config.layers)
+        )
+        self.modulation = ScaleModulation(config.embedding_size) if config.embedding_size else None
+
+    def pose(
+        self, t: float | Tensor, steps: int | None = None, deform: bool = True, sh_degree: int | None = None
+    ) -> PosedGaussians:
+        """The Gaussians at time `t`.
+
+        `steps` stops after that many layers, `deform=False` gives the canonical Gaussians without running any, and
+        `sh_degree` leaves out the SH bands above it.
+        """
+        g = self.gaussians
+        means, log_scales, quats = g.means, g.log_scales, unit_quats(g.raw_quats)
+        if deform and len(self.deformation) and steps != 0:
+            time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
+            deltas = self.deformation(means.detach() if self.config.detach_means else means, time, steps)
+            means = means + deltas.means
+            log_scales = log_scales + self.modulated(deltas.log_scales)
+            quats = unit_quats(quats + deltas.quats)
+        degree = self.config.sh_degree if sh_degree is None else sh_degree
+        sh = torch.cat([g.sh_dc, g.sh_rest[:, : sh_coefficients(degree) - 1]], dim=1)
+        return PosedGaussians(means, quats, log_scales.exp(), g.raw_opacities.sigmoid(), sh)
+
+    def modulated(self, delta_log_scales: Tensor) -> Tensor:
+        """Equation 12, or the deltas as they are where the model has no modulation."""
+        if self.modulation is None:
+            return delta_log_scales
+        return self.modulation(self.gaussians.embeddings) * delta_log_scales
+
+
+def unit_quats(raw_quats: Tensor) -> Tensor:
+    """Quaternions, [N, 4], scaled to unit length; those of norm under 1e-8 have no direction and become identity."""
+    norms = torch.linalg.vector_norm(raw_quats, dim=1, keepdim=True)
+    identity = raw_quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return torch.where(norms < MIN_NORM, identity, raw_quats / norms.clamp_min(MIN_NORM))
+
+
+def _check_shapes(config: ModelConfig, gaussians: CanonicalGaussians) -> None:
+    n = len(gaussians)
+    expected: dict[str, tuple[int, ...] | None] = {
+        "means": (n, 3),
+        "log_scales": (n, 3),
+        "raw_quats": (n, 4),
+        "raw_opacities": (n,),
+        "sh_dc": (n, 1, 3),
+        "sh_rest": (n, sh_coefficients(config.sh_degree) - 1, 3),
+        "embeddings": (n, config.embedding_size) if config.embedding_size else None,
+    }
+    for name, shape in expected.items():
+        tensor = getattr(gaussians, name)
+        got = None if tensor is None else tuple(tensor.shape)
+        if got != shape:
+            raise InvalidInput(f"gaussians.{name}", "absent" if shape is None else f"of shape {shape}", got)
