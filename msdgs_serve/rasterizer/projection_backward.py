@@ -1,0 +1,194 @@
+"""Gradient of the projection: from splats back to means, quaternions, scales and spherical harmonics."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.rasterizer.compositing_backward import SplatGradients
+from msdgs_serve.rasterizer.harmonics import basis_gradient_into, basis_into
+from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.projection import Splats, clamped, covariance2d, project_axes, rotation_into, to_camera
+from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
+from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.threads import run_parallel, split_evenly, thread_count
+
+
+class GaussianGradients(NamedTuple):
+    """d loss / d Gaussian; of the quaternion, as if its four numbers were free."""
+
+    means: np.ndarray  # [N, 3]
+    quats: np.ndarray  # [N, 4] wxyz
+    scales: np.ndarray  # [N, 3]
+    sh: np.ndarray  # [N, (degree + 1)², 3]
+
+
+def project_backward(
+    gaussians: Gaussians, splats: Splats, gradients: SplatGradients, camera: Camera, options: RasterizerOptions
+) -> GaussianGradients:
+    """Gradients of the Gaussians from the gradients of their splats."""
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
+    result = GaussianGradients(*(np.zeros_like(array) for array in arrays))
+    view = view_of(camera, options)
+    run_parallel(
+        _backward_range,
+        [
+            (start, stop, view, *arrays, splats.extents, gradients, result)
+            for start, stop in split_evenly(len(gaussians), 2 * thread_count())
+        ],
+    )
+    return result
+
+
+@kernel
+def _backward_range(
+    start: int,
+    stop: int,
+    view: View,
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    sh: np.ndarray,
+    extents: np.ndarray,
+    gradients: SplatGradients,
+    result: GaussianGradients,
+) -> None:
+    half_axes = np.empty((2, 3), np.float64)
+    grad_axes = np.empty((2, 3), np.float64)
+    grad_camera = np.empty(3, np.float64)
+    grad_world = np.empty(3, np.float64)
+    basis = np.empty(sh.shape[1], np.float64)
+    basis_gradient = np.empty((sh.shape[1], 3), np.float64)
+    for i in range(start, stop):
+        if extents[i, 0] == 0:
+            continue
+        x, y, z = to_camera(view, means, i)
+        project_axes(view, quats, scales, i, x, y, z, half_axes)
+        _axes_gradient(view, half_axes, gradients.conics, i, grad_axes)
+        grad_u, grad_v = float(gradients.means2d[i, 0]), float(gradients.means2d[i, 1])
+        grad_camera[0] = grad_u * view.fx / z
+        grad_camera[1] = grad_v * view.fy / z
+        grad_camera[2] = -(grad_u * view.fx * x + grad_v * view.fy * y) / (z * z)
+        _shape_gradient(view, quats, scales, i, x, y, z, grad_axes, grad_camera, result)
+        _color_gradient(view, means, sh, gradients.colors, i, basis, basis_gradient, grad_world, result.sh)
+        for k in range(3):
+            for j in range(3):
+                grad_world[k] += view.rotation[j, k] * grad_camera[j]
+            result.means[i, k] = grad_world[k]
+
+
+@kernel
+def _axes_gradient(view: View, half_axes: np.ndarray, grad_conics: np.ndarray, i: int, grad_axes: np.ndarray) -> None:
+    """Write d loss / d half-axes: the covariance is M Mᵀ + eps I and d conic = -conic d covariance conic."""
+    cov_xx, cov_xy, cov_yy, det = covariance2d(half_axes, view.eps2d)
+    a, b, c = cov_yy / det, -cov_xy / det, cov_xx / det
+    g_xx, g_xy, g_yy = float(grad_conics[i, 0]), 0.5 * float(grad_conics[i, 1]), float(grad_conics[i, 2])
+    # G = -conic grad conic, symmetric
+    p, q = a * g_xx + b * g_xy, a * g_xy + b * g_yy
+    r, s = b * g_xx + c * g_xy, b * g_xy + c * g_yy
+    v_xx, v_xy, v_yy = -(p * a + q * b), -(p * b + q * c), -(r * b + s * c)
+    for k in range(3):
+        grad_axes[0, k] = 2 * (v_xx * half_axes[0, k] + v_xy * half_axes[1, k])
+        grad_axes[1, k] = 2 * (v_xy * half_axes[0, k] + v_yy * half_axes[1, k])
+
+
+@kernel
+def _shape_gradient(
+    view: View,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    i: int,
+    x: float,
+    y: float,
+    z: float,
+    grad_axes: np.ndarray,
+    grad_camera: np.ndarray,
+    result: GaussianGradients,
+) -> None:
+    """Scales, quaternion and, through the Jacobian, the mean in camera axes (added to `grad_camera`)."""
+    w = view.rotation
+    ratio_x, ratio_y = clamped(x / z, view.min_x, view.max_x), clamped(y / z, view.min_y, view.max_y)
+    j00, j02, j11, j12 = view.fx / z, -view.fx * ratio_x / z, view.fy / z, -view.fy * ratio_y / z
+    rotation = np.empty((3, 3), np.float64)
+    grad_rotation = np.empty((3, 3), np.float64)
+    rotation_into(rotation, float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3]))
+    grad_j00, grad_j02, grad_j11, grad_j12 = 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        scale = float(scales[i, k])
+        grad_scale = 0.0
+        g0, g1 = grad_axes[0, k], grad_axes[1, k]
+        for j in range(3):
+            to_image = g0 * (j00 * w[0, j] + j02 * w[2, j]) + g1 * (j11 * w[1, j] + j12 * w[2, j])
+            grad_scale += to_image * rotation[j, k]
+            grad_rotation[j, k] = to_image * scale
+        result.scales[i, k] = grad_scale
+        a, b, c = rotation[0, k] * scale, rotation[1, k] * scale, rotation[2, k] * scale
+        axis_x = w[0, 0] * a + w[0, 1] * b + w[0, 2] * c
+        axis_y = w[1, 0] * a + w[1, 1] * b + w[1, 2] * c
+        axis_z = w[2, 0] * a + w[2, 1] * b + w[2, 2] * c
+        grad_j00 += g0 * axis_x
+        grad_j02 += g0 * axis_z
+        grad_j11 += g1 * axis_y
+        grad_j12 += g1 * axis_z
+    _quaternion_gradient(quats, i, grad_rotation, result.quats)
+    zz = z * z
+    grad_camera[2] -= (grad_j00 * view.fx + grad_j11 * view.fy) / zz
+    grad_camera[2] += (grad_j02 * view.fx * ratio_x + grad_j12 * view.fy * ratio_y) / zz
+    if view.min_x < x / z < view.max_x:
+        grad_camera[0] -= grad_j02 * view.fx / zz
+        grad_camera[2] += grad_j02 * view.fx * x / (zz * z)
+    if view.min_y < y / z < view.max_y:
+        grad_camera[1] -= grad_j12 * view.fy / zz
+        grad_camera[2] += grad_j12 * view.fy * y / (zz * z)
+
+
+@kernel
+def _quaternion_gradient(quats: np.ndarray, i: int, g: np.ndarray, grad_quats: np.ndarray) -> None:
+    w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
+    grad_quats[i, 0] = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
+    grad_quats[i, 1] = 2 * (
+        w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - 2 * x * (g[1, 1] + g[2, 2])
+    )
+    grad_quats[i, 2] = 2 * (
+        w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - 2 * y * (g[0, 0] + g[2, 2])
+    )
+    grad_quats[i, 3] = 2 * (
+        w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - 2 * z * (g[0, 0] + g[1, 1])
+    )
+
+
+@kernel
+def _color_gradient(
+    view: View,
+    means: np.ndarray,
+    sh: np.ndarray,
+    grad_colors: np.ndarray,
+    i: int,
+    basis: np.ndarray,
+    basis_gradient: np.ndarray,
+    grad_world: np.ndarray,
+    grad_sh: np.ndarray,
+) -> None:
+    """Coefficients, and the mean through the viewing direction (written to `grad_world`)."""
+    dx, dy, dz = means[i, 0] - view.position[0], means[i, 1] - view.position[1], means[i, 2] - view.position[2]
+    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / distance, dy / distance, dz / distance
+    basis_into(basis, dx, dy, dz)
+    basis_gradient_into(basis_gradient, dx, dy, dz)
+    gx, gy, gz = 0.0, 0.0, 0.0
+    for channel in range(3):
+        color = 0.5
+        for k in range(len(basis)):
+            color += basis[k] * sh[i, k, channel]
+        if color > 0:
+            g = float(grad_colors[i, channel])
+            for k in range(len(basis)):
+                grad_sh[i, k, channel] = g * basis[k]
+                gx += g * sh[i, k, channel] * basis_gradient[k, 0]
+                gy += g * sh[i, k, channel] * basis_gradient[k, 1]
+                gz += g * sh[i, k, channel] * basis_gradient[k, 2]
+    along = gx * dx + gy * dy + gz * dz
+    grad_world[0] = (gx - along * dx) / distance
+    grad_world[1] = (gy - along * dy) / distance
+    grad_world[2] = (gz - along * dz) / distance

@@ -1,0 +1,82 @@
+"""What the kernels need to know of a camera, and the constants of a rasterizer."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.errors import InvalidInput
+
+
+class RasterizerOptions(NamedTuple):
+    """Constants in which published rasterizers differ."""
+
+    near_plane: float  # scene units; Gaussians at this depth or nearer are not drawn
+    eps2d: float  # px², added to the diagonal of the projected covariance
+    alpha_min: float  # a Gaussian adds nothing to a pixel where its alpha is less
+    alpha_max: float  # alpha is cut to this
+    transmittance_min: float  # a pixel stops before the Gaussian that would take it to this or less
+
+
+GSPLAT = RasterizerOptions(near_plane=0.01, eps2d=0.3, alpha_min=1 / 255, alpha_max=0.999, transmittance_min=1e-4)
+INRIA = RasterizerOptions(near_plane=0.2, eps2d=0.3, alpha_min=1 / 255, alpha_max=0.99, transmittance_min=1e-4)
+
+
+class View(NamedTuple):
+    """A camera as float64 numbers for the projection kernels."""
+
+    rotation: np.ndarray  # [3, 3] world to camera
+    translation: np.ndarray  # [3] world to camera
+    position: np.ndarray  # [3] in world space
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    # where x/z and y/z are clamped in the Jacobian, so that splats far off axis stay finite (gsplat's limits)
+    min_x: float
+    max_x: float
+    min_y: float
+    max_y: float
+    near_plane: float
+    eps2d: float
+    alpha_min: float
+
+
+def view_of(camera: Camera, options: RasterizerOptions) -> View:
+    """The kernels' form of a camera; options out of range raise `InvalidInput`."""
+    _check(options)
+    world_to_camera = camera.world_to_camera
+    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
+    return View(
+        rotation=np.ascontiguousarray(world_to_camera[:3, :3]),
+        translation=np.ascontiguousarray(world_to_camera[:3, 3]),
+        position=np.ascontiguousarray(camera.position),
+        fx=float(camera.fx),
+        fy=float(camera.fy),
+        cx=float(camera.cx),
+        cy=float(camera.cy),
+        width=int(camera.width),
+        height=int(camera.height),
+        min_x=-camera.cx / camera.fx - margin_x,
+        max_x=(camera.width - camera.cx) / camera.fx + margin_x,
+        min_y=-camera.cy / camera.fy - margin_y,
+        max_y=(camera.height - camera.cy) / camera.fy + margin_y,
+        near_plane=float(options.near_plane),
+        eps2d=float(options.eps2d),
+        alpha_min=float(options.alpha_min),
+    )
+
+
+def _check(options: RasterizerOptions) -> None:
+    bounds = {
+        "near_plane": (options.near_plane > 0, "above 0"),
+        "eps2d": (options.eps2d >= 0, "0 or more"),
+        "alpha_min": (0 < options.alpha_min < 1, "in (0, 1)"),
+        "alpha_max": (options.alpha_min < options.alpha_max < 1, "in (alpha_min, 1)"),
+        "transmittance_min": (0 <= options.transmittance_min < 1, "in [0, 1)"),
+    }
+    for name, (holds, expected) in bounds.items():
+        if not holds or not np.isfinite(getattr(options, name)):
+            raise InvalidInput(f"options.{name}", expected, getattr(options, name))

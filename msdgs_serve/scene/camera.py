@@ -1,0 +1,145 @@
+"""A pinhole camera in OpenCV axes: x right, y down, z forward; pixel centres at half-integers."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdgs_serve.scene.errors import InvalidInput
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Right-multiplied to a camera-to-world matrix: turns the camera's own y and z axes around."""
+
+MAX_PIXELS_PER_SIDE = 16384
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels and a pose. The principal point (cx, cy) may lie anywhere."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    camera_to_world: np.ndarray  # [4, 4] float64, rigid
+
+    def __post_init__(self) -> None:
+        for name in ("fx", "fy"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InvalidInput(f"camera.{name}", "finite and above 0 pixels", getattr(self, name))
+        for name in ("cx", "cy"):
+            if not math.isfinite(getattr(self, name)):
+                raise InvalidInput(f"camera.{name}", "finite", getattr(self, name))
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | np.integer) and 1 <= value <= MAX_PIXELS_PER_SIDE):
+                raise InvalidInput(f"camera.{name}", f"an integer in [1, {MAX_PIXELS_PER_SIDE}]", value)
+        object.__setattr__(self, "camera_to_world", _rigid(self.camera_to_world))
+
+    @property
+    def world_to_camera(self) -> np.ndarray:
+        """[4, 4] float64, the inverse of `camera_to_world`."""
+        rotation, position = self.camera_to_world[:3, :3], self.camera_to_world[:3, 3]
+        inverse = np.eye(4)
+        inverse[:3, :3] = rotation.T
+        inverse[:3, 3] = -rotation.T @ position
+        return inverse
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] the centre of projection in world space."""
+        return self.camera_to_world[:3, 3]
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view drawn with other numbers of pixels."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height, self.camera_to_world)
+
+    @classmethod
+    def from_fov(cls, camera_to_world: np.ndarray, width: int, height: int, fov_y: float) -> "Camera":
+        """Square pixels, centred principal point; `fov_y` is the vertical field of view in degrees."""
+        if not 0 < fov_y < 180:
+            raise InvalidInput("camera.fov_y", "in (0, 180) degrees", fov_y)
+        focal = 0.5 * height / math.tan(0.5 * math.radians(fov_y))
+        return cls(focal, focal, width / 2, height / 2, width, height, camera_to_world)
+
+    @classmethod
+    def from_look_at(
+        cls, eye: np.ndarray, target: np.ndarray, up: np.ndarray, width: int, height: int, fov_y: float
+    ) -> "Camera":
+        """A camera at `eye` that sees `target` in its centre, with `up` (world direction) upwards in the picture."""
+        return cls.from_fov(look_at(eye, target, up), width, height, fov_y)
+
+    @classmethod
+    def from_opengl(
+        cls, camera_to_world: np.ndarray, width: int, height: int, *, fx: float, fy: float, cx: float, cy: float
+    ) -> "Camera":
+        """From a camera-to-world matrix in OpenGL axes (x right, y up, z backward), as NeRF, Blender and D-NeRF use."""
+        return cls(fx, fy, cx, cy, width, height, np.asarray(camera_to_world, float) @ OPENGL_TO_OPENCV)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The camera-to-world matrix, [4, 4], of a camera at `eye` looking at `target`."""
+    eye, target, up = (_vector(v, name) for v, name in ((eye, "eye"), (target, "target"), (up, "up")))
+    forward = target - eye
+    right = np.cross(forward, up)
+    if np.linalg.norm(forward) < 1e-12:
+        raise InvalidInput("camera.target", "apart from camera.eye", target.tolist())
+    if np.linalg.norm(right) < 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up) or not up.any():
+        raise InvalidInput("camera.up", "a direction other than the line of sight", up.tolist())
+    forward = forward / np.linalg.norm(forward)
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    return pose
+
+
+def orbit(target: np.ndarray, distance: float, azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:
+    """The camera-to-world matrix, [4, 4], of a camera on a sphere around `target`.
+
+    Angles in degrees. Azimuth turns around `up`, elevation rises above the horizon, in (-90, 90).
+    """
+    if not (math.isfinite(distance) and distance > 0):
+        raise InvalidInput("camera.distance", "finite and above 0", distance)
+    if not math.isfinite(azimuth):
+        raise InvalidInput("camera.azimuth", "finite", azimuth)
+    if not -90 < elevation < 90:
+        raise InvalidInput("camera.elevation", "in (-90, 90) degrees", elevation)
+    up = _vector(up, "up")
+    if not up.any():
+        raise InvalidInput("camera.up", "a direction", up.tolist())
+    up = up / np.linalg.norm(up)
+    # azimuth 0 lies along the world axis that is most level, made exactly level
+    level = np.eye(3)[np.argmin(np.abs(up))]
+    level = level - up * (level @ up)
+    level = level / np.linalg.norm(level)
+    a, e = math.radians(azimuth), math.radians(elevation)
+    outwards = math.cos(e) * (math.cos(a) * level + math.sin(a) * np.cross(up, level)) + math.sin(e) * up
+    target = _vector(target, "target")
+    return look_at(target + distance * outwards, target, up)
+
+
+def _vector(value: np.ndarray, name: str) -> np.ndarray:
+    vector = np.asarray(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InvalidInput(f"camera.{name}", "3 finite numbers", value)
+    return vector
+
+
+def _rigid(matrix: np.ndarray) -> np.ndarray:
+    """A rotation and a position, as float64, read-only; float32 noise in the rotation is tolerated."""
+    matrix = np.array(matrix, dtype=np.float64)
+    field = "camera.camera_to_world"
+    if matrix.shape != (4, 4):
+        raise InvalidInput(field, "a 4×4 matrix", f"shape {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise InvalidInput(field, "finite", "NaN or infinity")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise InvalidInput(field, "a rotation and a position, without scale or mirroring", rotation.tolist())
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise InvalidInput(field, "a matrix whose last row is 0 0 0 1", matrix[3].tolist())
+    matrix.flags.writeable = False
+    return matrix

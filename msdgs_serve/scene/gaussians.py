@@ -1,0 +1,54 @@
+"""A set of 3D Gaussians, activated and posed: what a rasterizer draws."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.spherical_harmonics import SH_DEGREES, sh_coefficients
+
+FloatArray = npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians in world space. Arrays share one dtype, float32 unless a test asks for float64."""
+
+    means: FloatArray  # [N, 3] centres, scene units
+    quats: FloatArray  # [N, 4] rotations, wxyz, unit
+    scales: FloatArray  # [N, 3] standard deviations, scene units, > 0
+    opacities: FloatArray  # [N] in [0, 1]
+    sh: FloatArray  # [N, (degree + 1)², 3] INRIA order; colour = SH + 0.5, clamped at 0
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return SH_DEGREES[self.sh.shape[1]]
+
+    def validate(self) -> "Gaussians":
+        """Return self if shapes agree and every value is usable, else raise `InvalidInput` naming the array."""
+        n = len(self.means)
+        expected_shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+        for name, shape in expected_shapes.items():
+            if getattr(self, name).shape != shape:
+                raise InvalidInput(f"gaussians.{name}", f"of shape {shape}", getattr(self, name).shape)
+        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in SH_DEGREES or self.sh.shape[2] != 3:
+            counts = [sh_coefficients(d) for d in range(4)]
+            raise InvalidInput("gaussians.sh", f"of shape ({n}, one of {counts}, 3)", self.sh.shape)
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            bad = int(np.count_nonzero(~np.isfinite(getattr(self, name))))
+            if bad:
+                raise InvalidInput(f"gaussians.{name}", "finite", f"{bad} values that are NaN or infinite")
+        if n and not (self.scales > 0).all():
+            raise InvalidInput("gaussians.scales", "above 0", float(self.scales.min()))
+        if n and not ((self.opacities >= 0) & (self.opacities <= 1)).all():
+            raise InvalidInput(
+                "gaussians.opacities", "in [0, 1]", f"[{self.opacities.min()}, {self.opacities.max()}]"
+            )
+        norms = np.linalg.norm(self.quats, axis=1)
+        if n and not (np.abs(norms - 1) < 1e-3).all():
+            raise InvalidInput("gaussians.quats", "unit quaternions", f"norms in [{norms.min()}, {norms.max()}]")
+        return self

@@ -1,0 +1,65 @@
+"""One pool of threads for the whole process: nogil kernels and onnxruntime calls share it, so cores are never oversubscribed.
+
+numba's own parallel layers abort when two threads enter them or when the process forks; plain threads over nogil
+kernels do neither.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+THREADS_VARIABLE = "MSDGS_THREADS"
+
+_lock = threading.Lock()
+_pool: ThreadPoolExecutor | None = None
+
+
+def thread_count() -> int:
+    """Threads in the pool: `MSDGS_THREADS`, or the cores this process may use."""
+    setting = os.environ.get(THREADS_VARIABLE)
+    if setting is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not setting.isdecimal() or int(setting) < 1:
+        raise ValueError(f"{THREADS_VARIABLE} must be a whole number above 0, got {setting!r}")
+    return int(setting)
+
+
+def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
+    """Call `function(*item)` for every item on the pool; results in the order of the items.
+
+    The first exception is raised after all calls have ended. Must not be called from inside the pool.
+    """
+    if len(items) <= 1 or thread_count() == 1:
+        return [function(*item) for item in items]
+    futures = [_shared_pool().submit(function, *item) for item in items]
+    errors = [error for future in futures if (error := future.exception()) is not None]
+    if errors:
+        raise errors[0]
+    return [future.result() for future in futures]
+
+
+def split_evenly(count: int, parts: int) -> list[tuple[int, int]]:
+    """`parts` or fewer consecutive, non-empty (start, stop) ranges that cover `range(count)`."""
+    parts = max(1, min(parts, count))
+    edges = [count * part // parts for part in range(parts + 1)]
+    return [(start, stop) for start, stop in zip(edges, edges[1:], strict=False) if stop > start]
+
+
+def _shared_pool() -> ThreadPoolExecutor:
+    global _pool
+    with _lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(thread_count(), thread_name_prefix="msdgs")
+        return _pool
+
+
+def _forget_pool() -> None:
+    """A forked child has none of its parent's threads, and perhaps a lock that nobody will release."""
+    global _pool, _lock
+    _pool, _lock = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pool)

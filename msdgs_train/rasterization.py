@@ -1,0 +1,97 @@
+"""Differentiable rendering: the service's own kernels on a CPU, gsplat on CUDA, behind one function."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msdgs_serve.rasterizer.compositing import composite
+from msdgs_serve.rasterizer.compositing_backward import composite_backward
+from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.projection_backward import project_backward
+from msdgs_serve.rasterizer.tiles import bin_into_tiles
+from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
+from msdgs_serve.scene import Camera, Gaussians
+
+
+class RasterizationInfo:
+    """What density control needs to know of one rendering."""
+
+    radii: Tensor
+    """[N] larger half-extent of the footprint in pixels, 0 where not drawn."""
+    means2d_grads: Tensor | None = None
+    """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    camera: Camera,
+    background: Tensor,
+    options: RasterizerOptions = GSPLAT,
+) -> tuple[Tensor, Tensor, RasterizationInfo]:
+    """Draw N activated Gaussians; differentiable in every tensor.
+
+    Args:
+        means: [N, 3] world space.
+        quats: [N, 4] wxyz, unit.
+        scales: [N, 3] standard deviations, scene units.
+        opacities: [N] in (0, 1).
+        sh: [N, (degree + 1)², 3].
+        camera: pinhole, OpenCV axes.
+        background: [3] colour behind everything.
+        options: rasterizer constants; on CUDA gsplat's own are fixed and others are refused.
+
+    Returns:
+        rgb [H, W, 3] with the background, alpha [H, W], and what density control needs.
+    """
+    info = RasterizationInfo()
+    if means.is_cuda:
+        from msdgs_train.rasterization_cuda import rasterize_cuda
+
+        rgb, alpha = rasterize_cuda(means, quats, scales, opacities, sh, camera, background, options, info)
+    else:
+        rgb, alpha = _Rasterize.apply(means, quats, scales, opacities, sh, background, camera, options, info)
+    return rgb, alpha, info
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        background: Tensor,
+        camera: Camera,
+        options: RasterizerOptions,
+        info: RasterizationInfo,
+    ) -> tuple[Tensor, Tensor]:
+        gaussians = Gaussians(*(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities, sh)))
+        splats = project(gaussians, camera, options)
+        tiles = bin_into_tiles(splats, camera.width, camera.height)
+        blend = composite(splats, tiles, camera.width, camera.height, options)
+        rgb = blend.rgb + blend.transmittance[..., None] * background.detach().numpy()
+        info.radii = torch.from_numpy(splats.extents.max(axis=1, initial=0))
+        ctx.rendered = (gaussians, splats, tiles, blend.transmittance, rgb)
+        ctx.view = (camera, options)
+        ctx.info = info
+        return torch.from_numpy(rgb), torch.from_numpy(1 - blend.transmittance)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
+        gaussians, splats, tiles, transmittance, rgb = ctx.rendered
+        grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
+        behind = np.einsum("hwc,hwc->hw", rgb, grad_rgb) + (1 - transmittance) * grad_alpha
+        splat_grads = composite_backward(splats, tiles, ctx.view[1], behind, grad_rgb, grad_alpha)
+        grads = project_backward(gaussians, splats, splat_grads, *ctx.view)
+        ctx.info.means2d_grads = torch.from_numpy(splat_grads.means2d)
+        grad_background = np.einsum("hw,hwc->c", transmittance, grad_rgb)
+        arrays = (grads.means, grads.quats, grads.scales, splat_grads.opacities, grads.sh, grad_background)
+        return *(torch.from_numpy(array) for array in arrays), None, None, None
