@@ -1,0 +1,141 @@
+"""Everything that shapes a training run, in one frozen dataclass that is checked when it is built."""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.model import ModelConfig
+
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Settings of a run. Learning rates decay exponentially from `_start` to `_end` over all steps."""
+
+    steps: int = 12_000
+    """Optimiser steps; one photograph each."""
+    size: int | None = None
+    """Width in pixels to train at; the photographs' own width if not given."""
+    seed: int = 0
+    """Of the initial Gaussians, the order of the photographs, random backgrounds and splits."""
+    threads: int = 2
+    """Threads that torch uses. The same seed gives the same bits for the same number of threads."""
+    max_minutes: float | None = None
+    """Stop, evaluate and save after so many minutes of training, even if steps are left; `--resume` goes on."""
+    background: Literal["white", "black", "random"] = "white"
+    """What is behind the scene. With `random` every step draws a colour, and evaluation is on white."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """The multi-step deformation: number of layers, their sizes, the scale modulation."""
+
+    init_count: int = 10_000
+    """Gaussians at the start, random in a cube around the origin."""
+    half_extent: float | None = None
+    """Half the side of that cube in scene units; what the dataset suggests if not given."""
+    warmup_fraction: float = 0.075
+    """The first part of the run is trained without deformation, so that it starts from a blurred static scene."""
+    sh_interval: int = 1000
+    """The degree of the spherical harmonics in use goes up by one each so many steps."""
+    l1_weight: float = 0.8
+    """λ in L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
+
+    means_rate_start: float = 8e-4
+    means_rate_end: float = 8e-6
+    field_rate_start: float = 8e-4
+    """Of the deformation layers."""
+    field_rate_end: float = 1.6e-6
+    modulation_rate_start: float = 8e-4
+    """Of the modulation network and the embeddings that it reads."""
+    modulation_rate_end: float = 1.6e-6
+    sh_dc_rate: float = 2.5e-3
+    sh_rest_rate: float = 1.25e-4
+    opacities_rate: float = 5e-2
+    scales_rate: float = 5e-3
+    quats_rate: float = 1e-3
+
+    densify_every: int = 100
+    """Density control: clone and split where the picture pulls hardest on the Gaussians; 0 switches it off."""
+    densify_from: int = 500
+    densify_until_fraction: float = 0.5
+    densify_gradient: float = 2e-4
+    """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified."""
+    split_scale: float = 0.01
+    """One with a larger standard deviation than this part of the scene's extent is split, a smaller one is cloned."""
+    max_gaussians: int = 20_000
+    """Densification stops here; the strongest gradients come first."""
+    prune_opacity: float = 0.005
+    """Fainter Gaussians are removed."""
+    prune_scale: float = 0.1
+    """Ones larger than this part of the scene's extent are removed, once opacities have been reset."""
+    opacity_reset_every: int = 3000
+    """All opacities are cut to 0.01 each so many steps, while densification lasts; 0 switches it off."""
+
+    log_every: int = 20
+    """Steps between lines in metrics.jsonl."""
+    eval_every: int = 1000
+    """Steps between evaluations of the held-out photographs; 0 leaves only the one at the end."""
+    checkpoint_every: int = 1000
+    """Steps between checkpoints; 0 leaves only the one at the end."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "threads", "init_count", "sh_interval", "max_gaussians", "log_every"):
+            self._require(name, "a whole number above 0", lambda v: v >= 1)
+        for name in ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed"):
+            self._require(name, "0 or above", lambda v: v >= 0)
+        for name in ("l1_weight", "warmup_fraction", "densify_until_fraction", "prune_opacity"):
+            self._require(name, "in [0, 1]", lambda v: 0 <= v <= 1)
+        for item in dataclasses.fields(self):
+            if "_rate" in item.name:
+                self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
+        for name in ("densify_gradient", "split_scale", "prune_scale"):
+            self._require(name, "finite and above 0", lambda v: 0 < v < math.inf)
+        for name in ("size", "half_extent", "max_minutes"):
+            self._require(name, "above 0, or left out", lambda v: v is None or 0 < v < math.inf)
+        self._require("max_gaussians", "init_count or more", lambda v: v >= self.init_count)
+        self._require("background", f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
+
+    def _require(self, name: str, expected: str, holds: Any) -> None:
+        value = getattr(self, name)
+        if not holds(value):
+            raise InvalidInput(f"config.{name}", expected, value)
+
+    @property
+    def warmup_steps(self) -> int:
+        """Steps before the deformation takes part."""
+        return round(self.warmup_fraction * self.steps)
+
+    @property
+    def densify_until(self) -> int:
+        """The last step of density control."""
+        return round(self.densify_until_fraction * self.steps)
+
+    @property
+    def evaluation_background(self) -> tuple[float, float, float]:
+        """RGB in [0, 1] that held-out photographs are judged on, and that the model is saved with."""
+        return BACKGROUNDS.get(self.background, BACKGROUNDS["white"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "TrainConfig":
+        """The inverse of `to_dict`. Raises `InvalidInput` naming a setting that is unknown or out of range."""
+        unknown = sorted(set(values) - {item.name for item in dataclasses.fields(cls)})
+        if unknown:
+            raise InvalidInput("config", "made of known settings", f"`{unknown[0]}`")
+        return cls(**{**values, "model": ModelConfig(**values.get("model", {}))})
+
+
+RESUMABLE_CHANGES = frozenset({"steps", "threads", "max_minutes", "log_every", "eval_every", "checkpoint_every"})
+"""Settings that may change when a run is resumed. All others shape what has been trained already."""
+
+
+def check_resumable(stored: TrainConfig, wanted: TrainConfig) -> None:
+    """Raise `InvalidInput` naming the first setting that a resumed run may not change."""
+    for name, value in stored.to_dict().items():
+        if name not in RESUMABLE_CHANGES and wanted.to_dict()[name] != value:
+            raise InvalidInput(f"config.{name}", f"{value}, as when the run began", wanted.to_dict()[name])

@@ -1,0 +1,151 @@
+"""A whole run in its folder: steps, evaluations, checkpoints, and what is left to look at."""
+
+import json
+import time
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.config import TrainConfig, check_resumable
+from msdgs_train.datasets import SceneData, load_scene
+from msdgs_train.metrics import Quality, mean_quality
+from msdgs_train.report import MetricsLog, draw_curve, write_side_by_side
+from msdgs_train.trainer import StepResult, Trainer
+
+CONFIG = "config.json"
+CHECKPOINT = "checkpoint.pt"
+MODEL = "model.pt"
+FINAL_METRICS = "metrics.json"
+EVALUATED_SPLITS = ("test", "val")
+RENDERS_WHILE_TRAINING = 4
+
+
+class Outcome(NamedTuple):
+    """How a run has ended. It can be resumed unless it is `finished`."""
+
+    status: Literal["finished", "interrupted", "out of time"]
+    step: int
+    qualities: dict[str, Quality]  # of each held-out split; none when interrupted
+    gaussians: int
+    seconds: float  # of training in all, evaluations included
+
+
+class Observer:
+    """Hears of what a run does. This one does nothing; the command line shows a progress bar."""
+
+    def step(self, result: StepResult, seconds: float) -> None:
+        """After every step."""
+
+    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+        """After a split has been evaluated."""
+
+    def should_stop(self) -> bool:
+        """Asked after every step; the run then saves a checkpoint and returns."""
+        return False
+
+
+def stored_config(run: Path) -> TrainConfig:
+    """The settings that a run began with. Raises `InvalidInput` where there is no such run."""
+    path = run / CONFIG
+    if not path.exists() or not (run / CHECKPOINT).exists():
+        raise InvalidInput("run", "the folder of a run with a checkpoint, to resume it", run)
+    return TrainConfig.from_dict(json.loads(path.read_text()))
+
+
+def fit(
+    config: TrainConfig, data: Path, run: Path, *, resume: bool = False, observer: Observer | None = None
+) -> Outcome:
+    """Train on the photographs in `data` and leave everything in the folder `run`.
+
+    Raises `InvalidInput` where `run` holds another run and `resume` is false, or where a resumed run would change
+    settings that have shaped it.
+    """
+    if resume:
+        check_resumable(stored_config(run), config)
+    elif (run / CHECKPOINT).exists():
+        raise InvalidInput("run", "a new folder, or a run to go on with (--resume)", f"{run}, which holds a run")
+    scene = load_scene(data, config.size)
+    run.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(config, scene)
+    seconds = trainer.load_checkpoint(run / CHECKPOINT) if resume else 0.0
+    (run / CONFIG).write_text(json.dumps(config.to_dict(), indent=2) + "\n")
+    return _Run(config, scene, run, trainer, observer or Observer(), seconds).execute()
+
+
+class _Run:
+    def __init__(
+        self, config: TrainConfig, scene: SceneData, folder: Path, trainer: Trainer, observer: Observer, seconds: float
+    ) -> None:
+        self.config = config
+        self.folder = folder
+        self.trainer = trainer
+        self.observer = observer
+        self.splits = [split for split in EVALUATED_SPLITS if scene.splits.get(split)]
+        self.log = MetricsLog(folder, keep_until=trainer.step_count)
+        self.started = time.perf_counter() - seconds
+
+    def execute(self) -> Outcome:
+        status = "finished"
+        while self.trainer.step_count < self.config.steps and status == "finished":
+            result = self.trainer.step()
+            self._after_step(result)
+            if result.step < self.config.steps:
+                status = self._reason_to_stop()
+        qualities = {}
+        if status != "interrupted":
+            qualities = {split: self._evaluate(split, renders=None) for split in self.splits}
+        self._save()
+        if qualities:
+            self._write_final_metrics(qualities)
+        count = len(self.trainer.model.gaussians)
+        return Outcome(status, self.trainer.step_count, qualities, count, self._seconds())
+
+    def _reason_to_stop(self) -> Literal["finished", "interrupted", "out of time"]:
+        if self.observer.should_stop():
+            return "interrupted"
+        budget = self.config.max_minutes
+        return "out of time" if budget is not None and self._seconds() >= 60 * budget else "finished"
+
+    def _after_step(self, result: StepResult) -> None:
+        if result.step % self.config.log_every == 0 or result.step == self.config.steps:
+            self.log.train(result, self._seconds())
+        self.observer.step(result, self._seconds())
+        if result.step < self.config.steps:
+            if _is_due(result.step, self.config.eval_every) and self.splits:
+                self._evaluate(self.splits[0], renders=RENDERS_WHILE_TRAINING)
+                draw_curve(self.folder)
+            if _is_due(result.step, self.config.checkpoint_every):
+                self._save()
+
+    def _evaluate(self, split: str, *, renders: int | None) -> Quality:
+        """The mean quality of a split; the first `renders` frames, or all, are written beside their photographs."""
+        qualities = []
+        for index, evaluated in enumerate(self.trainer.evaluate(split)):
+            qualities.append(evaluated.quality)
+            if renders is None or index < renders:
+                write_side_by_side(self.folder, split, evaluated)
+        quality = mean_quality(qualities)
+        self.log.evaluation(self.trainer.step_count, split, quality)
+        self.observer.evaluation(self.trainer.step_count, split, quality)
+        return quality
+
+    def _save(self) -> None:
+        self.trainer.save_checkpoint(self.folder / CHECKPOINT, self._seconds())
+        self.trainer.save_model(self.folder / MODEL)
+        draw_curve(self.folder)
+
+    def _write_final_metrics(self, qualities: dict[str, Quality]) -> None:
+        metrics = {
+            "step": self.trainer.step_count,
+            "seconds": round(self._seconds(), 1),
+            "gaussians": len(self.trainer.model.gaussians),
+            "splits": {split: quality._asdict() for split, quality in qualities.items()},
+        }
+        (self.folder / FINAL_METRICS).write_text(json.dumps(metrics, indent=2) + "\n")
+
+    def _seconds(self) -> float:
+        return time.perf_counter() - self.started
+
+
+def _is_due(step: int, every: int) -> bool:
+    return every > 0 and step % every == 0

@@ -1,0 +1,94 @@
+"""Adam over named groups of parameters, learning rates as functions of the step, and surgery on Adam's moments.
+
+Density control changes how many Gaussians there are in the middle of a run. Each row of a parameter has a row of
+first and second moments beside it; `replace_rows` keeps them together.
+"""
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from msdgs_train.config import TrainConfig
+from msdgs_train.model import DynamicGaussians
+
+Moments = Callable[[Tensor], Tensor]
+
+EPSILON = 1e-15
+"""Adam's own default, 1e-8, is as large as the gradients of small Gaussians."""
+
+_CONSTANT_RATES = {
+    "log_scales": "scales_rate",
+    "raw_quats": "quats_rate",
+    "raw_opacities": "opacities_rate",
+    "sh_dc": "sh_dc_rate",
+    "sh_rest": "sh_rest_rate",
+}
+_DECAYING_RATES = {"means": "means", "embeddings": "modulation", "modulation": "modulation", "deformation": "field"}
+
+
+def exponential(start: float, end: float, step: int, steps: int) -> float:
+    """From `start` at step 0 to `end` at `steps`, along a straight line in the logarithm; `end` ever after."""
+    return start * (end / start) ** min(step / steps, 1.0)
+
+
+def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
+    """The rate of each group of parameters at one step."""
+    rates = {group: getattr(config, name) for group, name in _CONSTANT_RATES.items()}
+    for group, name in _DECAYING_RATES.items():
+        start, end = getattr(config, f"{name}_rate_start"), getattr(config, f"{name}_rate_end")
+        rates[group] = exponential(start, end, step, config.steps)
+    return rates
+
+
+def make_optimizer(model: DynamicGaussians, config: TrainConfig) -> torch.optim.Adam:
+    """One Adam; a group for each attribute of the Gaussians, one for the deformation, one for the modulation."""
+    named: dict[str, list[nn.Parameter]] = {name: [p] for name, p in model.gaussians.named_parameters()}
+    named["deformation"] = list(model.deformation.parameters())
+    if model.modulation is not None:
+        named["modulation"] = list(model.modulation.parameters())
+    rates = learning_rates(config, 0)
+    groups = [{"params": params, "lr": rates[name], "name": name} for name, params in named.items() if params]
+    # fused: 1.1 ms a step for 10,000 Gaussians and two layers, 5.9 ms otherwise
+    return torch.optim.Adam(groups, eps=EPSILON, fused=True)
+
+
+def set_learning_rates(optimizer: torch.optim.Optimizer, rates: Mapping[str, float]) -> None:
+    """Give each group the rate of its name."""
+    for group in optimizer.param_groups:
+        group["lr"] = rates[group["name"]]
+
+
+def replace_rows(
+    optimizer: torch.optim.Optimizer, gaussians: nn.Module, kept: Tensor, added: Mapping[str, Tensor]
+) -> None:
+    """Keep the rows `kept` [M] (indices) of every parameter of `gaussians`, and put the rows `added` after them.
+
+    The moments of kept rows stay as they are; those of added rows start at zero.
+    """
+    for name, old in list(gaussians.named_parameters()):
+        new = nn.Parameter(torch.cat([old.detach()[kept], added[name]]))
+        _replace(optimizer, gaussians, name, new, lambda moment, rows=added[name]: _extended(moment, kept, rows))
+
+
+def replace_values(optimizer: torch.optim.Optimizer, gaussians: nn.Module, name: str, values: Tensor) -> None:
+    """Set one parameter to `values`, of the same shape, and its moments to zero."""
+    _replace(optimizer, gaussians, name, nn.Parameter(values), torch.zeros_like)
+
+
+def _extended(moment: Tensor, kept: Tensor, rows: Tensor) -> Tensor:
+    return torch.cat([moment[kept], torch.zeros_like(rows)])
+
+
+def _replace(
+    optimizer: torch.optim.Optimizer, gaussians: nn.Module, name: str, new: nn.Parameter, on_moments: Moments
+) -> None:
+    old = getattr(gaussians, name)
+    setattr(gaussians, name, new)
+    group = next(group for group in optimizer.param_groups if group["name"] == name)
+    group["params"] = [new]
+    state = optimizer.state.pop(old, None)
+    if state is not None:
+        for moment in ("exp_avg", "exp_avg_sq"):
+            state[moment] = on_moments(state[moment])
+        optimizer.state[new] = state

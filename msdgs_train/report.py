@@ -1,0 +1,97 @@
+"""What a run leaves to look at: metrics as JSON lines, a curve, and renderings beside their photographs."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import OpenImageIO as oiio
+
+from msdgs_train.metrics import Quality
+from msdgs_train.trainer import Evaluated, StepResult
+
+matplotlib.use("Agg")
+
+METRICS = "metrics.jsonl"
+CURVE = "curve.png"
+RENDERS = "renders"
+
+
+class MetricsLog:
+    """Lines of `metrics.jsonl`: {"kind": "train", "step", "loss", "psnr", …} and {"kind": "eval", "split", …}."""
+
+    def __init__(self, run: Path, *, keep_until: int = 0) -> None:
+        """Goes on after the lines up to step `keep_until`; those of steps after the last checkpoint are dropped."""
+        self.path = run / METRICS
+        kept = [line for line in read_metrics(run) if line["step"] <= keep_until]
+        self.path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+
+    def train(self, result: StepResult, seconds: float) -> None:
+        """One line about the steps so far."""
+        self._append({"kind": "train", **result._asdict(), "seconds": round(seconds, 3)})
+
+    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+        """One line about a split of held-out photographs."""
+        self._append({"kind": "eval", "step": step, "split": split, **quality._asdict()})
+
+    def _append(self, line: dict[str, Any]) -> None:
+        with self.path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """The lines of a run's `metrics.jsonl`, without a last one that was cut off; none if there is no such file."""
+    path = run / METRICS
+    lines = []
+    for text in path.read_text().splitlines() if path.exists() else ():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def draw_curve(run: Path) -> None:
+    """Loss, PSNR in training and on held-out photographs, and the number of Gaussians, over the steps."""
+    from matplotlib.figure import Figure
+
+    lines = read_metrics(run)
+    train = [line for line in lines if line["kind"] == "train"]
+    figure = Figure(figsize=(9, 9), layout="constrained")
+    loss, psnr, count = figure.subplots(3, 1, sharex=True)
+    steps = [line["step"] for line in train]
+    loss.semilogy(steps, [line["loss"] for line in train])
+    psnr.plot(steps, [line["psnr"] for line in train], label="train, last photographs")
+    for split in sorted({line["split"] for line in lines if line["kind"] == "eval"}):
+        points = [(line["step"], line["psnr"]) for line in lines if line["kind"] == "eval" and line["split"] == split]
+        psnr.plot(*zip(*points, strict=True), marker="o", label=f"{split}, last {points[-1][1]:.2f} dB")
+    psnr.legend()
+    count.plot(steps, [line["gaussians"] for line in train])
+    for axis, label in ((loss, "loss"), (psnr, "PSNR, dB"), (count, "Gaussians")):
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    count.set_xlabel("step")
+    figure.savefig(run / CURVE, dpi=110)
+
+
+def write_side_by_side(run: Path, split: str, evaluated: Evaluated) -> Path:
+    """The photograph at the left, the rendering at the right, in `renders/`; returns the PNG's path."""
+    folder = run / RENDERS
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{split}_{Path(evaluated.frame.name).name}.png"
+    pair = np.concatenate([evaluated.truth.numpy(), evaluated.rgb.numpy()], axis=1)
+    write_png(path, pair)
+    return path
+
+
+def write_png(path: Path, rgb: np.ndarray) -> None:
+    """Write display-referred RGB, [H, W, 3] in [0, 1], as 8-bit PNG; raises `OSError` if the disk won't have it."""
+    pixels = np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+    height, width = pixels.shape[:2]
+    output = oiio.ImageOutput.create(str(path))
+    if output is None:
+        raise OSError(f"{path}: {oiio.geterror()}")
+    written = output.open(str(path), oiio.ImageSpec(width, height, 3, "uint8")) and output.write_image(pixels)
+    if not (output.close() and written):
+        raise OSError(f"{path}: {output.geterror()}")

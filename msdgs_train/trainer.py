@@ -1,0 +1,241 @@
+"""One training run in memory: do a step, judge the model, save everything and go on from there."""
+
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
+
+from msdgs_serve.scene.errors import MsdgsError
+from msdgs_train import checkpoint
+from msdgs_train.config import TrainConfig
+from msdgs_train.datasets import Frame, SceneData, composite
+from msdgs_train.densification import DensityControl
+from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.losses import photometric_loss
+from msdgs_train.metrics import Quality, mean_quality, psnr_from_mse, quality
+from msdgs_train.model import DynamicGaussians, PosedGaussians
+from msdgs_train.optimizers import learning_rates, make_optimizer, set_learning_rates
+from msdgs_train.rasterization import rasterize
+
+MAX_SKIPPED_IN_A_ROW = 20
+SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 50 steps
+BOUNDS_TIMES = 9
+VISIBLE_OPACITY = 0.05
+
+
+class TrainingDiverged(MsdgsError):
+    """The loss or its gradient has not been finite for many steps in a row."""
+
+
+class StepResult(NamedTuple):
+    """What one step has shown, averaged over the last steps, and what it has cost."""
+
+    step: int  # counted from 1
+    loss: float
+    psnr: float  # dB, on training photographs
+    gaussians: int
+    skipped: int  # steps of the whole run whose loss or gradient was not finite
+
+
+class Evaluated(NamedTuple):
+    """A held-out frame: as photographed and as rendered, [H, W, 3] in [0, 1]."""
+
+    frame: Frame
+    truth: Tensor
+    rgb: Tensor
+    quality: Quality
+
+
+class Trainer:
+    """The model, its optimiser, its density control and the order of the photographs, moved on by `step`."""
+
+    def __init__(self, config: TrainConfig, scene: SceneData) -> None:
+        torch.set_num_threads(config.threads)
+        self.config = config
+        self.scene = scene
+        self.frames = scene.splits["train"]
+        self.step_count = 0
+        self.skipped = 0
+        self._skipped_in_a_row = 0
+        self._averages: tuple[float, float] | None = None  # loss, squared error
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._order = torch.empty(0, dtype=torch.int64)
+        self._half_extent = config.half_extent or scene.half_extent
+        self.model = _new_model(config, self._half_extent)
+        self.optimizer = make_optimizer(self.model, config)
+        self.density = DensityControl.start(config, self._extent(), config.init_count)
+
+    def step(self) -> StepResult:
+        """Render one training photograph's view, pull the model towards the photograph, and control density."""
+        frame, background = self._next_frame(), self._next_background()
+        truth = self._photograph(frame, background)
+        set_learning_rates(self.optimizer, learning_rates(self.config, self.step_count))
+        rgb, _, info = rasterize(*self._pose(frame.t), frame.camera, background)
+        loss = photometric_loss(rgb, truth, self.config.l1_weight)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.step_count += 1
+        if self._is_finite(loss):
+            self.optimizer.step()
+            self._average(loss.item(), float((rgb.detach() - truth).square().mean()))
+            if info.means2d_grads is not None:
+                self.density.gather(info.means2d_grads, info.radii, frame.camera.width, frame.camera.height)
+        self._control_density()
+        average_loss, average_error = self._averages or (float("nan"), float("nan"))
+        return StepResult(
+            self.step_count, average_loss, psnr_from_mse(average_error), len(self.model.gaussians), self.skipped
+        )
+
+    @torch.no_grad()
+    def evaluate(self, split: str) -> Iterator[Evaluated]:
+        """Render and judge each frame of a split, one after the other."""
+        background = torch.tensor(self.config.evaluation_background)
+        for frame in self.scene.splits[split]:
+            truth = self._photograph(frame, background)
+            rgb = rasterize(*self._pose(frame.t), frame.camera, background)[0].clamp(0, 1)
+            yield Evaluated(frame, truth, rgb, quality(rgb, truth))
+
+    def evaluate_mean(self, split: str) -> Quality:
+        """The mean PSNR and SSIM of a split."""
+        return mean_quality([evaluated.quality for evaluated in self.evaluate(split)])
+
+    def save_checkpoint(self, path: Path, seconds: float) -> None:
+        """Write all that a bit-exact continuation needs; `seconds` is the time trained so far. Atomic."""
+        state = {
+            "config": self.config.to_dict(),
+            "step_count": self.step_count,
+            "seconds": seconds,
+            "skipped": (self.skipped, self._skipped_in_a_row),
+            "averages": self._averages,
+            "generators": (self._generator.get_state(), self.density.generator.get_state()),
+            "order": self._order,
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "density": (self.density.gradients, self.density.counts),
+        }
+        checkpoint.save_atomic(path, state)
+
+    def load_checkpoint(self, path: Path) -> float:
+        """Go on from a checkpoint, of a run with the same settings; returns the seconds trained before."""
+        state: dict[str, Any] = checkpoint.load(path)
+        _resize(self.model.gaussians, state["model"])
+        self.model.load_state_dict(state["model"])
+        self.optimizer = make_optimizer(self.model, self.config)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.step_count, self._order, self._averages = state["step_count"], state["order"], state["averages"]
+        self.skipped, self._skipped_in_a_row = state["skipped"]
+        self._generator.set_state(state["generators"][0])
+        self.density.generator.set_state(state["generators"][1])
+        self.density.gradients, self.density.counts = state["density"]
+        return float(state["seconds"])
+
+    def save_model(self, path: Path) -> None:
+        """Write the model with what a service needs to show it: times, background, bounds and cameras."""
+        info = checkpoint.SceneInfo(
+            time_range=self.scene.time_range,
+            background=self.config.evaluation_background,
+            bounds=self._bounds(),
+            cameras=[_camera_entry(frame) for frame in self.scene.splits.get("test") or self.frames[:20]],
+        )
+        checkpoint.save_model(path, self.model, info, self.step_count)
+
+    def _pose(self, t: float) -> PosedGaussians:
+        degree = min(self.step_count // self.config.sh_interval, self.config.model.sh_degree)
+        return self.model.pose(t, deform=self.step_count >= self.config.warmup_steps, sh_degree=degree)
+
+    def _next_frame(self) -> Frame:
+        position = self.step_count % len(self.frames)
+        if position == 0:
+            self._order = torch.randperm(len(self.frames), generator=self._generator)
+        return self.frames[int(self._order[position])]
+
+    def _next_background(self) -> Tensor:
+        if self.config.background == "random":
+            return torch.rand(3, generator=self._generator)
+        return torch.tensor(self.config.evaluation_background)
+
+    @functools.cached_property
+    def _photographs(self) -> dict[Path, np.ndarray]:
+        return {}
+
+    def _photograph(self, frame: Frame, background: Tensor) -> Tensor:
+        """[H, W, 3] over a background. Pixels stay in memory as uint8 RGBA, read when first wanted."""
+        rgba = self._photographs.get(frame.image_path)
+        if rgba is None:
+            rgba = self._photographs[frame.image_path] = frame.load_rgba()
+        return torch.from_numpy(composite(rgba, background.numpy()))
+
+    def _is_finite(self, loss: Tensor) -> bool:
+        gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
+        if bool(torch.isfinite(loss.detach() + get_total_norm(gradients, foreach=True))):
+            self._skipped_in_a_row = 0
+            return True
+        self.skipped += 1
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
+            raise TrainingDiverged(
+                f"the loss or its gradient was not finite for {MAX_SKIPPED_IN_A_ROW} steps in a row, up to step "
+                f"{self.step_count}; lower the learning rates and resume from the last checkpoint"
+            )
+        return False
+
+    def _average(self, loss: float, squared_error: float) -> None:
+        old = self._averages or (loss, squared_error)
+        self._averages = (
+            SMOOTHING * old[0] + (1 - SMOOTHING) * loss,
+            SMOOTHING * old[1] + (1 - SMOOTHING) * squared_error,
+        )
+
+    def _control_density(self) -> None:
+        if self.density.is_due(self.step_count):
+            self.density.densify(self.model.gaussians, self.optimizer, self.step_count)
+        if self.density.is_reset_due(self.step_count):
+            self.density.reset_opacities(self.model.gaussians, self.optimizer)
+
+    def _extent(self) -> float:
+        """Radius of the cameras' positions, as 3D Gaussian Splatting measures a scene; one camera has none."""
+        positions = np.array([frame.camera.position for frame in self.frames])
+        radius = 1.1 * float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
+        return radius if radius > 0 else self._half_extent
+
+    @torch.no_grad()
+    def _bounds(self) -> list[list[float]]:
+        """Corners of the box that holds the centres of all Gaussians that can be seen, over the times of the scene."""
+        first, last = self.scene.time_range
+        boxes = []
+        for t in np.linspace(first, last, BOUNDS_TIMES):
+            posed = self._pose(float(t))
+            means = posed.means[posed.opacities >= VISIBLE_OPACITY]
+            if len(means):
+                boxes.append(torch.stack([means.amin(dim=0), means.amax(dim=0)]))
+        if not boxes:
+            return [[-self._half_extent] * 3, [self._half_extent] * 3]
+        stacked = torch.stack(boxes)
+        return [stacked[:, 0].amin(dim=0).tolist(), stacked[:, 1].amax(dim=0).tolist()]
+
+
+def _new_model(config: TrainConfig, half_extent: float) -> DynamicGaussians:
+    sizes = config.model
+    gaussians = CanonicalGaussians.random_in_cube(
+        config.init_count, half_extent, sizes.sh_degree, sizes.embedding_size, config.seed
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return DynamicGaussians(sizes, gaussians)
+
+
+def _resize(gaussians: nn.Module, state: dict[str, Tensor]) -> None:
+    for name, parameter in list(gaussians.named_parameters()):
+        rows = len(state[f"gaussians.{name}"])
+        setattr(gaussians, name, nn.Parameter(parameter.new_empty(rows, *parameter.shape[1:])))
+
+
+def _camera_entry(frame: Frame) -> dict[str, Any]:
+    camera = frame.camera
+    entry = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    return {"name": frame.name, **entry, "camera_to_world": camera.camera_to_world.tolist(), "t": frame.t}
