@@ -1,0 +1,69 @@
+# Two environments: .venv-serve has what serving needs and no torch, .venv has everything.
+# They are made anew when pyproject.toml or constraints.txt change.
+
+PYTHON ?= python3
+TORCH_INDEX ?=
+SCENE ?= examples/toybench.onnx
+PORT ?= 8000
+ONCE ?=
+ARGS ?=
+
+SERVE := .venv-serve
+FULL := .venv
+INSTALL := -m pip --disable-pip-version-check install --no-compile
+# the same pins for what is installed and for what builds the package
+PINS := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt
+DEMO_FLAGS = --port $(PORT) $(if $(filter-out 0,$(ONCE)),--once)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo demo-train test lint format clean
+
+help:  ## show this list
+	@awk -F ':.*## +' '/^[a-z-]+:.*##/ { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@echo
+	@echo "  ONCE=1 stops a demo after its frame; PORT=$(PORT); SCENE=$(SCENE); PYTHON=$(PYTHON)"
+	@echo "  TORCH_INDEX=URL adds a package index for torch (on Linux: the CPU one); ARGS='-k name' goes to pytest"
+
+demo: $(SERVE)/.installed  ## serve a trained scene, write out/demo.png, stay up until Ctrl-C
+	$(SERVE)/bin/python examples/demo.py $(SCENE) $(DEMO_FLAGS)
+
+demo-train: $(FULL)/.installed-train  ## make a moving scene, train, export, serve, write out/demo_train.png
+	$(FULL)/bin/python examples/demo_train.py $(DEMO_FLAGS)
+
+test: lint  ## install everything, check style, types and imports, run the tests
+	$(FULL)/bin/python -m pytest $(ARGS)
+
+lint: $(FULL)/.installed-dev  ## ruff, pyright and the import contracts
+	$(FULL)/bin/ruff check
+	$(FULL)/bin/ruff format --check
+	$(FULL)/bin/lint-imports
+	$(FULL)/bin/pyright
+
+format: $(FULL)/.installed-dev  ## write the sources as ruff likes them
+	$(FULL)/bin/ruff check --fix
+	$(FULL)/bin/ruff format
+
+clean:  ## remove the environments and what the demos wrote
+	rm -rf $(SERVE) $(FULL) out
+
+$(SERVE)/.installed: pyproject.toml constraints.txt
+	$(call make_environment,$(SERVE))
+	$(PINS) $(SERVE)/bin/python $(INSTALL) --editable .
+	@touch $@
+
+$(FULL)/.installed-train: pyproject.toml constraints.txt
+	$(call make_environment,$(FULL))
+	$(PINS) $(FULL)/bin/python $(INSTALL) $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) --editable '.[train,export]'
+	@touch $@
+
+$(FULL)/.installed-dev: $(FULL)/.installed-train
+	$(PINS) $(FULL)/bin/python $(INSTALL) --editable '.[train,export,dev]'
+	@touch $@
+
+define make_environment
+@$(PYTHON) -c 'import sys; ok = (3, 11) <= sys.version_info < (3, 14); \
+	sys.exit(None if ok else "Python 3.11 to 3.13 is needed, and $(PYTHON) is %d.%d: make PYTHON=..." % sys.version_info[:2])'
+@$(PYTHON) -c 'import ensurepip' || { echo "$(PYTHON) comes without venv: install it first (Debian: apt install python3-venv)"; exit 1; }
+$(PYTHON) -m venv --clear $(1)
+endef
