@@ -11,14 +11,14 @@ from numba.extending import intrinsic, overload
 LOG2_E = np.float32(1.4426950408889634)
 LN2_HIGH = np.float32(0.693359375)  # 9 bits, so that n * LN2_HIGH is exact
 LN2_LOW = np.float32(-2.12194440e-4)
-LOWEST = np.float32(-87.0)  # below this the result would be subnormal
+LOWEST = np.float32(-60.0)  # far above the subnormal numbers, in which a product takes 100 times as long
 C2, C3, C4, C5, C6 = (np.float32(1 / math.factorial(n)) for n in (2, 3, 4, 5, 6))
 ONE = np.float32(1)
 HALF = np.float32(0.5)
 
 
 def exp_nonpositive(x: Any) -> Any:
-    """exp(x), x <= 0. float32: within 2e-7 relative, and exp(-87) below -87. float64: `math.exp`."""
+    """exp(x), x <= 0. float32: within 2e-7 relative, and exp(-60) below -60. float64: `math.exp`."""
     return np.exp(x)
 
 
