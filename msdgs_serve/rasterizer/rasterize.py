@@ -36,7 +36,7 @@ def rasterize(
     Raises:
         InvalidInput: if an array of the Gaussians, the background or an option breaks its contract, by name.
     """
-    gaussians.validate()
+    gaussians = _kernel_arrays(gaussians.validate())
     background = np.asarray(background, dtype=gaussians.means.dtype)
     if background.shape != (3,) or not np.isfinite(background).all():
         raise InvalidInput("background", "3 finite numbers", background.tolist())
@@ -47,3 +47,10 @@ def rasterize(
     depth = np.full_like(alpha, np.inf)
     np.divide(blend.depth, alpha, out=depth, where=alpha > 0)
     return Rendering(blend.rgb + blend.transmittance[..., None] * background, alpha, depth)
+
+
+def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
+    """The same numbers in C order, writable and of one dtype: for each other combination numba would compile anew."""
+    dtype = np.float64 if gaussians.means.dtype == np.float64 else np.float32
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    return Gaussians(*(np.require(array, dtype, ("C", "W")) for array in arrays))
