@@ -1,0 +1,52 @@
+"""Every numeric tolerance of the tests: one row a quantity, with the reason for its size.
+
+A test says `assert_close(got, want, "rotation")` or `tolerance("rgb.float32")`; it never writes a number of its own.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Row(NamedTuple):
+    """`value` is an absolute bound unless the name ends in `.relative`, or in `_db`, which is a lower bound."""
+
+    name: str
+    value: float
+    reason: str
+
+
+TABLE = (
+    # scene vocabulary, float64
+    Row("rotation", 1e-12, "a few dozen float64 operations on numbers of size 1"),
+    Row("sh_basis", 1e-12, "polynomials of degree 3 in float64; published constants carry 16 digits"),
+    Row("sh_basis.float32", 2e-6, "the same in float32"),
+    Row("sh_basis.gsplat", 1e-12, "as sh_basis; gsplat keeps some constants to 14 digits"),
+    Row("float32.relative", 1e-6, "a handful of float32 operations"),
+    Row("pixel", 1e-9, "projecting a known point through float64 matrices, in pixels"),
+    # rasterizer against the float64 oracle, pixels where no decision is in doubt; colours are of size 1
+    Row("rgb.float32", 5e-6, "hundreds of blended splats, each alpha off by a few 1e-6 from the rounding of sigma"),
+    Row("alpha.float32", 5e-6, "as rgb"),
+    Row("depth.float32.relative", 3e-5, "a quotient of two such sums, both small at the faint edge of a splat"),
+    Row("rgb.float64", 1e-10, "the same in float64, sigma of needles loses six digits"),
+    Row("alpha.float64", 1e-10, "as rgb"),
+    Row("depth.float64.relative", 1e-10, "as rgb"),
+    Row("oracle_db", 70.0, "whole picture, threshold pixels included: one step in 1 of 5,000 at every pixel"),
+)
+
+_ROWS = {row.name: row for row in TABLE}
+assert len(_ROWS) == len(TABLE), "a quantity has two rows"
+
+
+def tolerance(name: str) -> float:
+    """The bound of one row of the table."""
+    return _ROWS[name].value
+
+
+def assert_close(got: object, want: object, name: str) -> None:
+    """Shapes agree and no element is further off than the row allows."""
+    got, want = np.asarray(got), np.asarray(want)
+    assert got.shape == want.shape, f"{got.shape} instead of {want.shape}"
+    relative = name.endswith(".relative")
+    bound = {"rtol": tolerance(name), "atol": 0.0} if relative else {"rtol": 0.0, "atol": tolerance(name)}
+    np.testing.assert_allclose(got, want, **bound)
