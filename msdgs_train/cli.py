@@ -35,7 +35,7 @@ class Fit:
     """The folder of this run; new, or one to --resume."""
     resume: bool = False
     """Go on with the run in RUN, with the settings it was begun with."""
-    config: tyro.conf.OmitArgPrefixes[TrainConfig] = field(default_factory=TrainConfig)
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
 
 @dataclass(frozen=True)
