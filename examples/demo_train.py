@@ -1,0 +1,120 @@
+"""The whole path on a scene made on the spot: photographs → training → ONNX scene → service → a frame no one saw.
+
+python examples/demo_train.py --once
+"""
+
+import argparse
+import contextlib
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import torch
+from serving import curl, get, render, say, serving, stay_up
+
+from msdgs_serve.scene import Camera
+from msdgs_train.datasets import Frame, composite, load_scene
+from msdgs_train.metrics import mean_quality, quality
+from msdgs_train.report import write_png
+
+ROOT = Path(__file__).resolve().parents[1]
+TRAIN = str(Path(sys.executable).with_name("msdgs-train"))
+EXPORT = [sys.executable, str(ROOT / "export" / "to_onnx.py")]
+MINIMUM_PSNR = 22.0
+"""dB on the held-out photographs, below which the demo counts as broken; an empty frame has about 12."""
+
+
+def main() -> None:
+    """Make, train, export, serve, compare with the held-out photographs, wait for Ctrl-C."""
+    arguments = parse_arguments()
+    folder = arguments.out.with_suffix("")
+    shutil.rmtree(folder, ignore_errors=True)
+    data, run, scene = folder / "data", folder / "run", folder / "toy.onnx"
+    folder.mkdir(parents=True)
+    step("a small moving scene, photographed", TRAIN, "synthetic", data, "--size", arguments.size)
+    step("training", TRAIN, "fit", data, run, *fit_flags(arguments))
+    step("export", *EXPORT, run / "model.pt", "--out", scene)
+    with serving(scene, arguments.port) as url:
+        compare(url, load_scene(data).splits["test"], arguments.out)
+        if not arguments.once:
+            stay_up(url)
+
+
+def fit_flags(arguments: argparse.Namespace) -> list[object]:
+    """Settings for minutes rather than for quality."""
+    return ["--steps", arguments.steps, "--max-minutes", arguments.minutes]
+
+
+def compare(url: str, frames: list[Frame], out: Path) -> None:
+    """Ask the service for every held-out photograph's camera and time; write one pair, photograph at the left."""
+    (scene,) = get(f"{url}/scenes")["scenes"]
+    background = get(f"{url}/scenes/{scene['name']}")["background"]
+    pairs = []
+    for frame in frames:
+        truth = composite(frame.load_rgba(), background)
+        pairs.append((truth, decode_png(render(url, request_for(frame)))))
+    qualities = [quality(torch.from_numpy(rgb), torch.from_numpy(truth)) for truth, rgb in pairs]
+    shown = len(frames) // 2
+    write_png(out, np.concatenate(pairs[shown], axis=1))
+    mean = mean_quality(qualities)
+    say(f"wrote {out}: photograph | render, {frames[shown].name} at t = {frames[shown].t:.3f}")
+    say(f"  this frame: PSNR {qualities[shown].psnr:.2f} dB, SSIM {qualities[shown].ssim:.4f}")
+    say(f"  all {len(frames)} held-out frames: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
+    say(f"ask for it again:\n{curl(url, request_for(frames[shown]), 'frame.png')}")
+    if not mean.psnr >= MINIMUM_PSNR:
+        raise SystemExit(f"the frames do not look like the photographs: {mean.psnr:.2f} dB < {MINIMUM_PSNR} dB")
+
+
+def request_for(frame: Frame) -> dict[str, Any]:
+    """The body of a `POST /render` for the frame's camera and time."""
+    camera: Camera = frame.camera
+    intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    pose = camera.camera_to_world.round(7).tolist()
+    return {
+        "camera": {"type": "matrix", "camera_to_world": pose, **intrinsics},
+        "t": frame.t,
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def decode_png(png: bytes) -> np.ndarray:
+    """RGB in [0, 1], [H, W, 3] float32."""
+    with tempfile.NamedTemporaryFile(suffix=".png") as file:
+        file.write(png)
+        file.flush()
+        return np.ascontiguousarray(oiio.ImageBuf(file.name).get_pixels(oiio.FLOAT)[..., :3])
+
+
+def step(title: str, *command: object) -> None:
+    """Run one command of the path, its output seen; ends the demo where it fails."""
+    words = [str(word) for word in command]
+    say(f"\n== {title}\n$ {shlex.join(words)}")
+    started = time.perf_counter()
+    if code := subprocess.run(words, check=False).returncode:
+        raise SystemExit(f"{title}: exit code {code}")
+    say(f"== {title}: {time.perf_counter() - started:.0f} s")
+
+
+def parse_arguments() -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(description="Make a moving scene, train on it, export, serve, compare.")
+    parser.add_argument("--port", type=int, default=8000, help="another one is used where it is taken")
+    parser.add_argument("--size", type=int, default=100, help="width and height of the photographs")
+    parser.add_argument("--steps", type=int, default=2500, help="of training")
+    parser.add_argument("--minutes", type=float, default=3.0, help="of training, at most")
+    parser.add_argument("--out", type=Path, default=Path("out/demo_train.png"))
+    parser.add_argument("--once", action="store_true", help="stop after the frames")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt):
+        main()
