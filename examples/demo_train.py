@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from serving import curl, get, render, say, serving, stay_up
 
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
 from msdgs_train.metrics import mean_quality, quality
 from msdgs_train.report import write_png
+from serving import curl, get, render, say, serving, stay_up
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = str(Path(sys.executable).with_name("msdgs-train"))
