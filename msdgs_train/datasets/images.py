@@ -1,0 +1,91 @@
+"""Photographs as 8-bit RGBA with straight alpha: reading, reducing and laying over a background."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import OpenImageIO as oiio
+
+EXTENSIONS = (".png", ".jpg", ".jpeg")
+
+
+class ImageUnreadable(Exception):
+    """A file is no image that can be used; the message says why."""
+
+
+class ImageSize(NamedTuple):
+    """In pixels."""
+
+    width: int
+    height: int
+
+
+def read_size(path: Path) -> ImageSize:
+    """The size that a photograph's header states. Raises `ImageUnreadable`."""
+    reader = _open(path)
+    spec = reader.spec()
+    reader.close()
+    return ImageSize(spec.width, spec.height)
+
+
+def read_rgba(path: Path) -> np.ndarray:
+    """[H, W, 4] uint8, straight alpha; grey becomes RGB, and what has no alpha is opaque. Raises `ImageUnreadable`."""
+    reader = _open(path)
+    pixels = reader.read_image("uint8")
+    problem = reader.geterror()
+    reader.close()
+    if pixels is None:
+        raise ImageUnreadable(problem.splitlines()[0] if problem else "no pixels")
+    channels = pixels.shape[2]
+    rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+    rgba[..., :3] = pixels[..., :3] if channels >= 3 else pixels[..., :1]
+    if channels in (2, 4):
+        rgba[..., 3] = pixels[..., -1]
+    return rgba
+
+
+def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Reduce uint8 [H, W, 4] to [height, width, 4]: each new pixel is the mean over the area it covers.
+
+    Colours are weighted by alpha, so that what is behind transparent pixels does not bleed in; where nothing is
+    opaque, the colour is black. For halves this is the exact 2×2 box.
+    """
+    if rgba.shape[:2] == (height, width):
+        return rgba
+    old_height, old_width, _ = rgba.shape
+    means = rgba.astype(np.float32)
+    means[..., :3] *= means[..., 3:]
+    means = (_cell_weights(old_height, height) @ means.reshape(old_height, -1)).reshape(height, old_width, 4)
+    means = _cell_weights(old_width, width) @ means
+    alpha = means[..., 3:]
+    means[..., :3] /= np.where(alpha > 0, alpha, 1)
+    return np.floor(means + 0.5).astype(np.uint8)
+
+
+def composite(rgba: np.ndarray, background: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """Lay uint8 [H, W, 4] with straight alpha over an RGB background in [0, 1]; returns float32 [H, W, 3]."""
+    scaled = rgba.astype(np.float32) * np.float32(1 / 255)
+    rgb, alpha = scaled[..., :3], scaled[..., 3:]
+    background = np.asarray(background, np.float32)
+    return background + alpha * (rgb - background)
+
+
+def _cell_weights(length: int, count: int) -> np.ndarray:
+    """[count, length] rows that average over `count` equal cells of `length` pixels; cells may cut pixels."""
+    edges = np.linspace(0, length, count + 1)
+    pixels = np.arange(length)
+    covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
+    return (np.maximum(covered, 0) * (count / length)).astype(np.float32)
+
+
+def _open(path: Path) -> oiio.ImageInput:
+    straight = oiio.ImageSpec()
+    straight.attribute("oiio:UnassociatedAlpha", 1)
+    reader = oiio.ImageInput.open(str(path), straight)
+    if reader is None:
+        raise ImageUnreadable(oiio.geterror().splitlines()[0])
+    spec = reader.spec()
+    if spec.format.basetype not in (oiio.UINT8, oiio.UINT16) or spec.nchannels > 4:
+        reader.close()
+        raise ImageUnreadable(f"{spec.nchannels} channels of {spec.format}; 1 to 4 of 8 or 16 bits are understood")
+    return reader
