@@ -19,14 +19,16 @@ RENDER_SECONDS = 300.0  # the first frame of a fresh install compiles the kernel
 
 
 @contextlib.contextmanager
-def serving(scene: Path, port: int) -> Iterator[str]:
+def serving(scene: Path, port: int, environment: Path = Path(sys.prefix)) -> Iterator[str]:
     """Run the service for one scene file; yields its URL once it answers, and ends it on leaving.
 
-    Where `port` is taken, a free one is used instead. Raises `SystemExit` with the reason if the service ends early.
+    The service is the one installed in `environment`. Where `port` is taken, a free one is used instead. Raises
+    `SystemExit` with the reason if the service ends early.
     """
-    command = [str(Path(sys.executable).with_name("msdgs-serve")), str(scene), "--port", str(_free_port(port))]
+    port = _free_port(port)
+    command = [str(environment / "bin" / "msdgs-serve"), str(scene), "--port", str(port)]
     say(f"$ {shlex.join(command)}")
-    url = f"http://{HOST}:{command[-1]}"
+    url = f"http://{HOST}:{port}"
     process = subprocess.Popen(command)
     try:
         _wait_until_healthy(url, process)
