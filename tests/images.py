@@ -18,7 +18,9 @@ def decode(body: bytes, image_format: ImageFormat) -> tuple[np.ndarray, oiio.Ima
         file.flush()
         reader = oiio.ImageInput.open(file.name, config)
         assert reader, oiio.geterror()
-        return reader.read_image(reader.spec().format), reader.spec()
+        pixels = reader.read_image(reader.spec().format)
+        assert pixels is not None, reader.geterror()
+        return pixels, reader.spec()
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:

@@ -1,0 +1,126 @@
+"""From a request's camera, and what it leaves to the scene, to a pinhole camera."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdgs_serve.api.schemas import LookAtCamera, MatrixCamera, OrbitCamera, RenderRequest, SceneCamera
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.baked import SceneCamera as StoredCamera
+from msdgs_serve.scene.baked import SceneMetadata
+from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
+
+DEFAULT_SIZE = 512
+DEFAULT_FOV_Y = 50.0
+
+
+@dataclass(frozen=True)
+class Framing:
+    """What a camera needs and a request may leave out."""
+
+    target: np.ndarray  # [3] the middle of the scene
+    distance: float  # from there, to see all
+    up: np.ndarray  # [3] unit
+    fov_y: float  # degrees
+    width: int
+    height: int
+
+
+def framing(metadata: SceneMetadata) -> Framing:
+    """From the scene's cameras, or its bounds where it has none (then z is up)."""
+    low, high = np.asarray(metadata.bounds, dtype=np.float64)
+    target = (low + high) / 2
+    if not metadata.cameras:
+        radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+        distance = radius / math.sin(math.radians(DEFAULT_FOV_Y) / 2)
+        return Framing(target, distance, np.array([0.0, 0.0, 1.0]), DEFAULT_FOV_Y, DEFAULT_SIZE, DEFAULT_SIZE)
+    poses = np.array([each.camera.camera_to_world for each in metadata.cameras])
+    distance = float(np.median(np.linalg.norm(poses[:, :3, 3] - target, axis=1)))
+    first = metadata.cameras[0].camera
+    fov_y = math.degrees(2 * math.atan(first.height / (2 * first.fy)))
+    return Framing(target, max(distance, 1e-3), _up(poses), fov_y, first.width, first.height)
+
+
+def resolve_camera(request: RenderRequest, metadata: SceneMetadata) -> Camera:
+    """The camera to draw with, of the size to draw. Raises `InvalidInput` naming the request's field."""
+    spec = request.camera
+    if isinstance(spec, SceneCamera):
+        camera = _pick(spec, metadata.cameras).camera
+        return camera.resized(*_size(request, camera.width, camera.height))
+    scene = framing(metadata)
+    if isinstance(spec, MatrixCamera):
+        return _matrix_camera(spec, request, scene)
+    width, height = _size(request, scene.width, scene.height)
+    target = scene.target if spec.target is None else np.array(spec.target)
+    up = scene.up if spec.up is None else np.array(spec.up)
+    fov_y = scene.fov_y if spec.fov_y is None else spec.fov_y
+    if isinstance(spec, LookAtCamera):
+        return Camera.from_look_at(np.array(spec.eye), target, up, width, height, fov_y)
+    assert isinstance(spec, OrbitCamera)
+    distance = scene.distance if spec.distance is None else spec.distance
+    return Camera.from_fov(orbit(target, distance, spec.azimuth, spec.elevation, up), width, height, fov_y)
+
+
+def _matrix_camera(spec: MatrixCamera, request: RenderRequest, scene: Framing) -> Camera:
+    if (spec.fx is None) == (spec.fov_y is None):
+        raise InvalidInput("camera.fov_y", "given, or camera.fx", "both" if spec.fx else "neither")
+    if spec.fx is not None and (request.width is None or request.height is None):
+        missing = "width" if request.width is None else "height"
+        raise InvalidInput(missing, "given together with camera.fx, which is in pixels", "nothing")
+    if spec.fx is None and spec.fy is not None:
+        raise InvalidInput("camera.fy", "left out where camera.fx is", spec.fy)
+    width, height = _size(request, scene.width, scene.height)
+    fx = spec.fx or 0.5 * height / math.tan(0.5 * math.radians(spec.fov_y or 0))
+    fy = spec.fy or fx
+    cx = width / 2 if spec.cx is None else spec.cx
+    cy = height / 2 if spec.cy is None else spec.cy
+    pose = np.array(spec.camera_to_world, dtype=np.float64)
+    if spec.axes == "opengl":
+        return Camera.from_opengl(pose, width, height, fx=fx, fy=fy, cx=cx, cy=cy)
+    return Camera(fx, fy, cx, cy, width, height, pose)
+
+
+def _size(request: RenderRequest, width: int, height: int) -> tuple[int, int]:
+    """Width and height asked for; what is left out follows from those given here."""
+    if request.width is not None and request.height is not None:
+        return request.width, request.height
+    if request.width is not None:
+        return request.width, _side("height", request.width * height / width)
+    if request.height is not None:
+        return _side("width", request.height * width / height), request.height
+    return width, height
+
+
+def _side(name: str, pixels: float) -> int:
+    if round(pixels) > MAX_PIXELS_PER_SIDE:
+        raise InvalidInput(name, f"at most {MAX_PIXELS_PER_SIDE}", f"{round(pixels)} by the camera's proportions")
+    return max(1, round(pixels))
+
+
+def _pick(spec: SceneCamera, cameras: Sequence[StoredCamera]) -> StoredCamera:
+    if spec.name is not None and spec.index is not None:
+        raise InvalidInput("camera.index", "left out where camera.name is given", spec.index)
+    if spec.name is not None:
+        named = [camera for camera in cameras if camera.name == spec.name]
+        if not named:
+            raise InvalidInput("camera.name", "that of a camera of the scene", repr(spec.name))
+        return named[0]
+    index = spec.index or 0
+    if index >= len(cameras):
+        raise InvalidInput("camera.index", f"below {len(cameras)}, the number of the scene's cameras", index)
+    return cameras[index]
+
+
+def _up(poses: np.ndarray) -> np.ndarray:
+    """The mean of the up directions of cameras, [N, 4, 4]; the world axis that is near it, where one is."""
+    mean = -poses[:, :3, 1].mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    if length < 1e-3:
+        return np.array([0.0, 0.0, 1.0])
+    mean = mean / length
+    axis = int(np.argmax(np.abs(mean)))
+    if abs(mean[axis]) > 0.8:
+        return np.sign(mean[axis]) * np.eye(3)[axis]
+    return mean

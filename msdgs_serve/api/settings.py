@@ -1,0 +1,61 @@
+"""What can be set, from flags and from the environment, by one definition."""
+
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+from pydantic.fields import FieldInfo
+from pydantic_settings import (
+    BaseSettings,
+    CliPositionalArg,
+    EnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
+
+PROGRAM = "msdgs-serve"
+
+
+class Settings(BaseSettings):
+    """Serve scenes over HTTP: POST /render returns a frame for any camera and any time.
+
+      msdgs-serve scene.onnx                  one scene
+      msdgs-serve scenes/ --port 9000         every .onnx file of a folder; files may come, change and go
+      MSDGS_SCENES=scenes/ msdgs-serve        every flag can be given as an environment variable, MSDGS_ before its name
+
+    A scene file comes from `python export/to_onnx.py model.pt`. Once it listens, /docs explains each call.
+    """
+
+    model_config = SettingsConfigDict(
+        env_prefix="MSDGS_", cli_prog_name=PROGRAM, cli_kebab_case=True, cli_hide_none_type=True, extra="ignore"
+    )
+
+    scenes: CliPositionalArg[list[Path]] = Field(
+        default=[], description="scene files (.onnx) and folders of them; in the environment joined by ':'"
+    )
+    host: str = Field(default="127.0.0.1", description="address to listen on; 0.0.0.0 for all networks")
+    port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
+    max_pixels: int = Field(default=4096 * 2160, ge=1, description="largest width × height of a frame")
+    max_body_bytes: int = Field(default=1 << 20, ge=1024, description="largest request body")
+    concurrent_renders: int = Field(default=4, ge=1, le=64, description="frames in work at once; others wait")
+    cached_poses: int = Field(default=16, ge=1, description="posed scenes kept in memory, one for each scene and time")
+    threads: int | None = Field(
+        default=None, ge=1, le=256, description="threads that compute; default: one for each core"
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="warning", description="`info` logs every request"
+    )
+
+    @classmethod
+    def settings_customise_sources(
+        cls, settings_cls: type[BaseSettings], init_settings: PydanticBaseSettingsSource, **_: Any
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Flags (put first by pydantic-settings), then arguments, then the environment."""
+        return init_settings, _Environment(settings_cls)
+
+
+class _Environment(EnvSettingsSource):
+    def decode_complex_value(self, field_name: str, field: FieldInfo, value: Any) -> Any:
+        """A list of paths is written as PATH is, not as JSON."""
+        return [part for part in value.split(os.pathsep) if part]
