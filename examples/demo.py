@@ -8,11 +8,11 @@ import contextlib
 import time
 from pathlib import Path
 
-from serving import curl, get, render, say, serving, stay_up
+from serving import get, render, say, serving, stay_up
 
 
 def main() -> None:
-    """Serve, render out/demo.png, print how to ask for more, wait for Ctrl-C."""
+    """Serve, render out/demo.png, wait for Ctrl-C."""
     arguments = parse_arguments()
     if not arguments.scene.is_file():
         raise SystemExit(f"{arguments.scene}: no such scene; `make demo-train` makes one from nothing")
@@ -25,17 +25,12 @@ def main() -> None:
             "width": 512,
             "height": 512,
         }
-        say(f"{scene['name']}: {scene['gaussians']['total']:,} Gaussians; the first frame compiles the kernels, once")
         started = time.perf_counter()
         frame = render(url, request)
-        first = time.perf_counter() - started
-        started = time.perf_counter()
-        render(url, {**request, "camera": {**request["camera"], "azimuth": arguments.azimuth + 30}})
-        say(f"first frame {first:.1f} s, another view {time.perf_counter() - started:.2f} s")
+        seconds = time.perf_counter() - started
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         arguments.out.write_bytes(frame)
-        say(f"wrote {arguments.out}")
-        say(f"ask for another:\n{curl(url, request, 'frame.png')}")
+        say(f"wrote {arguments.out}: {scene['gaussians']['total']:,} Gaussians at t = {request['t']}, {seconds:.2f} s")
         if not arguments.once:
             stay_up(url)
 

@@ -22,7 +22,7 @@ from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
 from msdgs_train.metrics import mean_quality, quality
 from msdgs_train.report import write_png
-from serving import curl, get, render, say, serving, stay_up
+from serving import get, render, say, serving, stay_up
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = str(Path(sys.executable).with_name("msdgs-train"))
@@ -67,7 +67,6 @@ def compare(url: str, frames: list[Frame], out: Path) -> None:
     say(f"wrote {out}: photograph | render, {frames[shown].name} at t = {frames[shown].t:.3f}")
     say(f"  this frame: PSNR {qualities[shown].psnr:.2f} dB, SSIM {qualities[shown].ssim:.4f}")
     say(f"  all {len(frames)} held-out frames: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
-    say(f"ask for it again:\n{curl(url, request_for(frames[shown]), 'frame.png')}")
     if not mean.psnr >= MINIMUM_PSNR:
         raise SystemExit(f"the frames do not look like the photographs: {mean.psnr:.2f} dB < {MINIMUM_PSNR} dB")
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 HOST = "127.0.0.1"
-START_SECONDS = 120.0
-RENDER_SECONDS = 300.0  # the first frame of a fresh install compiles the kernels
+START_SECONDS = 180.0  # the first start of a fresh install compiles the kernels
+ANSWER_SECONDS = 60.0
 
 
 @contextlib.contextmanager
@@ -49,15 +49,9 @@ def render(url: str, request: dict[str, Any]) -> bytes:
     return _fetch(urllib.request.Request(f"{url}/render", body, {"Content-Type": "application/json"}))
 
 
-def curl(url: str, request: dict[str, Any], out: str) -> str:
-    """The same request as a command to paste."""
-    body = shlex.quote(json.dumps(request, separators=(",", ":")))
-    return f"curl {url}/render -H 'Content-Type: application/json' -d {body} -o {out}"
-
-
 def stay_up(url: str) -> None:
     """Say where the service listens and return at Ctrl-C."""
-    say(f"listening on {url}  (API: {url}/docs)  Ctrl-C stops it")
+    say(f"still listening on {url}, Ctrl-C stops it")
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600)
@@ -70,7 +64,7 @@ def say(text: str) -> None:
 
 def _fetch(request: urllib.request.Request) -> bytes:
     try:
-        with urllib.request.urlopen(request, timeout=RENDER_SECONDS) as answer:
+        with urllib.request.urlopen(request, timeout=ANSWER_SECONDS) as answer:
             return answer.read()
     except urllib.error.HTTPError as error:
         raise SystemExit(f"{request.full_url} answered {error.code}: {error.read().decode()}") from None
