@@ -26,17 +26,16 @@ def project(
     means: Tensor, quats: Tensor, scales: Tensor, sh: Tensor, camera: Camera, options: RasterizerOptions = GSPLAT
 ) -> Projection:
     """Projection, covariance and colour by gsplat's reference functions."""
-    like = {"dtype": means.dtype}
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     assert covars is not None
-    view = torch.tensor(camera.world_to_camera, **like)[None]
-    intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], **like)[None]
+    view = torch.from_numpy(camera.world_to_camera).to(means.dtype)[None]
+    intrinsics = means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])[None]
     size = (camera.width, camera.height)
     _, means2d, depths, conics, _ = _fully_fused_projection(
         means, covars, view, intrinsics, *size, eps2d=options.eps2d, near_plane=options.near_plane
     )
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
-    directions = means - torch.tensor(camera.position, **like)
+    directions = means - means.new_tensor(camera.position)
     colors = (_spherical_harmonics(degree, directions, sh) + 0.5).clamp(min=0)
     return Projection(means2d[0], depths[0], conics[0], colors)
 

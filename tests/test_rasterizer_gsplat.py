@@ -4,17 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.rasterizer.projection import Splats, project
 from msdgs_serve.scene import Camera, Gaussians
+from tests import reference_torch
 from tests.scenes import ADVERSARIAL, as_dtype, random_scene
 from tests.tolerances import assert_close
-
-torch = pytest.importorskip("torch")
-pytest.importorskip("gsplat")
-
-from tests import reference_torch  # noqa: E402 after the skips
 
 SCENES = ["random", *sorted(ADVERSARIAL)]
 
@@ -28,7 +25,8 @@ def scene(name: str, dtype: type) -> tuple[Gaussians, Camera]:
 
 def gsplat_projection(gaussians: Gaussians, camera: Camera) -> reference_torch.Projection:
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
-    return reference_torch.project(*(torch.from_numpy(array.astype(np.float64)) for array in arrays), camera)
+    means, quats, scales, sh = (torch.from_numpy(array.astype(np.float64)) for array in arrays)
+    return reference_torch.project(means, quats, scales, sh, camera)
 
 
 def conics(splats: Splats) -> np.ndarray:

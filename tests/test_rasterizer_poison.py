@@ -78,13 +78,13 @@ def test_no_gaussians_are_the_background(dtype: type, degree: int):
 def test_all_behind_the_camera_are_the_background():
     gaussians = gaussians_of([[0, 0, -1], [0, 0, 0], [0.1, 0, -5]], scales=3.0, opacities=1.0)
     picture = rasterize(gaussians, front_camera(), background=BACKGROUND)
-    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32(BACKGROUND), picture.rgb.shape))
+    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.array(BACKGROUND, np.float32), picture.rgb.shape))
 
 
 def test_one_pixel_and_one_gaussian():
     camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, np.eye(4))
     picture = rasterize(gaussians_of([[0, 0, 2]], opacities=0.5, rgb=[1, 0, 0.5]), camera)
-    np.testing.assert_array_equal(picture.rgb, np.float32([[[0.5, 0, 0.25]]]))
+    np.testing.assert_array_equal(picture.rgb, np.array([[[0.5, 0, 0.25]]], np.float32))
     assert picture.alpha == 0.5
     assert picture.depth == 2
 

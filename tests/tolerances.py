@@ -38,7 +38,21 @@ TABLE = (
     Row("conic.float64.relative", 1e-10, "gsplat's determinant, a difference of products, loses digits for needles"),
     Row("color.float32", 2e-6, "16 products of size 1, stored as float32"),
     Row("color.float64", 1e-12, "the same in float64"),
+    # gradients, relative to the largest entry of their kind
+    Row(
+        "gradient.finite_differences",
+        1e-6,
+        "central differences with a step of 1e-6: 1e-10 / 1e-3 of the largest entry",
+    ),
+    Row("gradient.autograd", 1e-9, "the same derivative in another order of operations, float64"),
+    Row("gradient.float32", 1e-4, "sums over thousands of pixels of terms of both signs, each off by some 1e-6"),
+    Row("gradient.second_order", 1e-5, "what a linear step of 2e-4 leaves out: its square times curvatures up to 100"),
     Row("oracle_db", 70.0, "whole picture, threshold pixels included: one step in 1 of 5,000 at every pixel"),
+    # losses
+    Row("ssim.float32", 1e-5, "variances are differences of blurred squares; torch blurs in another order"),
+    Row("ssim.float64", 1e-12, "as ssim.float32"),
+    Row("psnr.relative", 1e-6, "torchmetrics adds in float32"),
+    Row("loss_gradient", 1e-7, "central differences with steps of 1e-7 and 1e-6 of a loss of size 1"),
 )
 
 _ROWS = {row.name: row for row in TABLE}
