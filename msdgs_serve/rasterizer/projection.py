@@ -59,11 +59,12 @@ def _project_range(
 ) -> None:
     basis = np.empty(sh.shape[1], np.float64)
     half_axes = np.empty((2, 3), np.float64)
+    rotation = np.empty((3, 3), np.float64)
     for i in range(start, stop):
         x, y, z = to_camera(view, means, i)
         if not z > view.near_plane or not opacities[i] >= view.alpha_min:
             continue
-        project_axes(view, quats, scales, i, x, y, z, half_axes)
+        project_axes(view, quats, scales, i, x, y, z, rotation, half_axes)
         cov_xx, cov_xy, cov_yy, det = covariance2d(half_axes, view.eps2d)
         if not (det > 0 and det < np.inf):
             continue
@@ -84,11 +85,19 @@ def _project_range(
         dx, dy, dz = means[i, 0] - view.position[0], means[i, 1] - view.position[1], means[i, 2] - view.position[2]
         distance = math.sqrt(dx * dx + dy * dy + dz * dz)
         basis_into(basis, dx / distance, dy / distance, dz / distance)
-        for channel in range(3):
-            color = 0.5
-            for k in range(len(basis)):
-                color += basis[k] * sh[i, k, channel]
-            splats.colors[i, channel] = max(color, 0.0)
+        red, green, blue = raw_color(basis, sh, i)
+        splats.colors[i, 0], splats.colors[i, 1], splats.colors[i, 2] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+
+
+@kernel
+def raw_color(basis: np.ndarray, sh: np.ndarray, i: int) -> tuple[float, float, float]:
+    """SH + 0.5 of the i-th Gaussian, before the clamp at 0."""
+    red, green, blue = 0.5, 0.5, 0.5
+    for k in range(len(basis)):
+        red += basis[k] * sh[i, k, 0]
+        green += basis[k] * sh[i, k, 1]
+        blue += basis[k] * sh[i, k, 2]
+    return red, green, blue
 
 
 @kernel
@@ -118,13 +127,20 @@ def rotation_into(rotation: np.ndarray, w: float, x: float, y: float, z: float) 
 
 @kernel
 def project_axes(
-    view: View, quats: np.ndarray, scales: np.ndarray, i: int, x: float, y: float, z: float, half_axes: np.ndarray
+    view: View,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    i: int,
+    x: float,
+    y: float,
+    z: float,
+    rotation: np.ndarray,
+    half_axes: np.ndarray,
 ) -> None:
-    """Write J W R S [2, 3]: the three half-axes of Gaussian i as vectors in the image, pixels."""
+    """Write R [3, 3] and J W R S [2, 3]: the three half-axes of Gaussian i as vectors in the image, pixels."""
     w = view.rotation
     j00, j02 = view.fx / z, -view.fx * clamped(x / z, view.min_x, view.max_x) / z
     j11, j12 = view.fy / z, -view.fy * clamped(y / z, view.min_y, view.max_y) / z
-    rotation = np.empty((3, 3), np.float64)
     rotation_into(rotation, float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3]))
     for k in range(3):
         a, b, c = rotation[0, k], rotation[1, k], rotation[2, k]

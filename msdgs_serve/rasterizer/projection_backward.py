@@ -8,7 +8,14 @@ import numpy as np
 from msdgs_serve.rasterizer.compositing_backward import SplatGradients
 from msdgs_serve.rasterizer.harmonics import basis_gradient_into, basis_into
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.projection import Splats, clamped, covariance2d, project_axes, rotation_into, to_camera
+from msdgs_serve.rasterizer.projection import (
+    Splats,
+    clamped,
+    covariance2d,
+    project_axes,
+    raw_color,
+    to_camera,
+)
 from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
@@ -54,6 +61,8 @@ def _backward_range(
     gradients: SplatGradients,
     result: GaussianGradients,
 ) -> None:
+    rotation = np.empty((3, 3), np.float64)
+    grad_rotation = np.empty((3, 3), np.float64)
     half_axes = np.empty((2, 3), np.float64)
     grad_axes = np.empty((2, 3), np.float64)
     grad_camera = np.empty(3, np.float64)
@@ -64,13 +73,14 @@ def _backward_range(
         if extents[i, 0] == 0:
             continue
         x, y, z = to_camera(view, means, i)
-        project_axes(view, quats, scales, i, x, y, z, half_axes)
+        project_axes(view, quats, scales, i, x, y, z, rotation, half_axes)
         _axes_gradient(view, half_axes, gradients.conics, i, grad_axes)
         grad_u, grad_v = float(gradients.means2d[i, 0]), float(gradients.means2d[i, 1])
         grad_camera[0] = grad_u * view.fx / z
         grad_camera[1] = grad_v * view.fy / z
         grad_camera[2] = -(grad_u * view.fx * x + grad_v * view.fy * y) / (z * z)
-        _shape_gradient(view, quats, scales, i, x, y, z, grad_axes, grad_camera, result)
+        _shape_gradient(view, scales, i, x, y, z, rotation, grad_axes, grad_rotation, grad_camera, result)
+        _quaternion_gradient(quats, i, grad_rotation, result.quats)
         _color_gradient(view, means, sh, gradients.colors, i, basis, basis_gradient, grad_world, result.sh)
         for k in range(3):
             for j in range(3):
@@ -96,23 +106,21 @@ def _axes_gradient(view: View, half_axes: np.ndarray, grad_conics: np.ndarray, i
 @kernel
 def _shape_gradient(
     view: View,
-    quats: np.ndarray,
     scales: np.ndarray,
     i: int,
     x: float,
     y: float,
     z: float,
+    rotation: np.ndarray,
     grad_axes: np.ndarray,
+    grad_rotation: np.ndarray,
     grad_camera: np.ndarray,
     result: GaussianGradients,
 ) -> None:
-    """Scales, quaternion and, through the Jacobian, the mean in camera axes (added to `grad_camera`)."""
+    """Scales, rotation matrix (written to `grad_rotation`) and, through the Jacobian, the mean in camera axes (added)."""
     w = view.rotation
     ratio_x, ratio_y = clamped(x / z, view.min_x, view.max_x), clamped(y / z, view.min_y, view.max_y)
     j00, j02, j11, j12 = view.fx / z, -view.fx * ratio_x / z, view.fy / z, -view.fy * ratio_y / z
-    rotation = np.empty((3, 3), np.float64)
-    grad_rotation = np.empty((3, 3), np.float64)
-    rotation_into(rotation, float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3]))
     grad_j00, grad_j02, grad_j11, grad_j12 = 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         scale = float(scales[i, k])
@@ -131,7 +139,6 @@ def _shape_gradient(
         grad_j02 += g0 * axis_z
         grad_j11 += g1 * axis_y
         grad_j12 += g1 * axis_z
-    _quaternion_gradient(quats, i, grad_rotation, result.quats)
     zz = z * z
     grad_camera[2] -= (grad_j00 * view.fx + grad_j11 * view.fy) / zz
     grad_camera[2] += (grad_j02 * view.fx * ratio_x + grad_j12 * view.fy * ratio_y) / zz
@@ -176,18 +183,19 @@ def _color_gradient(
     dx, dy, dz = dx / distance, dy / distance, dz / distance
     basis_into(basis, dx, dy, dz)
     basis_gradient_into(basis_gradient, dx, dy, dz)
+    red, green, blue = raw_color(basis, sh, i)
+    grad_red = grad_colors[i, 0] if red > 0 else 0.0
+    grad_green = grad_colors[i, 1] if green > 0 else 0.0
+    grad_blue = grad_colors[i, 2] if blue > 0 else 0.0
     gx, gy, gz = 0.0, 0.0, 0.0
-    for channel in range(3):
-        color = 0.5
-        for k in range(len(basis)):
-            color += basis[k] * sh[i, k, channel]
-        if color > 0:
-            g = float(grad_colors[i, channel])
-            for k in range(len(basis)):
-                grad_sh[i, k, channel] = g * basis[k]
-                gx += g * sh[i, k, channel] * basis_gradient[k, 0]
-                gy += g * sh[i, k, channel] * basis_gradient[k, 1]
-                gz += g * sh[i, k, channel] * basis_gradient[k, 2]
+    for k in range(len(basis)):
+        grad_sh[i, k, 0] = basis[k] * grad_red
+        grad_sh[i, k, 1] = basis[k] * grad_green
+        grad_sh[i, k, 2] = basis[k] * grad_blue
+        pull = sh[i, k, 0] * grad_red + sh[i, k, 1] * grad_green + sh[i, k, 2] * grad_blue
+        gx += pull * basis_gradient[k, 0]
+        gy += pull * basis_gradient[k, 1]
+        gz += pull * basis_gradient[k, 2]
     along = gx * dx + gy * dy + gz * dz
     grad_world[0] = (gx - along * dx) / distance
     grad_world[1] = (gy - along * dy) / distance
