@@ -1,7 +1,7 @@
 """The canonical Gaussians: what training stores for each Gaussian, before any deformation or activation."""
 
 import math
-from typing import Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +10,18 @@ from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
 
 INITIAL_OPACITY = 0.1
 MIN_NEIGHBOUR_DISTANCE = 1e-7  # scene units; two points in one place still get a scale above 0
+
+
+class StoredGaussians(NamedTuple):
+    """The tensors of `CanonicalGaussians`, or some rows of them."""
+
+    means: Tensor
+    log_scales: Tensor
+    raw_quats: Tensor
+    raw_opacities: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
+    embeddings: Tensor | None
 
 
 class CanonicalGaussians(nn.Module):
@@ -44,6 +56,11 @@ class CanonicalGaussians(nn.Module):
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def rows(self, ids: Tensor) -> StoredGaussians:
+        """The Gaussians `ids`, int64 [M]; gradients flow through."""
+        tensors = {name: parameter[ids] for name, parameter in self.named_parameters()}
+        return StoredGaussians(**{"embeddings": None, **tensors})
 
     @classmethod
     def from_points(

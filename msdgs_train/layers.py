@@ -56,6 +56,10 @@ class MLPLayer(nn.Module):
     the first Linear is a vector added to the bias. At the default sizes the layer has 235,561 parameters.
     """
 
+    kind = "mlp"
+    xyz_octaves: Tensor
+    time_octaves: Tensor
+
     def __init__(
         self,
         width: int = 256,

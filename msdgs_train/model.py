@@ -78,30 +78,32 @@ class DynamicGaussians(nn.Module):
         self.modulation = ScaleModulation(config.embedding_size) if config.embedding_size else None
 
     def pose(
-        self, t: float | Tensor, steps: int | None = None, deform: bool = True, sh_degree: int | None = None
+        self,
+        t: float | Tensor,
+        steps: int | None = None,
+        deform: bool = True,
+        sh_degree: int | None = None,
+        ids: Tensor | None = None,
     ) -> PosedGaussians:
         """The Gaussians at time `t`.
 
-        `steps` stops after that many layers, `deform=False` gives the canonical Gaussians without running any, and
-        `sh_degree` leaves out the SH bands above it.
+        `steps` stops after that many layers, `deform=False` gives the canonical Gaussians without running any,
+        `sh_degree` leaves out the SH bands above it, and `ids`, int64 [M], poses only these Gaussians.
         """
-        g = self.gaussians
+        g = self.gaussians if ids is None else self.gaussians.rows(ids)
         means, log_scales, quats = g.means, g.log_scales, unit_quats(g.raw_quats)
         if deform and len(self.deformation) and steps != 0:
             time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
             deltas = self.deformation(means.detach() if self.config.detach_means else means, time, steps)
             means = means + deltas.means
-            log_scales = log_scales + self.modulated(deltas.log_scales)
+            delta_log_scales = deltas.log_scales
+            if self.modulation is not None:
+                delta_log_scales = self.modulation(g.embeddings) * delta_log_scales  # equation 12
+            log_scales = log_scales + delta_log_scales
             quats = unit_quats(quats + deltas.quats)
         degree = self.config.sh_degree if sh_degree is None else sh_degree
         sh = torch.cat([g.sh_dc, g.sh_rest[:, : sh_coefficients(degree) - 1]], dim=1)
         return PosedGaussians(means, quats, log_scales.exp(), g.raw_opacities.sigmoid(), sh)
-
-    def modulated(self, delta_log_scales: Tensor) -> Tensor:
-        """Equation 12, or the deltas as they are where the model has no modulation."""
-        if self.modulation is None:
-            return delta_log_scales
-        return self.modulation(self.gaussians.embeddings) * delta_log_scales
 
 
 def unit_quats(raw_quats: Tensor) -> Tensor:

@@ -1,0 +1,1 @@
+"""Offline jobs between training and serving. Used from a checkout; no part of the installed package."""

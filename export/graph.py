@@ -1,0 +1,56 @@
+"""A small builder of ONNX graphs: constants and nodes, each with a name that a reader of the graph understands."""
+
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+OPSET = 18
+IR_VERSION = 9
+"""Of opset 18's own time: read by every onnxruntime since 1.14."""
+
+
+class GraphBuilder:
+    """Collects nodes in the order of their execution."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[str, onnx.TensorProto] = {}
+
+    def constant(self, name: str, values: np.ndarray) -> str:
+        """Store an array under `name`; returns the name."""
+        self.constants[name] = numpy_helper.from_array(np.ascontiguousarray(values), name)
+        return name
+
+    def node(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        """Add a node of one output; returns the output's name."""
+        self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
+        return output
+
+    def split(self, value: str, outputs: list[str], sizes: list[int]) -> list[str]:
+        """Columns of a matrix, `sizes` of them at a time."""
+        lengths = self.constant(f"{value}.sizes", np.array(sizes, np.int64))
+        self.nodes.append(helper.make_node("Split", [value, lengths], outputs, name=f"{value}.split", axis=1))
+        return outputs
+
+    def model(
+        self,
+        inputs: dict[str, tuple[int, list[int | str]]],
+        outputs: dict[str, list[int | str]],
+        properties: dict[str, str],
+    ) -> onnx.ModelProto:
+        """The checked model; inputs by name with type and shape, outputs (float32) by name with shape."""
+        graph = helper.make_graph(
+            self.nodes,
+            "msdgs",
+            [helper.make_tensor_value_info(name, *kind) for name, kind in inputs.items()],
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
+            list(self.constants.values()),
+        )
+        model = helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="msdgs"
+        )
+        helper.set_model_props(model, properties)
+        onnx.checker.check_model(model)
+        return model

@@ -1,0 +1,129 @@
+"""Plans: ways to compute a scene's deformation in an ONNX graph. All keep the contract `msdgs/1`.
+
+`network`, the one here, computes all layers in float32 as the model does.
+
+A graph deforms the ids that it is given in one go; the loop over chunks of ids, which keeps memory independent of the
+scene's size, is in the reader (`msdgs_serve.deformation`), where the chunks also run side by side.
+"""
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto
+
+from export.bake import Baked, Moving
+from export.graph import GraphBuilder
+from msdgs_serve.scene.baked import BakedScene
+from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_train.layers import MLPLayer
+
+DELTA_COLUMNS = 10
+"""Means 3, log_scales 3, quats 4: the order of `MLPLayer.heads`, whose last column is the weight."""
+
+
+def network(baked: Baked) -> onnx.ModelProto:
+    """The scene with all its layers, exactly as trained. Without moving Gaussians the graph has no nodes at all."""
+    graph = GraphBuilder()
+    graph.constant("ids", np.arange(len(baked.moving), dtype=np.int64))
+    if len(baked.moving):
+        _deform(graph, baked.moving, baked.layers)
+    else:
+        for name, columns in (("means", 3), ("quats", 4), ("scales", 3)):
+            graph.constant(name, np.empty((0, columns), np.float32))
+    return _finish(graph, baked.scene)
+
+
+def _finish(graph: GraphBuilder, scene: BakedScene) -> onnx.ModelProto:
+    count: int | str = "M" if scene.moving_count else 0
+    outputs: dict[str, list[int | str]] = {"means": [count, 3], "quats": [count, 4], "scales": [count, 3]}
+    for name in ("static_means", "static_quats", "static_scales", "opacities", "sh"):
+        array = getattr(scene, name)
+        graph.constant(name, array)
+        outputs[name] = list(array.shape)
+    inputs = {"t": (TensorProto.FLOAT, [1]), "ids": (TensorProto.INT64, ["M"])}
+    return graph.model(inputs, outputs, scene.metadata.to_properties())
+
+
+def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[MLPLayer, ...]) -> None:
+    """Canonical values of the ids, moved by each layer in turn, then activated: `DynamicGaussians.pose`."""
+    means = graph.node("Gather", [graph.constant("canonical_means", moving.means), "ids"], "ids.means")
+    log_scales = graph.node(
+        "Gather", [graph.constant("canonical_log_scales", moving.log_scales), "ids"], "ids.log_scales"
+    )
+    quats = graph.node("Gather", [graph.constant("canonical_quats", moving.quats), "ids"], "ids.quats")
+    time = graph.node("Reshape", ["t", graph.constant("time_shape", np.array([1, 1], np.int64))], "time")
+
+    deltas, moved, parts = "", means, [""] * 3
+    for k, layer in enumerate(layers, start=1):
+        name = f"layer{k}"
+        step = _layer(graph, name, layer, moved, time)  # equation 7
+        deltas = graph.node("Add", [deltas, step], f"{name}.deltas") if deltas else step  # equation 9
+        parts = graph.split(deltas, [f"{name}.means", f"{name}.log_scales", f"{name}.quats"], [3, 3, 4])
+        moved = graph.node("Add", [means, parts[0]], f"{name}.moved" if k < len(layers) else "means")  # equation 8
+
+    _, delta_log_scales, delta_quats = parts
+    if moving.scale_modulation is not None:
+        modulation = graph.constant("scale_modulation", moving.scale_modulation)
+        factors = graph.node("Gather", [modulation, "ids"], "ids.scale_modulation")
+        delta_log_scales = graph.node("Mul", [factors, delta_log_scales], "modulated")  # equation 12
+    graph.node("Exp", [graph.node("Add", [log_scales, delta_log_scales], "log_scales")], "scales")
+    _unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
+
+
+def _layer(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str) -> str:
+    """One layer at the means [M, 3]: its deltas, [M, 10], times its weight."""
+    encoded = _encode(graph, f"{name}.xyz", means, layer.xyz_octaves)
+    first = _numpy(layer.first.weight)
+    weight_xyz = graph.constant(f"{name}.first.weight_xyz", first[:, : layer.xyz_features])
+    hidden = graph.node(
+        "Gemm", [encoded, weight_xyz, _time_bias(graph, name, layer, time)], f"{name}.first.out", transB=1
+    )
+    hidden = graph.node("Relu", [hidden], f"{name}.first.relu")
+    for i, linear in enumerate(layer.trunk):
+        hidden = _linear(graph, f"{name}.trunk{i}", linear, hidden)
+        hidden = graph.node("Relu", [hidden], f"{name}.trunk{i}.relu")
+    heads = _linear(graph, f"{name}.heads", layer.heads, hidden)
+    deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [DELTA_COLUMNS, 1])
+    weight = graph.node("Sigmoid", [logit], f"{name}.weight")
+    return graph.node("Mul", [weight, deltas], f"{name}.weighted")
+
+
+def _time_bias(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:
+    """[1, width] what time adds to the first Linear, its bias included: one row a call, whatever the number of ids."""
+    encoded = _encode(graph, f"{name}.time", time, layer.time_octaves)
+    hidden = graph.node(
+        "Relu", [_linear(graph, f"{name}.time_hidden", layer.time_hidden, encoded)], f"{name}.time_relu"
+    )
+    features = _linear(graph, f"{name}.time_output", layer.time_output, hidden)
+    weight = graph.constant(f"{name}.first.weight_time", _numpy(layer.first.weight)[:, layer.xyz_features :])
+    bias = graph.constant(f"{name}.first.bias", _numpy(layer.first.bias))
+    return graph.node("Gemm", [features, weight, bias], f"{name}.time_bias", transB=1)
+
+
+def _encode(graph: GraphBuilder, name: str, value: str, octaves: torch.Tensor) -> str:
+    """`PositionalEncoding`: value, sines, cosines side by side."""
+    phases = graph.node("MatMul", [value, graph.constant(f"{name}.octaves", _numpy(octaves))], f"{name}.phases")
+    sines = graph.node("Sin", [phases], f"{name}.sines")
+    cosines = graph.node("Cos", [phases], f"{name}.cosines")
+    return graph.node("Concat", [value, sines, cosines], f"{name}.encoded", axis=1)
+
+
+def _linear(graph: GraphBuilder, name: str, linear: torch.nn.Module, value: str) -> str:
+    weight = graph.constant(f"{name}.weight", _numpy(linear.weight))
+    bias = graph.constant(f"{name}.bias", _numpy(linear.bias))
+    return graph.node("Gemm", [value, weight, bias], f"{name}.out", transB=1)
+
+
+def _unit_quats(graph: GraphBuilder, raw: str) -> None:
+    """Unit length; identity where the norm is under 1e-8: `msdgs_train.model.unit_quats`."""
+    axis = graph.constant("quats.axis", np.array([1], np.int64))
+    least = graph.constant("quats.min_norm", np.array(MIN_NORM, np.float32))
+    identity = graph.constant("quats.identity", np.array([[1, 0, 0, 0]], np.float32))
+    norms = graph.node("ReduceL2", [raw, axis], "quats.norms", keepdims=1)
+    scaled = graph.node("Div", [raw, graph.node("Max", [norms, least], "quats.divisors")], "quats.scaled")
+    graph.node("Where", [graph.node("Less", [norms, least], "quats.tiny"), identity, scaled], "quats")
+
+
+def _numpy(tensor: torch.Tensor | torch.nn.Module) -> np.ndarray:
+    assert isinstance(tensor, torch.Tensor)  # torch types every attribute of a module as either
+    return tensor.detach().to("cpu", torch.float32).numpy()

@@ -1,0 +1,184 @@
+"""What a scene file says about itself, contract `msdgs/1`: its `metadata_props`, each checked on reading."""
+
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.errors import SceneFileInvalid
+
+CONTRACT = "msdgs/1"
+
+
+@dataclass(frozen=True)
+class SceneCamera:
+    """A camera to start from, and the time it saw."""
+
+    name: str
+    t: float
+    camera: Camera
+
+    def to_plain(self) -> dict[str, Any]:
+        """Nested plain values, as the file stores it."""
+        c = self.camera
+        intrinsics = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "width": int(c.width), "height": int(c.height)}
+        return {"name": self.name, "t": self.t, **intrinsics, "camera_to_world": c.camera_to_world.tolist()}
+
+    @classmethod
+    def from_plain(cls, value: Mapping[str, Any]) -> "SceneCamera":
+        """The inverse of `to_plain`. Raises ValueError (`InvalidInput` is one) or KeyError."""
+        camera = Camera(
+            *(_finite(value[key]) for key in ("fx", "fy", "cx", "cy")),
+            width=value["width"],
+            height=value["height"],
+            camera_to_world=np.asarray(value["camera_to_world"], dtype=np.float64),
+        )
+        return cls(_text(value["name"]), _finite(value["t"]), camera)
+
+
+@dataclass(frozen=True)
+class SceneMetadata:
+    """`metadata_props` of a scene file. Each value is JSON under the field's own name, and none may be missing."""
+
+    contract: str
+    layers: tuple[str, ...]  # the kind of each deformation layer, in order; empty where nothing moves
+    plan: str  # how the deformation is computed, e.g. "network"
+    time_range: tuple[float, float]  # t0 <= t1
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]  # two opposite corners, scene units
+    sh_degree: int  # 0 to 3
+    delta_space: str  # where deltas were added in training, e.g. "raw"
+    background: tuple[float, float, float]  # sRGB in [0, 1], as trained
+    antialiasing: str  # "dilate": +0.3 px² on the projected covariance
+    cameras: tuple[SceneCamera, ...]  # to start from
+    left_out: tuple[Any, ...]  # what the export left out of the model
+    measured_error: dict[str, Any]  # of the plan, against the model it was made from
+    package_version: str
+    checkpoint_sha256: str  # of the model file
+
+    def to_properties(self) -> dict[str, str]:
+        """The `metadata_props` of a file."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values["cameras"] = [camera.to_plain() for camera in self.cameras]
+        return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}
+
+    @classmethod
+    def from_properties(cls, properties: Mapping[str, str], file: str) -> "SceneMetadata":
+        """Read and check them; `file` is for messages. Raises `SceneFileInvalid` naming the field."""
+        values = {}
+        for name, reader in _READERS.items():
+            if name not in properties:
+                raise SceneFileInvalid(file, name, "is missing from the metadata")
+            try:
+                values[name] = reader(json.loads(properties[name], parse_constant=_refuse_constant))
+            except KeyError as error:
+                raise SceneFileInvalid(file, name, f"lacks {error}") from error
+            except (ValueError, TypeError) as error:
+                raise SceneFileInvalid(file, name, f"can't be used: {error}") from error
+        return cls(**values)
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} isn't a finite number")
+
+
+def _finite(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{value!r} isn't a finite number")
+    return float(value)
+
+
+def _numbers(value: Any, count: int) -> tuple[float, ...]:
+    if not isinstance(value, list) or len(value) != count:
+        raise ValueError(f"{value!r} isn't a list of {count} numbers")
+    return tuple(_finite(v) for v in value)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"{value!r} isn't a text")
+    return value
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    return tuple(_text(v) for v in _list(value))
+
+
+def _list(value: Any) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise ValueError(f"{value!r} isn't a list")
+    return tuple(value)
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{value!r} isn't an object")
+    return value
+
+
+def _one_of(*known: str) -> Callable[[Any], str]:
+    def read(value: Any) -> str:
+        if value not in known:
+            raise ValueError(f"{value!r} isn't known to this reader, which knows {', '.join(known)}")
+        return value
+
+    return read
+
+
+def _time_range(value: Any) -> tuple[float, ...]:
+    t0, t1 = _numbers(value, 2)
+    if t0 > t1:
+        raise ValueError(f"it begins at {t0}, after its end at {t1}")
+    return t0, t1
+
+
+def _bounds(value: Any) -> tuple[tuple[float, ...], ...]:
+    low, high = (_numbers(corner, 3) for corner in _list(value))
+    if any(a > b for a, b in zip(low, high, strict=True)):
+        raise ValueError(f"the corner {low} isn't below {high}")
+    return low, high
+
+
+def _sh_degree(value: Any) -> int:
+    if isinstance(value, bool) or value not in (0, 1, 2, 3):
+        raise ValueError(f"{value!r} isn't 0, 1, 2 or 3")
+    return int(value)
+
+
+def _background(value: Any) -> tuple[float, ...]:
+    rgb = _numbers(value, 3)
+    if not all(0 <= v <= 1 for v in rgb):
+        raise ValueError(f"{rgb} isn't within [0, 1]")
+    return rgb
+
+
+def _cameras(value: Any) -> tuple[SceneCamera, ...]:
+    return tuple(SceneCamera.from_plain(_mapping(camera)) for camera in _list(value))
+
+
+def _sha256(value: Any) -> str:
+    if not re.fullmatch("[0-9a-f]{64}", _text(value)):
+        raise ValueError(f"{value!r} isn't a SHA-256 in lower-case hexadecimal")
+    return value
+
+
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "contract": _one_of(CONTRACT),
+    "layers": _texts,
+    "plan": _text,
+    "time_range": _time_range,
+    "bounds": _bounds,
+    "sh_degree": _sh_degree,
+    "delta_space": _text,
+    "background": _background,
+    "antialiasing": _one_of("dilate"),
+    "cameras": _cameras,
+    "left_out": _list,
+    "measured_error": _mapping,
+    "package_version": _text,
+    "checkpoint_sha256": _sha256,
+}
