@@ -9,24 +9,23 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
+from msdgs_train.datasets.images import read_rgba
 from msdgs_train.metrics import mean_quality, quality
 from msdgs_train.report import write_png
 from serving import get, render, say, serving, stay_up
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = str(Path(sys.executable).with_name("msdgs-train"))
-EXPORT = [sys.executable, str(ROOT / "export" / "to_onnx.py")]
+EXPORT = str(ROOT / "export" / "to_onnx.py")
 MINIMUM_PSNR = 22.0
 """dB on the held-out photographs, below which the demo counts as broken; an empty frame has about 12."""
 
@@ -40,9 +39,9 @@ def main() -> None:
     folder.mkdir(parents=True)
     step("a small moving scene, photographed", TRAIN, "synthetic", data, "--size", arguments.size)
     step("training", TRAIN, "fit", data, run, *fit_flags(arguments))
-    step("export", *EXPORT, run / "model.pt", "--out", scene)
+    step("export", sys.executable, EXPORT, run / "model.pt", "--output", scene)
     with serving(scene, arguments.port) as url:
-        compare(url, load_scene(data).splits["test"], arguments.out)
+        compare(url, load_scene(data).splits["test"], folder / "frames", arguments.out)
         if not arguments.once:
             stay_up(url)
 
@@ -52,14 +51,16 @@ def fit_flags(arguments: argparse.Namespace) -> list[object]:
     return ["--steps", arguments.steps, "--max-minutes", arguments.minutes]
 
 
-def compare(url: str, frames: list[Frame], out: Path) -> None:
+def compare(url: str, frames: list[Frame], folder: Path, out: Path) -> None:
     """Ask the service for every held-out photograph's camera and time; write one pair, photograph at the left."""
     (scene,) = get(f"{url}/scenes")["scenes"]
     background = get(f"{url}/scenes/{scene['name']}")["background"]
+    folder.mkdir()
     pairs = []
     for frame in frames:
-        truth = composite(frame.load_rgba(), background)
-        pairs.append((truth, decode_png(render(url, request_for(frame)))))
+        path = folder / f"{Path(frame.name).name}.png"
+        path.write_bytes(render(url, request_for(frame)))
+        pairs.append((composite(frame.load_rgba(), background), composite(read_rgba(path), background)))
     qualities = [quality(torch.from_numpy(rgb), torch.from_numpy(truth)) for truth, rgb in pairs]
     shown = len(frames) // 2
     write_png(out, np.concatenate(pairs[shown], axis=1))
@@ -82,14 +83,6 @@ def request_for(frame: Frame) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
     }
-
-
-def decode_png(png: bytes) -> np.ndarray:
-    """RGB in [0, 1], [H, W, 3] float32."""
-    with tempfile.NamedTemporaryFile(suffix=".png") as file:
-        file.write(png)
-        file.flush()
-        return np.ascontiguousarray(oiio.ImageBuf(file.name).get_pixels(oiio.FLOAT)[..., :3])
 
 
 def step(title: str, *command: object) -> None:
