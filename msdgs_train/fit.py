@@ -19,11 +19,13 @@ FINAL_METRICS = "metrics.json"
 EVALUATED_SPLITS = ("test", "val")
 RENDERS_WHILE_TRAINING = 4
 
+Status = Literal["finished", "interrupted", "out of time"]
+
 
 class Outcome(NamedTuple):
     """How a run has ended. It can be resumed unless it is `finished`."""
 
-    status: Literal["finished", "interrupted", "out of time"]
+    status: Status
     step: int
     qualities: dict[str, Quality]  # of each held-out split; none when interrupted
     gaussians: int
@@ -85,7 +87,7 @@ class _Run:
         self.started = time.perf_counter() - seconds
 
     def execute(self) -> Outcome:
-        status = "finished"
+        status: Status = "finished"
         while self.trainer.step_count < self.config.steps and status == "finished":
             result = self.trainer.step()
             self._after_step(result)
@@ -95,12 +97,13 @@ class _Run:
         if status != "interrupted":
             qualities = {split: self._evaluate(split, renders=None) for split in self.splits}
         self._save()
+        draw_curve(self.folder)
         if qualities:
             self._write_final_metrics(qualities)
         count = len(self.trainer.model.gaussians)
         return Outcome(status, self.trainer.step_count, qualities, count, self._seconds())
 
-    def _reason_to_stop(self) -> Literal["finished", "interrupted", "out of time"]:
+    def _reason_to_stop(self) -> Status:
         if self.observer.should_stop():
             return "interrupted"
         budget = self.config.max_minutes
@@ -132,7 +135,6 @@ class _Run:
     def _save(self) -> None:
         self.trainer.save_checkpoint(self.folder / CHECKPOINT, self._seconds())
         self.trainer.save_model(self.folder / MODEL)
-        draw_curve(self.folder)
 
     def _write_final_metrics(self, qualities: dict[str, Quality]) -> None:
         metrics = {

@@ -4,14 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import OpenImageIO as oiio
+from matplotlib.figure import Figure
 
 from msdgs_train.metrics import Quality
 from msdgs_train.trainer import Evaluated, StepResult
-
-matplotlib.use("Agg")
 
 METRICS = "metrics.jsonl"
 CURVE = "curve.png"
@@ -54,11 +52,10 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 def draw_curve(run: Path) -> None:
     """Loss, PSNR in training and on held-out photographs, and the number of Gaussians, over the steps."""
-    from matplotlib.figure import Figure
-
     lines = read_metrics(run)
     train = [line for line in lines if line["kind"] == "train"]
-    figure = Figure(figsize=(9, 9), layout="constrained")
+    figure = Figure(figsize=(9, 9))
+    figure.subplots_adjust(0.1, 0.06, 0.97, 0.98, hspace=0.05)
     loss, psnr, count = figure.subplots(3, 1, sharex=True)
     steps = [line["step"] for line in train]
     loss.semilogy(steps, [line["loss"] for line in train])

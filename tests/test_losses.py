@@ -1,0 +1,85 @@
+"""The photometric loss: against torchmetrics, against finite differences, and by its laws."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from msdgs_serve.scene import InvalidInput
+from msdgs_train.losses import RADIUS, photometric_loss, ssim
+from tests.tolerances import assert_close, tolerance
+
+
+def _pair(seed: int, height: int, width: int, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    truth = torch.rand(height, width, 3, generator=generator, dtype=dtype)
+    return (truth + 0.3 * torch.randn(truth.shape, generator=generator, dtype=dtype)).clamp(0, 1), truth
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_ssim_is_that_of_torchmetrics(dtype: torch.dtype) -> None:
+    """With black all around the pictures, for torchmetrics mirrors them at the border."""
+    rgb, truth = _pair(0, 40, 31, dtype)
+    padded = [torch.nn.functional.pad(v, (0, 0, *4 * [2 * RADIUS])) for v in (rgb, truth)]
+    expected: Any = structural_similarity_index_measure(
+        padded[0].permute(2, 0, 1)[None], padded[1].permute(2, 0, 1)[None], gaussian_kernel=True, data_range=1.0
+    )
+    assert_close(float(ssim(*padded)), float(expected), f"ssim.{str(dtype).removeprefix('torch.')}")
+
+
+def test_gradient_agrees_with_finite_differences() -> None:
+    rgb, truth = _pair(1, 13, 9)
+    rgb.requires_grad_(True)
+    atol = tolerance("loss_gradient")
+    assert torch.autograd.gradcheck(lambda x: ssim(x, truth), (rgb,), atol=atol, rtol=0)
+    assert torch.autograd.gradcheck(lambda x: photometric_loss(x, truth, 0.8), (rgb,), atol=atol, rtol=0, eps=1e-7)
+
+
+def test_equal_pictures_have_no_loss() -> None:
+    _, truth = _pair(2, 20, 20)
+    assert float(ssim(truth, truth)) == pytest.approx(1.0)
+    assert float(photometric_loss(truth, truth, 0.8)) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_ssim_is_symmetric_and_does_not_know_left_from_right() -> None:
+    rgb, truth = _pair(3, 17, 23)
+    value = float(ssim(rgb, truth))
+    assert float(ssim(truth, rgb)) == pytest.approx(value, rel=1e-12)
+    assert float(ssim(rgb.flip(1), truth.flip(1))) == pytest.approx(value, rel=1e-12)
+    assert float(ssim(rgb.transpose(0, 1), truth.transpose(0, 1))) == pytest.approx(value, rel=1e-12)
+    assert float(ssim(rgb.flip(2), truth.flip(2))) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1), (4, 4), (11, 11)])
+def test_pictures_smaller_than_the_window(shape: tuple[int, int]) -> None:
+    rgb, truth = _pair(4, *shape)
+    rgb.requires_grad_(True)
+    photometric_loss(rgb, truth, 0.5).backward()
+    assert rgb.grad is not None
+    assert torch.isfinite(rgb.grad).all()
+
+
+def test_weight_mixes_the_two_terms() -> None:
+    rgb, truth = _pair(5, 16, 16)
+    l1, dssim = float((rgb - truth).abs().mean()), 1 - float(ssim(rgb, truth))
+    for weight in (0.0, 0.3, 1.0):
+        expected = weight * l1 + (1 - weight) * dssim
+        assert float(photometric_loss(rgb, truth, weight)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_not_finite_pixels_are_not_hidden() -> None:
+    rgb, truth = _pair(6, 16, 16)
+    rgb[3, 4, 1] = np.nan
+    assert torch.isnan(photometric_loss(rgb, truth, 0.8))
+
+
+def test_shapes_that_disagree_are_refused() -> None:
+    rgb, truth = _pair(7, 16, 16)
+    with pytest.raises(InvalidInput, match="`truth`"):
+        photometric_loss(rgb, truth[:-1], 0.8)
+    with pytest.raises(InvalidInput, match="`truth`"):
+        photometric_loss(rgb, truth.float(), 0.8)
+    with pytest.raises(InvalidInput, match="`rgb`"):
+        ssim(rgb[..., 0], truth[..., 0])

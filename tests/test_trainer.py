@@ -1,0 +1,222 @@
+"""A whole run on a tiny scene: it learns, it stops, and it goes on with the same bits."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from msdgs_serve.scene import InvalidInput
+from msdgs_train import fit as fit_module
+from msdgs_train import trainer as trainer_module
+from msdgs_train.checkpoint import load_model
+from msdgs_train.config import TrainConfig
+from msdgs_train.datasets import load_scene
+from msdgs_train.fit import Observer, fit
+from msdgs_train.model import ModelConfig
+from msdgs_train.optimizers import exponential, learning_rates
+from msdgs_train.report import MetricsLog, read_metrics
+from msdgs_train.trainer import Trainer, TrainingDiverged
+from tests.training_scene import SIZE, small_config, write_scene
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture
+def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than all the rest of a tiny run."""
+    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+
+
+def _steps(trainer: Trainer, count: int) -> None:
+    for _ in range(count):
+        trainer.step()
+
+
+class _StopAfter(Observer):
+    def __init__(self, step: int) -> None:
+        self.last, self.limit = 0, step
+
+    def step(self, result, seconds) -> None:
+        self.last = result.step
+
+    def should_stop(self) -> bool:
+        return self.last >= self.limit
+
+
+def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    if isinstance(tree, dict):
+        items = list(tree.items())
+    elif isinstance(tree, list | tuple):
+        items = list(enumerate(tree))
+    else:
+        return {prefix: tree}
+    return {name: value for key, child in items for name, value in _flat(child, f"{prefix}/{key}").items()}
+
+
+def _state(run: Path) -> dict[str, Any]:
+    state = _flat(torch.load(run / "checkpoint.pt", weights_only=True))
+    return {name: value for name, value in state.items() if name != "/seconds"}
+
+
+def _assert_same_bits(one: dict[str, Any], other: dict[str, Any]) -> None:
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, other[name]), name
+        else:
+            assert value == other[name], name
+
+
+@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.parametrize("stop", [3, 11, 16])
+@pytest.mark.parametrize("background", ["white", "random"])
+def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, background: str) -> None:
+    """Stopped in the warm-up, between and after densifications, in the middle of a pass over the photographs."""
+    config = small_config(background=background)
+    fit(config, data, tmp_path / "whole")
+    outcome = fit(config, data, tmp_path / "parts", observer=_StopAfter(stop))
+    assert (outcome.status, outcome.step, outcome.qualities) == ("interrupted", stop, {})
+    torch.manual_seed(stop)
+    assert fit(config, data, tmp_path / "parts", resume=True).status == "finished"
+    whole, parts = (_state(tmp_path / name) for name in ("whole", "parts"))
+    assert len(whole["/density/0"]) != config.init_count, "density control should have taken part"
+    _assert_same_bits(whole, parts)
+    lines = [[{**line, "seconds": 0} for line in read_metrics(tmp_path / name)] for name in ("whole", "parts")]
+    assert lines[0] == lines[1]
+
+
+def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    outcome = fit(small_config(steps=150, eval_every=50, checkpoint_every=50, opacity_reset_every=0), data, run)
+    names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
+    assert names == {
+        "config.json", "metrics.jsonl", "metrics.json", "curve.png", "checkpoint.pt", "model.pt",
+        "renders/test_r_000.png", "renders/test_r_001.png", "renders/val_r_000.png",
+    }  # fmt: skip
+    first, *_, last = [line for line in read_metrics(run) if line["kind"] == "eval" and line["split"] == "test"]
+    assert last["psnr"] > first["psnr"] > 12
+    assert outcome.qualities["test"].psnr == last["psnr"]
+    assert json.loads((run / "metrics.json").read_text())["splits"]["test"]["psnr"] == last["psnr"]
+    assert TrainConfig.from_dict(json.loads((run / "config.json").read_text())).steps == 150
+    loaded = load_model(run / "model.pt")
+    assert loaded.step == 150
+    assert len(loaded.model.gaussians) == outcome.gaussians
+    assert [camera["t"] for camera in loaded.scene.cameras] == [0.25, 0.75]
+    low, high = loaded.scene.bounds
+    assert all(a < b for a, b in zip(low, high, strict=True))
+
+
+def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
+    from msdgs_train.metrics import quality
+
+    trainer = Trainer(small_config(), load_scene(data))
+    _steps(trainer, 24)
+    trainer.save_model(tmp_path / "model.pt")
+    model = load_model(tmp_path / "model.pt").model
+    for evaluated in trainer.evaluate("test"):
+        assert evaluated.rgb.shape == (SIZE, SIZE, 3)
+        posed = model.pose(evaluated.frame.t)
+        with torch.no_grad():
+            rgb = trainer_module.rasterize(*posed, evaluated.frame.camera, torch.ones(3))[0]
+        assert quality(rgb, evaluated.truth) == evaluated.quality
+
+
+@pytest.mark.usefixtures("_no_curve")
+def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
+    model = ModelConfig(sh_degree=0, layers=0, embedding_size=0)
+    assert fit(small_config(model=model), data, tmp_path / "run").status == "finished"
+
+
+@pytest.mark.usefixtures("_no_curve")
+def test_time_budget_stops_evaluates_and_saves(data: Path, tmp_path: Path) -> None:
+    outcome = fit(small_config(max_minutes=1e-9), data, tmp_path / "run")
+    assert (outcome.status, outcome.step) == ("out of time", 1)
+    assert set(outcome.qualities) == {"test", "val"}
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
+@pytest.mark.usefixtures("_no_curve")
+def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: Path) -> None:
+    config, run = small_config(steps=2), tmp_path / "run"
+    with pytest.raises(InvalidInput, match="with a checkpoint"):
+        fit(config, data, run, resume=True)
+    fit(config, data, run)
+    with pytest.raises(InvalidInput, match="--resume"):
+        fit(config, data, run)
+    with pytest.raises(InvalidInput, match=r"`config\.l1_weight`"):
+        fit(small_config(steps=2, l1_weight=0.5), data, run, resume=True)
+    assert fit(small_config(steps=3), data, run, resume=True).step == 3
+
+
+def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(small_config(steps=100, densify_every=0), load_scene(data))
+    trainer.step()
+    before = [p.detach().clone() for p in trainer.model.parameters()]
+    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, weight: rgb.sum() * float("nan"))
+    result = trainer.step()
+    assert (result.step, result.skipped) == (2, 1)
+    assert all(torch.equal(a, b) for a, b in zip(before, trainer.model.parameters(), strict=True))
+    with pytest.raises(TrainingDiverged, match="up to step 21"):
+        _steps(trainer, 19)
+
+
+def test_every_photograph_once_a_pass(data: Path) -> None:
+    trainer = Trainer(small_config(), load_scene(data))
+    seen = []
+    for _ in range(14):
+        seen.append(trainer._next_frame().name)
+        trainer.step_count += 1
+    assert len(set(seen[:7])) == len(set(seen[7:])) == 7
+    assert seen[:7] != seen[7:]
+
+
+def test_warmup_leaves_the_deformation_alone(data: Path) -> None:
+    trainer = Trainer(small_config(warmup_fraction=0.25), load_scene(data))
+    before = [p.detach().clone() for p in trainer.model.deformation.parameters()]
+    _steps(trainer, 6)
+    assert all(torch.equal(a, b) for a, b in zip(before, trainer.model.deformation.parameters(), strict=True))
+    trainer.step()
+    assert not all(torch.equal(a, b) for a, b in zip(before, trainer.model.deformation.parameters(), strict=True))
+
+
+def test_learning_rates() -> None:
+    assert exponential(1.0, 0.01, 0, 100) == 1.0
+    assert exponential(1.0, 0.01, 50, 100) == pytest.approx(0.1)
+    assert exponential(1.0, 0.01, 200, 100) == pytest.approx(0.01)
+    config = TrainConfig()
+    rates = learning_rates(config, config.steps)
+    assert rates["means"] == pytest.approx(8e-6)
+    assert rates["deformation"] == pytest.approx(1.6e-6)
+    assert rates["raw_opacities"] == 0.05
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("steps", 0), ("l1_weight", 1.5), ("l1_weight", float("nan")), ("means_rate_start", 0.0),
+        ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("densify_every", -1),
+        ("quats_rate", float("inf")), ("size", 0),
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_named(field: str, value: object) -> None:
+    with pytest.raises(InvalidInput, match=f"`config.{field}`"):
+        TrainConfig(**{field: value})  # type: ignore[arg-type]
+
+
+def test_settings_survive_json_and_strangers_are_refused() -> None:
+    config = small_config(background="random", size=SIZE)
+    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    with pytest.raises(InvalidInput, match="`colour`"):
+        TrainConfig.from_dict({"colour": 1})
+
+
+def test_metrics_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:
+    lines = [json.dumps({"kind": "train", "step": step}) for step in (1, 2, 3)]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + '\n{"kind": "tr')
+    MetricsLog(tmp_path, keep_until=2)
+    assert [line["step"] for line in read_metrics(tmp_path)] == [1, 2]
