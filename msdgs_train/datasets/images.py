@@ -70,6 +70,18 @@ def composite(rgba: np.ndarray, background: np.ndarray | tuple[float, float, flo
     return background + alpha * (rgb - background)
 
 
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write uint8 [H, W, 3 or 4], sRGB, straight alpha. Equal pixels give equal files. Raises `OSError`."""
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, "uint8")
+    spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    writer = oiio.ImageOutput.create(str(path))
+    written = writer is not None and writer.open(str(path), spec) and writer.write_image(pixels) and writer.close()
+    if not written:
+        raise OSError(f"{path}: can't be written: {writer.geterror() if writer else oiio.geterror()}")
+
+
 def _cell_weights(length: int, count: int) -> np.ndarray:
     """[count, length] rows that average over `count` equal cells of `length` pixels; cells may cut pixels."""
     edges = np.linspace(0, length, count + 1)

@@ -1,0 +1,142 @@
+"""What moves in the synthetic scene, and how: where every material point is at every time.
+
+World axes: z up, scene units, content within 1.25 of the origin. A point of an object at rest (`local`, [3]) is in the
+world at `offset + matrix · warp(local)`, where `warp` twists around z and bends along x and y, both growing with z.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+OBJECTS = ("ground", "frame", "ball", "ring", "jelly", "pendulum")
+"""In the order of the rows of `Motion`. The ground and the frame stand still."""
+
+GROUND_Z = -0.5
+GROUND_RADIUS, GROUND_THICKNESS = 1.1, 0.09
+PIVOT_Z, FRAME_HALF_WIDTH, BAR_RADIUS = 0.7, 0.27, 0.02
+BALL_RADIUS = 0.19
+RING_RADIUS, RING_TUBE = 0.27, 0.095
+JELLY_HALF_WIDTH, JELLY_HEIGHT = 0.2, 0.5
+ROD_LENGTH, ROD_RADIUS, BOB_RADIUS = 0.74, 0.014, 0.12
+
+BOUNCES = 3
+BOUNCE_HEIGHT = 0.6
+CONTACT = 0.1
+"""Part of a bounce for which the ball touches the ground."""
+SQUASH = 4 * BOUNCE_HEIGHT * CONTACT / ((1 - CONTACT) * math.pi * BALL_RADIUS)
+"""Depth of the squash, as part of the radius: the one that makes the velocity continuous at contact."""
+
+REST_BOXES = np.array(
+    [
+        [[-GROUND_RADIUS, -GROUND_RADIUS, -GROUND_THICKNESS], [GROUND_RADIUS, GROUND_RADIUS, 0]],
+        [
+            [-FRAME_HALF_WIDTH - BAR_RADIUS, -BAR_RADIUS, -BAR_RADIUS],
+            [FRAME_HALF_WIDTH + BAR_RADIUS, BAR_RADIUS, PIVOT_Z - GROUND_Z + BAR_RADIUS],
+        ],
+        [[-BALL_RADIUS] * 3, [BALL_RADIUS] * 3],
+        [
+            [-RING_RADIUS - RING_TUBE, -RING_RADIUS - RING_TUBE, -RING_TUBE],
+            [RING_RADIUS + RING_TUBE, RING_RADIUS + RING_TUBE, RING_TUBE],
+        ],
+        [[-JELLY_HALF_WIDTH, -JELLY_HALF_WIDTH, 0], [JELLY_HALF_WIDTH, JELLY_HALF_WIDTH, JELLY_HEIGHT]],
+        [[-BOB_RADIUS, -BOB_RADIUS, -ROD_LENGTH - BOB_RADIUS], [BOB_RADIUS, BOB_RADIUS, 2 * ROD_RADIUS]],
+    ]
+)
+"""[objects, 2, 3] the corners that hold each object at rest."""
+
+_UNIT_GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, 5)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+_BOUND_MARGIN = 1.03  # the grid does not hit the farthest point of a bent box exactly
+
+
+class Motion(NamedTuple):
+    """All objects at one time, a row each, float64. Crosses into the ray-marching kernels as it is."""
+
+    offsets: np.ndarray  # [objects, 3]
+    matrices: np.ndarray  # [objects, 3, 3]
+    inverses: np.ndarray  # [objects, 3, 3] of `matrices`
+    warps: np.ndarray  # [objects, 3]: twist in radians a unit of z, bend along x and along y in 1 / unit
+    shrinks: np.ndarray  # [objects] world distance to a surface is at least this, times that at rest
+    centers: np.ndarray  # [objects, 3] of a sphere in the world that holds the object
+    radii: np.ndarray  # [objects] of that sphere
+
+
+def motion_at(t: float) -> Motion:
+    """The whole scene at time t; one run of the scene is [0, 1]."""
+    identity, still = np.eye(3), np.zeros(3)
+    ground = np.array([0.0, 0.0, GROUND_Z])
+    ball_offset, ball_matrix = _ball(t)
+    jelly_matrix, jelly_warp = _jelly(t)
+    rows = (
+        (ground, identity, still),
+        (ground, identity, still),
+        (ball_offset, ball_matrix, still),
+        (*_ring(t), still),
+        (np.array([0.6, 0.34, GROUND_Z]), jelly_matrix, jelly_warp),
+        (np.array([0.0, 0.0, PIVOT_Z]), _rotation(0, 0.72 * math.cos(3 * math.pi * t)), still),
+    )
+    offsets, matrices, warps = (np.stack(column) for column in zip(*rows, strict=True))
+    boxes = REST_BOXES[:, :1] + _UNIT_GRID * (REST_BOXES[:, 1:] - REST_BOXES[:, :1])
+    outlines = np.stack([_place(*row, box) for row, box in zip(rows, boxes, strict=True)])
+    centers = outlines.mean(axis=1)
+    radii = np.linalg.norm(outlines - centers[:, None], axis=2).max(axis=1) * _BOUND_MARGIN
+    return Motion(offsets, matrices, np.linalg.inv(matrices), warps, _shrinks(matrices, warps), centers, radii)
+
+
+def world_positions(name: str, local: np.ndarray, t: float) -> np.ndarray:
+    """Where points of object `name`, [..., 3] at rest, are in the world at time t. The ground truth of the motion."""
+    motion, index = motion_at(t), OBJECTS.index(name)
+    return _place(motion.offsets[index], motion.matrices[index], motion.warps[index], np.asarray(local, float))
+
+
+def _place(offset: np.ndarray, matrix: np.ndarray, warp: np.ndarray, local: np.ndarray) -> np.ndarray:
+    x, y, z = np.moveaxis(local, -1, 0)
+    cos, sin = np.cos(warp[0] * z), np.sin(warp[0] * z)
+    warped = np.stack([cos * x - sin * y + warp[1] * z * z, sin * x + cos * y + warp[2] * z * z, z], axis=-1)
+    return offset + warped @ matrix.T
+
+
+def _ball(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounces along an arc in front, spinning; squashed, at constant volume, while it touches the ground."""
+    phase = (t * BOUNCES + 0.5) % 1.0
+    height, flat = BALL_RADIUS, 1.0
+    if phase < CONTACT:
+        flat = 1 - SQUASH * math.sin(math.pi * phase / CONTACT)
+        height *= flat
+    else:
+        flight = (phase - CONTACT) / (1 - CONTACT)
+        height += 4 * BOUNCE_HEIGHT * flight * (1 - flight)
+    around = math.radians(-155 + 130 * t)
+    offset = np.array([0.78 * math.cos(around), 0.78 * math.sin(around), GROUND_Z + height])
+    squash = np.diag([flat**-0.5, flat**-0.5, flat])
+    return offset, squash @ _rotation(2, around) @ _rotation(0, -2.5 * math.pi * t) @ _rotation(1, 0.5)
+
+
+def _ring(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Floats, tumbles around the vertical and turns in itself: rigid."""
+    offset = np.array([-0.6, 0.34, 0.06 + 0.06 * math.sin(2 * math.pi * t)])
+    return offset, _rotation(2, 2 * math.pi * t) @ _rotation(0, 1.15) @ _rotation(2, -2 * math.pi * t)
+
+
+def _jelly(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Stretches and squashes at constant volume, twists and bends; its base stays on the ground."""
+    stretch = 1 + 0.32 * math.sin(4 * math.pi * t)
+    warp = np.array([2.4 * math.sin(3 * math.pi * t), 0.7 * math.sin(2 * math.pi * t + 1), 0.5 * math.cos(4 * t)])
+    return np.diag([stretch**-0.5, stretch**-0.5, stretch]), warp
+
+
+def _shrinks(matrices: np.ndarray, warps: np.ndarray) -> np.ndarray:
+    smallest = np.linalg.svd(matrices, compute_uv=False)[:, -1]
+    twist = 1 + np.abs(warps[:, 0]) * math.sqrt(2) * JELLY_HALF_WIDTH
+    bend = 1 + 2 * np.hypot(warps[:, 1], warps[:, 2]) * JELLY_HEIGHT
+    return smallest / (twist * bend)
+
+
+def _rotation(axis: int, angle: float) -> np.ndarray:
+    """Right-handed, around a coordinate axis."""
+    rotation = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    rotation[i, i] = rotation[j, j] = math.cos(angle)
+    rotation[j, i] = math.sin(angle)
+    rotation[i, j] = -rotation[j, i]
+    return rotation
