@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -11,12 +12,14 @@ from msdgs_serve.scene import Camera
 from msdgs_serve.scene.baked import CONTRACT, SceneCamera, SceneMetadata
 from msdgs_serve.scene.camera import orbit
 
-RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+Color = tuple[float, float, float]
+RED: Color = (1.0, 0.0, 0.0)
+GREEN: Color = (0.0, 1.0, 0.0)
 UP = np.array([0.0, 0.0, 1.0])
 SH_DC = 0.28209479177387814
 
 
-def metadata(**changes: object) -> SceneMetadata:
+def metadata(**changes: Any) -> SceneMetadata:
     """Of a scene in the cube [-1, 1]³, seen by two cameras of 64 × 48 pixels, z up; t from 0 to 1."""
     cameras = tuple(
         SceneCamera(f"view_{azimuth}", 0.0, Camera.from_fov(orbit(np.zeros(3), 5.0, azimuth, 20, UP), 64, 48, 40.0))
@@ -41,20 +44,20 @@ def metadata(**changes: object) -> SceneMetadata:
     return replace(plain, **changes)
 
 
-def write_scene(path: Path, *, static_color: tuple[float, float, float] = RED, **changes: object) -> Path:
-    """One ball that moves from (0, 0, -1) to (0, 0, 1), green, and one at the origin that doesn't, `static_color`."""
-    moving_sh, static_sh = (_constant_color(color) for color in (GREEN, static_color))
+def write_scene(path: Path, *, static_color: Color = RED, moving: bool = True, **changes: Any) -> Path:
+    """A ball at the origin, `static_color`, and if `moving` a green one that goes from (0, 0, -1) to (0, 0, 1)."""
+    count = int(moving)
     constants = {
-        "base": np.array([[0, 0, -1]], np.float32),
-        "velocity": np.array([[0, 0, 2]], np.float32),
-        "moving_quats": np.array([[1, 0, 0, 0]], np.float32),
-        "moving_scales": np.full((1, 3), 0.15, np.float32),
-        "ids": np.arange(1, dtype=np.int64),
+        "base": np.array([[0, 0, -1]], np.float32)[:count],
+        "velocity": np.array([[0, 0, 2]], np.float32)[:count],
+        "moving_quats": np.array([[1, 0, 0, 0]], np.float32)[:count],
+        "moving_scales": np.full((count, 3), 0.15, np.float32),
+        "ids": np.arange(count, dtype=np.int64),
         "all_static_means": np.zeros((1, 3), np.float32),
         "all_static_quats": np.array([[1, 0, 0, 0]], np.float32),
         "all_static_scales": np.full((1, 3), 0.15, np.float32),
-        "all_opacities": np.array([0.95, 0.95], np.float32),
-        "all_sh": np.concatenate([moving_sh, static_sh]),
+        "all_opacities": np.full(count + 1, 0.95, np.float32),
+        "all_sh": np.concatenate([_constant_color(GREEN)[:count], _constant_color(static_color)]),
     }
     nodes = [
         helper.make_node("Gather", ["base", "ids"], ["at_rest"]),

@@ -60,7 +60,7 @@ def _settings(arguments: Sequence[str]) -> Settings:
 
 def _serve(settings: Settings) -> None:
     store, renderer = SceneStore(settings.scenes), Renderer(settings.cached_poses)
-    with _bind(settings.host, settings.port) as listener:
+    with bind(settings.host, settings.port) as listener:
         _load(settings, store, renderer)
         app = create_app(store, renderer, settings)
         config = uvicorn.Config(
@@ -89,8 +89,11 @@ class _Server(uvicorn.Server):
         sys.stdout.flush()
 
 
-def _bind(host: str, port: int) -> socket.socket:
-    """A socket that has its port but doesn't listen yet, so that a port in use is told before anything is loaded."""
+def bind(host: str, port: int) -> socket.socket:
+    """A socket that has its port but doesn't listen yet, so that a port in use is told before anything is loaded.
+
+    It knows its protocol: only then asyncio sends without Nagle's delay, which would cost 40 ms a request.
+    """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)

@@ -66,7 +66,7 @@ def render_examples(store: SceneStore) -> Examples:
 def _examples(metadata: SceneMetadata, scene: dict[str, str]) -> Examples:
     frame = framing(metadata)
     pose = orbit(frame.target, frame.distance, azimuth=60, elevation=25, up=frame.up)
-    t = round(float(np.mean(metadata.time_range)), 4)
+    t = float(np.clip(round(np.mean(metadata.time_range), 4), *metadata.time_range))
     size = {"width": 400, "height": 400}
     around = {"type": "orbit", "azimuth": 30, "elevation": 20}
     look_at = {"type": "look_at", "eye": _rounded(pose[:3, 3]), "target": _rounded(frame.target), "fov_y": 45}

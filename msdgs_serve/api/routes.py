@@ -110,7 +110,8 @@ def _scene_name(name: str | None, store: SceneStore) -> str:
 def _check_pixels(camera: Camera, limit: int) -> None:
     if camera.width * camera.height > limit:
         size = f"{camera.width} × {camera.height}"
-        raise InvalidInput("width", f"such that width × height is at most {limit} pixels", size)
+        larger = "width" if camera.width >= camera.height else "height"
+        raise InvalidInput(larger, f"such that width × height is at most {limit} pixels", size)
 
 
 def _background(body: RenderRequest) -> Background:

@@ -18,7 +18,8 @@ PROGRAM = "msdgs-serve"
 
 
 class Settings(BaseSettings):
-    """Serve scenes over HTTP: POST /render returns a frame for any camera and any time.
+    """\
+    Serve scenes over HTTP: POST /render returns a frame for any camera and any time.
 
       msdgs-serve scene.onnx                  one scene
       msdgs-serve scenes/ --port 9000         every .onnx file of a folder; files may come, change and go
