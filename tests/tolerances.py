@@ -53,6 +53,11 @@ TABLE = (
     Row("ssim.float64", 1e-12, "as ssim.float32"),
     Row("psnr.relative", 1e-6, "torchmetrics adds in float32"),
     Row("loss_gradient", 1e-7, "central differences with steps of 1e-7 and 1e-6 of a loss of size 1"),
+    # the deformation network
+    Row("encoding.float64", 1e-12, "sines of phases up to 1024, each rounded once"),
+    Row("encoding.float32", 1e-5, "phases are exact products; what is left is the sine's own rounding"),
+    Row("network.float64", 1e-11, "matrix products in another order, five deep, through frequencies up to 512"),
+    Row("neighbour_distances", 1e-6, "differences of float32 coordinates of size 5"),
 )
 
 _ROWS = {row.name: row for row in TABLE}

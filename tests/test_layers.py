@@ -1,0 +1,124 @@
+"""The deformation layers against the paper's sizes and a plain float64 reading of its equations."""
+
+import numpy as np
+import pytest
+import torch
+
+from msdgs_train.deformation import MultiStepDeformation
+from msdgs_train.layers import MLPLayer, PositionalEncoding, octaves
+from msdgs_train.modulation import ScaleModulation
+from tests.tolerances import assert_close, tolerance
+
+PAPER_LAYER_PARAMETERS = 235_561
+PAPER_MODULATION_PARAMETERS = 1_155
+
+
+def parameters(module: torch.nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def random_layer(seed: int, **sizes: int) -> MLPLayer:
+    torch.manual_seed(seed)
+    layer = MLPLayer(**({"width": 16, "depth": 3, "time_width": 8, "time_features": 5} | sizes)).double()
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter.normal_(std=0.2)
+    return layer
+
+
+def plain_encoding(x: np.ndarray, frequencies: int) -> np.ndarray:
+    phases = [x * 2.0**k for k in range(frequencies)]
+    return np.concatenate([x, *(np.sin(p) for p in phases), *(np.cos(p) for p in phases)], axis=-1)
+
+
+def plain_step(layer: MLPLayer, means: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Equations 7 and 10 with the time features repeated for every Gaussian: deltas [N, 10] and weights [N, 1]."""
+
+    def linear(module: torch.nn.Module, value: np.ndarray) -> np.ndarray:
+        assert isinstance(module, torch.nn.Linear)
+        return value @ module.weight.detach().numpy().T + module.bias.detach().numpy()
+
+    time = np.maximum(linear(layer.time_hidden, plain_encoding(np.array([[t]]), layer.time_octaves.shape[1])), 0)
+    features = np.repeat(linear(layer.time_output, time), len(means), axis=0)
+    hidden = np.concatenate([plain_encoding(means, layer.xyz_octaves.shape[1] // 3), features], axis=1)
+    for module in [layer.first, *layer.trunk]:
+        hidden = np.maximum(linear(module, hidden), 0)
+    heads = linear(layer.heads, hidden)
+    return heads[:, :10], 1 / (1 + np.exp(-heads[:, 10:]))
+
+
+def test_a_layer_has_the_papers_number_of_parameters():
+    assert parameters(MLPLayer()) == PAPER_LAYER_PARAMETERS
+    assert parameters(MultiStepDeformation(MLPLayer() for _ in range(2))) == 2 * PAPER_LAYER_PARAMETERS
+
+
+def test_the_modulation_has_the_papers_number_of_parameters_and_starts_at_one():
+    modulation = ScaleModulation()
+    assert parameters(modulation) == PAPER_MODULATION_PARAMETERS
+    assert torch.equal(modulation(torch.randn(7, 32)), torch.ones(7, 3))
+
+
+def test_a_new_layer_moves_nothing_but_has_weights():
+    step = MLPLayer(width=32)(torch.randn(9, 3), torch.tensor(0.3))
+    for delta in (step.delta_means, step.delta_log_scales, step.delta_quats):
+        assert not delta.any()
+    assert step.weight.shape == (9, 1)
+    assert ((step.weight > 0) & (step.weight < 1)).all()
+    assert step.weight.unique().numel() > 1
+
+
+@pytest.mark.parametrize(("dimensions", "frequencies"), [(3, 10), (1, 6), (3, 1)])
+def test_encoding_is_value_sines_cosines(dimensions: int, frequencies: int):
+    x = torch.rand(50, dimensions, dtype=torch.float64) * 4 - 2
+    got = PositionalEncoding.apply(x, octaves(dimensions, frequencies).double())
+    assert got.shape[1] == dimensions * (1 + 2 * frequencies)
+    assert_close(got, plain_encoding(x.numpy(), frequencies), "encoding.float64")
+
+
+def test_encoding_in_float32_is_precise_at_the_highest_frequency():
+    x = torch.rand(20_000, 3) * 4 - 2
+    got = PositionalEncoding.apply(x, octaves(3, 10))
+    assert_close(got, plain_encoding(x.double().numpy(), 10), "encoding.float32")
+
+
+def test_encoding_gradient():
+    x = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(PositionalEncoding.apply, (x, octaves(3, 4).double()))
+
+
+@pytest.mark.parametrize("sizes", [{}, {"depth": 1}, {"width": 1}, {"xyz_frequencies": 2, "time_frequencies": 1}])
+def test_layer_agrees_with_a_plain_reading(sizes: dict[str, int]):
+    layer = random_layer(1, **sizes)
+    means = torch.randn(20, 3, dtype=torch.float64)
+    step = layer(means, torch.tensor(0.7, dtype=torch.float64))
+    deltas, weight = plain_step(layer, means.numpy(), 0.7)
+    got = torch.cat([step.delta_means, step.delta_log_scales, step.delta_quats], dim=1)
+    assert_close(got.detach(), deltas, "network.float64")
+    assert_close(step.weight.detach(), weight, "network.float64")
+
+
+def test_layer_gradients():
+    layer = random_layer(2, width=4, depth=2, time_width=3, time_features=2, xyz_frequencies=1, time_frequencies=1)
+    means = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
+    t = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda *x: tuple(layer(*x[:2])), (means, t, *layer.parameters()))
+
+
+@pytest.mark.parametrize("steps", [None, 0, 1, 2, 3])
+def test_steps_are_weighted_and_summed(steps: int | None):
+    layers = [random_layer(seed) for seed in range(3)]
+    means = torch.randn(20, 3, dtype=torch.float64)
+    deltas = MultiStepDeformation(layers)(means, torch.tensor(0.2, dtype=torch.float64), steps)
+    moved, total = means.numpy(), np.zeros((20, 10))
+    for layer in layers[:steps]:
+        step, weight = plain_step(layer, moved, 0.2)  # equation 7
+        moved = moved + weight * step[:, :3]  # equation 8
+        total = total + weight * step  # equation 9
+    assert_close(torch.cat(deltas, dim=1).detach(), total, "network.float64")
+    assert np.abs(moved - means.numpy() - total[:, :3]).max() < tolerance("network.float64")
+
+
+def test_no_layers_and_no_gaussians():
+    for deformation in (MultiStepDeformation([]), MultiStepDeformation([MLPLayer(width=8)])):
+        deltas = deformation(torch.empty(0, 3), torch.tensor(0.0))
+        assert [tuple(d.shape) for d in deltas] == [(0, 3), (0, 3), (0, 4)]
