@@ -73,20 +73,25 @@ class _Rasterize(torch.autograd.Function):
         options: RasterizerOptions,
         info: RasterizationInfo,
     ) -> tuple[Tensor, Tensor]:
-        gaussians = Gaussians(*(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities, sh)))
+        gaussians = Gaussians(*map(_array, (means, quats, scales, opacities, sh)))
         splats = project(gaussians, camera, options)
         tiles = bin_into_tiles(splats, camera.width, camera.height)
         blend = composite(splats, tiles, camera.width, camera.height, options)
         rgb = blend.rgb + blend.transmittance[..., None] * background.detach().numpy()
         info.radii = torch.from_numpy(splats.extents.max(axis=1, initial=0))
-        ctx.rendered = (gaussians, splats, tiles, blend.transmittance, rgb)
+        image = torch.from_numpy(rgb)
+        # saved as tensors: autograd then notices if one is written to before the backward pass
+        ctx.save_for_backward(means, quats, scales, opacities, sh, image)
+        ctx.drawn = (splats, tiles, blend.transmittance)
         ctx.view = (camera, options)
         ctx.info = info
-        return torch.from_numpy(rgb), torch.from_numpy(1 - blend.transmittance)
+        return image, torch.from_numpy(1 - blend.transmittance)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
-        gaussians, splats, tiles, transmittance, rgb = ctx.rendered
+        *arrays, rgb = map(_array, ctx.saved_tensors)
+        gaussians = Gaussians(*arrays)
+        splats, tiles, transmittance = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
         behind = np.einsum("hwc,hwc->hw", rgb, grad_rgb) + (1 - transmittance) * grad_alpha
         splat_grads = composite_backward(splats, tiles, ctx.view[1], behind, grad_rgb, grad_alpha)
@@ -95,3 +100,7 @@ class _Rasterize(torch.autograd.Function):
         grad_background = np.einsum("hw,hwc->c", transmittance, grad_rgb)
         arrays = (grads.means, grads.quats, grads.scales, splat_grads.opacities, grads.sh, grad_background)
         return *(torch.from_numpy(array) for array in arrays), None, None, None
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()

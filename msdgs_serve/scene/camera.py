@@ -26,6 +26,7 @@ class Camera:
     camera_to_world: np.ndarray  # [4, 4] float64, rigid
 
     def __post_init__(self) -> None:
+        self._take_numbers()
         for name in ("fx", "fy"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InvalidInput(f"camera.{name}", "finite and above 0 pixels", getattr(self, name))
@@ -34,9 +35,20 @@ class Camera:
                 raise InvalidInput(f"camera.{name}", "finite", getattr(self, name))
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not (isinstance(value, int | np.integer) and 1 <= value <= MAX_PIXELS_PER_SIDE):
+            if not (type(value) is int and 1 <= value <= MAX_PIXELS_PER_SIDE):
                 raise InvalidInput(f"camera.{name}", f"an integer in [1, {MAX_PIXELS_PER_SIDE}]", value)
         object.__setattr__(self, "camera_to_world", _rigid(self.camera_to_world))
+
+    def _take_numbers(self) -> None:
+        """Plain Python numbers, whatever array they came from: kernels are compiled for one type."""
+        for name in ("fx", "fy", "cx", "cy"):
+            try:
+                object.__setattr__(self, name, float(getattr(self, name)))
+            except (TypeError, ValueError):
+                raise InvalidInput(f"camera.{name}", "a number", repr(getattr(self, name))) from None
+        for name in ("width", "height"):
+            if isinstance(getattr(self, name), np.integer):
+                object.__setattr__(self, name, int(getattr(self, name)))
 
     @property
     def world_to_camera(self) -> np.ndarray:
