@@ -29,11 +29,11 @@ class Fit:
     A first look, in a few minutes:  msdgs-train fit data/scene runs/first --size 200 --steps 3000
     """
 
-    data: tyro.conf.Positional[Path]
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """A dataset folder; D-NeRF layout: transforms_train.json, transforms_test.json and PNGs."""
-    run: tyro.conf.Positional[Path]
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The folder of this run; new, or one to --resume."""
-    resume: bool = False
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the run in RUN, with the settings it was begun with."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
@@ -45,12 +45,14 @@ class Synthetic:
     Example:  msdgs-train synthetic data/toy && msdgs-train fit data/toy runs/toy --steps 2000
     """
 
-    out: tyro.conf.Positional[Path]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The folder to make."""
-    size: int = 200
+    size: int = 128
     """Width and height of the photographs in pixels."""
-    train_frames: int = 100
-    test_frames: int = 10
+    train_frames: int = 64
+    """At evenly spaced times, from all around."""
+    test_frames: int = 12
+    """Held out: at times between, from one smooth turn around the scene."""
     seed: int = 0
     """Of the cameras and times."""
 
@@ -75,7 +77,7 @@ def _parse(arguments: Sequence[str]) -> Fit | Synthetic:
         from msdgs_train.fit import stored_config
 
         # parsed again with the run's own settings as defaults, so that only what is given now differs from them
-        stored = Fit(command.data, command.run, True, stored_config(command.run))
+        stored = Fit(command.data, command.run, config=stored_config(command.run))
         command = tyro.cli(Fit, args=arguments[1:], prog="msdgs-train fit", default=stored)
     return command
 

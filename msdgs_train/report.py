@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 from matplotlib.figure import Figure
 
+from msdgs_train.datasets.images import write_png
 from msdgs_train.metrics import Quality
 from msdgs_train.trainer import Evaluated, StepResult
 
@@ -78,17 +78,10 @@ def write_side_by_side(run: Path, split: str, evaluated: Evaluated) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{split}_{Path(evaluated.frame.name).name}.png"
     pair = np.concatenate([evaluated.truth.numpy(), evaluated.rgb.numpy()], axis=1)
-    write_png(path, pair)
+    write_png(path, to_bytes(pair))
     return path
 
 
-def write_png(path: Path, rgb: np.ndarray) -> None:
-    """Write display-referred RGB, [H, W, 3] in [0, 1], as 8-bit PNG; raises `OSError` if the disk won't have it."""
-    pixels = np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    height, width = pixels.shape[:2]
-    output = oiio.ImageOutput.create(str(path))
-    if output is None:
-        raise OSError(f"{path}: {oiio.geterror()}")
-    written = output.open(str(path), oiio.ImageSpec(width, height, 3, "uint8")) and output.write_image(pixels)
-    if not (output.close() and written):
-        raise OSError(f"{path}: {output.geterror()}")
+def to_bytes(rgb: np.ndarray) -> np.ndarray:
+    """uint8 of display-referred values in [0, 1], rounded."""
+    return np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)

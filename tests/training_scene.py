@@ -11,8 +11,9 @@ from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
 from msdgs_train.config import TrainConfig
+from msdgs_train.datasets.images import write_png
 from msdgs_train.model import ModelConfig
-from msdgs_train.report import write_png
+from msdgs_train.report import to_bytes
 from tests.scenes import gaussians_of
 
 SIZE = 24
@@ -53,5 +54,6 @@ def _write_frame(folder: Path, name: str, t: float) -> dict:
         opacities=0.95,
         rgb=[[0.9, 0.2, 0.1], [0.1, 0.8, 0.2], [0.2, 0.2, 0.9]],
     )
-    write_png(folder / f"{name}.png", rasterize(blobs, camera, background=(1.0, 1.0, 1.0)).rgb)
+    rgb = rasterize(blobs, camera, background=(1.0, 1.0, 1.0)).rgb
+    write_png(folder / f"{name}.png", to_bytes(rgb))
     return {"file_path": f"./{name}", "time": t, "transform_matrix": (pose @ OPENGL_TO_OPENCV).tolist()}
