@@ -296,4 +296,5 @@ def test_a_failure_of_the_server_says_nothing_of_its_inside(
     assert response.status_code == 500
     check_problem(response)
     assert "secret" not in response.text
+    assert client.get("/healthz").status_code == 200, "the connection lives on"
     assert any(record.exc_info and "secret" in str(record.exc_info[1]) for record in caplog.records)

@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
 
@@ -22,6 +23,7 @@ STATUS_OF: dict[type[MsdgsError], HTTPStatus] = {
 
 MEDIA_TYPE = "application/problem+json"
 MAX_BODY_BYTES = 8192
+MAX_ERRORS = 20
 MAX_FIELD_LENGTH = 100
 MAX_MESSAGE_LENGTH = 200
 
@@ -51,7 +53,7 @@ def problem_response(
     """A problem as a response; what would make it too long is cut off."""
     shown = [
         FieldError(field=_cut(error.field, MAX_FIELD_LENGTH), message=_cut(error.message, MAX_MESSAGE_LENGTH))
-        for error in errors
+        for error in errors[:MAX_ERRORS]
     ]
     problem = Problem(
         title=HTTPStatus(status).phrase, status=status, detail=_cut(detail, MAX_MESSAGE_LENGTH), errors=shown
@@ -67,14 +69,44 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(MsdgsError, _on_domain_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_error)
-    app.add_exception_handler(Exception, _on_unexpected_error)
+    app.add_middleware(UnexpectedErrors)
+
+
+class UnexpectedErrors:
+    """ASGI middleware: an error that nothing else handles is logged and answered with 500.
+
+    In place of a handler for `Exception`, after which the connection is closed under a client that may be using it.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        answering = False
+
+        async def watched(message: Message) -> None:
+            nonlocal answering
+            answering = True
+            await send(message)
+
+        try:
+            await self._app(scope, receive, watched)
+        except Exception as error:
+            if answering or scope["type"] != "http":
+                raise
+            logger.error("%s %s failed", scope["method"], scope["path"], exc_info=error)
+            await _server_error()(scope, receive, send)
+
+
+def _server_error() -> Response:
+    return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The server failed; its log says why.")
 
 
 async def _on_domain_error(_: Request, error: Exception) -> Response:
     status = next((status for kind, status in STATUS_OF.items() if isinstance(error, kind)), None)
     if status is None:
         logger.error("unexpected domain error", exc_info=error)
-        return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The server failed; its log says why.")
+        return _server_error()
     if isinstance(error, SceneFileInvalid):
         logger.error("%s", error)
         return problem_response(status, f"The scene's file is broken at `{error.field}`; the server's log says how.")
@@ -84,7 +116,7 @@ async def _on_domain_error(_: Request, error: Exception) -> Response:
 
 async def _on_validation_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    errors = [_field_error(item) for item in error.errors()]
+    errors = [_field_error(item) for item in error.errors()[:MAX_ERRORS]]
     detail = f"`{_cut(errors[0].field, MAX_FIELD_LENGTH)}`: {errors[0].message}"
     return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, detail, errors)
 
@@ -95,11 +127,6 @@ async def _on_http_error(_: Request, error: Exception) -> Response:
     if error.status_code == HTTPStatus.BAD_REQUEST:  # FastAPI's, for a body that is no text or no JSON
         errors.append(FieldError(field="body", message=str(error.detail)))
     return problem_response(error.status_code, str(error.detail), errors, dict(error.headers or {}))
-
-
-async def _on_unexpected_error(request: Request, error: Exception) -> Response:
-    logger.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The server failed; its log says why.")
 
 
 def _field_error(item: dict[str, Any]) -> FieldError:
