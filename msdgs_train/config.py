@@ -13,7 +13,7 @@ BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of a run. Learning rates decay exponentially from `_start` to `_end` over all steps."""
+    """Settings of a run; the defaults are those of the field, at the size of a small scene on a CPU."""
 
     steps: int = 12_000
     """Optimiser steps; one photograph each."""
@@ -43,23 +43,34 @@ class TrainConfig:
     """λ in L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
 
     means_rate_start: float = 8e-4
+    """Learning rate of the canonical centres, in scene units; Adam moves a centre by about this much a step."""
     means_rate_end: float = 8e-6
+    """At the last step; in between it decays exponentially."""
     field_rate_start: float = 8e-4
-    """Of the deformation layers."""
+    """Learning rate of the deformation layers."""
     field_rate_end: float = 1.6e-6
+    """At the last step."""
     modulation_rate_start: float = 8e-4
-    """Of the modulation network and the embeddings that it reads."""
+    """Learning rate of the modulation network and the embeddings that it reads."""
     modulation_rate_end: float = 1.6e-6
+    """At the last step."""
     sh_dc_rate: float = 2.5e-3
+    """Learning rate of the colours; this and those below stay the same all along."""
     sh_rest_rate: float = 1.25e-4
+    """Of how colours change with the direction of view."""
     opacities_rate: float = 5e-2
+    """Of the opacities, before the sigmoid."""
     scales_rate: float = 5e-3
+    """Of the logarithms of the scales."""
     quats_rate: float = 1e-3
+    """Of the quaternions."""
 
     densify_every: int = 100
     """Density control: clone and split where the picture pulls hardest on the Gaussians; 0 switches it off."""
     densify_from: int = 500
+    """The first step of density control."""
     densify_until_fraction: float = 0.5
+    """Density control ends after this part of the run."""
     densify_gradient: float = 2e-4
     """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified."""
     split_scale: float = 0.01
