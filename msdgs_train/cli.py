@@ -95,7 +95,8 @@ def _fit(command: Fit) -> int:
         console.print(f"{split:>5}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
     console.print(f"model: {command.run / 'model.pt'}", soft_wrap=True)
     if outcome.status != "finished":
-        console.print(f"go on with: msdgs-train fit {command.data} {command.run} --resume", soft_wrap=True)
+        more = " --max-minutes None" if outcome.status == "out of time" else ""
+        console.print(f"go on with: msdgs-train fit {command.data} {command.run} --resume{more}", soft_wrap=True)
     return EXIT_INTERRUPTED if outcome.status == "interrupted" else 0
 
 

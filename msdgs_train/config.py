@@ -24,7 +24,7 @@ class TrainConfig:
     threads: int = 2
     """Threads that torch uses. The same seed gives the same bits for the same number of threads."""
     max_minutes: float | None = None
-    """Stop, evaluate and save after so many minutes of training, even if steps are left; `--resume` goes on."""
+    """Stop, evaluate and save after so many minutes in all, resumed parts included, even if steps are left."""
     background: Literal["white", "black", "random"] = "white"
     """What is behind the scene. With `random` every step draws a colour, and evaluation is on white."""
 
