@@ -166,10 +166,10 @@ def opacity_extremes() -> Scene:
 
 
 def crowd() -> Scene:
-    """Two thousand splats behind one another on one pixel, faint enough that hundreds are blended."""
-    depths = np.linspace(2, 6, 2000)
+    """A thousand splats behind one another on one pixel, faint enough that hundreds are blended."""
+    depths = np.linspace(2, 6, 1000)
     rng = np.random.default_rng(5)
-    opacities = rng.uniform(0.004, 0.02, 2000)
+    opacities = rng.uniform(0.004, 0.02, 1000)
     means = np.column_stack([0.01 * depths, 0.01 * depths, depths])
     return gaussians_of(means, scales=0.02, opacities=opacities), front_camera(19, 17)
 

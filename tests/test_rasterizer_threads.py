@@ -1,7 +1,5 @@
 """Same bytes from any number of threads; compiled once, for every process and every layout of arrays."""
 
-import os
-import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -14,9 +12,9 @@ from numba.core.dispatcher import Dispatcher
 
 from msdgs_serve.rasterizer import Rendering, rasterize
 from msdgs_serve.scene import Gaussians
+from tests.processes import run_python
 from tests.scenes import as_dtype, random_scene
 
-ROOT = Path(__file__).parents[1]
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 RENDER_TO_FILE = """
@@ -47,15 +45,6 @@ def kernels() -> list[Dispatcher]:
 def compiled() -> int:
     """Versions of kernels in this process, one for each combination of argument types."""
     return sum(len(kernel.signatures) for kernel in kernels())
-
-
-def run_python(code: str, *arguments: object, **environment: str) -> str:
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    done = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def bytes_of(picture: Rendering) -> list[bytes]:
