@@ -50,9 +50,10 @@ def verify(
             for name, error in _errors(got, _posed_by_model(reference, t, ids)).items():
                 worst[precision][name] = max(worst[precision][name], error)
                 if not error <= tolerance:
+                    own = _errors(_posed_by_model(model, t, ids), _posed_by_model(models["float64"], t, ids))[name]
                     raise VerificationFailed(
-                        f"`{name}` at t = {t} is off by {error:.3g} from the model in {precision}, "
-                        f"allowed is {tolerance:g}"
+                        f"`{name}` at t = {t} is off by {error:.3g} from the model in {precision}, allowed is "
+                        f"{tolerance:g}; the model's own float32 is off by {own:.3g} from its float64"
                     )
         on_time()
     return {**worst["float64"], "against": "model in float64", "against_float32": worst["float32"], "times": times}

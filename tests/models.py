@@ -8,6 +8,9 @@ from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians, ModelConfig
 
+torch.set_num_threads(1)
+"""The tests themselves run side by side, and OpenMP threads that wait for a core spin."""
+
 CAMERA = {
     "fx": 50.0,
     "fy": 50.0,

@@ -1,0 +1,132 @@
+"""The reader of scene files: times, ids, threads and memory."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from export.bake import bake
+from export.plans import network
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.checkpoint import SceneInfo
+from msdgs_train.model import DynamicGaussians
+from tests.models import random_model
+from tests.scene_files import write_scene
+from tests.tolerances import tolerance
+
+
+def written(path: Path, model: DynamicGaussians, **scene: Any) -> Path:
+    path.write_bytes(network(bake(model, SceneInfo(**scene), "0" * 64)).SerializeToString())
+    return path
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("scene") / "scene.onnx", random_model(1000))
+
+
+@pytest.fixture(scope="module")
+def session(path: Path) -> DeformationSession:
+    return DeformationSession(path, chunk=128)
+
+
+def test_all_moving_gaussians_by_default(session: DeformationSession):
+    means, quats, scales = session.pose(0.5)
+    assert (means.shape, quats.shape, scales.shape) == ((1000, 3), (1000, 4), (1000, 3))
+    gaussians = session.gaussians(0.5).validate()
+    assert (len(gaussians), gaussians.sh_degree) == (1000, 3)
+    assert np.array_equal(gaussians.means, means)
+
+
+def test_moving_gaussians_come_first_then_static_ones(tmp_path: Path):
+    session = DeformationSession(write_scene(tmp_path / "scene.onnx"))
+    assert (session.scene.moving_count, session.scene.static_count) == (1, 1)
+    for t in (0.0, 0.25, 1.0):
+        assert np.allclose(session.gaussians(t).means, [[0, 0, 2 * t - 1], [0, 0, 0]])
+
+
+@pytest.mark.parametrize("ids", [[], [3], [999, 0, 5, 5], list(range(999, -1, -1))])
+def test_ids_come_back_in_their_order(session: DeformationSession, ids: list[int]):
+    for some, every in zip(session.pose(0.5, ids), session.pose(0.5), strict=True):
+        assert some.shape == every[ids].shape
+        # rows of a product may be added in another order in a chunk of another length
+        assert np.abs(some - every[ids]).max(initial=0) <= tolerance("export.relative")
+
+
+@pytest.mark.parametrize("ids", [[-1], [1000], [0.5], [[1]], ["a"], 3])
+def test_ids_that_are_not_there_are_refused(session: DeformationSession, ids: list[int]):
+    with pytest.raises(InvalidInput, match="ids"):
+        session.pose(0.5, ids)
+
+
+@pytest.mark.parametrize("t", [-0.001, 1.001, float("nan"), float("inf")])
+def test_times_outside_the_range_are_refused(session: DeformationSession, t: float):
+    for ask in (session.pose, session.gaussians):
+        with pytest.raises(InvalidInput, match=r"`t` must be in the scene's range \[0.0, 1.0\]"):
+            ask(t)
+
+
+def test_the_scene_has_its_own_range_of_times(tmp_path: Path):
+    session = DeformationSession(written(tmp_path / "scene.onnx", random_model(9), time_range=(0.2, 0.6)))
+    session.pose(0.2)
+    session.pose(0.6)
+    with pytest.raises(InvalidInput, match="t"):
+        session.pose(0.1)
+
+
+def test_the_same_bits_for_any_number_of_threads(session: DeformationSession, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MSDGS_THREADS", "2")
+    parallel = session.pose(0.7)
+    monkeypatch.setenv("MSDGS_THREADS", "1")
+    for one, two in zip(session.pose(0.7), parallel, strict=True):
+        assert one.tobytes() == two.tobytes()
+
+
+def test_several_callers_at_once(session: DeformationSession):
+    times = np.linspace(0, 1, 12).tolist()
+    alone = [session.pose(t)[0].tobytes() for t in times]
+    with ThreadPoolExecutor(4) as callers:
+        together = list(callers.map(lambda t: session.pose(t)[0].tobytes(), times))
+    assert together == alone
+
+
+def test_a_chunk_must_have_a_size(path: Path):
+    with pytest.raises(InvalidInput, match="chunk"):
+        DeformationSession(path, chunk=0)
+
+
+PEAK_GROWTH = """
+import sys
+from pathlib import Path
+from msdgs_serve.deformation import DeformationSession
+def peak_mb():  # not getrusage: its peak is inherited from the process that started this one
+    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024
+session = DeformationSession(sys.argv[1])
+session.pose(0.5, range(2 * 2048))
+before = peak_mb()
+session.pose(0.5)
+print(peak_mb() - before)
+assert "torch" not in sys.modules and "onnx" not in sys.modules
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from Linux's /proc")
+def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
+    count, width = 60_000, 256
+    model = random_model(1, layers=1, width=width, sh_degree=0, embedding_size=0)
+    for name, parameter in list(model.gaussians.named_parameters()):
+        setattr(
+            model.gaussians, name, torch.nn.Parameter(parameter.detach().repeat(count, *[1] * (parameter.ndim - 1)))
+        )
+    path = written(tmp_path / "scene.onnx", model)
+    done = subprocess.run([sys.executable, "-c", PEAK_GROWTH, str(path)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    activation_mb = count * width * 4 / 2**20
+    outputs_mb = count * 10 * 4 / 2**20
+    assert float(done.stdout) < outputs_mb + 0.25 * activation_mb
