@@ -8,6 +8,7 @@ they are used instead of the angle. The time range of the scene runs from the fi
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,6 @@ HALF_EXTENT = 1.3
 """Of the cube that all D-NeRF scenes fit in; Deformable-3D-Gaussians and 4DGaussians begin with points in it."""
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-ASPECT_TOLERANCE = 0.01
 
 
 def load_dnerf(folder: Path | str, size: int | None = None) -> SceneData:
@@ -54,11 +54,14 @@ class _Entry(NamedTuple):
     def get(self, key: str) -> Any:
         return self.values.get(key, self.shared.get(key))
 
+    def has(self, key: str) -> bool:
+        return self.get(key) is not None
+
     def number(self, key: str) -> float:
         value = self.get(key)
         if value is None:
             raise self.invalid(key, "is missing")
-        if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        if not _is_finite_number(value):
             raise self.invalid(key, f"must be a finite number, got {value!r}")
         return float(value)
 
@@ -68,8 +71,8 @@ def _read_entries(file: Path, split: str) -> list[_Entry]:
         return []
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DatasetInvalid(file, "file", "does not exist") from None
+    except OSError as error:
+        raise DatasetInvalid(file, "file", f"can't be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise DatasetInvalid(file, "file", f"is not JSON: {error}") from None
     if not isinstance(content, dict):
@@ -123,22 +126,14 @@ def _camera(entry: _Entry, photograph: ImageSize) -> Camera:
     for key in DISTORTION:
         if entry.get(key):
             raise entry.invalid(key, "must be 0: photographs have to be undistorted first")
-    width, height = photograph
-    if entry.get("w") is not None or entry.get("h") is not None:
-        width, height = (int(entry.number(key)) for key in ("w", "h"))
-        if (
-            min(width, height) < 1
-            or abs(width * photograph.height / (height * photograph.width) - 1) > ASPECT_TOLERANCE
-        ):
-            raise entry.invalid("w", f"and h are {width}×{height}, but the photograph is {_times(photograph)}")
-    fx = entry.number("fl_x") if entry.get("fl_x") is not None else _focal_length(entry, width)
+    width, height = _stated_size(entry, photograph)
+    fx = entry.number("fl_x") if entry.has("fl_x") else _focal_length(entry, width)
     fy, cx, cy = (
-        entry.number(key) if entry.get(key) is not None else default
+        entry.number(key) if entry.has(key) else default
         for key, default in (("fl_y", fx), ("cx", width / 2), ("cy", height / 2))
     )
-    pose = _matrix(entry)
     try:
-        return Camera.from_opengl(pose, width, height, fx=fx, fy=fy, cx=cx, cy=cy).resized(*photograph)
+        return Camera.from_opengl(_matrix(entry), width, height, fx=fx, fy=fy, cx=cx, cy=cy).resized(*photograph)
     except InvalidInput as error:
         raise entry.invalid(_KEYS.get(error.field, "transform_matrix"), f"is no camera: {error}") from None
 
@@ -146,11 +141,22 @@ def _camera(entry: _Entry, photograph: ImageSize) -> Camera:
 _KEYS = {"camera.fx": "fl_x", "camera.fy": "fl_y", "camera.width": "w", "camera.height": "h"}
 
 
+def _stated_size(entry: _Entry, photograph: ImageSize) -> ImageSize:
+    """The size that the intrinsics are about: `w` and `h`, or else the photograph's own."""
+    if not (entry.has("w") or entry.has("h")):
+        return photograph
+    stated = ImageSize(round(entry.number("w")), round(entry.number("h")))
+    if min(stated) < 1 or abs(stated.width * photograph.height / (stated.height * photograph.width) - 1) > 0.01:
+        told, found = ("×".join(map(str, size)) for size in (stated, photograph))
+        raise entry.invalid("w", f"and h are {told}, but the photograph is {found}")
+    return stated
+
+
 def _focal_length(entry: _Entry, width: int) -> float:
-    angle = entry.shared.get("camera_angle_x", entry.values.get("camera_angle_x"))
+    angle = entry.shared.get("camera_angle_x")
     if angle is None:
         raise DatasetInvalid(entry.file, "camera_angle_x", f"is missing, and frames[{entry.index}] has no fl_x")
-    if not isinstance(angle, int | float) or isinstance(angle, bool) or not 0 < angle < math.pi:
+    if not (_is_finite_number(angle) and 0 < angle < math.pi):
         raise DatasetInvalid(entry.file, "camera_angle_x", f"must be in (0, π) radians, got {angle!r}")
     return 0.5 * width / math.tan(0.5 * angle)
 
@@ -161,12 +167,13 @@ def _matrix(entry: _Entry) -> np.ndarray:
         raise entry.invalid("transform_matrix", "is missing")
     try:
         matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise entry.invalid("transform_matrix", "must be 4×4 numbers") from None
     if matrix.shape != (4, 4):
         raise entry.invalid("transform_matrix", f"must be 4×4 numbers, got shape {matrix.shape}")
     return matrix
 
 
-def _times(size: ImageSize) -> str:
-    return f"{size.width}×{size.height}"
+def _is_finite_number(value: object) -> bool:
+    largest = sys.float_info.max
+    return isinstance(value, int | float) and not isinstance(value, bool) and -largest <= value <= largest

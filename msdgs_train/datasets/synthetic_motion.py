@@ -63,36 +63,41 @@ class Motion(NamedTuple):
 
 def motion_at(t: float) -> Motion:
     """The whole scene at time t; one run of the scene is [0, 1]."""
-    identity, still = np.eye(3), np.zeros(3)
-    ground = np.array([0.0, 0.0, GROUND_Z])
-    ball_offset, ball_matrix = _ball(t)
-    jelly_matrix, jelly_warp = _jelly(t)
-    rows = (
-        (ground, identity, still),
-        (ground, identity, still),
-        (ball_offset, ball_matrix, still),
-        (*_ring(t), still),
-        (np.array([0.6, 0.34, GROUND_Z]), jelly_matrix, jelly_warp),
-        (np.array([0.0, 0.0, PIVOT_Z]), _rotation(0, 0.72 * math.cos(3 * math.pi * t)), still),
-    )
-    offsets, matrices, warps = (np.stack(column) for column in zip(*rows, strict=True))
+    placements = _placements(t)
     boxes = REST_BOXES[:, :1] + _UNIT_GRID * (REST_BOXES[:, 1:] - REST_BOXES[:, :1])
-    outlines = np.stack([_place(*row, box) for row, box in zip(rows, boxes, strict=True)])
+    outlines = np.stack([_place(placement, box) for placement, box in zip(placements, boxes, strict=True)])
     centers = outlines.mean(axis=1)
     radii = np.linalg.norm(outlines - centers[:, None], axis=2).max(axis=1) * _BOUND_MARGIN
+    offsets, matrices, warps = (np.stack(column) for column in zip(*placements, strict=True))
     return Motion(offsets, matrices, np.linalg.inv(matrices), warps, _shrinks(matrices, warps), centers, radii)
 
 
 def world_positions(name: str, local: np.ndarray, t: float) -> np.ndarray:
     """Where points of object `name`, [..., 3] at rest, are in the world at time t. The ground truth of the motion."""
-    motion, index = motion_at(t), OBJECTS.index(name)
-    return _place(motion.offsets[index], motion.matrices[index], motion.warps[index], np.asarray(local, float))
+    return _place(_placements(t)[OBJECTS.index(name)], np.asarray(local, float))
 
 
-def _place(offset: np.ndarray, matrix: np.ndarray, warp: np.ndarray, local: np.ndarray) -> np.ndarray:
+class _Placement(NamedTuple):
+    offset: np.ndarray  # [3]
+    matrix: np.ndarray  # [3, 3]
+    warp: np.ndarray  # [3]
+
+
+def _placements(t: float) -> tuple[_Placement, ...]:
+    """One for each of `OBJECTS`."""
+    still = np.zeros(3)
+    ground = _Placement(np.array([0.0, 0.0, GROUND_Z]), np.eye(3), still)
+    jelly = _Placement(np.array([0.6, 0.34, GROUND_Z]), *_jelly(t))
+    swing = _rotation(0, 0.72 * math.cos(3 * math.pi * t))
+    pendulum = _Placement(np.array([0.0, 0.0, PIVOT_Z]), swing, still)
+    return ground, ground, _Placement(*_ball(t), still), _Placement(*_ring(t), still), jelly, pendulum
+
+
+def _place(placement: _Placement, local: np.ndarray) -> np.ndarray:
+    offset, matrix, (twist, bend_x, bend_y) = placement
     x, y, z = np.moveaxis(local, -1, 0)
-    cos, sin = np.cos(warp[0] * z), np.sin(warp[0] * z)
-    warped = np.stack([cos * x - sin * y + warp[1] * z * z, sin * x + cos * y + warp[2] * z * z, z], axis=-1)
+    cos, sin = np.cos(twist * z), np.sin(twist * z)
+    warped = np.stack([cos * x - sin * y + bend_x * z * z, sin * x + cos * y + bend_y * z * z, z], axis=-1)
     return offset + warped @ matrix.T
 
 

@@ -20,7 +20,7 @@ from msdgs_train.datasets.synthetic_shapes import (
 )
 
 SAMPLES = 2  # rays along each side of a pixel
-MAX_STEPS = 160
+MAX_STEPS = 400
 HIT = 2e-4  # scene units; a pixel of an 800-pixel picture is 20 times larger
 SURFACE_OFFSET = 4e-3  # where shadow rays begin
 PENUMBRA = 7.0  # the larger, the harder

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from msdgs_serve.rasterizer.jit import kernel
 from msdgs_train.datasets.synthetic_motion import OBJECTS, REST_BOXES, world_positions
 from msdgs_train.datasets.synthetic_shapes import PALETTE, color_at_rest, distance_at_rest
 
@@ -16,8 +17,9 @@ def surface_points(name: str, count: int, seed: int = 0) -> np.ndarray:
     """[count, 3] points on the surface of object `name` at rest, scattered; for `world_positions`."""
     shape = OBJECTS.index(name)
     low, high = REST_BOXES[shape]
-    start = np.random.default_rng(seed).uniform(low, high, size=(count, 3))
-    return np.array([_onto_surface(shape, point) for point in start])
+    points = np.random.default_rng(seed).uniform(low, high, size=(count, 3))
+    _onto_surface(shape, points)
+    return points
 
 
 def surface_colors(name: str, local: np.ndarray) -> np.ndarray:
@@ -38,11 +40,17 @@ def trajectories(points_per_object: int, times: np.ndarray, seed: int = 0) -> di
     return {"times": times.tolist(), "points": points}
 
 
-def _onto_surface(shape: int, point: np.ndarray) -> np.ndarray:
-    """Newton's way to the zero of the signed distance, along its gradient."""
-    for _ in range(ROUNDS):
-        distance = distance_at_rest(shape, *point)
-        ahead = np.array([distance_at_rest(shape, *(point + offset)) for offset in STEP * np.eye(3)])
-        gradient = (ahead - distance) / STEP
-        point = point - distance * gradient / max(gradient @ gradient, 1e-12)
-    return point
+@kernel
+def _onto_surface(shape: int, points: np.ndarray) -> None:
+    """Newton's way to the zero of the signed distance, along its gradient; moves [N, 3] points in place."""
+    for point in points:
+        for _ in range(ROUNDS):
+            x, y, z = point
+            distance = distance_at_rest(shape, x, y, z)
+            gx = (distance_at_rest(shape, x + STEP, y, z) - distance) / STEP
+            gy = (distance_at_rest(shape, x, y + STEP, z) - distance) / STEP
+            gz = (distance_at_rest(shape, x, y, z + STEP) - distance) / STEP
+            step = distance / max(gx * gx + gy * gy + gz * gz, 1e-12)
+            point[0] -= step * gx
+            point[1] -= step * gy
+            point[2] -= step * gz
