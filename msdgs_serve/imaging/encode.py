@@ -25,7 +25,7 @@ PNG_ATTRIBUTES: Attributes = {
 }
 WEBP_ATTRIBUTES: Attributes = {"webp:method": 0}  # 4 times faster than the default with soft alpha, 10-30 % larger
 EXR_ATTRIBUTES: Attributes = {
-    "compression": "zip",
+    "compression": "zips",  # 4 times faster than "zip" while other threads compute, files 4 % larger
     "oiio:ColorSpace": "lin_rec709_scene",
     "DateTime": "1970:01:01 00:00:00",  # otherwise the writer puts in the time of writing
 }

@@ -40,7 +40,10 @@ class Image:
         """8-bit sRGB, rounded to nearest: [H, W, 3], or [H, W, 4] with straight alpha where `transparent`."""
         if not self.transparent:
             return _to_8_bits(self.rgb)
-        return _to_8_bits(np.dstack([_straight(self.rgb, self.alpha), self.alpha]))
+        pixels = np.empty((self.height, self.width, 4), np.uint8)
+        pixels[..., :3] = _to_8_bits(_straight(self.rgb, self.alpha))
+        pixels[..., 3] = _to_8_bits(self.alpha)
+        return pixels
 
     def linear_pixels(self) -> FloatArray:
         """[H, W, 5] float32: scene-linear Rec.709 R, G, B premultiplied by A, and the depth Z.
@@ -48,9 +51,15 @@ class Image:
         A is 1 everywhere unless `transparent`. The transfer function is not linear, so that it is undone on straight
         colour, between taking alpha out and putting it back.
         """
-        alpha = self.alpha if self.transparent else np.ones_like(self.alpha)
-        rgb = srgb_to_linear(_straight(self.rgb, alpha)) * alpha[..., None]
-        return np.dstack([rgb, alpha, self.depth]).astype(np.float32, copy=False)
+        pixels = np.empty((self.height, self.width, 5), np.float32)
+        if self.transparent:
+            np.multiply(srgb_to_linear(_straight(self.rgb, self.alpha)), self.alpha[..., None], out=pixels[..., :3])
+            pixels[..., 3] = self.alpha
+        else:
+            pixels[..., :3] = srgb_to_linear(self.rgb)
+            pixels[..., 3] = 1
+        pixels[..., 4] = self.depth
+        return pixels
 
 
 def srgb_to_linear(encoded: FloatArray) -> FloatArray:
@@ -59,9 +68,8 @@ def srgb_to_linear(encoded: FloatArray) -> FloatArray:
 
 
 def _straight(premultiplied: FloatArray, alpha: FloatArray) -> FloatArray:
-    """[H, W, 3] colour with alpha taken out; 0 where alpha is 0."""
-    covered = alpha[..., None] > 0
-    return np.divide(premultiplied, alpha[..., None], out=np.zeros_like(premultiplied), where=covered)
+    """[H, W, 3] colour with alpha taken out; where alpha is 0, premultiplied colour is 0 and stays so."""
+    return premultiplied / np.where(alpha > 0, alpha, 1)[..., None]
 
 
 def _to_8_bits(values: FloatArray) -> np.ndarray:
