@@ -14,6 +14,7 @@ from msdgs_serve.rasterizer import Rendering, rasterize
 from msdgs_serve.scene import Gaussians
 from tests.processes import run_python
 from tests.scenes import as_dtype, random_scene
+from tests.tolerances import assert_close
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -93,7 +94,7 @@ def test_without_the_compiler_the_picture_is_the_same(tmp_path: Path):
     expected = rasterize(*random_scene(40, 12, 19, 13))
     with np.load(tmp_path / "picture.npz") as plain:
         for name, channel in expected._asdict().items():
-            np.testing.assert_allclose(plain[name], channel, rtol=1e-4, atol=1e-5)
+            assert_close(plain[name], channel, f"{name}.float32" + (".relative" if name == "depth" else ""))
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
