@@ -1,9 +1,9 @@
 """Domain errors, raised low and mapped to an HTTP status in one table of `msdgs_serve.api.errors`.
 
-    MsdgsError
-    ├── InvalidInput      a value that a caller gave is wrong; `field` names it
-    ├── SceneNotFound     no scene of that name
-    └── SceneFileInvalid  a scene file breaks the contract; `field` names what
+MsdgsError
+├── InvalidInput      a value that a caller gave is wrong; `field` names it
+├── SceneNotFound     no scene of that name
+└── SceneFileInvalid  a scene file breaks the contract; `field` names what
 """
 
 
