@@ -37,6 +37,11 @@ class TrainConfig:
     """Half the side of that cube in scene units; what the dataset suggests if not given."""
     warmup_fraction: float = 0.075
     """The first part of the run is trained without deformation, so that it starts from a blurred static scene."""
+    window_start: float = 0.03
+    """Training begins with photographs of the middle of the scene's time, up to this part of it away on either side.
+    What moves is sharp there, and is then followed outwards, photograph by photograph."""
+    window_until_fraction: float = 0.5
+    """The part of the run after which all times take part; 0: they do from the start."""
     sh_interval: int = 1000
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
@@ -96,11 +101,12 @@ class TrainConfig:
             self._require(name, "a whole number above 0", lambda v: v >= 1)
         for name in ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed"):
             self._require(name, "0 or above", lambda v: v >= 0)
-        for name in ("l1_weight", "warmup_fraction", "densify_until_fraction", "prune_opacity"):
+        for name in ("l1_weight", "warmup_fraction", "densify_until_fraction", "prune_opacity", "window_until_fraction"):
             self._require(name, "in [0, 1]", lambda v: 0 <= v <= 1)
         for item in dataclasses.fields(self):
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
+        self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         for name in ("densify_gradient", "split_scale", "prune_scale"):
             self._require(name, "finite and above 0", lambda v: 0 < v < math.inf)
         for name in ("size", "half_extent", "max_minutes"):

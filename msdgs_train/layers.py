@@ -9,6 +9,9 @@ from torch.autograd.function import once_differentiable
 HEAD_SIZES = (3, 3, 4, 1)
 """Columns of `MLPLayer.heads`: delta_means, delta_log_scales, delta_quats, weight before its sigmoid."""
 
+SILENCE, PLACE_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
+"""Of a new layer: bias of the hidden units, and what the first Linear's columns are multiplied by."""
+
 
 class LayerStep(NamedTuple):
     """What one layer proposes for N Gaussians at one time; the deltas aren't yet multiplied by the weight."""
@@ -78,9 +81,25 @@ class MLPLayer(nn.Module):
         self.first = nn.Linear(self.xyz_features + time_features, width)  # columns: encoded xyz, then time features
         self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(depth - 1))
         self.heads = nn.Linear(width, sum(HEAD_SIZES))
-        with torch.no_grad():  # a new layer moves nothing; its weight keeps a random direction to learn from
-            self.heads.weight[:-1] = 0
-            self.heads.bias[:-1] = 0
+        self._initialize()
+
+    @torch.no_grad()
+    def _initialize(self) -> None:
+        """He's initialisation with bias towards silence: a hidden unit answers to some places and times only.
+
+        The paper names none. torch's default makes the last features of any two places and times nearly parallel
+        (cosine 0.99 or more), so that whatever one part of the scene learns moves all others at all times, and they
+        push it back. Here the cosine is 0.6 for times 0.1 apart and 0.5 for places one unit apart.
+        """
+        for linear in (self.time_hidden, self.first, *self.trunk):
+            nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
+            nn.init.constant_(linear.bias, SILENCE)
+        nn.init.kaiming_normal_(self.time_output.weight, nonlinearity="linear")
+        nn.init.zeros_(self.time_output.bias)
+        self.first.weight[:, : self.xyz_features] *= PLACE_GAIN
+        self.first.weight[:, self.xyz_features :] *= TIME_GAIN
+        self.heads.weight[:-1] = 0  # a new layer moves nothing; its weight keeps a random direction to learn from
+        self.heads.bias[:] = 0
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
         """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""

@@ -27,9 +27,9 @@ _CONSTANT_RATES = {
 _DECAYING_RATES = {"means": "means", "embeddings": "modulation", "modulation": "modulation", "deformation": "field"}
 
 
-def exponential(start: float, end: float, step: int, steps: int) -> float:
+def exponential(start: float, end: float, step: float, steps: float) -> float:
     """From `start` at step 0 to `end` at `steps`, along a straight line in the logarithm; `end` ever after."""
-    return start * (end / start) ** min(step / steps, 1.0)
+    return start * (end / start) ** (min(step / steps, 1.0) if steps > 0 else 0.0)
 
 
 def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
@@ -37,7 +37,8 @@ def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
     rates = {group: getattr(config, name) for group, name in _CONSTANT_RATES.items()}
     for group, name in _DECAYING_RATES.items():
         start, end = getattr(config, f"{name}_rate_start"), getattr(config, f"{name}_rate_end")
-        rates[group] = exponential(start, end, step, config.steps)
+        held = config.window_until_fraction * config.steps if name == "field" else 0
+        rates[group] = exponential(start, end, max(step - held, 0), config.steps - held)
     return rates
 
 

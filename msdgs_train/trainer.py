@@ -25,6 +25,7 @@ from msdgs_train.rasterization import rasterize
 MAX_SKIPPED_IN_A_ROW = 20
 SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 50 steps
 BOUNDS_TIMES = 9
+OUTERMOST = 0.8  # of the time window: from there on a photograph counts as new
 VISIBLE_OPACITY = 0.05
 
 
@@ -65,6 +66,7 @@ class Trainer:
         self._averages: tuple[float, float] | None = None  # loss, squared error
         self._generator = torch.Generator().manual_seed(config.seed)
         self._order = torch.empty(0, dtype=torch.int64)
+        self._distances = _distances_from_middle(scene.time_range, self.frames)
         self._half_extent = config.half_extent or scene.half_extent
         self.model = _new_model(config, self._half_extent)
         self.optimizer = make_optimizer(self.model, config)
@@ -149,10 +151,28 @@ class Trainer:
         return self.model.pose(t, deform=self.step_count >= self.config.warmup_steps, sh_degree=degree)
 
     def _next_frame(self) -> Frame:
-        position = self.step_count % len(self.frames)
-        if position == 0:
-            self._order = torch.randperm(len(self.frames), generator=self._generator)
-        return self.frames[int(self._order[position])]
+        """From a shuffled pass over the photographs of the time window, one pass after the other.
+
+        While the window grows, half of a pass are its outermost photographs, over and over.
+        """
+        if not len(self._order):
+            window = self._window()
+            inside = torch.nonzero(self._distances <= window)[:, 0]
+            if window < 0.5:
+                outermost = inside[self._distances[inside] >= OUTERMOST * window]
+                inside = torch.cat([inside, outermost.repeat(len(inside) // max(len(outermost), 1))])
+            self._order = inside[torch.randperm(len(inside), generator=self._generator)]
+        chosen, self._order = self._order[0], self._order[1:]
+        return self.frames[int(chosen)]
+
+    def _window(self) -> float:
+        """How far from the middle of the scene's time photographs are taken in: 0.5 is all of it."""
+        c = self.config
+        if c.window_until_fraction == 0:
+            return 0.5
+        done = self.step_count / c.steps - c.warmup_fraction
+        growth = done / max(c.window_until_fraction - c.warmup_fraction, 1e-9)
+        return min(c.window_start + (0.5 - c.window_start) * max(growth, 0.0), 0.5)
 
     def _next_background(self) -> Tensor:
         if self.config.background == "random":
@@ -217,6 +237,15 @@ class Trainer:
             return [[-self._half_extent] * 3, [self._half_extent] * 3]
         stacked = torch.stack(boxes)
         return [stacked[:, 0].amin(dim=0).tolist(), stacked[:, 1].amax(dim=0).tolist()]
+
+
+def _distances_from_middle(time_range: tuple[float, float], frames: list[Frame]) -> Tensor:
+    """[F] in [0, 0.5], as parts of the time range; the nearest is set to 0 so that no window is empty."""
+    first, last = time_range
+    middle, length = (first + last) / 2, (last - first) or 1.0
+    distances = torch.tensor([min(abs(frame.t - middle) / length, 0.5) for frame in frames], dtype=torch.float64)
+    distances[distances.argmin()] = 0
+    return distances
 
 
 def _new_model(config: TrainConfig, half_extent: float) -> DynamicGaussians:

@@ -166,13 +166,35 @@ def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.Mo
 
 
 def test_every_photograph_once_a_pass(data: Path) -> None:
-    trainer = Trainer(small_config(), load_scene(data))
+    trainer = Trainer(small_config(window_until_fraction=0.0), load_scene(data))
     seen = []
     for _ in range(14):
         seen.append(trainer._next_frame().name)
         trainer.step_count += 1
     assert len(set(seen[:7])) == len(set(seen[7:])) == 7
     assert seen[:7] != seen[7:]
+
+
+def test_time_window_grows_from_the_middle(data: Path) -> None:
+    config = small_config(steps=1000, warmup_fraction=0.1, window_start=0.1, window_until_fraction=0.6)
+    trainer = Trainer(config, load_scene(data))
+    first, last = trainer.scene.time_range
+    farthest = []
+    for step in range(1000):
+        trainer.step_count = step
+        farthest.append(abs(trainer._next_frame().t - (first + last) / 2) / (last - first))
+    assert max(farthest[:100]) <= 0.1
+    assert all(max(farthest[:step]) <= 0.1 + 0.4 * (step - 100) / 500 + 1e-9 for step in range(101, 600))
+    assert max(farthest[600:]) == max(trainer._distances)
+
+
+def test_the_outermost_photographs_are_about_half_of_a_pass(data: Path) -> None:
+    trainer = Trainer(small_config(window_start=0.4), load_scene(data))
+    drawn = torch.cat([torch.tensor([trainer.frames.index(trainer._next_frame())]), trainer._order])
+    distances = trainer._distances[drawn]
+    assert set(drawn.tolist()) == set(torch.nonzero(trainer._distances <= 0.4)[:, 0].tolist())
+    assert distances.max() <= 0.4 < trainer._distances.max()
+    assert 0.5 <= (distances >= 0.8 * 0.4).double().mean() <= 0.7
 
 
 def test_warmup_leaves_the_deformation_alone(data: Path) -> None:
@@ -193,6 +215,9 @@ def test_learning_rates() -> None:
     assert rates["means"] == pytest.approx(8e-6)
     assert rates["deformation"] == pytest.approx(1.6e-6)
     assert rates["raw_opacities"] == 0.05
+    while_the_window_grows = learning_rates(config, round(config.window_until_fraction * config.steps))
+    assert while_the_window_grows["deformation"] == config.field_rate_start
+    assert while_the_window_grows["means"] < config.means_rate_start
 
 
 @pytest.mark.parametrize(
