@@ -62,9 +62,18 @@ def _export(model: Path, output: Path, tolerance: float, times: int, console: Co
         exported = export_scene(model, output, tolerance=tolerance, times=times, on_time=lambda: progress.advance(task))
     error = exported.measured_error
     table = Table("max error against the model", "float64", "float32", box=None)
-    for name, how in (("means", "relative to their RMS"), ("quats", "absolute"), ("scales", "relative to each")):
+    for name, how in (
+        ("means", "relative to the scene's size"),
+        ("quats", "absolute"),
+        ("scales", "relative to each Gaussian's size"),
+    ):
         table.add_row(f"{name}, {how}", f"{error[name]:.2e}", f"{error['against_float32'][name]:.2e}")
     console.print(table)
+    if error["unstable"]["count"]:
+        console.print(
+            f"{error['unstable']['count']:,} Gaussians left out of these errors: there the model's own float32 differs "
+            f"from its float64. The worst is off by {error['unstable']['error']:.2e}"
+        )
     console.print(
         f"{error['times']} times, tolerance {tolerance:g}: passed\n"
         f"{exported.path}: {exported.size / 1e6:.2f} MB, {exported.moving_count:,} moving and "

@@ -41,14 +41,14 @@ def small_config(**changes: Any) -> ModelConfig:
     return ModelConfig(**(sizes | changes))
 
 
-def random_model(count: int = 300, seed: int = 0, noise: float = 0.1, **config: Any) -> DynamicGaussians:
+def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config: Any) -> DynamicGaussians:
     """A model whose Gaussians and networks all differ from their start by normal noise."""
     settings = small_config(**config)
     gaussians = CanonicalGaussians.random_in_cube(count, 1.3, settings.sh_degree, settings.embedding_size, seed)
-    model = DynamicGaussians(settings, gaussians)
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(seed)
+        model = DynamicGaussians(settings, gaussians)
         for parameter in model.parameters():
             if parameter is not gaussians.means:
-                parameter += noise * torch.randn(parameter.shape, generator=generator)
+                parameter += noise * torch.randn_like(parameter)
     return model

@@ -50,7 +50,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
     [
         (300, {}, 300),
         (300, {"layers": 1, "depth": 1}, 300),
-        (300, {"layers": 4, "embedding_size": 0, "noise": 0.03}, 300),
+        (300, {"layers": 4, "embedding_size": 0, "noise": 0.01}, 300),
         (300, {"sh_degree": 0}, 300),
         (300, {"layers": 0}, 0),
         (1, {}, 1),
@@ -164,6 +164,27 @@ def test_a_file_that_is_not_its_model_is_found_out(scene_file: Path, name: str):
         other.get_parameter(name).view(-1)[100] += 0.5
     with pytest.raises(VerificationFailed):
         verify(DeformationSession(scene_file), other)
+
+
+@pytest.mark.parametrize("count", [1, 30])
+def test_a_few_gaussians_may_be_unstable_but_are_counted(tmp_path: Path, count: int):
+    model = random_model(300, layers=1)
+    heads, raw_quats = model.get_submodule("deformation.layers.0.heads"), model.gaussians.raw_quats
+    assert isinstance(heads, torch.nn.Linear)
+    with torch.no_grad():
+        heads.weight *= 1e-4
+        heads.weight[-1] = 0
+        heads.bias[:] = torch.tensor([0.0] * 6 + [-2.0, 0, 0, 0] + [0.0])
+        raw_quats[:] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+        raw_quats[:count] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # its delta, 0.5 × -2, cancels all but the last digits
+    checkpoint = saved(tmp_path, model)
+    if count > 3:
+        with pytest.raises(VerificationFailed, match=r"\d+ of 300 Gaussians are unstable"):
+            export_scene(checkpoint, tmp_path / "scene.onnx", times=4)
+    else:
+        unstable = export_scene(checkpoint, tmp_path / "scene.onnx", times=4).measured_error["unstable"]
+        assert unstable["count"] == count
+        assert unstable["error"] > tolerance("export.relative")
 
 
 def interrupt() -> None:
