@@ -67,12 +67,7 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
 
 def _moving(model: DynamicGaussians) -> Moving:
     g = model.gaussians
-    modulation = None
-    if model.modulation is not None:
-        modulation = _array(model.modulation(g.embeddings))
-        bad = int(np.count_nonzero(~np.isfinite(modulation).all(axis=1)))
-        if bad:
-            raise ModelNotExportable(f"the scale modulation overflows for {bad:,} of {len(g):,} Gaussians")
+    modulation = None if model.modulation is None else _array(model.modulation(g.embeddings))
     return Moving(_array(g.means), _array(g.log_scales), _array(unit_quats(g.raw_quats)), modulation)
 
 

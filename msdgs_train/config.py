@@ -10,12 +10,14 @@ from msdgs_train.model import ModelConfig
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
+SMALL_MODEL = ModelConfig(sh_degree=2, layers=2, width=96, depth=2, xyz_frequencies=4, time_width=64)
+
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of a run; the defaults are those of the field, at the size of a small scene on a CPU."""
+    """Settings of a run; the defaults suit a small scene, 200 pixels wide, on two cores in half an hour."""
 
-    steps: int = 12_000
+    steps: int = 16_000
     """Optimiser steps; one photograph each."""
     size: int | None = None
     """Width in pixels to train at; the photographs' own width if not given."""
@@ -28,21 +30,22 @@ class TrainConfig:
     background: Literal["white", "black", "random"] = "white"
     """What is behind the scene. With `random` every step draws a colour, and evaluation is on white."""
 
-    model: ModelConfig = field(default_factory=ModelConfig)
-    """The multi-step deformation: number of layers, their sizes, the scale modulation."""
+    model: ModelConfig = field(default_factory=lambda: SMALL_MODEL)
+    """The multi-step deformation: number of layers, their sizes, the scale modulation. The defaults suit two cores;
+    the paper's are width 256, depth 4, xyz_frequencies 10, time_width 256, sh_degree 3."""
 
-    init_count: int = 10_000
+    init_count: int = 8_000
     """Gaussians at the start, random in a cube around the origin."""
     half_extent: float | None = None
     """Half the side of that cube in scene units; what the dataset suggests if not given."""
-    warmup_fraction: float = 0.075
+    warmup_fraction: float = 0.03
     """The first part of the run is trained without deformation, so that it starts from a blurred static scene."""
     window_start: float = 0.03
     """Training begins with photographs of the middle of the scene's time, up to this part of it away on either side.
     What moves is sharp there, and is then followed outwards, photograph by photograph."""
     window_until_fraction: float = 0.5
     """The part of the run after which all times take part; 0: they do from the start."""
-    sh_interval: int = 1000
+    sh_interval: int = 2000
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
     """λ in L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
@@ -51,9 +54,9 @@ class TrainConfig:
     """Learning rate of the canonical centres, in scene units; Adam moves a centre by about this much a step."""
     means_rate_end: float = 8e-6
     """At the last step; in between it decays exponentially."""
-    field_rate_start: float = 8e-4
+    field_rate_start: float = 2e-3
     """Learning rate of the deformation layers."""
-    field_rate_end: float = 1.6e-6
+    field_rate_end: float = 2e-5
     """At the last step."""
     modulation_rate_start: float = 8e-4
     """Learning rate of the modulation network and the embeddings that it reads."""
@@ -74,19 +77,19 @@ class TrainConfig:
     """Density control: clone and split where the picture pulls hardest on the Gaussians; 0 switches it off."""
     densify_from: int = 500
     """The first step of density control."""
-    densify_until_fraction: float = 0.5
+    densify_until_fraction: float = 0.7
     """Density control ends after this part of the run."""
-    densify_gradient: float = 2e-4
+    densify_gradient: float = 4e-4
     """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified."""
     split_scale: float = 0.01
     """One with a larger standard deviation than this part of the scene's extent is split, a smaller one is cloned."""
-    max_gaussians: int = 20_000
+    max_gaussians: int = 10_000
     """Densification stops here; the strongest gradients come first."""
     prune_opacity: float = 0.005
     """Fainter Gaussians are removed."""
     prune_scale: float = 0.1
     """Ones larger than this part of the scene's extent are removed, once opacities have been reset."""
-    opacity_reset_every: int = 3000
+    opacity_reset_every: int = 0
     """All opacities are cut to 0.01 each so many steps, while densification lasts; 0 switches it off."""
 
     log_every: int = 20

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
+from torch.nn.utils import clip_grad_norm_, get_total_norm
 
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train import checkpoint
@@ -23,6 +23,7 @@ from msdgs_train.optimizers import learning_rates, make_optimizer, set_learning_
 from msdgs_train.rasterization import rasterize
 
 MAX_SKIPPED_IN_A_ROW = 20
+MAX_FIELD_GRADIENT = 1.0  # norm; 0.05 to 0.6 is usual
 SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 50 steps
 BOUNDS_TIMES = 9
 OUTERMOST = 0.8  # of the time window: from there on a photograph counts as new
@@ -83,6 +84,8 @@ class Trainer:
         loss.backward()
         self.step_count += 1
         if self._is_finite(loss):
+            # one outlier would stay in Adam's second moment, and slow the field down, for a thousand steps
+            clip_grad_norm_(self.model.deformation.parameters(), MAX_FIELD_GRADIENT)
             self.optimizer.step()
             self._average(loss.item(), float((rgb.detach() - truth).square().mean()))
             if info.means2d_grads is not None:

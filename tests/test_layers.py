@@ -58,8 +58,16 @@ def test_the_modulation_has_the_papers_number_of_parameters_and_starts_at_one():
     assert torch.equal(modulation(torch.randn(7, 32)), torch.ones(7, 3))
 
 
+def test_the_modulation_stays_bounded():
+    modulation = ScaleModulation()
+    with torch.no_grad():
+        modulation.output.bias[:] = torch.tensor([200.0, -200.0, 1.0])
+    torch.testing.assert_close(modulation(torch.randn(7, 32)), torch.tensor([2.0, -2.0, 1.0]).exp().expand(7, 3))
+
+
 def test_a_new_layer_moves_nothing_but_has_weights():
-    step = MLPLayer(width=32)(torch.randn(9, 3), torch.tensor(0.3))
+    torch.manual_seed(0)
+    step = MLPLayer(depth=2)(torch.randn(9, 3), torch.tensor(0.3))
     for delta in (step.delta_means, step.delta_log_scales, step.delta_quats):
         assert not delta.any()
     assert step.weight.shape == (9, 1)

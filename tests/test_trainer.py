@@ -165,6 +165,14 @@ def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.Mo
         _steps(trainer, 19)
 
 
+def test_an_outlier_of_a_gradient_is_cut(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(small_config(steps=100, warmup_fraction=0.0), load_scene(data))
+    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, weight: 1e9 * (rgb - truth).square().sum())
+    _steps(trainer, 3)
+    gradients = [p.grad for p in trainer.model.deformation.parameters() if p.grad is not None]
+    assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer_module.MAX_FIELD_GRADIENT)
+
+
 def test_every_photograph_once_a_pass(data: Path) -> None:
     trainer = Trainer(small_config(window_until_fraction=0.0), load_scene(data))
     seen = []
@@ -213,7 +221,7 @@ def test_learning_rates() -> None:
     config = TrainConfig()
     rates = learning_rates(config, config.steps)
     assert rates["means"] == pytest.approx(8e-6)
-    assert rates["deformation"] == pytest.approx(1.6e-6)
+    assert rates["deformation"] == pytest.approx(config.field_rate_end)
     assert rates["raw_opacities"] == 0.05
     while_the_window_grows = learning_rates(config, round(config.window_until_fraction * config.steps))
     assert while_the_window_grows["deformation"] == config.field_rate_start
