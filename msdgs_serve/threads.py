@@ -1,9 +1,10 @@
-"""One pool of threads for the whole process: nogil kernels and onnxruntime calls share it, so cores are never oversubscribed.
+"""One pool of threads for the whole process: nogil kernels and onnxruntime calls share it and never outnumber the cores.
 
 numba's own parallel layers abort when two threads enter them or when the process forks; plain threads over nogil
 kernels do neither.
 """
 
+import itertools
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -44,7 +45,7 @@ def split_evenly(count: int, parts: int) -> list[tuple[int, int]]:
     """`parts` or fewer consecutive, non-empty (start, stop) ranges that cover `range(count)`."""
     parts = max(1, min(parts, count))
     edges = [count * part // parts for part in range(parts + 1)]
-    return [(start, stop) for start, stop in zip(edges, edges[1:], strict=False) if stop > start]
+    return [(start, stop) for start, stop in itertools.pairwise(edges) if stop > start]
 
 
 def _shared_pool() -> ThreadPoolExecutor:

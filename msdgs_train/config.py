@@ -104,7 +104,8 @@ class TrainConfig:
             self._require(name, "a whole number above 0", lambda v: v >= 1)
         for name in ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed"):
             self._require(name, "0 or above", lambda v: v >= 0)
-        for name in ("l1_weight", "warmup_fraction", "densify_until_fraction", "prune_opacity", "window_until_fraction"):
+        parts = ("warmup_fraction", "window_until_fraction", "densify_until_fraction")
+        for name in ("l1_weight", "prune_opacity", *parts):
             self._require(name, "in [0, 1]", lambda v: 0 <= v <= 1)
         for item in dataclasses.fields(self):
             if "_rate" in item.name:

@@ -1,9 +1,10 @@
 """Alpha blending of the splats of each tile, front to back (equation 2).
 
-A tile's pixels are blended together, a row of 16 at a time, so that each line of the inner loop is one vector operation.
+A tile's pixels are blended together, a row of 16 at a time: each line of the inner loop is one vector operation.
 All state of a tile lives in one scratch array at fixed places: LLVM then sees that its parts do not overlap.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -30,16 +31,13 @@ class Blend(NamedTuple):
     depth: np.ndarray  # [H, W] sum of z alpha T
 
 
-def composite(
-    splats: Splats, tiles: TileLists, width: int, height: int, options: RasterizerOptions
-) -> Blend:
+def composite(splats: Splats, tiles: TileLists, width: int, height: int, options: RasterizerOptions) -> Blend:
     """Blend the splats into an image of the splats' dtype."""
     dtype = splats.means2d.dtype
-    blend = Blend(np.empty((height, width, 3), dtype), np.empty((height, width), dtype), np.empty((height, width), dtype))
+    rgb, transmittance, depth = (np.empty((height, width, *more), dtype) for more in ((3,), (), ()))
+    blend = Blend(rgb, transmittance, depth)
     limits = pixel_limits(options, dtype)
-    run_parallel(
-        _composite_tiles, [(*chunk, splats, tiles, limits, blend) for chunk in balanced_chunks(tiles)]
-    )
+    run_parallel(_composite_tiles, [(*chunk, splats, tiles, limits, blend) for chunk in balanced_chunks(tiles)])
     return blend
 
 
@@ -63,7 +61,7 @@ def balanced_chunks(tiles: TileLists) -> list[tuple[int, int]]:
     work = tiles.offsets + 64 * np.arange(len(tiles.offsets))  # an empty tile costs something too
     edges = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
     edges = np.unique(np.concatenate([[0], edges, [len(tiles.offsets) - 1]]))
-    return [(int(start), int(stop)) for start, stop in zip(edges, edges[1:], strict=False)]
+    return [(int(start), int(stop)) for start, stop in itertools.pairwise(edges)]
 
 
 @kernel

@@ -1,5 +1,5 @@
-"""Gradient of the blending. Runs front to back like the forward pass and repeats its arithmetic, so that it takes the very
-decisions (which splat is drawn in which pixel) that the image was made with.
+"""Gradient of the blending. Runs front to back like the forward pass and repeats its arithmetic, so that it takes the
+very decisions (which splat is drawn in which pixel) that the image was made with.
 
 For a pixel with gradient g, the splat's share of the loss is s = color · g_rgb + g_alpha and
 d loss / d alpha_i = T_i s_i - (what all splats behind it and the background add) / (1 - alpha_i).
@@ -30,7 +30,8 @@ from msdgs_serve.threads import run_parallel
 
 # places in a tile's scratch after TRANSMITTANCE and DRAWING: the pixel's gradient, and what is still behind
 GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND = (np.uint64(PIXELS * place) for place in range(2, 7))
-# nine sums of a splat, a row of lanes each, in an array of their own: red, green, blue, then the moments of d loss / d sigma about the splat
+# nine sums of a splat, a row of lanes each, in an array of their own: red, green, blue, then the moments of
+# d loss / d sigma about the splat
 SUMS = 9
 (SUM_RED, SUM_GREEN, SUM_BLUE, SUM_1, SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY) = (
     np.uint64(TILE * place) for place in range(SUMS)
@@ -66,10 +67,7 @@ def composite_backward(
     limits = pixel_limits(options, dtype)
     run_parallel(
         _tiles_backward,
-        [
-            (*chunk, splats, tiles, limits, behind, grad_rgb, grad_alpha, pair_sums)
-            for chunk in balanced_chunks(tiles)
-        ],
+        [(*chunk, splats, tiles, limits, behind, grad_rgb, grad_alpha, pair_sums) for chunk in balanced_chunks(tiles)],
     )
     count = len(splats.depths)
     gradients = SplatGradients(

@@ -117,7 +117,7 @@ def _shape_gradient(
     grad_camera: np.ndarray,
     result: GaussianGradients,
 ) -> None:
-    """Scales, rotation matrix (written to `grad_rotation`) and, through the Jacobian, the mean in camera axes (added)."""
+    """Scales, rotation matrix (into `grad_rotation`) and, through the Jacobian, the mean in camera axes (added)."""
     w = view.rotation
     ratio_x, ratio_y = clamped(x / z, view.min_x, view.max_x), clamped(y / z, view.min_y, view.max_y)
     j00, j02, j11, j12 = view.fx / z, -view.fx * ratio_x / z, view.fy / z, -view.fy * ratio_y / z
