@@ -130,3 +130,39 @@ def test_no_layers_and_no_gaussians():
     for deformation in (MultiStepDeformation([]), MultiStepDeformation([MLPLayer(width=8)])):
         deltas = deformation(torch.empty(0, 3), torch.tensor(0.0))
         assert [tuple(d.shape) for d in deltas] == [(0, 3), (0, 3), (0, 4)]
+
+
+def last_features(layer: MLPLayer, places: torch.Tensor, t: float) -> torch.Tensor:
+    features = []
+    hook = layer.heads.register_forward_pre_hook(lambda module, inputs: features.append(inputs[0]))
+    with torch.no_grad():
+        layer(places, torch.tensor(t))
+    hook.remove()
+    return features[0]
+
+
+def mean_cosines(layer: MLPLayer) -> tuple[float, float]:
+    """Between the last features of one place at times 0.1 apart, and of places one unit apart at one time."""
+    places = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    here = last_features(layer, places, 0.5)
+    later = last_features(layer, places, 0.6)
+    elsewhere = last_features(layer, places + torch.tensor([1.0, 0.0, 0.0]), 0.5)
+    in_time, in_space = (torch.cosine_similarity(here, other).mean().item() for other in (later, elsewhere))
+    return in_time, in_space
+
+
+def test_a_new_layer_is_local_in_time_and_space():
+    def small_layer(seed: int) -> MLPLayer:
+        torch.manual_seed(seed)
+        return MLPLayer(width=96, depth=2, xyz_frequencies=4, time_width=64)
+
+    ours = torch.tensor([mean_cosines(small_layer(seed)) for seed in range(8)]).mean(dim=0)
+    torchs_own = []
+    for seed in range(8):
+        layer = small_layer(seed)
+        for module in layer.modules():
+            if isinstance(module, torch.nn.Linear):
+                module.reset_parameters()
+        torchs_own.append(mean_cosines(layer))
+    assert (ours < torch.tensor([0.65, 0.5])).all(), ours
+    assert (torch.tensor(torchs_own).mean(dim=0) > torch.tensor([0.95, 0.75])).all(), torchs_own
