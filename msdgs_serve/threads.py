@@ -1,4 +1,4 @@
-"""One pool of threads for the whole process: nogil kernels and onnxruntime calls share it, never outnumbering the cores.
+"""One pool of threads for the whole process: nogil kernels and onnxruntime calls share it, not more than cores.
 
 numba's own parallel layers abort when two threads enter them or when the process forks; plain threads over nogil
 kernels do neither.

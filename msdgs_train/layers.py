@@ -87,9 +87,9 @@ class MLPLayer(nn.Module):
     def _initialize(self) -> None:
         """He's initialisation with bias towards silence: a hidden unit answers to some places and times only.
 
-        The paper names none. With torch's default the last features of a small layer (width 96, depth 2) have a cosine similarity of
-        0.98 for times 0.1 apart and 0.81 for places one unit apart: whatever one part of the scene learns moves all
-        others at all times, and they push it back. Here it is 0.57 and 0.39.
+        The paper names none. With torch's default the last features of a small layer (width 96, depth 2) have a cosine
+        similarity of 0.98 for times 0.1 apart and 0.81 for places one unit apart: whatever one part of the scene
+        learns moves all others at all times, and they push it back. Here it is 0.57 and 0.39.
         """
         for linear in (self.time_hidden, self.first, *self.trunk):
             nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
