@@ -32,7 +32,7 @@ def _exp_nonpositive(x: Any) -> Any:
         n = np.floor(x * LOG2_E + HALF)
         r = x - n * LN2_HIGH - n * LN2_LOW
         poly = ONE + r * (ONE + r * (C2 + r * (C3 + r * (C4 + r * (C5 + r * C6)))))
-        return poly * _power_of_two(np.int32(n))
+        return poly * _power_of_two(np.int32(n))  # type: ignore[call-arg]  # numba passes the typing context
 
     return float64 if x == types.float64 else float32
 
