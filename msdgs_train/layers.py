@@ -79,21 +79,24 @@ class MLPLayer(nn.Module):
         self.time_hidden = nn.Linear(1 + 2 * time_frequencies, time_width)
         self.time_output = nn.Linear(time_width, time_features)
         self.first = nn.Linear(self.xyz_features + time_features, width)  # columns: encoded xyz, then time features
-        self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(depth - 1))
+        trunk = [nn.Linear(width, width) for _ in range(depth - 1)]
+        self.trunk = nn.ModuleList(trunk)
         self.heads = nn.Linear(width, sum(HEAD_SIZES))
-        self._initialize()
+        self._initialize(trunk)
 
     @torch.no_grad()
-    def _initialize(self) -> None:
+    def _initialize(self, trunk: list[nn.Linear]) -> None:
         """He's initialisation with bias towards silence: a hidden unit answers to some places and times only.
 
         The paper names none. With torch's default the last features of a small layer (width 96, depth 2) have a cosine
         similarity of 0.98 for times 0.1 apart and 0.81 for places one unit apart: whatever one part of the scene
         learns moves all others at all times, and they push it back. Here it is 0.57 and 0.39.
         """
-        for linear in (self.time_hidden, self.first, *self.trunk):
+        for linear in (self.time_hidden, self.first, *trunk):
             nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
             nn.init.constant_(linear.bias, SILENCE)
+        for linear in trunk[1:]:  # silence grows with depth: at depth 4 no last unit would answer anywhere
+            nn.init.zeros_(linear.bias)
         nn.init.kaiming_normal_(self.time_output.weight, nonlinearity="linear")
         nn.init.zeros_(self.time_output.bias)
         self.first.weight[:, : self.xyz_features] *= PLACE_GAIN

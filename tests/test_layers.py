@@ -141,6 +141,18 @@ def last_features(layer: MLPLayer, places: torch.Tensor, t: float) -> torch.Tens
     return features[0]
 
 
+@pytest.mark.parametrize(
+    "sizes", [{}, {"depth": 8}, {"width": 96, "depth": 2, "time_width": 64}, {"width": 64, "depth": 3}]
+)
+def test_some_last_unit_answers_everywhere(sizes: dict[str, int]):
+    places = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 2.6 - 1.3
+    torch.manual_seed(0)
+    layer = MLPLayer(**sizes)
+    for t in (0.0, 0.3, 1.0):
+        silent = (last_features(layer, places, t) == 0).all(dim=1)
+        assert silent.float().mean() < tolerance("silent_places")
+
+
 def mean_cosines(layer: MLPLayer) -> tuple[float, float]:
     """Between the last features of one place at times 0.1 apart, and of places one unit apart at one time."""
     places = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
