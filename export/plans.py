@@ -16,7 +16,7 @@ from export.graph import GraphBuilder
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.layers import MLPLayer
-from msdgs_train.model import MAX_LOG_SCALE
+from msdgs_train.model import LOG_SCALE_LIMIT
 
 DELTA_COLUMNS = 10
 """Means 3, log_scales 3, quats 4: the order of `MLPLayer.heads`, whose last column is the weight."""
@@ -67,14 +67,12 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[MLPLayer, ...]) -
         modulation = graph.constant("scale_modulation", moving.scale_modulation)
         factors = graph.node("Gather", [modulation, "ids"], "ids.scale_modulation")
         delta_log_scales = graph.node("Mul", [factors, delta_log_scales], "modulated")  # equation 12
-    bounded = graph.node(
-        "Min",
-        [
-            graph.node("Add", [log_scales, delta_log_scales], "log_scales"),
-            graph.constant("max_log_scale", np.array(MAX_LOG_SCALE, np.float32)),
-        ],
-        "bounded_log_scales",
-    )
+    log_scales = graph.node("Add", [log_scales, delta_log_scales], "log_scales")
+    limits = [
+        graph.constant(f"log_scales.{name}", np.array(limit, np.float32))
+        for name, limit in (("min", -LOG_SCALE_LIMIT), ("max", LOG_SCALE_LIMIT))
+    ]
+    bounded = graph.node("Clip", [log_scales, *limits], "log_scales.bounded")
     graph.node("Exp", [bounded], "scales")
     _unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
 

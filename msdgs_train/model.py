@@ -14,8 +14,9 @@ from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.layers import MLPLayer
 from msdgs_train.modulation import ScaleModulation
 
-MAX_LOG_SCALE = 20.0
-"""Scales are cut to e^20: where a layer flings a Gaussian away its scale may overflow, and 0 · inf is NaN."""
+LOG_SCALE_LIMIT = 20.0
+"""Scales stay within e^-20 and e^20: where a layer flings a Gaussian away its scale may vanish or overflow, and 0 · inf
+is NaN."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,8 @@ class DynamicGaussians(nn.Module):
             quats = unit_quats(quats + deltas.quats)
         degree = self.config.sh_degree if sh_degree is None else sh_degree
         sh = torch.cat([g.sh_dc, g.sh_rest[:, : sh_coefficients(degree) - 1]], dim=1)
-        return PosedGaussians(means, quats, log_scales.clamp(max=MAX_LOG_SCALE).exp(), g.raw_opacities.sigmoid(), sh)
+        scales = log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
+        return PosedGaussians(means, quats, scales, g.raw_opacities.sigmoid(), sh)
 
 
 def unit_quats(raw_quats: Tensor) -> Tensor:

@@ -213,7 +213,7 @@ def test_values_that_no_gaussian_has_are_refused(tmp_path: Path, name: str, valu
 
 @pytest.mark.parametrize(
     ("names", "output"),
-    [(["canonical_means", "layer1.heads.bias"], "means"), (["canonical_log_scales", "max_log_scale"], "scales")],
+    [(["canonical_means", "layer1.heads.bias"], "means"), (["canonical_log_scales", "log_scales.max"], "scales")],
 )
 def test_a_deformation_that_overflows_is_refused(tmp_path: Path, names: list[str], output: str):
     def change(model: onnx.ModelProto) -> None:

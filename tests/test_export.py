@@ -22,7 +22,7 @@ from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.checkpoint import SceneInfo, save_model
-from msdgs_train.model import MAX_LOG_SCALE, DynamicGaussians
+from msdgs_train.model import LOG_SCALE_LIMIT, DynamicGaussians
 from tests.models import SCENE, random_model
 from tests.tolerances import tolerance
 
@@ -228,11 +228,12 @@ def test_poison_in_a_model_is_named(tmp_path: Path, poison: Callable[[DynamicGau
 
 
 @pytest.mark.parametrize("layers", [0, 2])
-def test_a_scale_that_would_overflow_is_cut(tmp_path: Path, layers: int):
-    fill("gaussians.log_scales", 200.0)(model := random_model(layers=layers))
+@pytest.mark.parametrize(("log_scale", "limit"), [(200.0, LOG_SCALE_LIMIT), (-200.0, -LOG_SCALE_LIMIT)])
+def test_a_scale_that_would_overflow_or_vanish_is_cut(tmp_path: Path, layers: int, log_scale: float, limit: float):
+    fill("gaussians.log_scales", log_scale)(model := random_model(layers=layers))
     path = export_scene(saved(tmp_path, model), tmp_path / "scene.onnx").path
-    largest = DeformationSession(path).gaussians(0.5).validate().scales.max()
-    assert largest == pytest.approx(np.exp(MAX_LOG_SCALE), rel=tolerance("float32.relative"))
+    scales = DeformationSession(path).gaussians(0.5).validate().scales
+    np.testing.assert_allclose(scales[-1], np.exp(limit), rtol=tolerance("float32.relative"))
 
 
 @pytest.mark.parametrize("contents", [None, b"", b"no model", "folder"])
