@@ -28,6 +28,7 @@ SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 5
 BOUNDS_TIMES = 9
 OUTERMOST = 0.8  # of the time window: from there on a photograph counts as new
 VISIBLE_OPACITY = 0.05
+OUTSIDE_BOUNDS = 0.01
 
 
 class TrainingDiverged(MsdgsError):
@@ -228,14 +229,17 @@ class Trainer:
 
     @torch.no_grad()
     def _bounds(self) -> list[list[float]]:
-        """Corners of the box that holds the centres of all Gaussians that can be seen, over the times of the scene."""
+        """Corners of the box that holds the centres of the Gaussians that can be seen, over the times of the scene.
+
+        The outermost on each side are left out: some are flung far away, where no photograph shows them.
+        """
         first, last = self.scene.time_range
         boxes = []
         for t in np.linspace(first, last, BOUNDS_TIMES):
             posed = self._pose(float(t))
             means = posed.means[posed.opacities >= VISIBLE_OPACITY]
             if len(means):
-                boxes.append(torch.stack([means.amin(dim=0), means.amax(dim=0)]))
+                boxes.append(torch.quantile(means, torch.tensor([OUTSIDE_BOUNDS, 1 - OUTSIDE_BOUNDS]), dim=0))
         if not boxes:
             return [[-self._half_extent] * 3, [self._half_extent] * 3]
         stacked = torch.stack(boxes)
