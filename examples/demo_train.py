@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TRAIN = str(Path(sys.executable).with_name("msdgs-train"))
 EXPORT = str(ROOT / "export" / "to_onnx.py")
 MINIMUM_PSNR = 19.0
-"""dB on the held-out photographs, below which the demo counts as broken; an empty frame has about 12."""
+"""dB on the held-out photographs, below which the demo counts as broken; an empty frame has about 10."""
 
 
 def main() -> None:
