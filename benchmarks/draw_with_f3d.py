@@ -8,7 +8,7 @@ import json
 import sys
 import time
 
-import f3d
+import f3d  # pyright: ignore[reportMissingImports]
 
 OPTIONS = {
     "model.point_sprites.type": "gaussian",

@@ -26,11 +26,11 @@ def sh_coefficients(degree: int) -> int:
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """The basis functions, shape (*, (degree + 1)²), at unit directions, shape (*, 3), from the eye to the Gaussian."""
     x, y, z = np.moveaxis(np.asarray(directions), -1, 0)
+    xx, yy, zz = x * x, y * y, z * z
     basis = [np.full_like(x, SH_C0)]
     if degree >= 1:
         basis += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
         basis += [
             SH_C2[0] * x * y,
             SH_C2[1] * y * z,
