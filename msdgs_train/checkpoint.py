@@ -82,6 +82,7 @@ def save_atomic(path: str | Path, obj: Any) -> None:
     """`torch.save` into a new file in the same folder, flushed to the disk, then moved over `path`."""
     path = Path(path)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    os.fchmod(handle, 0o644) if hasattr(os, "fchmod") else None  # mkstemp's own mode shuts out everybody else
     try:
         with os.fdopen(handle, "wb") as file:
             torch.save(obj, file)
