@@ -85,8 +85,9 @@ class Trainer:
         loss.backward()
         self.step_count += 1
         if self._is_finite(loss):
-            # one outlier would stay in Adam's second moment, and slow the field down, for a thousand steps
-            clip_grad_norm_(self.model.deformation.parameters(), MAX_FIELD_GRADIENT)
+            if len(self.model.deformation):
+                # one outlier would stay in Adam's second moment, and slow the field down, for a thousand steps
+                clip_grad_norm_(self.model.deformation.parameters(), MAX_FIELD_GRADIENT)
             self.optimizer.step()
             self._average(loss.item(), float((rgb.detach() - truth).square().mean()))
             if info.means2d_grads is not None:
