@@ -15,7 +15,7 @@ from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
 
 class Splats(NamedTuple):
-    """N projected Gaussians; where `extents` is 0 nothing is drawn and the rest is undefined."""
+    """N projected Gaussians; where `extents` is 0 nothing is drawn and the rest is 0 too."""
 
     means2d: np.ndarray  # [N, 2] pixels
     depths: np.ndarray  # [N] scene units along the camera axis
@@ -29,12 +29,12 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     """Project N Gaussians into the camera's image."""
     count, dtype = len(gaussians), gaussians.means.dtype
     splats = Splats(
-        means2d=np.empty((count, 2), dtype),
-        depths=np.empty(count, dtype),
-        conic_roots=np.empty((count, 3), dtype),
+        means2d=np.zeros((count, 2), dtype),
+        depths=np.zeros(count, dtype),
+        conic_roots=np.zeros((count, 3), dtype),
         extents=np.zeros((count, 2), dtype),
         opacities=gaussians.opacities,
-        colors=np.empty((count, 3), dtype),
+        colors=np.zeros((count, 3), dtype),
     )
     view = view_of(camera, options)
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
