@@ -83,7 +83,7 @@ def _env() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
 
 
-def _wait_for_lines(path: Path, process: subprocess.Popen, lines: int = 3, seconds: float = 90) -> None:
+def _wait_for_lines(path: Path, process: subprocess.Popen, lines: int = 3, seconds: float = 300) -> None:
     deadline = time.monotonic() + seconds
     while not (path.exists() and len(path.read_text().splitlines()) >= lines):
         assert process.poll() is None, process.communicate()[0]
