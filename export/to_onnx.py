@@ -8,10 +8,14 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     folder = Path(__file__).resolve().parent
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
-import tyro
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
+try:
+    import torch  # noqa: F401
+    import tyro
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+except ModuleNotFoundError as error:
+    raise SystemExit(f"to_onnx.py needs {error.name}, which serving alone does not: pip install '.[export]'") from None
 
 from msdgs_serve.scene.errors import MsdgsError
 

@@ -75,6 +75,17 @@ def test_the_wheel_holds_the_two_packages_and_their_data(described: dict) -> Non
     assert "msdgs_serve/py.typed" in shipped
 
 
+@pytest.mark.parametrize("command", [["msdgs-train", "--help"], ["python", str(ROOT / "export" / "to_onnx.py")]])
+def test_training_and_export_name_the_extra_that_they_need(environment: Path, command: list[str]) -> None:
+    program = [environment / "bin" / command[0], *command[1:]]
+    told = subprocess.run(
+        program, cwd=environment, env=clean_environment(), capture_output=True, text=True, check=False
+    )
+    assert told.returncode != 0
+    assert "pip install" in told.stderr
+    assert "Traceback" not in told.stderr
+
+
 def test_help_teaches(environment: Path) -> None:
     program = environment / "bin" / "msdgs-serve"
     told = subprocess.check_output([program, "--help"], cwd=environment, env=clean_environment(), text=True)

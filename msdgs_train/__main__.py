@@ -1,0 +1,19 @@
+"""`msdgs-train` and `python -m msdgs_train`: the command line, or what has to be installed first."""
+
+import sys
+
+
+def main() -> int:
+    """Entry point; returns the exit code."""
+    try:
+        from msdgs_train.cli import main
+    except ModuleNotFoundError as error:
+        print(
+            f"msdgs-train needs {error.name}, which serving alone does not: pip install 'msdgs[train]'", file=sys.stderr
+        )
+        return 2
+    return main()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
