@@ -45,3 +45,5 @@ class SceneData:
     splits: dict[str, list[Frame]]  # "train" has one frame or more; "val" and "test" may be empty
     time_range: tuple[float, float]  # first and last time of any frame of any split; equal in a static scene
     half_extent: float  # half the side of the cube around the origin that the scene fills, in scene units
+    points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
+    point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None where `points` have no colours
