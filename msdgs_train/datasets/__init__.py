@@ -2,22 +2,32 @@
 
 from pathlib import Path
 
+from msdgs_train.datasets.colmap import LAST_NUMBER, SPARSE, load_colmap
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
 from msdgs_train.datasets.images import composite
+from msdgs_train.datasets.nerfstudio import TRANSFORMS_FILE, load_nerfstudio
 from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, SceneData
 
 __all__ = ["DatasetInvalid", "Frame", "SceneData", "composite", "load_scene"]
 
+LAYOUTS = (("D-NeRF", TRAIN_FILE, load_dnerf), ("nerfstudio", TRANSFORMS_FILE, load_nerfstudio))
+"""The name of each, what tells it, and who reads it; COLMAP's comes after them, since others are made from it."""
 
-def load_scene(path: Path | str, size: int | None = None) -> SceneData:
+
+def load_scene(path: Path | str, size: int | None = None, time_pattern: str | None = LAST_NUMBER) -> SceneData:
     """Read the dataset in folder `path`, whatever its layout.
 
     `size` is the width in pixels that photographs are reduced to, height in proportion. Pixels are read later, by
-    `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't be.
+    `Frame.load_rgba`. `time_pattern` is for COLMAP's layout, which has no times: see `load_colmap`. Raises
+    `DatasetInvalid` naming file and field, and `InvalidInput` where `size` or `time_pattern` can't be.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
-    if (folder / TRAIN_FILE).exists():
-        return load_dnerf(folder, size)
-    raise DatasetInvalid(folder, "folder", f"is in no known layout: D-NeRF's has {TRAIN_FILE}")
+    for _, marker, load in LAYOUTS:
+        if (folder / marker).exists():
+            return load(folder, size)
+    if (folder / SPARSE).is_dir():
+        return load_colmap(folder, size, time_pattern)
+    markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
+    raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}, COLMAP's has {SPARSE}")

@@ -19,6 +19,14 @@ class ImageSize(NamedTuple):
     width: int
     height: int
 
+    def __str__(self) -> str:
+        return f"{self.width}×{self.height}"
+
+    def has_shape_of(self, other: "ImageSize") -> bool:
+        """Whether one is the other in another size; copies are rounded to whole pixels, so 1 % may be missing."""
+        across, down = self.width * other.height, self.height * other.width
+        return min(*self, *other) > 0 and 100 * abs(across - down) <= down
+
 
 def read_size(path: Path) -> ImageSize:
     """The size that a photograph's header states. Raises `ImageUnreadable`."""
