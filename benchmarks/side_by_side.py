@@ -66,7 +66,7 @@ def main(options: SideBySide) -> None:
 
 def name(model: LoadedModel) -> str:
     """How a column is called."""
-    return f"K = {model.model.config.layers}"
+    return f"K = {len(model.model.deformation)}"
 
 
 @torch.no_grad()

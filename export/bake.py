@@ -12,6 +12,7 @@ from msdgs_serve.scene.gaussians import FloatArray
 from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.layers import MLPLayer
 from msdgs_train.model import DynamicGaussians, unit_quats
+from msdgs_train.plane_layer import PlaneLayer
 
 STARTING_CAMERAS = 8
 """Cameras kept in a scene file, evenly spread over those of the training."""
@@ -19,6 +20,9 @@ STARTING_CAMERAS = 8
 
 class ModelNotExportable(MsdgsError):
     """A model has values or parts that a scene file can't hold."""
+
+
+Layer = MLPLayer | PlaneLayer
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Baked:
 
     scene: BakedScene
     moving: Moving
-    layers: tuple[MLPLayer, ...]  # float32; empty where nothing moves
+    layers: tuple[Layer, ...]  # float32; empty where nothing moves
 
 
 def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Baked:
@@ -108,8 +112,8 @@ def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
         raise ModelNotExportable(f"a camera of the model's scene can't be used: {error}") from error
 
 
-def _checked_layer(layer: torch.nn.Module) -> MLPLayer:
-    if not isinstance(layer, MLPLayer):
+def _checked_layer(layer: torch.nn.Module) -> Layer:
+    if not isinstance(layer, Layer):
         raise ModelNotExportable(f"a layer of type {type(layer).__name__} has no graph in the plan `network`")
     return layer
 

@@ -11,8 +11,9 @@ import onnx
 import torch
 from onnx import TensorProto
 
-from export.bake import Baked, Moving
+from export.bake import Baked, Layer, Moving
 from export.graph import GraphBuilder
+from export.plane_graph import plane_heads
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.layers import MLPLayer
@@ -45,7 +46,7 @@ def _finish(graph: GraphBuilder, scene: BakedScene) -> onnx.ModelProto:
     return graph.model(inputs, outputs, scene.metadata.to_properties())
 
 
-def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[MLPLayer, ...]) -> None:
+def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...]) -> None:
     """Canonical values of the ids, moved by each layer in turn, then activated: `DynamicGaussians.pose`."""
     means = graph.node("Gather", [graph.constant("canonical_means", moving.means), "ids"], "ids.means")
     log_scales = graph.node(
@@ -77,8 +78,16 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[MLPLayer, ...]) -
     _unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
 
 
-def _layer(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str) -> str:
+def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str) -> str:
     """One layer at the means [M, 3]: its deltas, [M, 10], times its weight."""
+    heads = (_mlp_heads if isinstance(layer, MLPLayer) else plane_heads)(graph, name, layer, means, time)
+    deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [DELTA_COLUMNS, 1])
+    weight = graph.node("Sigmoid", [logit], f"{name}.weight")
+    return graph.node("Mul", [weight, deltas], f"{name}.weighted")
+
+
+def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str) -> str:
+    """[M, 11] what the heads of one layer say of means [M, 3]: deltas, and the weight before its sigmoid."""
     encoded = _encode(graph, f"{name}.xyz", means, layer.xyz_octaves)
     first = _numpy(layer.first.weight)
     weight_xyz = graph.constant(f"{name}.first.weight_xyz", first[:, : layer.xyz_features])
@@ -89,10 +98,7 @@ def _layer(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: st
     for i, linear in enumerate(layer.trunk):
         hidden = _linear(graph, f"{name}.trunk{i}", linear, hidden)
         hidden = graph.node("Relu", [hidden], f"{name}.trunk{i}.relu")
-    heads = _linear(graph, f"{name}.heads", layer.heads, hidden)
-    deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [DELTA_COLUMNS, 1])
-    weight = graph.node("Sigmoid", [logit], f"{name}.weight")
-    return graph.node("Mul", [weight, deltas], f"{name}.weighted")
+    return _linear(graph, f"{name}.heads", layer.heads, hidden)
 
 
 def _time_bias(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:

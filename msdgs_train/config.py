@@ -10,7 +10,7 @@ from msdgs_train.model import ModelConfig
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
-SMALL_MODEL = ModelConfig(sh_degree=2, layers=2, width=96, depth=2, xyz_frequencies=4, time_width=64)
+SMALL_MODEL = ModelConfig(sh_degree=2, width=96, depth=2, xyz_frequencies=4, time_width=64)
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,12 @@ class TrainConfig:
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
     """λ in L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
+    rigidity_weight: float = 0.1
+    """Of the mean relative change of distances between Gaussians, added to the loss; 0: none."""
+    plane_bends_weight: float = 1e-2
+    """Of the mean squared second difference along time of the grids of plane layers."""
+    plane_slopes_weight: float = 1e-4
+    """Of the mean squared first difference along space."""
 
     means_rate_start: float = 8e-4
     """Learning rate of the canonical centres, in scene units; Adam moves a centre by about this much a step."""
@@ -57,6 +63,10 @@ class TrainConfig:
     field_rate_start: float = 2e-3
     """Learning rate of the deformation layers."""
     field_rate_end: float = 2e-5
+    """At the last step."""
+    grids_rate_start: float = 1e-2
+    """Learning rate of the grids of plane layers; it falls as that of the other parts of the layers."""
+    grids_rate_end: float = 1e-3
     """At the last step."""
     modulation_rate_start: float = 8e-4
     """Learning rate of the modulation network and the embeddings that it reads."""
@@ -111,6 +121,8 @@ class TrainConfig:
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
         self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
+        for name in ("rigidity_weight", "plane_bends_weight", "plane_slopes_weight"):
+            self._require(name, "finite and 0 or above", lambda v: 0 <= v < math.inf)
         for name in ("densify_gradient", "split_scale", "prune_scale"):
             self._require(name, "finite and above 0", lambda v: 0 < v < math.inf)
         for name in ("size", "half_extent", "max_minutes"):

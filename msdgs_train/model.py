@@ -1,7 +1,7 @@
 """The whole model: canonical Gaussians, their deformation in time, and the modulation of its scaling."""
 
 from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -13,10 +13,18 @@ from msdgs_train.deformation import MultiStepDeformation
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.layers import MLPLayer
 from msdgs_train.modulation import ScaleModulation
+from msdgs_train.plane_layer import PlaneLayer
 
 LOG_SCALE_LIMIT = 20.0
 """Scales stay within e^-20 and e^20: where a layer flings a Gaussian away its scale may vanish or overflow, and 0 · inf
 is NaN."""
+
+LayerKind = Literal["mlp", "plane"]
+LEAST = {"width": 1, "depth": 1, "time_width": 1, "time_features": 1, "plane_channels": 1, "plane_width": 1} | {
+    "plane_space_nodes": 2,
+    "plane_time_nodes": 2,
+}
+"""The smallest sizes that make sense; the others may be 0."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +32,19 @@ class ModelConfig:
     """Sizes of a model. The defaults are the paper's, with K = 2 layers; K = 0 is a static scene."""
 
     sh_degree: int = 3
-    layers: int = 2
+    layers: tuple[LayerKind, ...] = ("mlp", "mlp")
+    """The kind of each of the K layers, in order; kinds may be mixed."""
     width: int = 256
     depth: int = 4
     xyz_frequencies: int = 10
     time_frequencies: int = 6
     time_width: int = 256
     time_features: int = 30
+    plane_channels: int = 16
+    """This and the following are sizes of layers of kind `plane`, those above of kind `mlp`."""
+    plane_space_nodes: int = 32
+    plane_time_nodes: int = 50
+    plane_width: int = 32
     embedding_size: int = 32
     """0: no modulation."""
     delta_space: Literal["raw"] = "raw"
@@ -39,15 +53,28 @@ class ModelConfig:
     """Photometric gradients through the positional encoding don't reach the canonical means, as in DeformGS."""
 
     def __post_init__(self) -> None:
-        least = {"width": 1, "depth": 1, "time_width": 1, "time_features": 1}
+        object.__setattr__(self, "layers", tuple(self.layers))
+        unknown = [kind for kind in self.layers if kind not in get_args(LayerKind)]
+        if unknown:
+            raise InvalidInput("model.layers", f"kinds out of {list(get_args(LayerKind))}", unknown[0])
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.type is int and not (type(value) is int and value >= least.get(field.name, 0)):
-                raise InvalidInput(f"model.{field.name}", f"an integer of {least.get(field.name, 0)} or more", value)
+            if field.type is int and not (type(value) is int and value >= LEAST.get(field.name, 0)):
+                raise InvalidInput(f"model.{field.name}", f"an integer of {LEAST.get(field.name, 0)} or more", value)
         if self.sh_degree > 3:
             raise InvalidInput("model.sh_degree", "0, 1, 2 or 3", self.sh_degree)
         if self.delta_space != "raw":
             raise InvalidInput("model.delta_space", '"raw"', self.delta_space)
+
+
+class Domain(NamedTuple):
+    """Where and when a model's scene takes place: what the grids of plane layers span. Stored with their weights."""
+
+    half_extent: float = 1.0  # of a cube around the origin, scene units
+    time_range: tuple[float, float] = (0.0, 1.0)
+
+
+DEFAULT_DOMAIN = Domain()
 
 
 class PosedGaussians(NamedTuple):
@@ -63,23 +90,17 @@ class PosedGaussians(NamedTuple):
 class DynamicGaussians(nn.Module):
     """Gaussians that move: `pose(t)` gives them at any time."""
 
-    def __init__(self, config: ModelConfig, gaussians: CanonicalGaussians) -> None:
+    def __init__(self, config: ModelConfig, gaussians: CanonicalGaussians, domain: Domain = DEFAULT_DOMAIN) -> None:
         super().__init__()
         _check_shapes(config, gaussians)
         self.config = config
         self.gaussians = gaussians
-        self.deformation = MultiStepDeformation(
-            MLPLayer(
-                config.width,
-                config.depth,
-                config.xyz_frequencies,
-                config.time_frequencies,
-                config.time_width,
-                config.time_features,
-            )
-            for _ in range(config.layers)
-        )
+        self.deformation = MultiStepDeformation(_new_layer(kind, config, domain) for kind in config.layers)
         self.modulation = ScaleModulation(config.embedding_size) if config.embedding_size else None
+
+    def plane_layers(self) -> list[PlaneLayer]:
+        """Those of the layers that are grids."""
+        return [layer for layer in self.deformation.layers if isinstance(layer, PlaneLayer)]
 
     def pose(
         self,
@@ -109,6 +130,25 @@ class DynamicGaussians(nn.Module):
         sh = torch.cat([g.sh_dc, g.sh_rest[:, : sh_coefficients(degree) - 1]], dim=1)
         scales = log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
         return PosedGaussians(means, quats, scales, g.raw_opacities.sigmoid(), sh)
+
+
+def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer | PlaneLayer:
+    if kind == "mlp":
+        return MLPLayer(
+            config.width,
+            config.depth,
+            config.xyz_frequencies,
+            config.time_frequencies,
+            config.time_width,
+            config.time_features,
+        )
+    return PlaneLayer(
+        config.plane_channels,
+        config.plane_space_nodes,
+        config.plane_time_nodes,
+        config.plane_width,
+        *domain,
+    )
 
 
 def unit_quats(raw_quats: Tensor) -> Tensor:

@@ -24,7 +24,14 @@ _CONSTANT_RATES = {
     "sh_dc": "sh_dc_rate",
     "sh_rest": "sh_rest_rate",
 }
-_DECAYING_RATES = {"means": "means", "embeddings": "modulation", "modulation": "modulation", "deformation": "field"}
+_DECAYING_RATES = {
+    "means": "means",
+    "embeddings": "modulation",
+    "modulation": "modulation",
+    "deformation": "field",
+    "grids": "grids",
+}
+_HELD_RATES = ("field", "grids")  # as they begin until all times take part
 
 
 def exponential(start: float, end: float, step: float, steps: float) -> float:
@@ -37,7 +44,7 @@ def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
     rates = {group: getattr(config, name) for group, name in _CONSTANT_RATES.items()}
     for group, name in _DECAYING_RATES.items():
         start, end = getattr(config, f"{name}_rate_start"), getattr(config, f"{name}_rate_end")
-        held = config.window_until_fraction * config.steps if name == "field" else 0
+        held = config.window_until_fraction * config.steps if name in _HELD_RATES else 0
         rates[group] = exponential(start, end, max(step - held, 0), config.steps - held)
     return rates
 
@@ -45,7 +52,9 @@ def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
 def make_optimizer(model: DynamicGaussians, config: TrainConfig) -> torch.optim.Adam:
     """One Adam; a group for each attribute of the Gaussians, one for the deformation, one for the modulation."""
     named: dict[str, list[nn.Parameter]] = {name: [p] for name, p in model.gaussians.named_parameters()}
-    named["deformation"] = list(model.deformation.parameters())
+    named["grids"] = [grid for layer in model.plane_layers() for grid in (layer.space, layer.time)]
+    grids = {id(grid) for grid in named["grids"]}
+    named["deformation"] = [p for p in model.deformation.parameters() if id(p) not in grids]
     if model.modulation is not None:
         named["modulation"] = list(model.modulation.parameters())
     rates = learning_rates(config, 0)

@@ -18,9 +18,10 @@ from msdgs_train.densification import DensityControl
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.losses import photometric_loss
 from msdgs_train.metrics import Quality, mean_quality, psnr_from_mse, quality
-from msdgs_train.model import DynamicGaussians, PosedGaussians
+from msdgs_train.model import Domain, DynamicGaussians, PosedGaussians
 from msdgs_train.optimizers import learning_rates, make_optimizer, set_learning_rates
 from msdgs_train.rasterization import rasterize
+from msdgs_train.rigidity import stretch
 
 MAX_SKIPPED_IN_A_ROW = 20
 MAX_FIELD_GRADIENT = 1.0  # norm; 0.05 to 0.6 is usual
@@ -70,17 +71,20 @@ class Trainer:
         self._order = torch.empty(0, dtype=torch.int64)
         self._distances = _distances_from_middle(scene.time_range, self.frames)
         self._half_extent = config.half_extent or scene.half_extent
-        self.model = _new_model(config, self._half_extent)
+        self.model = _new_model(config, Domain(self._half_extent, scene.time_range))
         self.optimizer = make_optimizer(self.model, config)
         self.density = DensityControl.start(config, self._extent(), config.init_count)
+        self._pairs_generator = torch.Generator().manual_seed(config.seed + 2)
 
     def step(self) -> StepResult:
         """Render one training photograph's view, pull the model towards the photograph, and control density."""
+        self._widen_window()
         frame, background = self._next_frame(), self._next_background()
         truth = self._photograph(frame, background)
         set_learning_rates(self.optimizer, learning_rates(self.config, self.step_count))
-        rgb, _, info = rasterize(*self._pose(frame.t), frame.camera, background)
-        loss = photometric_loss(rgb, truth, self.config.l1_weight)
+        posed = self._pose(frame.t)
+        rgb, _, info = rasterize(*posed, frame.camera, background)
+        loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.step_count += 1
@@ -119,7 +123,7 @@ class Trainer:
             "seconds": seconds,
             "skipped": (self.skipped, self._skipped_in_a_row),
             "averages": self._averages,
-            "generators": (self._generator.get_state(), self.density.generator.get_state()),
+            "generators": [generator.get_state() for generator in self._generators],
             "order": self._order,
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -136,8 +140,8 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step_count, self._order, self._averages = state["step_count"], state["order"], state["averages"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
-        self._generator.set_state(state["generators"][0])
-        self.density.generator.set_state(state["generators"][1])
+        for generator, stored in zip(self._generators, state["generators"], strict=True):
+            generator.set_state(stored)
         self.density.gradients, self.density.counts = state["density"]
         return float(state["seconds"])
 
@@ -151,9 +155,36 @@ class Trainer:
         )
         checkpoint.save_model(path, self.model, info, self.step_count)
 
+    @property
+    def _generators(self) -> tuple[torch.Generator, ...]:
+        return self._generator, self.density.generator, self._pairs_generator
+
     def _pose(self, t: float) -> PosedGaussians:
         degree = min(self.step_count // self.config.sh_interval, self.config.model.sh_degree)
-        return self.model.pose(t, deform=self.step_count >= self.config.warmup_steps, sh_degree=degree)
+        return self.model.pose(t, deform=self._deforms(), sh_degree=degree)
+
+    def _deforms(self) -> bool:
+        return self.step_count >= self.config.warmup_steps and len(self.model.deformation) > 0
+
+    def _priors(self, posed: PosedGaussians) -> Tensor | float:
+        """What is asked of the deformation besides the photographs: rigid neighbourhoods, smooth grids."""
+        c, total = self.config, 0.0
+        if not self._deforms():
+            return total
+        if c.rigidity_weight:
+            means = self.model.gaussians.means
+            stretched = stretch(means, posed.means, self._half_extent, self._pairs_generator)
+            total = total + c.rigidity_weight * stretched
+        for layer in self.model.plane_layers():
+            bends, slopes = layer.roughness()
+            total = total + c.plane_bends_weight * bends + c.plane_slopes_weight * slopes
+        return total
+
+    def _widen_window(self) -> None:
+        before, after = self._window(self.step_count - 1), self._window(self.step_count)
+        if before < after:
+            for layer in self.model.plane_layers():
+                layer.carry_outwards(before, after)
 
     def _next_frame(self) -> Frame:
         """From a shuffled pass over the photographs of the time window, one pass after the other.
@@ -161,7 +192,7 @@ class Trainer:
         While the window grows, half of a pass are its outermost photographs, over and over.
         """
         if not len(self._order):
-            window = self._window()
+            window = self._window(self.step_count)
             inside = torch.nonzero(self._distances <= window)[:, 0]
             if window < 0.5:
                 outermost = inside[self._distances[inside] >= OUTERMOST * window]
@@ -170,12 +201,12 @@ class Trainer:
         chosen, self._order = self._order[0], self._order[1:]
         return self.frames[int(chosen)]
 
-    def _window(self) -> float:
+    def _window(self, step: int) -> float:
         """How far from the middle of the scene's time photographs are taken in: 0.5 is all of it."""
         c = self.config
         if c.window_until_fraction == 0:
             return 0.5
-        done = self.step_count / c.steps - c.warmup_fraction
+        done = step / c.steps - c.warmup_fraction
         growth = done / max(c.window_until_fraction - c.warmup_fraction, 1e-9)
         return min(c.window_start + (0.5 - c.window_start) * max(growth, 0.0), 0.5)
 
@@ -256,14 +287,14 @@ def _distances_from_middle(time_range: tuple[float, float], frames: list[Frame])
     return distances
 
 
-def _new_model(config: TrainConfig, half_extent: float) -> DynamicGaussians:
+def _new_model(config: TrainConfig, domain: Domain) -> DynamicGaussians:
     sizes = config.model
     gaussians = CanonicalGaussians.random_in_cube(
-        config.init_count, half_extent, sizes.sh_degree, sizes.embedding_size, config.seed
+        config.init_count, domain.half_extent, sizes.sh_degree, sizes.embedding_size, config.seed
     )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return DynamicGaussians(sizes, gaussians)
+        return DynamicGaussians(sizes, gaussians, domain)
 
 
 def _resize(gaussians: nn.Module, state: dict[str, Tensor]) -> None:

@@ -31,7 +31,7 @@ SCENE = SceneInfo(
 def small_config(**changes: Any) -> ModelConfig:
     """Two layers of width 32."""
     sizes: dict[str, Any] = {
-        "layers": 2,
+        "layers": ("mlp", "mlp"),
         "width": 32,
         "depth": 3,
         "time_width": 16,

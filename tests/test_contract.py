@@ -19,7 +19,7 @@ from tests.models import SCENE, random_model
 
 FIELDS = tuple(SceneMetadata.__dataclass_fields__)
 SCENE_BYTES = network(bake(random_model(20), SCENE, "0" * 64)).SerializeToString()
-STATIC_BYTES = network(bake(random_model(20, layers=0), SCENE, "0" * 64)).SerializeToString()
+STATIC_BYTES = network(bake(random_model(20, layers=()), SCENE, "0" * 64)).SerializeToString()
 FLOATS = [
     (name, contents)
     for contents in (SCENE_BYTES, STATIC_BYTES)

@@ -49,14 +49,17 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
     ("count", "changes", "moving"),
     [
         (300, {}, 300),
-        (300, {"layers": 1, "depth": 1}, 300),
-        (300, {"layers": 4, "embedding_size": 0, "noise": 0.01}, 300),
+        (300, {"layers": ("mlp",), "depth": 1}, 300),
+        (300, {"layers": ("mlp",) * 4, "embedding_size": 0, "noise": 0.01}, 300),
+        (300, {"layers": ("plane",)}, 300),
+        (300, {"layers": ("mlp", "plane", "plane"), "plane_time_nodes": 2, "plane_space_nodes": 2}, 300),
+        (1, {"layers": ("plane", "mlp")}, 1),
         (300, {"sh_degree": 0}, 300),
-        (300, {"layers": 0}, 0),
+        (300, {"layers": ()}, 0),
         (1, {}, 1),
-        (1, {"layers": 0}, 0),
+        (1, {"layers": ()}, 0),
         (0, {}, 0),
-        (0, {"layers": 0, "embedding_size": 0}, 0),
+        (0, {"layers": (), "embedding_size": 0}, 0),
     ],
 )
 def test_every_kind_of_model_exports(tmp_path: Path, count: int, changes: dict[str, Any], moving: int):
@@ -74,7 +77,7 @@ def test_every_kind_of_model_exports(tmp_path: Path, count: int, changes: dict[s
 
 
 def test_a_scene_that_does_not_move_has_no_graph(tmp_path: Path):
-    exported = export_scene(saved(tmp_path, random_model(layers=0)), tmp_path / "scene.onnx")
+    exported = export_scene(saved(tmp_path, random_model(layers=())), tmp_path / "scene.onnx")
     assert not onnx.load(exported.path).graph.node
 
 
@@ -168,7 +171,7 @@ def test_a_file_that_is_not_its_model_is_found_out(scene_file: Path, name: str):
 
 @pytest.mark.parametrize("count", [1, 30])
 def test_a_few_gaussians_may_be_unstable_but_are_counted(tmp_path: Path, count: int):
-    model = random_model(300, layers=1)
+    model = random_model(300, layers=("mlp",))
     heads, raw_quats = model.get_submodule("deformation.layers.0.heads"), model.gaussians.raw_quats
     assert isinstance(heads, torch.nn.Linear)
     with torch.no_grad():
@@ -230,7 +233,7 @@ def test_poison_in_a_model_is_named(tmp_path: Path, poison: Callable[[DynamicGau
 @pytest.mark.parametrize("layers", [0, 2])
 @pytest.mark.parametrize(("log_scale", "limit"), [(200.0, LOG_SCALE_LIMIT), (-200.0, -LOG_SCALE_LIMIT)])
 def test_a_scale_that_would_overflow_or_vanish_is_cut(tmp_path: Path, layers: int, log_scale: float, limit: float):
-    fill("gaussians.log_scales", log_scale)(model := random_model(layers=layers))
+    fill("gaussians.log_scales", log_scale)(model := random_model(layers=("mlp",) * layers))
     path = export_scene(saved(tmp_path, model), tmp_path / "scene.onnx").path
     scales = DeformationSession(path).gaussians(0.5).validate().scales
     np.testing.assert_allclose(scales[-1], np.exp(limit), rtol=tolerance("float32.relative"))

@@ -39,14 +39,14 @@ def test_deltas_are_added_before_activation():
 
 
 def test_stopping_after_a_step_is_a_model_of_fewer_layers():
-    model, shorter = random_model(layers=3), random_model(layers=1)
+    model, shorter = random_model(layers=("mlp",) * 3), random_model(layers=("mlp",))
     shorter.load_state_dict(model.state_dict(), strict=False)
     for got, want in zip(model.pose(0.6, steps=1), shorter.pose(0.6), strict=True):
         assert torch.equal(got, want)
 
 
 def test_a_model_without_layers_is_static():
-    model = random_model(layers=0)
+    model = random_model(layers=())
     for early, late in zip(model.pose(0.0), model.pose(1.0), strict=True):
         assert torch.equal(early, late)
 

@@ -128,7 +128,7 @@ def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("_no_curve")
 def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
-    model = ModelConfig(sh_degree=0, layers=0, embedding_size=0)
+    model = ModelConfig(sh_degree=0, layers=(), embedding_size=0)
     assert fit(small_config(model=model), data, tmp_path / "run").status == "finished"
 
 
