@@ -49,7 +49,7 @@ class TrainConfig:
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
     """λ in L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
-    rigidity_weight: float = 0.1
+    rigidity_weight: float = 0.0
     """Of the mean relative change of distances between Gaussians, added to the loss; 0: none."""
     plane_bends_weight: float = 1e-2
     """Of the mean squared second difference along time of the grids of plane layers."""
