@@ -4,13 +4,20 @@ from pathlib import Path
 
 from msdgs_train.datasets.colmap import LAST_NUMBER, SPARSE, load_colmap
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
+from msdgs_train.datasets.hypernerf import DATASET_FILE, load_hypernerf
 from msdgs_train.datasets.images import composite
 from msdgs_train.datasets.nerfstudio import TRANSFORMS_FILE, load_nerfstudio
+from msdgs_train.datasets.neu3d import CAMERAS, load_neu3d
 from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, SceneData
 
 __all__ = ["DatasetInvalid", "Frame", "SceneData", "composite", "load_scene"]
 
-LAYOUTS = (("D-NeRF", TRAIN_FILE, load_dnerf), ("nerfstudio", TRANSFORMS_FILE, load_nerfstudio))
+LAYOUTS = (
+    ("D-NeRF", TRAIN_FILE, load_dnerf),
+    ("nerfstudio", TRANSFORMS_FILE, load_nerfstudio),
+    ("HyperNeRF", DATASET_FILE, load_hypernerf),
+    ("Neu3D", CAMERAS, load_neu3d),
+)
 """The name of each, what tells it, and who reads it; COLMAP's comes after them, since others are made from it."""
 
 
@@ -25,7 +32,7 @@ def load_scene(path: Path | str, size: int | None = None, time_pattern: str | No
     if not folder.is_dir():
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
     for _, marker, load in LAYOUTS:
-        if (folder / marker).exists():
+        if any(folder.glob(marker)):
             return load(folder, size)
     if (folder / SPARSE).is_dir():
         return load_colmap(folder, size, time_pattern)

@@ -1,0 +1,175 @@
+"""Neu3D (DyNeRF) layout: `poses_bounds.npy` and, for each of some fixed cameras, a video or a folder of photographs.
+
+`poses_bounds.npy` is LLFF's: a row of 17 numbers for each camera, in the order of the cameras' names. Those are a 3×5
+matrix, row by row, and the nearest and furthest depth. The matrix's columns are the camera's axes in world space (down,
+right, back), its position, and height, width and focal length in pixels; the principal point is the picture's centre.
+World axes stay what they are in the file. Photographs may be a reduced copy of the size that the matrix states.
+
+A camera is `cam07.mp4`, or a folder `cam07/` or `cam07/images/`, which is preferred as it needs no decoding. Cameras
+run in step: all have F frames, frame i is at t = i / (F - 1). The first camera, cam00, is the test view.
+"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_train.datasets.extent import half_extent
+from msdgs_train.datasets.images import EXTENSIONS, ImageSize
+from msdgs_train.datasets.npy import read_table
+from msdgs_train.datasets.ply_points import read_ply_points
+from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
+from msdgs_train.datasets.video import VideoFrame, read_info
+
+POSES_FILE = "poses_bounds.npy"
+CAMERAS = "cam0*"
+"""The files or folders that tell this layout: static scenes of LLFF have a `poses_bounds.npy` too."""
+
+POINTS_FILES = ("points3D_downsample*.ply", "points3d.ply", "points3D.ply")
+"""The first of these that there is; of several downsampled ones the last by name, which is the smallest."""
+
+CAMERA_NAME = re.compile(r"cam\d+")
+
+
+def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
+    """Read the cameras of a Neu3D scene and, where there is a `.ply` file, its sparse points.
+
+    `size` is the width in pixels that photographs are reduced to. Videos are decoded later, by `Frame.load_rgba`.
+    Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't be.
+    """
+    folder = Path(folder)
+    sources = _find_sources(folder)
+    poses = _read_poses(folder / POSES_FILE, sources)
+    views = [_view(folder / POSES_FILE, row, *pair, size) for row, pair in enumerate(zip(sources, poses, strict=True))]
+    for view in views:
+        if len(view) != len(views[0]):
+            raise DatasetInvalid(
+                view[0].image_path.parent,
+                "frames",
+                f"are {len(view)}, but {views[0][0].image_path.parent} has {len(views[0])}: "
+                f"cut all cameras to the frames that they have in common",
+            )
+    points, colors = _read_points(folder)
+    extent = half_extent(points, [view[0].camera for view in views])
+    splits = {"train": [frame for view in views[1:] for frame in view], "val": [], "test": views[0]}
+    return SceneData(splits, (0.0, views[0][-1].t), extent, points, colors)
+
+
+class _Source(NamedTuple):
+    """Where a camera's photographs come from: a video, or files in the order of time."""
+
+    name: str
+    video: Path | None
+    images: list[Path]
+
+
+def _find_sources(folder: Path) -> list[_Source]:
+    try:
+        names = {path.stem for path in folder.iterdir() if CAMERA_NAME.fullmatch(path.stem)}
+    except OSError as error:
+        raise DatasetInvalid(folder, "folder", f"can't be read: {error.strerror}") from None
+    sources = [_source(folder, name) for name in sorted(names, key=_natural)]
+    if len(sources) < 2:
+        raise DatasetInvalid(
+            folder, "cameras", f"must be two or more, got {len(sources)}: cam00 for testing, cam01 and on for training"
+        )
+    return sources
+
+
+def _source(folder: Path, name: str) -> _Source:
+    for place in (folder / name / "images", folder / name):
+        if place.is_dir():
+            files = [path for path in place.iterdir() if path.suffix.lower() in EXTENSIONS and path.is_file()]
+            if files:
+                return _Source(name, None, sorted(files, key=lambda path: _natural(path.name)))
+    video = folder / f"{name}.mp4"
+    if video.is_file():
+        return _Source(name, video, [])
+    raise DatasetInvalid(
+        folder / name, "frames", f"are missing: there is no {video.name} and no {'|'.join(EXTENSIONS)}"
+    )
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Numbers in order of their value, also where they are not filled up with zeros."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _read_poses(file: Path, sources: list[_Source]) -> np.ndarray:
+    """[M, 17] float64, finite, with as many rows as there are cameras."""
+    poses = read_table(file, 17)
+    if len(poses) != len(sources):
+        raise DatasetInvalid(
+            file,
+            "rows",
+            f"are {len(poses)}, but there are {len(sources)} cameras: {' '.join(source.name for source in sources)}. "
+            f"Each camera has its row, in the order of their names",
+        )
+    return poses
+
+
+def _view(file: Path, row: int, source: _Source, pose: np.ndarray, size: int | None) -> list[Frame]:
+    """All frames of one camera, in the order of time."""
+    if source.video is None:
+        return _image_frames(file, row, source, pose, size)
+    info = read_info(source.video)
+    camera = reduced(_camera(file, row, pose, ImageSize(info.width, info.height)), size, source.video)
+    return [
+        VideoFrame(
+            f"{source.name}_{index:06d}",
+            camera,
+            _time(index, info.count),
+            source.video / f"{index:06d}",
+            video=source.video,
+            index=index,
+            count=info.count,
+        )
+        for index in range(info.count)
+    ]
+
+
+def _image_frames(file: Path, row: int, source: _Source, pose: np.ndarray, size: int | None) -> list[Frame]:
+    photograph = photograph_size(source.images[0])
+    for path in source.images:
+        if photograph_size(path) != photograph:
+            raise DatasetInvalid(path, "image", f"is {photograph_size(path)}, but {source.images[0]} is {photograph}")
+    camera = reduced(_camera(file, row, pose, photograph), size, source.images[0])
+    return [
+        Frame(f"{source.name}_{path.stem}", camera, _time(index, len(source.images)), path)
+        for index, path in enumerate(source.images)
+    ]
+
+
+def _time(index: int, count: int) -> float:
+    return index / (count - 1) if count > 1 else 0.0
+
+
+def _camera(file: Path, row: int, values: np.ndarray, photograph: ImageSize) -> Camera:
+    down, right, back, position, (height, width, focal) = values[:15].reshape(3, 5).T
+    near, far = values[15:]
+    if not 0 < near < far:
+        raise _invalid_row(file, row, f"must end in 0 < near < far, got {near:g} and {far:g}")
+    stated = ImageSize(round(width), round(height))
+    if not stated.has_shape_of(photograph):
+        raise _invalid_row(file, row, f"states a size of {stated}, but the photograph is {photograph}")
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, down, -back, position], axis=1)
+    try:
+        return Camera(focal, focal, width / 2, height / 2, *stated, pose).resized(*photograph)
+    except InvalidInput as error:
+        raise _invalid_row(file, row, f"is no camera: {error}") from None
+
+
+def _invalid_row(file: Path, row: int, problem: str) -> DatasetInvalid:
+    return DatasetInvalid(file, f"row {row}", problem)
+
+
+def _read_points(folder: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    for pattern in POINTS_FILES:
+        files = sorted(folder.glob(pattern), key=lambda path: _natural(path.stem))
+        if files:
+            points, colors = read_ply_points(files[-1])
+            return (points, colors) if len(points) else (None, None)
+    return None, None
