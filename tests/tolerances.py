@@ -68,6 +68,7 @@ TABLE = (
     Row("ray_hit", 1e-3, "scene units; a ray stops 2e-4 before a surface, earlier in a bent one or along a wall"),
     Row("material_point", 1e-6, "scene units; trajectories are written with 7 digits"),
     Row("picture_offset", 0.1, "pixels; estimated from colours at 96×96, where half a pixel would be a wrong centre"),
+    Row("dot_centroid", 0.05, "pixels; a dot of 2 pixels in 8 bits, stretched unevenly over its width by the lens"),
     Row(
         "silent_places",
         0.02,
