@@ -53,6 +53,8 @@ class ModelConfig:
     """Photometric gradients through the positional encoding don't reach the canonical means, as in DeformGS."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.layers, tuple | list):
+            raise InvalidInput("model.layers", f"a list of kinds out of {list(get_args(LayerKind))}", self.layers)
         object.__setattr__(self, "layers", tuple(self.layers))
         unknown = [kind for kind in self.layers if kind not in get_args(LayerKind)]
         if unknown:

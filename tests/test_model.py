@@ -121,6 +121,10 @@ def test_quaternions_without_direction_become_identity():
         ("time_width", 0),
         ("embedding_size", -1),
         ("layers", True),
+        ("layers", ("mlp", "grid")),
+        ("layers", "mlp"),
+        ("plane_space_nodes", 1),
+        ("plane_channels", 0),
         ("delta_space", "activated"),
     ],
 )
@@ -164,12 +168,12 @@ def test_neighbour_distances_against_all_pairs(spread: str, count: int):
     points = {
         "uniform": points,
         "clustered": points * 1e-3 + (points[:, :1] > 0.5) * 5.0,
-        "plane": points * torch.tensor([0.0, 1.0, 1.0]),  # all at the same x, along which neighbours are sought
+        "plane": points * torch.tensor([0.0, 1.0, 1.0]),
         "line": points * torch.tensor([1.0, 0.0, 0.0]),
     }[spread]
     pairs = (points[:, None] - points[None]).double().norm(dim=2).sort(dim=1).values
     want = pairs[:, 1 : min(count, 4)].mean(dim=1)
-    assert_close(neighbour_distances(points, chunk=16), want.float(), "neighbour_distances")
+    assert_close(neighbour_distances(points), want.float(), "neighbour_distances")
 
 
 def test_points_in_one_place_have_a_scale():
