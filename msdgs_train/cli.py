@@ -1,16 +1,21 @@
-"""`msdgs-train`: fit a moving scene to photographs, or make a synthetic one to try it on."""
+"""`msdgs-train`: fit a moving scene to photographs, judge and look at what came out, or make a scene to try it on."""
 
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
 
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.config import TrainConfig
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from msdgs_train.evaluation import Evaluation
 
 EXIT_INVALID = 2
 EXIT_INTERRUPTED = 130  # as a shell reports a program that Ctrl-C has stopped
@@ -20,8 +25,8 @@ console = Console()
 
 @dataclass(frozen=True)
 class Fit:
-    """Train on a folder of photographs; RUN gets config.json, metrics.jsonl, curve.png, renders/, checkpoint.pt and
-    model.pt.
+    """Train on a folder of photographs; RUN gets config.json, run.json, metrics.jsonl, curve.png, renders/,
+    checkpoint.pt, model.pt (the last) and best.pt (of the highest PSNR on held-out photographs).
 
     Ctrl-C finishes the step, saves a checkpoint and stops. The same command with --resume goes on from there, with
     the same bits as if it had never stopped; more --steps, another --max-minutes and the like may be given then.
@@ -57,21 +62,79 @@ class Synthetic:
     """Of the cameras and times."""
 
 
-Command = Annotated[Fit, tyro.conf.subcommand("fit")] | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
+@dataclass(frozen=True)
+class Evaluate:
+    """Judge the last and the best model of a run on held-out photographs: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR where
+    something moves, since a static background hides what is wrong with the motion.
+
+    RUN/eval gets numbers for every image (<split>.json), a table (<split>.md) and a contact sheet of photographs,
+    renderings and errors (<split>.png). LPIPS and ꟻLIP are left out where their packages or weights are not on this
+    machine; nothing is downloaded.
+
+    Example:  msdgs-train eval runs/first
+    """
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The folder of a run that `msdgs-train fit` has filled."""
+    data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = None
+    """The dataset, where it is not any more where the run found it."""
+    split: Literal["test", "val", "train"] = "test"
+    """Which photographs."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Draw the Gaussians after k = 0, 1, …, K layers of the deformation side by side: what each layer adds.
+
+    Example:  msdgs-train steps runs/first/model.pt --t 0.9
+    """
+
+    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
+    """The model.pt or best.pt of a run."""
+    t: float | None = None
+    """Time, in the scene's range; left out: 0.3 of the way through it."""
+    out: Path = Path("steps.png")
+    """The PNG to write."""
+    size: int = 400
+    """Width of each picture in pixels, the height in proportion."""
+    camera: str | None = None
+    """Name of a camera that the model holds; left out: the one whose photograph is nearest in time."""
+
+
+Command = (
+    Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
+    | Annotated[Evaluate, tyro.conf.subcommand("eval")]
+    | Annotated[Steps, tyro.conf.subcommand("steps")]
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of `msdgs-train`; returns the exit code: 0 done, 2 wrong input, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        command = _parse(arguments)
-        return _synthetic(command) if isinstance(command, Synthetic) else _fit(command)
+        return _run(_parse(arguments))
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted")
+        return EXIT_INTERRUPTED
     except MsdgsError as error:
-        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
+        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         return EXIT_INVALID
 
 
-def _parse(arguments: Sequence[str]) -> Fit | Synthetic:
+def _run(command: Fit | Synthetic | Evaluate | Steps) -> int:
+    match command:
+        case Fit():
+            return _fit(command)
+        case Synthetic():
+            return _synthetic(command)
+        case Evaluate():
+            return _evaluate(command)
+        case Steps():
+            return _steps(command)
+
+
+def _parse(arguments: Sequence[str]) -> Fit | Synthetic | Evaluate | Steps:
     command = tyro.cli(Command, args=arguments, prog="msdgs-train", description=__doc__)  # type: ignore[arg-type]
     if isinstance(command, Fit) and command.resume:
         from msdgs_train.fit import stored_config
@@ -94,6 +157,9 @@ def _fit(command: Fit) -> int:
     for split, quality in outcome.qualities.items():
         console.print(f"{split:>5}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
     console.print(f"model: {command.run / 'model.pt'}", soft_wrap=True)
+    if outcome.best is not None:
+        best = outcome.best
+        console.print(f"best:  {command.run / 'best.pt'}, {best.split} {best.psnr:.2f} dB, step {best.step:,}")
     if outcome.status != "finished":
         more = " --max-minutes None" if outcome.status == "out of time" else ""
         console.print(f"go on with: msdgs-train fit {command.data} {command.run} --resume{more}", soft_wrap=True)
@@ -114,6 +180,42 @@ def _synthetic(command: Synthetic) -> int:
             progress=progress,
         )
     console.print(f"made {command.out}; next: msdgs-train fit {command.out} runs/first", soft_wrap=True)
+    return 0
+
+
+def _evaluate(command: Evaluate) -> int:
+    from msdgs_train.evaluation import evaluate_run
+    from msdgs_train.evaluation_report import notes, write_evaluation
+    from msdgs_train.progress import frame_progress
+
+    with frame_progress(console, 0) as progress:
+        evaluation = evaluate_run(command.run, command.data, command.split, progress)
+    paths = write_evaluation(command.run, evaluation)
+    console.print(_table(evaluation))
+    for note in notes(evaluation):
+        console.print(note, soft_wrap=True, highlight=False)
+    console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+    return 0
+
+
+def _table(evaluation: "Evaluation") -> "Table":
+    from rich.table import Table
+
+    from msdgs_train.evaluation_report import HEADINGS, cells
+
+    table = Table(title=f"{evaluation.split}, mean of {len(evaluation.frames)} images")
+    for heading in ("model", "step", *HEADINGS.values()):
+        table.add_column(heading, justify="left" if heading == "model" else "right")
+    for judged in evaluation.models:
+        table.add_row(judged.name, f"{judged.loaded.step:,}", *cells(evaluation, judged.mean))
+    return table
+
+
+def _steps(command: Steps) -> int:
+    from msdgs_train.steps import write_steps
+
+    pictures = write_steps(command.model, command.out, t=command.t, size=command.size, camera=command.camera)
+    console.print(f"wrote {command.out}: k = 0 to {len(pictures) - 1}", soft_wrap=True)
     return 0
 
 

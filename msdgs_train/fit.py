@@ -1,7 +1,9 @@
 """A whole run in its folder: steps, evaluations, checkpoints, and what is left to look at."""
 
 import json
+import math
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -10,13 +12,16 @@ from msdgs_train.config import TrainConfig, check_resumable
 from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.metrics import Quality, mean_quality
 from msdgs_train.report import MetricsLog, draw_curve, write_side_by_side
+from msdgs_train.run_record import Best, RunRecord, read_record, write_record
 from msdgs_train.trainer import StepResult, Trainer
 
 CONFIG = "config.json"
 CHECKPOINT = "checkpoint.pt"
 MODEL = "model.pt"
+BEST = "best.pt"
 FINAL_METRICS = "metrics.json"
 EVALUATED_SPLITS = ("test", "val")
+CHOOSING_SPLITS = ("val", "test")  # the first that the dataset has decides which model is the best
 RENDERS_WHILE_TRAINING = 4
 
 Status = Literal["finished", "interrupted", "out of time"]
@@ -30,6 +35,7 @@ class Outcome(NamedTuple):
     qualities: dict[str, Quality]  # of each held-out split; none when interrupted
     gaussians: int
     seconds: float  # of training in all, evaluations included
+    best: Best | None  # what `best.pt` is; None while nothing has been evaluated
 
 
 class Observer:
@@ -71,18 +77,42 @@ def fit(
     trainer = Trainer(config, scene)
     seconds = trainer.load_checkpoint(run / CHECKPOINT) if resume else 0.0
     (run / CONFIG).write_text(json.dumps(config.to_dict(), indent=2) + "\n")
-    return _Run(config, scene, run, trainer, observer or Observer(), seconds).execute()
+    best = _best_so_far(run, scene) if resume else None
+    if best is None:
+        (run / BEST).unlink(missing_ok=True)
+    record = RunRecord(data.absolute(), best)
+    write_record(run, record)
+    return _Run(config, scene, run, trainer, observer or Observer(), seconds, record).execute()
+
+
+def _choosing_split(scene: SceneData) -> str | None:
+    return next((split for split in CHOOSING_SPLITS if scene.splits.get(split)), None)
+
+
+def _best_so_far(run: Path, scene: SceneData) -> Best | None:
+    record = read_record(run)
+    best = record.best if record else None
+    return best if best and best.split == _choosing_split(scene) and (run / BEST).exists() else None
 
 
 class _Run:
     def __init__(
-        self, config: TrainConfig, scene: SceneData, folder: Path, trainer: Trainer, observer: Observer, seconds: float
+        self,
+        config: TrainConfig,
+        scene: SceneData,
+        folder: Path,
+        trainer: Trainer,
+        observer: Observer,
+        seconds: float,
+        record: RunRecord,
     ) -> None:
         self.config = config
         self.folder = folder
         self.trainer = trainer
         self.observer = observer
+        self.record = record
         self.splits = [split for split in EVALUATED_SPLITS if scene.splits.get(split)]
+        self.choosing_split = _choosing_split(scene)
         self.log = MetricsLog(folder, keep_until=trainer.step_count)
         self.started = time.perf_counter() - seconds
 
@@ -101,7 +131,7 @@ class _Run:
         if qualities:
             self._write_final_metrics(qualities)
         count = len(self.trainer.model.gaussians)
-        return Outcome(status, self.trainer.step_count, qualities, count, self._seconds())
+        return Outcome(status, self.trainer.step_count, qualities, count, self._seconds(), self.record.best)
 
     def _reason_to_stop(self) -> Status:
         if self.observer.should_stop():
@@ -115,7 +145,8 @@ class _Run:
         self.observer.step(result, self._seconds())
         if result.step < self.config.steps:
             if _is_due(result.step, self.config.eval_every) and self.splits:
-                self._evaluate(self.splits[0], renders=RENDERS_WHILE_TRAINING)
+                for split in self.splits:
+                    self._evaluate(split, renders=RENDERS_WHILE_TRAINING)
                 draw_curve(self.folder)
             if _is_due(result.step, self.config.checkpoint_every):
                 self._save()
@@ -130,7 +161,16 @@ class _Run:
         quality = mean_quality(qualities)
         self.log.evaluation(self.trainer.step_count, split, quality)
         self.observer.evaluation(self.trainer.step_count, split, quality)
+        if split == self.choosing_split and math.isfinite(quality.psnr):
+            self._keep_if_best(Best(split, self.trainer.step_count, quality.psnr))
         return quality
+
+    def _keep_if_best(self, candidate: Best) -> None:
+        best = self.record.best
+        if best is None or candidate.psnr > best.psnr:
+            self.trainer.save_model(self.folder / BEST)
+            self.record = RunRecord(self.record.data, candidate)
+            write_record(self.folder, self.record)
 
     def _save(self) -> None:
         self.trainer.save_checkpoint(self.folder / CHECKPOINT, self._seconds())
@@ -142,6 +182,7 @@ class _Run:
             "seconds": round(self._seconds(), 1),
             "gaussians": len(self.trainer.model.gaussians),
             "splits": {split: quality._asdict() for split, quality in qualities.items()},
+            "best": self.record.best and {"file": BEST, **asdict(self.record.best)},
         }
         (self.folder / FINAL_METRICS).write_text(json.dumps(metrics, indent=2) + "\n")
 

@@ -3,6 +3,8 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from msdgs_train.losses import ssim
@@ -21,6 +23,12 @@ class Quality(NamedTuple):
 def psnr(rgb: Tensor, truth: Tensor) -> float:
     """Peak signal-to-noise ratio in dB of [H, W, 3] pictures with values in [0, 1], over all pixels and channels."""
     return psnr_from_mse(float((rgb - truth).double().square().mean()))
+
+
+def masked_psnr(rgb: Tensor, truth: Tensor, mask: np.ndarray) -> float | None:
+    """PSNR in dB over the pixels of `mask`, [H, W] bool, and all channels of [H, W, 3]; None where there are none."""
+    inside = torch.from_numpy(mask)
+    return psnr_from_mse(float((rgb - truth)[inside].double().square().mean())) if mask.any() else None
 
 
 def psnr_from_mse(mse: float) -> float:

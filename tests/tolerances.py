@@ -52,6 +52,7 @@ TABLE = (
     Row("ssim.float32", 1e-5, "variances are differences of blurred squares; torch blurs in another order"),
     Row("ssim.float64", 1e-12, "as ssim.float32"),
     Row("psnr.relative", 1e-6, "torchmetrics adds in float32"),
+    Row("flip.relative", 1e-5, "the same program; in the rendering it is given, the last bits may differ"),
     Row("loss_gradient", 1e-7, "central differences with steps of 1e-7 and 1e-6 of a loss of size 1"),
     # the deformation network
     Row("encoding.float64", 1e-12, "sines of phases up to 1024, each rounded once"),
