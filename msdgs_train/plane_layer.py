@@ -49,10 +49,9 @@ class PlaneLayer(nn.Module):
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in HEAD_SIZES)
         self.heads = nn.ModuleList(nn.Linear(width, size) for size in HEAD_SIZES)
         with torch.no_grad():
-            for head in self.heads[:-1]:
-                nn.init.zeros_(head.weight)
-            for head in self.heads:
-                nn.init.zeros_(head.bias)
+            for name, parameter in self.heads.named_parameters():
+                if name.endswith("bias") or name != f"{len(HEAD_SIZES) - 1}.weight":
+                    parameter.zero_()  # a new layer moves nothing; its weight keeps a random direction to learn from
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
         """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""

