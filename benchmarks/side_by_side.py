@@ -66,7 +66,8 @@ def main(options: SideBySide) -> None:
 
 def name(model: LoadedModel) -> str:
     """How a column is called."""
-    return f"K = {len(model.model.deformation)}"
+    kinds = model.model.config.layers
+    return f"K = {len(kinds)} ({', '.join(sorted(set(kinds)))})"
 
 
 @torch.no_grad()

@@ -35,7 +35,7 @@ class Fit:
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """A dataset folder; D-NeRF layout: transforms_train.json, transforms_test.json and PNGs."""
+    """A dataset folder in the layout of D-NeRF, nerfstudio, COLMAP, Neu3D or HyperNeRF, seen from the files in it."""
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The folder of this run; new, or one to --resume."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
