@@ -20,8 +20,8 @@ SIZE = 24
 FOV = 40.0
 
 SMALL_MODEL = ModelConfig(
-    sh_degree=1, layers=("mlp", "mlp"), width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8, time_features=4,
-    embedding_size=4,
+    sh_degree=1, layers=("mlp", "mlp"), width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8,
+    time_features=4, embedding_size=4,
 )  # fmt: skip
 
 
