@@ -80,7 +80,10 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...]) -> N
 
 def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str) -> str:
     """One layer at the means [M, 3]: its deltas, [M, 10], times its weight."""
-    heads = (_mlp_heads if isinstance(layer, MLPLayer) else plane_heads)(graph, name, layer, means, time)
+    if isinstance(layer, MLPLayer):
+        heads = _mlp_heads(graph, name, layer, means, time)
+    else:
+        heads = plane_heads(graph, name, layer, means, time)
     deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [DELTA_COLUMNS, 1])
     weight = graph.node("Sigmoid", [logit], f"{name}.weight")
     return graph.node("Mul", [weight, deltas], f"{name}.weighted")

@@ -8,9 +8,9 @@ from torch import Tensor
 from msdgs_train.plane_layer import PlaneLayer
 
 
-def layer(dtype: torch.dtype = torch.float64, **sizes: int) -> PlaneLayer:
+def layer(dtype: torch.dtype = torch.float64) -> PlaneLayer:
     torch.manual_seed(0)
-    made = PlaneLayer(**{"channels": 5, "space_nodes": 6, "time_nodes": 7, "width": 8, **sizes}, half_extent=1.3)
+    made = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8, half_extent=1.3)
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
