@@ -45,7 +45,7 @@ def verify(
 ) -> dict[str, Any]:
     """The largest errors against the model in float64 and float32, as `measured_error` stores them.
 
-    Errors of means are relative to the scene's half diagonal or, further out, to the distance from the origin; those
+    Errors of means are relative to the scene's half diagonal or, further out, to the largest coordinate; those
     of scales to the Gaussian's largest scale; those of quaternions are absolute. Raises `VerificationFailed` where one
     is above `tolerance` for a stable Gaussian, or too many Gaussians are unstable.
     """

@@ -35,7 +35,7 @@ class TrainConfig:
     the paper's are width 256, depth 4, xyz_frequencies 10, time_width 256, sh_degree 3."""
 
     init_count: int = 8_000
-    """Gaussians at the start, random in a cube around the origin."""
+    """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
     half_extent: float | None = None
     """Half the side of that cube in scene units; what the dataset suggests if not given."""
     warmup_fraction: float = 0.03

@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -89,6 +90,24 @@ class CanonicalGaussians(nn.Module):
         points = (2 * torch.rand(count, 3, generator=generator) - 1) * half_extent
         colours = torch.rand(count, 3, generator=generator)
         return cls.from_points(points, colours, sh_degree, embedding_size, generator)
+
+    @classmethod
+    def from_sparse_points(
+        cls,
+        points: np.ndarray,
+        colours: np.ndarray | None,
+        max_count: int,
+        sh_degree: int,
+        embedding_size: int,
+        seed: int,
+    ) -> Self:
+        """At most `max_count` of the points, [M, 3], that came with a dataset; of random colours where there are none,
+        [M, 3] in [0, 1]."""
+        generator = torch.Generator().manual_seed(seed)
+        chosen = torch.randperm(len(points), generator=generator)[:max_count]
+        random = torch.rand(len(chosen), 3, generator=generator)
+        known = random if colours is None else torch.from_numpy(colours).float()[chosen]
+        return cls.from_points(torch.from_numpy(points).float()[chosen], known, sh_degree, embedding_size, generator)
 
 
 def neighbour_distances(points: Tensor, neighbours: int = 3) -> Tensor:

@@ -72,9 +72,9 @@ class Trainer:
         self._order = torch.empty(0, dtype=torch.int64)
         self._distances = _distances_from_middle(scene.time_range, self.frames)
         self._half_extent = config.half_extent or scene.half_extent
-        self.model = _new_model(config, Domain(self._half_extent, scene.time_range))
+        self.model = _new_model(config, scene, Domain(self._half_extent, scene.time_range))
         self.optimizer = make_optimizer(self.model, config)
-        self.density = DensityControl.start(config, self._extent(), config.init_count)
+        self.density = DensityControl.start(config, self._extent(), len(self.model.gaussians))
         self._pairs_generator = torch.Generator().manual_seed(config.seed + 2)
 
     def step(self) -> StepResult:
@@ -290,11 +290,14 @@ def _distances_from_middle(time_range: tuple[float, float], frames: list[Frame])
     return distances
 
 
-def _new_model(config: TrainConfig, domain: Domain) -> DynamicGaussians:
+def _new_model(config: TrainConfig, scene: SceneData, domain: Domain) -> DynamicGaussians:
     sizes = config.model
-    gaussians = CanonicalGaussians.random_in_cube(
-        config.init_count, domain.half_extent, sizes.sh_degree, sizes.embedding_size, config.seed
-    )
+    rest = (sizes.sh_degree, sizes.embedding_size, config.seed)
+    if scene.points is not None and len(scene.points):
+        points = (scene.points, scene.point_colors)
+        gaussians = CanonicalGaussians.from_sparse_points(*points, config.init_count, *rest)
+    else:
+        gaussians = CanonicalGaussians.random_in_cube(config.init_count, domain.half_extent, *rest)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return DynamicGaussians(sizes, gaussians, domain)

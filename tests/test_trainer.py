@@ -1,13 +1,16 @@
 """A whole run on a tiny scene: it learns, it stops, and it goes on with the same bits."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from msdgs_serve.scene import InvalidInput
+from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train import fit as fit_module
 from msdgs_train import trainer as trainer_module
 from msdgs_train.checkpoint import load_model
@@ -35,6 +38,22 @@ def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
 def _steps(trainer: Trainer, count: int) -> None:
     for _ in range(count):
         trainer.step()
+
+
+@pytest.mark.parametrize("found", [20, 500])
+def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: int) -> None:
+    numbers = np.random.default_rng(0)
+    points, colors = numbers.uniform(-0.5, 0.5, (found, 3)), numbers.uniform(0.1, 0.9, (found, 3))
+    scene = dataclasses.replace(load_scene(data), points=points, point_colors=colors)
+    trainer = Trainer(small_config(), scene)
+    first, started = trainer.model.gaussians, min(found, trainer.config.init_count)
+    assert 20 < trainer.config.init_count < 500
+    assert len(first) == started
+    nearest = np.linalg.norm(first.means.detach().numpy()[:, None] - points[None], axis=2).argmin(axis=1)
+    assert len(set(nearest)) == started
+    np.testing.assert_allclose(first.means.detach(), points[nearest], atol=1e-6)
+    np.testing.assert_allclose(first.sh_dc.detach()[:, 0] * SH_C0 + 0.5, colors[nearest], atol=1e-6)
+    _steps(trainer, 3)
 
 
 class _StopAfter(Observer):
