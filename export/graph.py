@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+import torch
 from onnx import TensorProto, helper, numpy_helper
 
 OPSET = 18
@@ -54,3 +55,9 @@ class GraphBuilder:
         helper.set_model_props(model, properties)
         onnx.checker.check_model(model)
         return model
+
+
+def to_numpy(tensor: torch.Tensor | torch.nn.Module) -> np.ndarray:
+    """A parameter or buffer as float32."""
+    assert isinstance(tensor, torch.Tensor)  # torch types every attribute of a module as either
+    return tensor.detach().to("cpu", torch.float32).numpy()

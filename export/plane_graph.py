@@ -2,8 +2,9 @@
 
 import numpy as np
 import torch
+from onnx import TensorProto
 
-from export.graph import GraphBuilder
+from export.graph import GraphBuilder, to_numpy
 from msdgs_train.plane_layer import PlaneLayer
 
 FIRST_AXES = np.array([0, 0, 1], np.int64)  # of the planes xy, xz, yz
@@ -13,23 +14,27 @@ SECOND_AXES = np.array([1, 2, 2], np.int64)
 def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str) -> str:
     """[M, 11] what the heads of one layer say of means [M, 3]: deltas, and the weight before its sigmoid."""
     size, channels = layer.space.shape[1], layer.space.shape[3]
-    scaled = graph.node("Mul", [means, graph.constant(f"{name}.cells", _numpy(layer.cells))], f"{name}.scaled")
+    scaled = graph.node("Mul", [means, graph.constant(f"{name}.cells", to_numpy(layer.cells))], f"{name}.scaled")
     middle = graph.constant(f"{name}.middle", np.array((size - 1) / 2, np.float32))
     positions = graph.node("Add", [scaled, middle], f"{name}.positions")
     cells, parts = _cells(graph, f"{name}.xyz", positions, size)
     lines = _lines(graph, name, layer, time)
     over_time = _interpolated_lines(graph, name, lines, cells, parts, size)
-    table = graph.constant(f"{name}.space", _numpy(layer.space).reshape(-1, channels))
+    table = graph.constant(f"{name}.space", to_numpy(layer.space).reshape(-1, channels))
     over_space = _interpolated_planes(graph, name, table, cells, parts, size)
     features = graph.node("Mul", [over_space, over_time], f"{name}.features")
     hidden = _affine(graph, f"{name}.features.linear", features, layer.features.weight, layer.features.bias)
     hidden = graph.node("Relu", [hidden], f"{name}.features.relu")
     weights, biases = (
-        torch.cat([_tensor(getattr(linear, kind)) for linear in layer.hidden]) for kind in ("weight", "bias")
+        torch.cat([linear.get_parameter(kind) for linear in layer.hidden]) for kind in ("weight", "bias")
     )
     hidden = graph.node("Relu", [_affine(graph, f"{name}.hidden", hidden, weights, biases)], f"{name}.hidden.relu")
-    heads = torch.block_diag(*(_tensor(head.weight) for head in layer.heads))  # each head reads its own hidden units
-    return _affine(graph, f"{name}.heads", hidden, heads, torch.cat([_tensor(head.bias) for head in layer.heads]))
+    heads = torch.block_diag(
+        *(head.get_parameter("weight") for head in layer.heads)
+    )  # each head reads its own hidden units
+    return _affine(
+        graph, f"{name}.heads", hidden, heads, torch.cat([head.get_parameter("bias") for head in layer.heads])
+    )
 
 
 def _cells(graph: GraphBuilder, name: str, positions: str, nodes: int) -> tuple[str, str]:
@@ -42,17 +47,17 @@ def _cells(graph: GraphBuilder, name: str, positions: str, nodes: int) -> tuple[
     inside = graph.node("Clip", [positions, zero, last], f"{name}.inside")
     below = graph.node("Min", [graph.node("Floor", [inside], f"{name}.floor"), last_cell], f"{name}.below")
     parts = graph.node("Sub", [inside, below], f"{name}.parts")
-    return graph.node("Cast", [below], f"{name}.cell", to=7), parts  # 7: int64
+    return graph.node("Cast", [below], f"{name}.cell", to=TensorProto.INT64), parts
 
 
 def _lines(graph: GraphBuilder, name: str, layer: PlaneLayer, time: str) -> str:
     """[3 S, C] the planes over time at `time`, [1, 1]: one lookup a call, whatever the number of ids."""
     nodes, channels = layer.time.shape[1], layer.time.shape[3]
-    first = graph.constant(f"{name}.first_time", _numpy(layer.first_time))
-    rate = graph.constant(f"{name}.time_cells", _numpy(layer.time_cells))
+    first = graph.constant(f"{name}.first_time", to_numpy(layer.first_time))
+    rate = graph.constant(f"{name}.time_cells", to_numpy(layer.time_cells))
     since = graph.node("Sub", [time, first], f"{name}.since")
     cell, part = _cells(graph, f"{name}.t", graph.node("Mul", [since, rate], f"{name}.t.position"), nodes)
-    rows = _numpy(layer.time).transpose(1, 0, 2, 3).reshape(nodes, -1)
+    rows = to_numpy(layer.time).transpose(1, 0, 2, 3).reshape(nodes, -1)
     table = graph.constant(f"{name}.time", rows)
     one = graph.constant(f"{name}.t.one", np.array(1, np.int64))
     flat = graph.constant(f"{name}.t.flat", np.array([1], np.int64))
@@ -129,14 +134,5 @@ def _product(graph: GraphBuilder, name: str, values: str) -> str:
 
 
 def _affine(graph: GraphBuilder, name: str, value: str, weight: torch.Tensor, bias: torch.Tensor) -> str:
-    constants = [graph.constant(f"{name}.{kind}", _numpy(v)) for kind, v in (("weight", weight), ("bias", bias))]
+    constants = [graph.constant(f"{name}.{kind}", to_numpy(v)) for kind, v in (("weight", weight), ("bias", bias))]
     return graph.node("Gemm", [value, *constants], f"{name}.out", transB=1)
-
-
-def _tensor(value: torch.Tensor | torch.nn.Module) -> torch.Tensor:
-    assert isinstance(value, torch.Tensor)  # torch types every attribute of a module as either
-    return value
-
-
-def _numpy(value: torch.Tensor | torch.nn.Module) -> np.ndarray:
-    return _tensor(value).detach().to("cpu", torch.float32).numpy()

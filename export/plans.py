@@ -12,7 +12,7 @@ import torch
 from onnx import TensorProto
 
 from export.bake import Baked, Layer, Moving
-from export.graph import GraphBuilder
+from export.graph import GraphBuilder, to_numpy
 from export.plane_graph import plane_heads
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.quaternion import MIN_NORM
@@ -92,7 +92,7 @@ def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str) 
 def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str) -> str:
     """[M, 11] what the heads of one layer say of means [M, 3]: deltas, and the weight before its sigmoid."""
     encoded = _encode(graph, f"{name}.xyz", means, layer.xyz_octaves)
-    first = _numpy(layer.first.weight)
+    first = to_numpy(layer.first.weight)
     weight_xyz = graph.constant(f"{name}.first.weight_xyz", first[:, : layer.xyz_features])
     hidden = graph.node(
         "Gemm", [encoded, weight_xyz, _time_bias(graph, name, layer, time)], f"{name}.first.out", transB=1
@@ -111,22 +111,22 @@ def _time_bias(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> st
         "Relu", [_linear(graph, f"{name}.time_hidden", layer.time_hidden, encoded)], f"{name}.time_relu"
     )
     features = _linear(graph, f"{name}.time_output", layer.time_output, hidden)
-    weight = graph.constant(f"{name}.first.weight_time", _numpy(layer.first.weight)[:, layer.xyz_features :])
-    bias = graph.constant(f"{name}.first.bias", _numpy(layer.first.bias))
+    weight = graph.constant(f"{name}.first.weight_time", to_numpy(layer.first.weight)[:, layer.xyz_features :])
+    bias = graph.constant(f"{name}.first.bias", to_numpy(layer.first.bias))
     return graph.node("Gemm", [features, weight, bias], f"{name}.time_bias", transB=1)
 
 
 def _encode(graph: GraphBuilder, name: str, value: str, octaves: torch.Tensor) -> str:
     """`PositionalEncoding`: value, sines, cosines side by side."""
-    phases = graph.node("MatMul", [value, graph.constant(f"{name}.octaves", _numpy(octaves))], f"{name}.phases")
+    phases = graph.node("MatMul", [value, graph.constant(f"{name}.octaves", to_numpy(octaves))], f"{name}.phases")
     sines = graph.node("Sin", [phases], f"{name}.sines")
     cosines = graph.node("Cos", [phases], f"{name}.cosines")
     return graph.node("Concat", [value, sines, cosines], f"{name}.encoded", axis=1)
 
 
 def _linear(graph: GraphBuilder, name: str, linear: torch.nn.Module, value: str) -> str:
-    weight = graph.constant(f"{name}.weight", _numpy(linear.weight))
-    bias = graph.constant(f"{name}.bias", _numpy(linear.bias))
+    weight = graph.constant(f"{name}.weight", to_numpy(linear.weight))
+    bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
     return graph.node("Gemm", [value, weight, bias], f"{name}.out", transB=1)
 
 
@@ -138,8 +138,3 @@ def _unit_quats(graph: GraphBuilder, raw: str) -> None:
     norms = graph.node("ReduceL2", [raw, axis], "quats.norms", keepdims=1)
     scaled = graph.node("Div", [raw, graph.node("Max", [norms, least], "quats.divisors")], "quats.scaled")
     graph.node("Where", [graph.node("Less", [norms, least], "quats.tiny"), identity, scaled], "quats")
-
-
-def _numpy(tensor: torch.Tensor | torch.nn.Module) -> np.ndarray:
-    assert isinstance(tensor, torch.Tensor)  # torch types every attribute of a module as either
-    return tensor.detach().to("cpu", torch.float32).numpy()

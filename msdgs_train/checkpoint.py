@@ -3,9 +3,7 @@
 Every file is written beside its place and moved over it, so that a reader finds the old one or the new one whole.
 """
 
-import os
 import pickle
-import tempfile
 import zipfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -17,6 +15,7 @@ from torch import Tensor
 
 from msdgs_serve import __version__
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_train.files import replacing
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians, ModelConfig
 
@@ -79,19 +78,9 @@ def load_model(path: str | Path) -> LoadedModel:
 
 
 def save_atomic(path: str | Path, obj: Any) -> None:
-    """`torch.save` into a new file in the same folder, flushed to the disk, then moved over `path`."""
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    os.fchmod(handle, 0o644) if hasattr(os, "fchmod") else None  # mkstemp's own mode shuts out everybody else
-    try:
-        with os.fdopen(handle, "wb") as file:
-            torch.save(obj, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    """`torch.save`, atomically."""
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        torch.save(obj, file)
 
 
 def load(path: str | Path) -> Any:

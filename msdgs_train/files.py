@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside their place, then moved over it."""
+"""Files that are whole or not there: written beside their place, flushed to the disk, then moved over it."""
 
 import contextlib
 import os
@@ -19,6 +19,8 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
-from msdgs_train.neighbours import nearest
 
 INITIAL_OPACITY = 0.1
 MIN_NEIGHBOUR_DISTANCE = 1e-7  # scene units; two points in one place still get a scale above 0
@@ -111,6 +111,18 @@ class CanonicalGaussians(nn.Module):
 
 
 def neighbour_distances(points: Tensor, neighbours: int = 3) -> Tensor:
-    """[N] mean distance of each point, [N, 3], to its nearest `neighbours`; 1 where there is no other point."""
-    distances, _ = nearest(points, neighbours)
-    return distances.mean(dim=1) if distances.numel() else torch.ones(len(points))
+    """[N] mean distance of each point, [N, 3], to its nearest `neighbours`; 1 where there is no other point.
+
+    Raises `InvalidInput` if a coordinate is not finite.
+    """
+    n = len(points)
+    broken = int((~torch.isfinite(points)).any(dim=1).sum())
+    if broken:
+        raise InvalidInput("points", "finite", f"{broken} of {n} with NaN or infinity")
+    if n < 2:
+        return torch.ones(n)
+    from scipy.spatial import KDTree  # not wanted to load a model, so not in the export extra
+
+    positions = points.detach().cpu().numpy()
+    distances, _ = KDTree(positions).query(positions, k=min(neighbours, n - 1) + 1)
+    return torch.from_numpy(distances[:, 1:].mean(axis=1)).to(points)  # the first is the point itself

@@ -20,9 +20,15 @@ LOG_SCALE_LIMIT = 20.0
 is NaN."""
 
 LayerKind = Literal["mlp", "plane"]
-LEAST = {"width": 1, "depth": 1, "time_width": 1, "time_features": 1, "plane_channels": 1, "plane_width": 1} | {
+LEAST = {
+    "width": 1,
+    "depth": 1,
+    "time_width": 1,
+    "time_features": 1,
+    "plane_channels": 1,
     "plane_space_nodes": 2,
     "plane_time_nodes": 2,
+    "plane_width": 1,
 }
 """The smallest sizes that make sense; the others may be 0."""
 

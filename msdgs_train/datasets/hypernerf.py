@@ -18,7 +18,6 @@ model, where k3 stands behind p2. `Frame.load_rgba` takes the distortion out; th
 intrinsics. `skew` has to be 0.
 """
 
-import json
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +28,7 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.distortion import Distortion
 from msdgs_train.datasets.extent import half_extent
 from msdgs_train.datasets.images import ImageSize
+from msdgs_train.datasets.json_file import read_json
 from msdgs_train.datasets.npy import read_table
 from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
 
@@ -73,7 +73,7 @@ class _World(NamedTuple):
 
 
 def _read_ids(file: Path) -> dict[str, list[str]]:
-    content = _read_json(file)
+    content = read_json(file)
     ids = {split: _id_list(file, content, key) for split, key in (("train", "train_ids"), ("test", "val_ids"))}
     if not ids["train"]:
         raise DatasetInvalid(file, "train_ids", "must name one frame or more")
@@ -89,7 +89,7 @@ def _id_list(file: Path, content: dict[str, Any], key: str) -> list[str]:
 
 def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
     """In [0, 1]; all are 0 where the largest time_id is."""
-    content = _read_json(file)
+    content = read_json(file)
     numbers = {}
     for id_ in ids:
         entry = _get(file, content, id_)
@@ -107,7 +107,7 @@ def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
 
 
 def _read_world(file: Path) -> _World:
-    content = _read_json(file)
+    content = read_json(file)
     scale = float(_numbers(file, content, "scale", ()))
     if scale <= 0:
         raise DatasetInvalid(file, "scale", f"must be above 0, got {scale:g}")
@@ -127,7 +127,7 @@ def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
 
 
 def _frame(file: Path, image_path: Path, t: float, world: _World, size: int | None) -> Frame:
-    content = _read_json(file)
+    content = read_json(file)
     camera = _camera(file, content, world, photograph_size(image_path))
     distortion = _distortion(file, content)
     if distortion is not None and distortion.folds(camera):
@@ -173,18 +173,6 @@ def _read_points(file: Path, world: _World) -> np.ndarray | None:
         return None
     points = read_table(file, 3)
     return world.apply(points) if len(points) else None
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetInvalid(file, "file", f"can't be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise DatasetInvalid(file, "file", f"is not JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise DatasetInvalid(file, "file", "must hold a JSON object")
-    return content
 
 
 def _get(file: Path, content: dict[str, Any], key: str) -> Any:

@@ -91,7 +91,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
     """[count, …] means over `count` equal cells of float64 [length, …]; cells may cut rows.
 
-    Differences of running sums: 2704×2028 pixels are halved in 1.7 s; products with a matrix took over a minute.
+    Differences of running sums, which cost the same whatever the size of a cell.
     """
     length = len(rows)
     sums = np.zeros((length + 1, *rows.shape[1:]))

@@ -3,7 +3,6 @@
 Pixels are those of the stored photograph: where it is a reduced copy of what `w` and `h` say, intrinsics are scaled.
 """
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.images import EXTENSIONS, ImageSize
+from msdgs_train.datasets.json_file import read_json
 from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, photograph_size, reduced
 
 
@@ -53,14 +53,7 @@ class Entry(NamedTuple):
 
 def read_entries(file: Path, may_be_empty: bool = False) -> list[Entry]:
     """The frames of one JSON, unchecked but for being objects. Raises `DatasetInvalid` naming file and field."""
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetInvalid(file, "file", f"can't be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise DatasetInvalid(file, "file", f"is not JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise DatasetInvalid(file, "file", "must hold a JSON object")
+    content = read_json(file)
     frames = content.get("frames")
     if not isinstance(frames, list) or not (frames or may_be_empty):
         raise DatasetInvalid(file, "frames", "must be a list" + " of one frame or more" * (not may_be_empty))
