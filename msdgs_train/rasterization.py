@@ -76,28 +76,27 @@ class _Rasterize(torch.autograd.Function):
         gaussians = Gaussians(*map(_array, (means, quats, scales, opacities, sh)))
         splats = project(gaussians, camera, options)
         tiles = bin_into_tiles(splats, camera.width, camera.height)
-        blend = composite(splats, tiles, camera.width, camera.height, options)
-        rgb = blend.rgb + blend.transmittance[..., None] * background.detach().numpy()
+        frame = composite(splats, tiles, camera.width, camera.height, _array(background), options)
         info.radii = torch.from_numpy(splats.extents.max(axis=1, initial=0))
-        image = torch.from_numpy(rgb)
+        image = torch.from_numpy(frame.rgb)
         # saved as tensors: autograd then notices if one is written to before the backward pass
         ctx.save_for_backward(means, quats, scales, opacities, sh, image)
-        ctx.drawn = (splats, tiles, blend.transmittance)
+        ctx.drawn = (splats, tiles, frame.alpha)
         ctx.view = (camera, options)
         ctx.info = info
-        return image, torch.from_numpy(1 - blend.transmittance)
+        return image, torch.from_numpy(frame.alpha)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         *arrays, rgb = map(_array, ctx.saved_tensors)
         gaussians = Gaussians(*arrays)
-        splats, tiles, transmittance = ctx.drawn
+        splats, tiles, alpha = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
-        behind = np.einsum("hwc,hwc->hw", rgb, grad_rgb) + (1 - transmittance) * grad_alpha
+        behind = np.einsum("hwc,hwc->hw", rgb, grad_rgb) + alpha * grad_alpha
         splat_grads = composite_backward(splats, tiles, ctx.view[1], behind, grad_rgb, grad_alpha)
         grads = project_backward(gaussians, splats, splat_grads, *ctx.view)
         ctx.info.means2d_grads = torch.from_numpy(splat_grads.means2d)
-        grad_background = np.einsum("hw,hwc->c", transmittance, grad_rgb)
+        grad_background = np.einsum("hw,hwc->c", 1 - alpha, grad_rgb)
         arrays = (grads.means, grads.quats, grads.scales, splat_grads.opacities, grads.sh, grad_background)
         return *(torch.from_numpy(array) for array in arrays), None, None, None
 

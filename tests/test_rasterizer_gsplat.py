@@ -7,7 +7,20 @@ import pytest
 import torch
 
 from msdgs_serve.rasterizer import GSPLAT, rasterize
-from msdgs_serve.rasterizer.projection import Splats, project
+from msdgs_serve.rasterizer.projection import (
+    BLUE,
+    DEPTH,
+    GREEN,
+    RED,
+    ROOT_A,
+    ROOT_B,
+    ROOT_C,
+    ROOT_SCALE,
+    Splats,
+    X,
+    Y,
+    project,
+)
 from msdgs_serve.scene import Camera, Gaussians
 from tests import reference_torch
 from tests.scenes import ADVERSARIAL, as_dtype, random_scene
@@ -31,7 +44,7 @@ def gsplat_projection(gaussians: Gaussians, camera: Camera) -> reference_torch.P
 
 def conics(splats: Splats) -> np.ndarray:
     """[N, 3] xx, xy, yy of the inverse covariance from its root [[a, b], [0, c]]."""
-    a, b, c = splats.conic_roots.astype(np.float64).T
+    a, b, c = splats.records[:, [ROOT_A, ROOT_B, ROOT_C]].astype(np.float64).T / ROOT_SCALE
     return np.stack([a * a, a * b, b * b + c * c], axis=1)
 
 
@@ -43,11 +56,11 @@ def test_projection(name: str, dtype: type):
     drawn = got.extents[:, 0] > 0
     assert drawn.any()
     row = np.dtype(dtype).name
-    assert_close(got.depths[drawn], want.depths.numpy()[drawn], f"projection.{row}.relative")
-    assert_close(got.colors[drawn], want.colors.numpy()[drawn], f"color.{row}")
+    assert_close(got.records[drawn, DEPTH], want.depths.numpy()[drawn], f"projection.{row}.relative")
+    assert_close(got.records[drawn][:, [RED, GREEN, BLUE]], want.colors.numpy()[drawn], f"color.{row}")
     pixels = want.means2d.numpy()[drawn]
     size = np.maximum(np.abs(pixels), max(camera.width, camera.height))  # float32 has so many digits after the point
-    assert_close((got.means2d[drawn] - pixels) / size + 1, np.ones_like(pixels), f"projection.{row}.relative")
+    assert_close((got.records[drawn][:, [X, Y]] - pixels) / size + 1, np.ones_like(pixels), f"projection.{row}.relative")
     inverse = want.conics.numpy()[drawn]
     size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])  # of xy: the most that a covariance allows
     assert_close((conics(got)[drawn] - inverse) / size + 1, np.ones_like(inverse), f"conic.{row}.relative")

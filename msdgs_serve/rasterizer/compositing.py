@@ -1,148 +1,323 @@
 """Alpha blending of the splats of each tile, front to back (equation 2).
 
-A tile's pixels are blended together, a row of 16 at a time: each line of the inner loop is one vector operation.
-All state of a tile lives in one scratch array at fixed places: LLVM then sees that its parts do not overlap.
+A tile of 16 × 16 pixels is 16 blocks of 4 × 4, one `Lanes` each. Splats are taken 63 at a time: first each one's
+ellipse is tested against all blocks at once, then each block blends the splats that touch it, its state in registers.
 """
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.exponential import exp_nonpositive
+from msdgs_serve.rasterizer.atomic import fetch_add
+from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.projection import Splats
-from msdgs_serve.rasterizer.tiles import TILE, TileLists
-from msdgs_serve.rasterizer.view import RasterizerOptions
+from msdgs_serve.rasterizer.lanes import (
+    LANES,
+    Lanes,
+    Mask,
+    bits_of,
+    filled,
+    first_of,
+    fma,
+    load,
+    lowest_bit,
+    mark,
+    maximum,
+    minimum,
+    negative,
+    pair,
+    prefetch,
+    second_of,
+    select,
+    spread,
+    store,
+    store_square,
+    store_square_of_triples,
+)
+from msdgs_serve.rasterizer.projection import (
+    BLUE,
+    DEPTH,
+    GREEN,
+    LOG2_OPACITY,
+    RECORD,
+    RED,
+    ROOT_A,
+    ROOT_B,
+    ROOT_C,
+    SLOPE_X,
+    SLOPE_Y,
+    Splats,
+    X,
+    Y,
+)
+from msdgs_serve.rasterizer.tiles import TileLists
+from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_parallel, thread_count
 
+BLOCKS = TILE * TILE // LANES
+BLOCK_SIDE = 4
 PIXELS = TILE * TILE
-# unsigned, or numba compiles a test for negative indices into every access: 3.5x
-LANES = np.uint64(TILE)
-TRANSMITTANCE, DRAWING, RED, GREEN, BLUE, DEPTH = (np.uint64(PIXELS * place) for place in range(6))
-SPLATS_BETWEEN_CHECKS = 16
-
-
-class Blend(NamedTuple):
-    """The blended image, before division by alpha and before the background."""
-
-    rgb: np.ndarray  # [H, W, 3] sum of c alpha T
-    transmittance: np.ndarray  # [H, W] what of the background is seen
-    depth: np.ndarray  # [H, W] sum of z alpha T
-
-
-def composite(splats: Splats, tiles: TileLists, width: int, height: int, options: RasterizerOptions) -> Blend:
-    """Blend the splats into an image of the splats' dtype."""
-    dtype = splats.means2d.dtype
-    rgb, transmittance, depth = (np.empty((height, width, *more), dtype) for more in ((3,), (), ()))
-    blend = Blend(rgb, transmittance, depth)
-    limits = pixel_limits(options, dtype)
-    run_parallel(_composite_tiles, [(*chunk, splats, tiles, limits, blend) for chunk in balanced_chunks(tiles)])
-    return blend
+BATCH = 63
+NOBODY = np.uint64(1 << BATCH)
+TILES_A_TURN = 16
 
 
 class PixelLimits(NamedTuple):
     """The options that the inner loop needs, in its dtype."""
 
-    alpha_min: np.floating
+    log2_alpha_min: np.floating
     alpha_max: np.floating
     transmittance_min: np.floating
+    exp2: tuple  # coefficients of its polynomial
 
 
 def pixel_limits(options: RasterizerOptions, dtype: np.dtype) -> PixelLimits:
     """`options` as scalars of `dtype`, so that no float64 enters a float32 loop."""
     real = dtype.type
-    return PixelLimits(real(options.alpha_min), real(options.alpha_max), real(options.transmittance_min))
+    polynomial = exp2_polynomial(5 if dtype == np.float32 else 12)
+    return PixelLimits(
+        real(np.log2(options.alpha_min)),
+        real(options.alpha_max),
+        real(options.transmittance_min),
+        tuple(map(real, polynomial)),
+    )
 
 
-def balanced_chunks(tiles: TileLists) -> list[tuple[int, int]]:
-    """Ranges of tiles of about equal numbers of pairs, four a thread."""
-    parts = 4 * thread_count()
-    work = tiles.offsets + 64 * np.arange(len(tiles.offsets))  # an empty tile costs something too
-    edges = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
-    edges = np.unique(np.concatenate([[0], edges, [len(tiles.offsets) - 1]]))
-    return [(int(start), int(stop)) for start, stop in itertools.pairwise(edges)]
+class Frame(NamedTuple):
+    """What is drawn into; in the splats' dtype."""
+
+    rgb: np.ndarray  # [H, W, 3] the background included
+    alpha: np.ndarray  # [H, W] 1 - transmittance
+    depth: np.ndarray  # [H, W] mean distance along the camera axis, infinite where alpha is 0
+
+
+def composite(
+    splats: Splats, tiles: TileLists, width: int, height: int, background: np.ndarray, options: RasterizerOptions
+) -> Frame:
+    """Blend the splats into an image."""
+    dtype = splats.records.dtype
+    frame = Frame(*(np.empty((height, width, *more), dtype) for more in ((3,), (), ())))
+    limits = pixel_limits(options, dtype)
+    turn = np.zeros(1, np.int64)
+    run_parallel(
+        _composite_tiles, [(turn, splats.records, tiles, limits, background, frame) for _ in range(thread_count())]
+    )
+    return frame
 
 
 @kernel
 def _composite_tiles(
-    start: int, stop: int, splats: Splats, tiles: TileLists, limits: PixelLimits, blend: Blend
+    turn: np.ndarray,
+    records: np.ndarray,
+    tiles: TileLists,
+    limits: PixelLimits,
+    background: np.ndarray,
+    frame: Frame,
 ) -> None:
-    scratch = np.empty(6 * PIXELS, splats.means2d.dtype)
-    height, width = blend.transmittance.shape
-    for tile in range(start, stop):
-        x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
-        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
-        scratch[:] = 0
-        scratch[: 2 * PIXELS] = 1
-        since_check = 0
-        for pair in range(tiles.offsets[tile], tiles.offsets[tile + 1]):
-            _blend_splat(np.uint64(tiles.splat_ids[pair]), splats, x0, y0, rows, limits, scratch)
-            since_check += 1
-            if since_check == SPLATS_BETWEEN_CHECKS:
-                since_check = 0
-                if not is_drawing(scratch):
+    """Draw tiles, `TILES_A_TURN` of them at each turn, until all have been."""
+    real = records.dtype.type
+    count = len(tiles.offsets) - 1
+    state = np.empty(5 * PIXELS, records.dtype)
+    batch = np.zeros((BATCH + 1) * RECORD, records.dtype)
+    batch[np.uint64(BATCH * RECORD) + LOG2_OPACITY] = -np.inf
+    origin = np.zeros(RECORD, records.dtype)
+    grid = grid_of_a_tile(records)
+    alive = np.empty(BLOCKS, np.bool_)
+    touching = np.empty(BLOCKS, np.uint64)
+    height, width = frame.alpha.shape
+    flat = records.reshape(-1)
+    while True:
+        first = fetch_add(turn, TILES_A_TURN)
+        if first >= count:
+            return
+        for tile in range(first, min(first + TILES_A_TURN, count)):
+            x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
+            origin[0], origin[1] = x0, y0
+            _prefetch_tile(x0, y0, min(TILE, height - y0), frame)
+            state[:PIXELS] = 1
+            state[PIXELS:] = 0
+            alive[:] = True
+            for begin in range(tiles.offsets[tile], tiles.offsets[tile + 1], BATCH):
+                many = min(BATCH, tiles.offsets[tile + 1] - begin)
+                ahead = min(BATCH, tiles.offsets[tile + 1] - begin - many)
+                for k in range(np.uint64(begin + many), np.uint64(begin + many + ahead)):
+                    prefetch(flat, np.uint64(tiles.splat_ids[k]) * np.uint64(RECORD))
+                touching[:] = np.uint64(0)
+                for k in range(np.uint64(many)):
+                    source = np.uint64(tiles.splat_ids[np.uint64(begin) + k]) * np.uint64(RECORD)
+                    place = k * np.uint64(RECORD)
+                    store(batch, place, load(flat, source) - load(origin, 0))
+                    mark(touching, k, touched_blocks(batch, place, grid, limits.log2_alpha_min))
+                some = False
+                for block in range(np.uint64(BLOCKS)):
+                    if alive[block]:
+                        bits = touching[block]
+                        if bits != np.uint64(0):
+                            alive[block] = _blend_block(block, bits, batch, grid, limits, state)
+                        some |= alive[block]
+                if not some:
                     break
+            _write_tile(x0, y0, min(TILE, width - x0), min(TILE, height - y0), state, background, frame)
+
+
+@kernel
+def grid_of_a_tile(like: np.ndarray) -> np.ndarray:
+    """Where the 16 blocks of a tile begin, x then y, and where the 16 pixel centres of a block are, x then y.
+
+    In pixels from the corner, in the dtype of `like`.
+    """
+    grid = np.empty(4 * LANES, like.dtype)
+    for k in range(LANES):
+        column, row = k % BLOCK_SIDE, k // BLOCK_SIDE
+        grid[k], grid[LANES + k] = BLOCK_SIDE * column, BLOCK_SIDE * row
+        grid[2 * LANES + k], grid[3 * LANES + k] = column + 0.5, row + 0.5
+    return grid
+
+
+@kernel
+def _prefetch_tile(x0: int, y0: int, rows: int, frame: Frame) -> None:
+    """Fetch what the tile will be written to while it is blended: a row's pixels are a page away from the next's."""
+    width = frame.alpha.shape[1]
+    rgb, alphas, depths = frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1)
+    for row in range(rows):
+        start = (y0 + row) * width + x0
+        for third in range(3):
+            prefetch(rgb, 3 * start + third * TILE)
+        prefetch(alphas, start)
+        prefetch(depths, start)
+
+
+@kernel
+def touched_blocks(batch: np.ndarray, place: np.uint64, grid: np.ndarray, log2_alpha_min: float) -> Mask:
+    """Which of the tile's blocks have a point in the ellipse in which the splat's alpha is `alpha_min` or more.
+
+    Of a convex form's minima over a box that doesn't hold its centre, one lies on a side that faces the centre; on a
+    line the form is least where the `SLOPE`s say, or at the end of the side that is nearest to that.
+    """
+    real = batch.dtype.type
+    zero, side = spread(real(0)), real(BLOCK_SIDE)
+    low_x, low_y = load(grid, 0) - batch[place + X], load(grid, 16) - batch[place + Y]
+    high_x, high_y = low_x + side, low_y + side
+    a, b, c = spread(batch[place + ROOT_A]), spread(batch[place + ROOT_B]), spread(batch[place + ROOT_C])
+    near_x, near_y = maximum(low_x, minimum(high_x, zero)), maximum(low_y, minimum(high_y, zero))
+    best_y = maximum(low_y, minimum(high_y, near_x * batch[place + SLOPE_Y]))
+    best_x = maximum(low_x, minimum(high_x, near_y * batch[place + SLOPE_X]))
+    p, q = fma(a, near_x, b * best_y), c * best_y
+    r, s = fma(a, best_x, b * near_y), c * near_y
+    least = minimum(fma(p, p, q * q), fma(r, r, s * s))
+    reach = batch[place + LOG2_OPACITY] - log2_alpha_min
+    return least <= reach * real(1.001) + real(1e-3)
+
+
+@kernel
+def _blend_block(
+    block: np.uint64, bits: np.uint64, batch: np.ndarray, grid: np.ndarray, limits: PixelLimits, state: np.ndarray
+) -> bool:
+    """Blend the splats of the batch that `bits` names into a block; whether any of its pixels is still open.
+
+    The transmittance of a pixel that is done is kept with a minus sign.
+    """
+    real = batch.dtype.type
+    lane = block * np.uint64(LANES)
+    pixel_x, pixel_y = load(grid, 32) + grid[block], load(grid, 48) + grid[np.uint64(16) + block]
+    left = load(state, lane)
+    red, green = load(state, lane + np.uint64(PIXELS)), load(state, lane + np.uint64(2 * PIXELS))
+    blue, depth = load(state, lane + np.uint64(3 * PIXELS)), load(state, lane + np.uint64(4 * PIXELS))
+    while bits != np.uint64(0):
+        first, bits = _next(bits)
+        second, bits = _next(bits)
+        third, bits = _next(bits)
+        fourth, bits = _next(bits)
+        exponent = pair(
+            pair(log2_alpha(batch, first, pixel_x, pixel_y), log2_alpha(batch, second, pixel_x, pixel_y)),
+            pair(log2_alpha(batch, third, pixel_x, pixel_y), log2_alpha(batch, fourth, pixel_x, pixel_y)),
+        )
+        alpha = exp2(exponent, limits.exp2)
+        alpha = minimum(alpha, filled(limits.alpha_max, alpha))
+        alpha = select(exponent >= limits.log2_alpha_min, alpha, filled(0, alpha))
+        one, two = first_of(alpha), second_of(alpha)
+        weight, left = _seen(first_of(one), left, limits.transmittance_min)
+        red, green, blue, depth = _added(weight, batch, first, red, green, blue, depth)
+        weight, left = _seen(second_of(one), left, limits.transmittance_min)
+        red, green, blue, depth = _added(weight, batch, second, red, green, blue, depth)
+        weight, left = _seen(first_of(two), left, limits.transmittance_min)
+        red, green, blue, depth = _added(weight, batch, third, red, green, blue, depth)
+        weight, left = _seen(second_of(two), left, limits.transmittance_min)
+        red, green, blue, depth = _added(weight, batch, fourth, red, green, blue, depth)
+    store(state, lane, left)
+    store(state, lane + np.uint64(PIXELS), red)
+    store(state, lane + np.uint64(2 * PIXELS), green)
+    store(state, lane + np.uint64(3 * PIXELS), blue)
+    store(state, lane + np.uint64(4 * PIXELS), depth)
+    return bits_of(left > real(0)) != np.uint64(0)
+
+
+@kernel
+def log2_alpha(batch: np.ndarray, place: np.uint64, pixel_x: Lanes, pixel_y: Lanes) -> Lanes:
+    dx, dy = pixel_x - batch[place + X], pixel_y - batch[place + Y]
+    p = fma(spread(batch[place + ROOT_A]), dx, batch[place + ROOT_B] * dy)
+    q = batch[place + ROOT_C] * dy
+    return fma(-p, p, fma(-q, q, spread(batch[place + LOG2_OPACITY])))
+
+
+@kernel
+def _next(bits: np.uint64) -> tuple[np.uint64, np.uint64]:
+    """Where the record of the lowest set bit is, or that of nobody, and the bits without it."""
+    return lowest_bit(bits | NOBODY) * np.uint64(RECORD), bits & (bits - np.uint64(1))
+
+
+@kernel
+def _added(
+    weight: Lanes, batch: np.ndarray, place: np.uint64, red: Lanes, green: Lanes, blue: Lanes, depth: Lanes
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    red = fma(weight, spread(batch[place + RED]), red)
+    green = fma(weight, spread(batch[place + GREEN]), green)
+    blue = fma(weight, spread(batch[place + BLUE]), blue)
+    return red, green, blue, fma(weight, spread(batch[place + DEPTH]), depth)
+
+
+@kernel
+def _seen(alpha: Lanes, left: Lanes, transmittance_min: float) -> tuple[Lanes, Lanes]:
+    """With which weight a splat is seen, and the transmittance that it leaves."""
+    after = fma(-alpha, left, left)
+    goes_on = after > transmittance_min
+    return select(goes_on, alpha * left, filled(0, left)), select(goes_on, after, negative(left))
+
+
+@kernel
+def _write_tile(
+    x0: int, y0: int, columns: int, rows: int, state: np.ndarray, background: np.ndarray, frame: Frame
+) -> None:
+    whole = rows == TILE and columns == TILE
+    width = frame.alpha.shape[1]
+    rgb, alphas, depths = frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1)
+    infinite = spread(state.dtype.type(np.inf))
+    for block in range(np.uint64(BLOCKS)):
+        lane = block * np.uint64(LANES)
+        left = -negative(load(state, lane))
+        red = load(state, lane + np.uint64(PIXELS)) + left * background[0]
+        green = load(state, lane + np.uint64(2 * PIXELS)) + left * background[1]
+        blue = load(state, lane + np.uint64(3 * PIXELS)) + left * background[2]
+        alpha = 1 - left
+        depth = select(alpha > 0, load(state, lane + np.uint64(4 * PIXELS)) / alpha, infinite)
+        if whole:
+            x, y = x0 + BLOCK_SIDE * (block % np.uint64(4)), y0 + BLOCK_SIDE * (block // np.uint64(4))
+            start = np.int64(y) * width + np.int64(x)
+            store_square_of_triples(rgb, 3 * start, 3 * width, red, green, blue)
+            store_square(alphas, start, width, alpha)
+            store_square(depths, start, width, depth)
+        else:
+            store(state, lane, alpha)
+            store(state, lane + np.uint64(PIXELS), red)
+            store(state, lane + np.uint64(2 * PIXELS), green)
+            store(state, lane + np.uint64(3 * PIXELS), blue)
+            store(state, lane + np.uint64(4 * PIXELS), depth)
+    if not whole:
         for row in range(rows):
             for column in range(columns):
-                pixel = np.uint64(row * TILE + column)
-                blend.rgb[y0 + row, x0 + column, 0] = scratch[RED + pixel]
-                blend.rgb[y0 + row, x0 + column, 1] = scratch[GREEN + pixel]
-                blend.rgb[y0 + row, x0 + column, 2] = scratch[BLUE + pixel]
-                blend.transmittance[y0 + row, x0 + column] = scratch[TRANSMITTANCE + pixel]
-                blend.depth[y0 + row, x0 + column] = scratch[DEPTH + pixel]
-
-
-@kernel
-def is_drawing(scratch: np.ndarray) -> bool:
-    """Whether any pixel of the tile is still open."""
-    for pixel in range(DRAWING, DRAWING + np.uint64(PIXELS)):
-        if scratch[pixel] > 0:
-            return True
-    return False
-
-
-@kernel
-def row_range(y: float, extent: float, y0: int, rows: int) -> tuple[int, int]:
-    """The rows of a tile whose pixel centres lie within `extent` of `y`, as (first, past the last)."""
-    first = max(0.0, np.ceil(y - extent - 0.5 - y0))
-    past = min(float(rows), np.floor(y + extent - 0.5 - y0) + 1.0)
-    return int(min(first, float(rows))), int(max(past, 0.0))
-
-
-@kernel
-def _blend_splat(
-    i: np.uint64, splats: Splats, x0: int, y0: int, rows: int, limits: PixelLimits, scratch: np.ndarray
-) -> None:
-    real = scratch.dtype.type
-    one, half = real(1), real(0.5)
-    a, b, c = splats.conic_roots[i, 0], splats.conic_roots[i, 1], splats.conic_roots[i, 2]
-    red, green, blue = splats.colors[i, 0], splats.colors[i, 1], splats.colors[i, 2]
-    opacity, depth = splats.opacities[i], splats.depths[i]
-    # tile-relative, so that the loop counts pixels from 0
-    x = real(splats.means2d[i, 0] - x0) - half
-    y = real(splats.means2d[i, 1] - y0) - half
-    first, past = row_range(splats.means2d[i, 1], splats.extents[i, 1], y0, rows)
-    for row in range(first, past):
-        dy = real(row) - y
-        b_dy, c_dy = b * dy, c * dy
-        cc = c_dy * c_dy
-        base = np.uint64(row) * LANES
-        for lane in range(LANES):
-            pixel = base + lane
-            root = a * (real(lane) - x) + b_dy
-            alpha = opacity * exp_nonpositive(-half * (root * root + cc))
-            alpha = alpha if alpha < limits.alpha_max else limits.alpha_max
-            transmittance = scratch[TRANSMITTANCE + pixel]
-            drawing = scratch[DRAWING + pixel]
-            alpha = drawing * (alpha if alpha >= limits.alpha_min else real(0))
-            left = transmittance * (one - alpha)
-            stops = left <= limits.transmittance_min
-            alpha = real(0) if stops else alpha
-            weight = alpha * transmittance
-            scratch[DRAWING + pixel] = real(0) if stops else drawing
-            scratch[TRANSMITTANCE + pixel] = transmittance if stops else left
-            scratch[RED + pixel] += weight * red
-            scratch[GREEN + pixel] += weight * green
-            scratch[BLUE + pixel] += weight * blue
-            scratch[DEPTH + pixel] += weight * depth
+                block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
+                place = block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE
+                frame.alpha[y0 + row, x0 + column] = state[place]
+                for channel in range(3):
+                    frame.rgb[y0 + row, x0 + column, channel] = state[place + PIXELS * (channel + 1)]
+                frame.depth[y0 + row, x0 + column] = state[place + 4 * PIXELS]

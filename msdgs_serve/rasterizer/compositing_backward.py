@@ -9,33 +9,58 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msdgs_serve.rasterizer.atomic import fetch_add
 from msdgs_serve.rasterizer.compositing import (
-    DRAWING,
-    LANES,
+    BLOCK_SIDE,
+    BLOCKS,
     PIXELS,
-    SPLATS_BETWEEN_CHECKS,
-    TRANSMITTANCE,
+    TILES_A_TURN,
     PixelLimits,
-    balanced_chunks,
-    is_drawing,
+    grid_of_a_tile,
+    log2_alpha,
     pixel_limits,
-    row_range,
+    touched_blocks,
 )
-from msdgs_serve.rasterizer.exponential import exp_nonpositive
+from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.projection import Splats
-from msdgs_serve.rasterizer.tiles import TILE, TileLists
-from msdgs_serve.rasterizer.view import RasterizerOptions
-from msdgs_serve.threads import run_parallel
-
-# places in a tile's scratch after TRANSMITTANCE and DRAWING: the pixel's gradient, and what is still behind
-GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND = (np.uint64(PIXELS * place) for place in range(2, 7))
-# nine sums of a splat, a row of lanes each, in an array of their own: red, green, blue, then the moments of
-# d loss / d sigma about the splat
-SUMS = 9
-(SUM_RED, SUM_GREEN, SUM_BLUE, SUM_1, SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY) = (
-    np.uint64(TILE * place) for place in range(SUMS)
+from msdgs_serve.rasterizer.lanes import (
+    LANES,
+    bits_of,
+    filled,
+    fma,
+    load,
+    lowest_bit,
+    minimum,
+    negative,
+    select,
+    spread,
+    store,
+    sums_of,
 )
+from msdgs_serve.rasterizer.projection import (
+    BLUE,
+    GREEN,
+    LOG2_OPACITY,
+    RECORD,
+    RED,
+    ROOT_A,
+    ROOT_B,
+    ROOT_C,
+    ROOT_SCALE,
+    Splats,
+    X,
+    Y,
+)
+from msdgs_serve.rasterizer.tiles import TileLists
+from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
+from msdgs_serve.threads import run_parallel, thread_count
+
+# places in a tile's scratch: what is left of the light (with a minus sign where a pixel is done), the pixel's gradient,
+# and what is still behind
+LEFT, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND = (np.uint64(PIXELS * place) for place in range(6))
+SUMS = LANES
+"""Numbers of a pair of splat and tile, nine in use: red, green, blue, then the moments of d loss / d sigma about the
+splat: 1, x, y, xx, xy, yy."""
 
 
 class SplatGradients(NamedTuple):
@@ -62,26 +87,23 @@ def composite_backward(
         grad_rgb: [H, W, 3].
         grad_alpha: [H, W].
     """
-    dtype = splats.means2d.dtype
+    records = splats.records
+    count, dtype = len(records), records.dtype
     pair_sums = np.zeros((len(tiles.splat_ids), SUMS), dtype)
-    limits = pixel_limits(options, dtype)
-    run_parallel(
-        _tiles_backward,
-        [(*chunk, splats, tiles, limits, behind, grad_rgb, grad_alpha, pair_sums) for chunk in balanced_chunks(tiles)],
-    )
-    count = len(splats.depths)
+    turn = np.zeros(1, np.int64)
+    arguments = (turn, records, tiles, pixel_limits(options, dtype), behind, grad_rgb, grad_alpha, pair_sums)
+    run_parallel(_tiles_backward, [arguments] * thread_count())
     gradients = SplatGradients(
         np.zeros((count, 2), dtype), np.zeros((count, 3), dtype), np.zeros(count, dtype), np.zeros((count, 3), dtype)
     )
-    _gather(tiles.splat_ids, pair_sums, splats, gradients)
+    _gather(tiles.splat_ids, pair_sums, records, gradients)
     return gradients
 
 
 @kernel
 def _tiles_backward(
-    start: int,
-    stop: int,
-    splats: Splats,
+    turn: np.ndarray,
+    records: np.ndarray,
     tiles: TileLists,
     limits: PixelLimits,
     behind: np.ndarray,
@@ -89,108 +111,134 @@ def _tiles_backward(
     grad_alpha: np.ndarray,
     pair_sums: np.ndarray,
 ) -> None:
-    scratch = np.empty(7 * PIXELS, splats.means2d.dtype)
-    sums = np.empty(SUMS * TILE, splats.means2d.dtype)
+    count = len(tiles.offsets) - 1
+    state = np.empty(6 * PIXELS, records.dtype)
+    record = np.empty(RECORD, records.dtype)
+    origin = np.zeros(RECORD, records.dtype)
+    grid = grid_of_a_tile(records)
     height, width = behind.shape
-    for tile in range(start, stop):
-        x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
-        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
-        scratch[:] = 0
-        for row in range(rows):
-            for column in range(columns):
-                pixel = np.uint64(row * TILE + column)
-                scratch[TRANSMITTANCE + pixel] = 1
-                scratch[DRAWING + pixel] = 1
-                scratch[GRAD_RED + pixel] = grad_rgb[y0 + row, x0 + column, 0]
-                scratch[GRAD_GREEN + pixel] = grad_rgb[y0 + row, x0 + column, 1]
-                scratch[GRAD_BLUE + pixel] = grad_rgb[y0 + row, x0 + column, 2]
-                scratch[GRAD_ALPHA + pixel] = grad_alpha[y0 + row, x0 + column]
-                scratch[BEHIND + pixel] = behind[y0 + row, x0 + column]
-        since_check = 0
-        for pair in range(tiles.offsets[tile], tiles.offsets[tile + 1]):
-            _splat_backward(np.uint64(tiles.splat_ids[pair]), splats, x0, y0, rows, limits, scratch, sums)
-            for place in range(SUMS):
-                total = sums[place * TILE]
-                for lane in range(1, TILE):
-                    total += sums[place * TILE + lane]
-                pair_sums[pair, place] = total
-            since_check += 1
-            if since_check == SPLATS_BETWEEN_CHECKS:
-                since_check = 0
-                if not is_drawing(scratch):
-                    break
+    flat, flat_sums = records.reshape(-1), pair_sums.reshape(-1)
+    while True:
+        first = fetch_add(turn, TILES_A_TURN)
+        if first >= count:
+            return
+        for tile in range(first, min(first + TILES_A_TURN, count)):
+            x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
+            origin[0], origin[1] = x0, y0
+            state[:] = 0
+            state[:PIXELS] = 1
+            for row in range(min(TILE, height - y0)):
+                for column in range(min(TILE, width - x0)):
+                    block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
+                    pixel = np.uint64(block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE)
+                    state[GRAD_RED + pixel] = grad_rgb[y0 + row, x0 + column, 0]
+                    state[GRAD_GREEN + pixel] = grad_rgb[y0 + row, x0 + column, 1]
+                    state[GRAD_BLUE + pixel] = grad_rgb[y0 + row, x0 + column, 2]
+                    state[GRAD_ALPHA + pixel] = grad_alpha[y0 + row, x0 + column]
+                    state[BEHIND + pixel] = behind[y0 + row, x0 + column]
+            alive = np.uint64((1 << BLOCKS) - 1)
+            for pair in range(np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])):
+                store(record, 0, load(flat, np.uint64(tiles.splat_ids[pair]) * np.uint64(RECORD)) - load(origin, 0))
+                bits = alive & bits_of(touched_blocks(record, np.uint64(0), grid, limits.log2_alpha_min))
+                if bits != np.uint64(0):
+                    alive &= ~_splat_backward(bits, record, grid, limits, state, flat_sums, pair * np.uint64(SUMS))
+                    if alive == np.uint64(0):
+                        break
 
 
 @kernel
 def _splat_backward(
-    i: np.uint64,
-    splats: Splats,
-    x0: int,
-    y0: int,
-    rows: int,
+    bits: np.uint64,
+    record: np.ndarray,
+    grid: np.ndarray,
     limits: PixelLimits,
-    scratch: np.ndarray,
+    state: np.ndarray,
     sums: np.ndarray,
-) -> None:
-    real = scratch.dtype.type
-    zero, one, half = real(0), real(1), real(0.5)
-    a, b, c = splats.conic_roots[i, 0], splats.conic_roots[i, 1], splats.conic_roots[i, 2]
-    red, green, blue = splats.colors[i, 0], splats.colors[i, 1], splats.colors[i, 2]
-    opacity = splats.opacities[i]
-    x = real(splats.means2d[i, 0] - x0) - half
-    y = real(splats.means2d[i, 1] - y0) - half
-    first, past = row_range(splats.means2d[i, 1], splats.extents[i, 1], y0, rows)
-    sums[:] = 0
-    for row in range(first, past):
-        dy = real(row) - y
-        b_dy, c_dy = b * dy, c * dy
-        cc = c_dy * c_dy
-        base = np.uint64(row) * LANES
-        for lane in range(LANES):
-            pixel = base + lane
-            dx = real(lane) - x
-            root = a * dx + b_dy
-            raw_alpha = opacity * exp_nonpositive(-half * (root * root + cc))
-            alpha = raw_alpha if raw_alpha < limits.alpha_max else limits.alpha_max
-            transmittance = scratch[TRANSMITTANCE + pixel]
-            drawing = scratch[DRAWING + pixel]
-            alpha = drawing * (alpha if alpha >= limits.alpha_min else zero)
-            left = transmittance * (one - alpha)
-            stops = left <= limits.transmittance_min
-            alpha = zero if stops else alpha
-            weight = alpha * transmittance
-            scratch[DRAWING + pixel] = zero if stops else drawing
-            scratch[TRANSMITTANCE + pixel] = transmittance if stops else left
-
-            grad_red, grad_green, grad_blue = (
-                scratch[GRAD_RED + pixel],
-                scratch[GRAD_GREEN + pixel],
-                scratch[GRAD_BLUE + pixel],
+    place: np.uint64,
+) -> np.uint64:
+    """Write the sums of a splat over the blocks that `bits` names; returns those of them that are done now."""
+    zero = spread(record.dtype.type(0))
+    sum_red, sum_green, sum_blue, sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = (
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+    )
+    done = np.uint64(0)
+    while bits != np.uint64(0):
+        block = lowest_bit(bits)
+        bits &= bits - np.uint64(1)
+        lane = block * np.uint64(LANES)
+        pixel_x, pixel_y = load(grid, 32) + grid[block], load(grid, 48) + grid[np.uint64(16) + block]
+        dx, dy = pixel_x - record[X], pixel_y - record[Y]
+        left = load(state, LEFT + lane)
+        exponent = log2_alpha(record, np.uint64(0), pixel_x, pixel_y)
+        raw_alpha = exp2(exponent, limits.exp2)
+        uncut = raw_alpha < limits.alpha_max
+        alpha = minimum(raw_alpha, filled(limits.alpha_max, raw_alpha))
+        alpha = select(exponent >= limits.log2_alpha_min, alpha, zero)
+        after = fma(-alpha, left, left)
+        goes_on = after > limits.transmittance_min
+        alpha = select(goes_on, alpha, zero)
+        store(state, LEFT + lane, select(goes_on, after, negative(left)))
+        weight = alpha * left
+        grad_red, grad_green = load(state, GRAD_RED + lane), load(state, GRAD_GREEN + lane)
+        grad_blue = load(state, GRAD_BLUE + lane)
+        share = fma(grad_red, spread(record[RED]), load(state, GRAD_ALPHA + lane))
+        share = fma(grad_blue, spread(record[BLUE]), fma(grad_green, spread(record[GREEN]), share))
+        behind = fma(-weight, share, load(state, BEHIND + lane))
+        store(state, BEHIND + lane, behind)
+        grad_alpha = left * share - behind / (1 - alpha)
+        # d alpha / d sigma = -alpha where the splat is drawn and not cut to alpha_max
+        grad_sigma = select(uncut, -alpha * grad_alpha, zero)
+        sum_red, sum_green = fma(weight, grad_red, sum_red), fma(weight, grad_green, sum_green)
+        sum_blue = fma(weight, grad_blue, sum_blue)
+        along_x, along_y = grad_sigma * dx, grad_sigma * dy
+        sum_1, sum_x, sum_y = sum_1 + grad_sigma, sum_x + along_x, sum_y + along_y
+        sum_xx, sum_xy, sum_yy = fma(along_x, dx, sum_xx), fma(along_x, dy, sum_xy), fma(along_y, dy, sum_yy)
+        if bits_of(goes_on) == np.uint64(0):
+            done |= np.uint64(1) << block
+    store(
+        sums,
+        place,
+        sums_of(
+            (
+                sum_red,
+                sum_green,
+                sum_blue,
+                sum_1,
+                sum_x,
+                sum_y,
+                sum_xx,
+                sum_xy,
+                sum_yy,
+                zero,
+                zero,
+                zero,
+                zero,
+                zero,
+                zero,
+                zero,
             )
-            share = red * grad_red + green * grad_green + blue * grad_blue + scratch[GRAD_ALPHA + pixel]
-            behind = scratch[BEHIND + pixel] - weight * share
-            scratch[BEHIND + pixel] = behind
-            grad_alpha = transmittance * share - behind / (one - alpha)
-            # d alpha / d sigma = -alpha where the splat is drawn and not cut to alpha_max
-            grad_sigma = -alpha * (grad_alpha if raw_alpha < limits.alpha_max else zero)
-            sums[SUM_RED + lane] += weight * grad_red
-            sums[SUM_GREEN + lane] += weight * grad_green
-            sums[SUM_BLUE + lane] += weight * grad_blue
-            sums[SUM_1 + lane] += grad_sigma
-            sums[SUM_X + lane] += grad_sigma * dx
-            sums[SUM_Y + lane] += grad_sigma * dy
-            sums[SUM_XX + lane] += grad_sigma * dx * dx
-            sums[SUM_XY + lane] += grad_sigma * dx * dy
-            sums[SUM_YY + lane] += grad_sigma * dy * dy
+        ),
+    )
+    return done
 
 
 @kernel
-def _gather(splat_ids: np.ndarray, pair_sums: np.ndarray, splats: Splats, gradients: SplatGradients) -> None:
+def _gather(splat_ids: np.ndarray, pair_sums: np.ndarray, records: np.ndarray, gradients: SplatGradients) -> None:
     """Add up each splat's tiles, always in the same order, and turn moments into gradients."""
+    real = records.dtype.type
+    unscaled = real(1 / ROOT_SCALE)
     for pair in range(len(splat_ids)):
         i = splat_ids[pair]
         sums = pair_sums[pair]
-        a, b, c = splats.conic_roots[i, 0], splats.conic_roots[i, 1], splats.conic_roots[i, 2]
+        a, b, c = records[i, ROOT_A] * unscaled, records[i, ROOT_B] * unscaled, records[i, ROOT_C] * unscaled
         for channel in range(3):
             gradients.colors[i, channel] += sums[channel]
         # sigma = half of xx dx² + 2 xy dx dy + yy dy², with dx and dy growing as the mean falls
@@ -199,4 +247,4 @@ def _gather(splat_ids: np.ndarray, pair_sums: np.ndarray, splats: Splats, gradie
         gradients.conics[i, 0] += sums[6] / 2
         gradients.conics[i, 1] += sums[7]
         gradients.conics[i, 2] += sums[8] / 2
-        gradients.opacities[i] -= sums[3] / splats.opacities[i]
+        gradients.opacities[i] -= sums[3] / 2 ** records[i, LOG2_OPACITY]

@@ -1,48 +1,53 @@
-"""exp(x) for x <= 0, written so that LLVM can put it into vector lanes; `math.exp` is a call per lane."""
+"""2^x and log2 x of 16 numbers at once; NumPy's and the C library's are a call a number."""
 
 import math
-from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic, overload
 
-LOG2_E = np.float32(1.4426950408889634)
-LN2_HIGH = np.float32(0.693359375)  # 9 bits, so that n * LN2_HIGH is exact
-LN2_LOW = np.float32(-2.12194440e-4)
-LOWEST = np.float32(-60.0)  # far above the subnormal numbers, in which a product takes 100 times as long
-C2, C3, C4, C5, C6 = (np.float32(1 / math.factorial(n)) for n in (2, 3, 4, 5, 6))
-ONE = np.float32(1)
-HALF = np.float32(0.5)
+from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.lanes import (
+    Lanes,
+    exponent_of,
+    filled,
+    mantissa_of,
+    rounder,
+    select,
+    times_power_of_two,
+)
 
-
-def exp_nonpositive(x: Any) -> Any:
-    """exp(x), x <= 0. float32: within 2e-7 relative, and exp(-60) below -60. float64: `math.exp`."""
-    return np.exp(x)
+ATANH_SERIES = tuple(2 / math.log(2) / n for n in range(21, 0, -2))
+"""Of 2 atanh(s) / ln 2 over s, highest power of s² first."""
 
 
-@overload(exp_nonpositive, inline="always")
-def _exp_nonpositive(x: Any) -> Any:
-    def float64(x: Any) -> Any:
-        return math.exp(x)
+def exp2_polynomial(degree: int) -> tuple[float, ...]:
+    """Coefficients, highest power first, of the polynomial that meets 2^r at the Chebyshev nodes of [-1/2, 1/2].
 
-    def float32(x: Any) -> Any:
-        x = x if x > LOWEST else LOWEST
-        n = np.floor(x * LOG2_E + HALF)
-        r = x - n * LN2_HIGH - n * LN2_LOW
-        poly = ONE + r * (ONE + r * (C2 + r * (C3 + r * (C4 + r * (C5 + r * C6)))))
-        return poly * _power_of_two(np.int32(n))  # type: ignore[call-arg]  # numba passes the typing context
-
-    return float64 if x == types.float64 else float32
+    Its relative error is 3e-6 for degree 4, 1.5e-7 for degree 5, 1e-15 for degree 11.
+    """
+    interpolated = np.polynomial.Chebyshev.interpolate(np.exp2, degree, domain=[-0.5, 0.5])
+    return tuple(interpolated.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist())
 
 
-@intrinsic
-def _power_of_two(typing_context: Any, n: Any) -> Any:
-    """2^n for an int32 n in [-126, 127], by writing the exponent bits of a float32."""
+@kernel
+def exp2(x: Lanes, polynomial: tuple[float, ...]) -> Lanes:
+    """2^x where that is a normal number; what is returned for other x means nothing."""
+    rounded = x + rounder(x)
+    r = x - (rounded - rounder(x))
+    value = r * polynomial[0] + polynomial[1]
+    for coefficient in polynomial[2:]:
+        value = value * r + coefficient
+    return times_power_of_two(value, rounded)
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        biased = builder.add(args[0], ir.Constant(ir.IntType(32), 127))
-        return builder.bitcast(builder.shl(biased, ir.Constant(ir.IntType(32), 23)), ir.FloatType())
 
-    return types.float32(types.int32), codegen
+@kernel
+def log2(x: Lanes) -> Lanes:
+    """log2 of positive normal numbers, by 2 atanh((m - 1) / (m + 1)) / ln 2; within 1e-15 in float64."""
+    exponent, mantissa = exponent_of(x), mantissa_of(x)
+    upper = mantissa > math.sqrt(2)
+    exponent = select(upper, exponent + 1, exponent)
+    mantissa = select(upper, 0.5 * mantissa, mantissa)
+    s = (mantissa - 1) / (mantissa + 1)
+    value = filled(0, s)
+    for coefficient in ATANH_SERIES:
+        value = value * (s * s) + coefficient
+    return exponent + s * value

@@ -1,5 +1,7 @@
 """Spherical harmonics of one direction for the kernels: values and derivatives, degree 0 to 3."""
 
+from typing import Any
+
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
@@ -10,28 +12,26 @@ C30, C31, C32, C33, C34, C35, C36 = SH_C3
 
 
 @kernel
-def basis_into(basis: np.ndarray, x: float, y: float, z: float) -> None:
-    """Write as many basis functions as `basis` [1, 4, 9 or 16] has places, at the unit direction (x, y, z)."""
-    basis[0] = SH_C0
-    if len(basis) > 1:
-        basis[1] = -SH_C1 * y
-        basis[2] = SH_C1 * z
-        basis[3] = -SH_C1 * x
+def harmonics_above_0(x: Any, y: Any, z: Any) -> tuple:
+    """The 15 basis functions of degree 1 to 3 at the unit direction (x, y, z), numbers or `Lanes`."""
     xx, yy, zz = x * x, y * y, z * z
-    if len(basis) > 4:
-        basis[4] = C20 * x * y
-        basis[5] = C21 * y * z
-        basis[6] = C22 * (2 * zz - xx - yy)
-        basis[7] = C23 * x * z
-        basis[8] = C24 * (xx - yy)
-    if len(basis) > 9:
-        basis[9] = C30 * y * (3 * xx - yy)
-        basis[10] = C31 * x * y * z
-        basis[11] = C32 * y * (4 * zz - xx - yy)
-        basis[12] = C33 * z * (2 * zz - 3 * xx - 3 * yy)
-        basis[13] = C34 * x * (4 * zz - xx - yy)
-        basis[14] = C35 * z * (xx - yy)
-        basis[15] = C36 * x * (xx - 3 * yy)
+    return (
+        -SH_C1 * y,
+        SH_C1 * z,
+        -SH_C1 * x,
+        C20 * x * y,
+        C21 * y * z,
+        C22 * (2 * zz - xx - yy),
+        C23 * x * z,
+        C24 * (xx - yy),
+        C30 * y * (3 * xx - yy),
+        C31 * x * y * z,
+        C32 * y * (4 * zz - xx - yy),
+        C33 * z * (2 * zz - 3 * xx - 3 * yy),
+        C34 * x * (4 * zz - xx - yy),
+        C35 * z * (xx - yy),
+        C36 * x * (xx - 3 * yy),
+    )
 
 
 @kernel

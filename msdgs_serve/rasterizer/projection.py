@@ -1,48 +1,89 @@
-"""3D Gaussians to 2D splats: position, depth, inverse covariance, footprint and colour. Computed in float64, stored as
-the Gaussians' dtype: the arithmetic is once a Gaussian, and needles and giants lose nothing to cancellation."""
+"""3D Gaussians to 2D splats: position, depth, inverse covariance, footprint and colour, 16 Gaussians at a time.
+
+Computed in float64, stored as the Gaussians' dtype: the arithmetic is once a Gaussian, and needles and giants lose
+nothing to cancellation.
+"""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.harmonics import basis_into
+from msdgs_serve.rasterizer.exponential import log2
+from msdgs_serve.rasterizer.harmonics import harmonics_above_0
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
+from msdgs_serve.rasterizer.lanes import (
+    LANES,
+    Lanes,
+    bits_of,
+    converted,
+    fma,
+    load,
+    load_columns,
+    load_or,
+    lowest_bit,
+    maximum,
+    minimum,
+    select,
+    spread,
+    square_root,
+    store,
+    store_rows,
+)
+from msdgs_serve.rasterizer.view import TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
+
+RECORD = LANES
+"""Numbers that a splat's record has: one load. Their places:"""
+(X, Y, ROOT_A, ROOT_B, ROOT_C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, EXTENT_X, EXTENT_Y) = (
+    np.uint64(place) for place in range(14)
+)
+ROOT_SCALE = math.sqrt(0.5 / math.log(2))
+"""alpha = 2^(LOG2_OPACITY - |root @ d|²): the root is that of the inverse covariance times this."""
 
 
 class Splats(NamedTuple):
-    """N projected Gaussians; where `extents` is 0 nothing is drawn and the rest is 0 too."""
+    """N projected Gaussians. Of one that isn't drawn the record is 0 and the rectangle empty.
 
-    means2d: np.ndarray  # [N, 2] pixels
-    depths: np.ndarray  # [N] scene units along the camera axis
-    conic_roots: np.ndarray  # [N, 3] (a, b, c) of the root [[a, b], [0, c]] of the inverse 2D covariance, 1/px
-    extents: np.ndarray  # [N, 2] half-size of the box outside of which alpha < alpha_min, pixels
-    opacities: np.ndarray  # [N]
-    colors: np.ndarray  # [N, 3] seen from the camera, >= 0
+    A record: the mean X, Y in pixels; the root [[A, B], [0, C]] of the inverse 2D covariance times `ROOT_SCALE`²,
+    1/px; log2 of the opacity; the colour seen from the camera, 0 or more; the depth along the camera's axis, scene
+    units; where the ellipse's extreme points lie (`SLOPE_X`: dx of the least distance a unit of dy, and the other way
+    round); half the size of the box outside of which alpha < alpha_min, pixels.
+    """
+
+    records: np.ndarray  # [N, RECORD]
+    rectangles: np.ndarray  # [N, 4] uint16: columns and rows of tiles, each first and past the last
+    visible: np.ndarray  # [V] uint64: bits of the float32 depth above the index of each splat that is drawn
+
+    @property
+    def extents(self) -> np.ndarray:
+        """[N, 2] half of the footprint's box in pixels, 0 where nothing is drawn."""
+        return self.records[:, EXTENT_X : EXTENT_Y + 1]
 
 
 def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) -> Splats:
     """Project N Gaussians into the camera's image."""
     count, dtype = len(gaussians), gaussians.means.dtype
-    splats = Splats(
-        means2d=np.zeros((count, 2), dtype),
-        depths=np.zeros(count, dtype),
-        conic_roots=np.zeros((count, 3), dtype),
-        extents=np.zeros((count, 2), dtype),
-        opacities=gaussians.opacities,
-        colors=np.zeros((count, 3), dtype),
-    )
     view = view_of(camera, options)
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    run_parallel(
+    records = np.empty((count, RECORD), dtype)
+    rectangles = np.empty((count, 4), np.uint16)
+    keys = np.empty(count, np.uint64)
+    groups = split_evenly(-(-count // LANES), 2 * thread_count())
+    ranges = [(first * LANES, min(past * LANES, count)) for first, past in groups]
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    sh = gaussians.sh.reshape(count, -1)
+    visible = run_parallel(
         _project_range,
-        [(start, stop, view, *arrays, splats) for start, stop in split_evenly(count, 2 * thread_count())],
+        [
+            (start, stop, view, *arrays, sh, records, rectangles, keys)
+            for start, stop in ranges
+        ],
     )
-    return splats
+    parts = [keys[start : start + found] for (start, _), found in zip(ranges, visible, strict=True)]
+    return Splats(records, rectangles, np.concatenate(parts))
 
 
 @kernel
@@ -55,111 +96,165 @@ def _project_range(
     scales: np.ndarray,
     opacities: np.ndarray,
     sh: np.ndarray,
-    splats: Splats,
-) -> None:
-    basis = np.empty(sh.shape[1], np.float64)
-    half_axes = np.empty((2, 3), np.float64)
-    rotation = np.empty((3, 3), np.float64)
-    for i in range(start, stop):
-        x, y, z = to_camera(view, means, i)
-        if not z > view.near_plane or not opacities[i] >= view.alpha_min:
-            continue
-        project_axes(view, quats, scales, i, x, y, z, rotation, half_axes)
-        cov_xx, cov_xy, cov_yy, det = covariance2d(half_axes, view.eps2d)
-        if not (det > 0 and det < np.inf):
-            continue
-        # alpha_min <= opacity exp(-sigma) bounds sigma, and the ellipse of that sigma has this bounding box
-        max_sigma = math.log(float(opacities[i]) / view.alpha_min)
-        extent_x = math.sqrt(2 * max_sigma * cov_xx) * 1.0001 + 1e-3
-        extent_y = math.sqrt(2 * max_sigma * cov_yy) * 1.0001 + 1e-3
-        u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-        if u + extent_x < 0 or u - extent_x > view.width or v + extent_y < 0 or v - extent_y > view.height:
-            continue
-        splats.means2d[i, 0], splats.means2d[i, 1] = u, v
-        splats.depths[i] = z
-        # a sum of two squares, |root @ d|², keeps its digits along a needle where the quadratic form cancels
-        splats.conic_roots[i, 0] = math.sqrt(cov_yy / det)
-        splats.conic_roots[i, 1] = -cov_xy / math.sqrt(det * cov_yy)
-        splats.conic_roots[i, 2] = 1 / math.sqrt(cov_yy)
-        splats.extents[i, 0], splats.extents[i, 1] = extent_x, extent_y
-        dx, dy, dz = means[i, 0] - view.position[0], means[i, 1] - view.position[1], means[i, 2] - view.position[2]
-        distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-        basis_into(basis, dx / distance, dy / distance, dz / distance)
-        red, green, blue = raw_color(basis, sh, i)
-        splats.colors[i, 0], splats.colors[i, 1], splats.colors[i, 2] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
-
-
-@kernel
-def raw_color(basis: np.ndarray, sh: np.ndarray, i: int) -> tuple[float, float, float]:
-    """SH + 0.5 of the i-th Gaussian, before the clamp at 0."""
-    red, green, blue = 0.5, 0.5, 0.5
-    for k in range(len(basis)):
-        red += basis[k] * sh[i, k, 0]
-        green += basis[k] * sh[i, k, 1]
-        blue += basis[k] * sh[i, k, 2]
-    return red, green, blue
-
-
-@kernel
-def to_camera(view: View, means: np.ndarray, i: int) -> tuple[float, float, float]:
-    """The i-th mean in camera axes."""
+    records: np.ndarray,
+    rectangles: np.ndarray,
+    keys: np.ndarray,
+) -> int:
+    """Splats `start` to `stop`; the number of those that are drawn, whose keys are written from `start`."""
+    real = records.dtype.type
+    zero = spread(real(0))
+    double = np.empty(1, np.float64)
+    boxes = np.empty(5 * LANES, records.dtype)
+    scratch = np.empty(48 * LANES, sh.dtype)
     r, t = view.rotation, view.translation
-    a, b, c = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
-    x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c + t[0]
-    y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c + t[1]
-    z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c + t[2]
-    return x, y, z
+    found = start
+    for first in range(start, stop, LANES):
+        columns = load_columns(means, first, 0)
+        wx, wy, wz = converted(columns[0], double), converted(columns[1], double), converted(columns[2], double)
+        opacity = converted(load_or(opacities, first, spread(opacities.dtype.type(0))), double)
+        x = fma(spread(r[0, 0]), wx, fma(spread(r[0, 1]), wy, fma(spread(r[0, 2]), wz, spread(t[0]))))
+        y = fma(spread(r[1, 0]), wx, fma(spread(r[1, 1]), wy, fma(spread(r[1, 2]), wz, spread(t[1]))))
+        z = fma(spread(r[2, 0]), wx, fma(spread(r[2, 1]), wy, fma(spread(r[2, 2]), wz, spread(t[2]))))
+        drawn = (z > view.near_plane) & (opacity >= view.alpha_min)
+        if bits_of(drawn) == np.uint64(0):
+            _store_nothing(records, first)
+            continue
+        per_z = 1 / z
+        slope_x, slope_y = x * per_z, y * per_z
+        j00, j11 = view.fx * per_z, view.fy * per_z
+        j02 = -j00 * maximum(minimum(slope_x, spread(view.max_x)), spread(view.min_x))
+        j12 = -j11 * maximum(minimum(slope_y, spread(view.max_y)), spread(view.min_y))
+        qs = load_columns(quats, first, 0)
+        qw, qx = converted(qs[0], double), converted(qs[1], double)
+        qy, qz = converted(qs[2], double), converted(qs[3], double)
+        ss = load_columns(scales, first, 0)
+        mx0, my0 = _half_axis(
+            r, j00, j02, j11, j12, 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
+        )
+        mx1, my1 = _half_axis(
+            r, j00, j02, j11, j12, 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
+        )
+        mx2, my2 = _half_axis(
+            r, j00, j02, j11, j12, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
+        )
+        s0, s1, s2 = converted(ss[0], double), converted(ss[1], double), converted(ss[2], double)
+        mx0, my0, mx1, my1, mx2, my2 = mx0 * s0, my0 * s0, mx1 * s1, my1 * s1, mx2 * s2, my2 * s2
+        # the determinant is a sum of squares (Cauchy-Binet), so that a needle of 1e6 : 1 keeps its digits
+        xx, yy = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, my0 * my0 + my1 * my1 + my2 * my2
+        xy = mx0 * my0 + mx1 * my1 + mx2 * my2
+        d0, d1, d2 = mx1 * my2 - mx2 * my1, mx2 * my0 - mx0 * my2, mx0 * my1 - mx1 * my0
+        det = d0 * d0 + d1 * d1 + d2 * d2 + view.eps2d * (xx + yy) + view.eps2d * view.eps2d
+        xx, yy = xx + view.eps2d, yy + view.eps2d
+        # from here on in the records' dtype: ratios, roots and sums of the above lose nothing in float32
+        u, v = converted(view.fx * slope_x + view.cx, records), converted(view.fy * slope_y + view.cy, records)
+        slope_h, slope_v = converted(xy / yy, records), converted(xy / xx, records)
+        # alpha_min <= 2^(log2_opacity - |root @ d|²) bounds the distance; that ellipse has this bounding box
+        log2_opacity = log2(maximum(converted(opacity, records), spread(real(view.alpha_min))))
+        reach = (log2_opacity - view.log2_alpha_min) * (2 * math.log(2))
+        extent_x = square_root(reach * converted(xx, records)) * 1.0001 + 1e-3
+        extent_y = square_root(reach * converted(yy, records)) * 1.0001 + 1e-3
+        drawn = drawn & (det > 0) & (det < np.inf)
+        drawn = drawn & (u + extent_x >= 0) & (u - extent_x <= view.width)
+        drawn = drawn & (v + extent_y >= 0) & (v - extent_y <= view.height)
+        bits = bits_of(drawn)
+        if bits == np.uint64(0):
+            _store_nothing(records, first)
+            continue
+        # a sum of two squares, |root @ d|², keeps its digits along a needle where the quadratic form cancels
+        root_a = square_root(converted(yy / det, records))
+        root_b = -slope_h * root_a
+        root_c = 1 / square_root(converted(yy, records))
+        dx = converted(wx - view.position[0], records)
+        dy = converted(wy - view.position[1], records)
+        dz = converted(wz - view.position[2], records)
+        per_distance = 1 / square_root(dx * dx + dy * dy + dz * dz)
+        red, green, blue = _colors(sh, first, scratch, dx * per_distance, dy * per_distance, dz * per_distance)
+        store_rows(
+            records,
+            first,
+            (
+                select(drawn, u, zero),
+                select(drawn, v, zero),
+                select(drawn, ROOT_SCALE * root_a, zero),
+                select(drawn, ROOT_SCALE * root_b, zero),
+                select(drawn, ROOT_SCALE * root_c, zero),
+                select(drawn, log2_opacity, zero),
+                select(drawn, red, zero),
+                select(drawn, green, zero),
+                select(drawn, blue, zero),
+                select(drawn, converted(z, records), zero),
+                select(drawn, slope_h, zero),
+                select(drawn, slope_v, zero),
+                select(drawn, extent_x, zero),
+                select(drawn, extent_y, zero),
+                zero,
+                zero,
+            ),
+        )
+        scale, past_column, past_row = 1 / TILE, spread(real(view.tile_columns)), spread(real(view.tile_rows))
+        # clamped as floats: a giant's bounds do not fit an integer
+        store(boxes, 0, maximum(scale * (u - extent_x), zero))
+        store(boxes, 16, minimum(scale * (u + extent_x) + 1, past_column))
+        store(boxes, 32, maximum(scale * (v - extent_y), zero))
+        store(boxes, 48, minimum(scale * (v + extent_y) + 1, past_row))
+        store(boxes, 64, converted(z, records))
+        while bits != np.uint64(0):
+            lane = lowest_bit(bits)
+            bits &= bits - np.uint64(1)
+            i = np.uint64(first) + lane
+            for side in range(np.uint64(4)):
+                rectangles[i, side] = np.uint16(boxes[np.uint64(LANES) * side + lane])
+            keys[np.uint64(found)] = (depth_bits(boxes[lane + np.uint64(64)]) << np.uint64(32)) | i
+            found += 1
+    return found - start
 
 
 @kernel
-def clamped(value: float, low: float, high: float) -> float:
-    """`value`, cut to [low, high]."""
-    return min(max(value, low), high)
+def depth_bits(depth: float) -> np.uint64:
+    """The bits of a depth as a float32: of positive ones they sort as the numbers do."""
+    return np.uint64(np.float32(depth).view(np.uint32))
 
 
 @kernel
-def rotation_into(rotation: np.ndarray, w: float, x: float, y: float, z: float) -> None:
-    """Write the rotation matrix [3, 3] of a unit quaternion."""
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+def _store_nothing(records: np.ndarray, first: int) -> None:
+    zero = spread(records.dtype.type(0))
+    store_rows(
+        records,
+        first,
+        (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero),
+    )
 
 
 @kernel
-def project_axes(
-    view: View,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    i: int,
-    x: float,
-    y: float,
-    z: float,
-    rotation: np.ndarray,
-    half_axes: np.ndarray,
-) -> None:
-    """Write R [3, 3] and J W R S [2, 3]: the three half-axes of Gaussian i as vectors in the image, pixels."""
-    w = view.rotation
-    j00, j02 = view.fx / z, -view.fx * clamped(x / z, view.min_x, view.max_x) / z
-    j11, j12 = view.fy / z, -view.fy * clamped(y / z, view.min_y, view.max_y) / z
-    rotation_into(rotation, float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3]))
-    for k in range(3):
-        a, b, c = rotation[0, k], rotation[1, k], rotation[2, k]
-        depth = w[2, 0] * a + w[2, 1] * b + w[2, 2] * c
-        half_axes[0, k] = (j00 * (w[0, 0] * a + w[0, 1] * b + w[0, 2] * c) + j02 * depth) * scales[i, k]
-        half_axes[1, k] = (j11 * (w[1, 0] * a + w[1, 1] * b + w[1, 2] * c) + j12 * depth) * scales[i, k]
+def _half_axis(
+    r: np.ndarray, j00: Lanes, j02: Lanes, j11: Lanes, j12: Lanes, a: Lanes, b: Lanes, c: Lanes
+) -> tuple[Lanes, Lanes]:
+    """J W of a world vector (a, b, c): x and y in the image."""
+    depth = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
+    x = j00 * (r[0, 0] * a + r[0, 1] * b + r[0, 2] * c) + j02 * depth
+    y = j11 * (r[1, 0] * a + r[1, 1] * b + r[1, 2] * c) + j12 * depth
+    return x, y
 
 
 @kernel
-def covariance2d(half_axes: np.ndarray, eps2d: float) -> tuple[float, float, float, float]:
-    """xx, xy, yy and determinant of M Mᵀ + eps2d I for half-axes M [2, 3].
-
-    The determinant is a sum of squares (Cauchy-Binet), so that a needle of 1e6 : 1 keeps its digits.
-    """
-    m = half_axes
-    xx = m[0, 0] * m[0, 0] + m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2]
-    xy = m[0, 0] * m[1, 0] + m[0, 1] * m[1, 1] + m[0, 2] * m[1, 2]
-    yy = m[1, 0] * m[1, 0] + m[1, 1] * m[1, 1] + m[1, 2] * m[1, 2]
-    a = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-    b = m[0, 2] * m[1, 0] - m[0, 0] * m[1, 2]
-    c = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-    return xx + eps2d, xy, yy + eps2d, a * a + b * b + c * c + eps2d * (xx + yy) + eps2d * eps2d
+def _colors(
+    sh: np.ndarray, first: int, scratch: np.ndarray, x: Lanes, y: Lanes, z: Lanes
+) -> tuple[Lanes, Lanes, Lanes]:
+    """SH + 0.5 towards the unit directions (x, y, z), cut at 0; `sh` is [N, 3 coefficients]."""
+    width = sh.shape[1]
+    for window in range(0, width, LANES):
+        columns = load_columns(sh, first, window)
+        for k in range(LANES):
+            store(scratch, np.uint64((window + k) * LANES), columns[k])
+    red = SH_C0 * load(scratch, 0) + 0.5
+    green = SH_C0 * load(scratch, 16) + 0.5
+    blue = SH_C0 * load(scratch, 32) + 0.5
+    if width > 3:
+        basis = harmonics_above_0(x, y, z)
+        for k in range(1, width // 3):
+            place = np.uint64(48 * k)
+            red = fma(load(scratch, place), basis[k - 1], red)
+            green = fma(load(scratch, place + np.uint64(16)), basis[k - 1], green)
+            blue = fma(load(scratch, place + np.uint64(32)), basis[k - 1], blue)
+    zero = spread(sh.dtype.type(0))
+    return maximum(red, zero), maximum(green, zero), maximum(blue, zero)

@@ -42,11 +42,7 @@ def rasterize(
         raise InvalidInput("background", "3 finite numbers", background.tolist())
     splats = project(gaussians, camera, options)
     tiles = bin_into_tiles(splats, camera.width, camera.height)
-    blend = composite(splats, tiles, camera.width, camera.height, options)
-    alpha = 1 - blend.transmittance
-    depth = np.full_like(alpha, np.inf)
-    np.divide(blend.depth, alpha, out=depth, where=alpha > 0)
-    return Rendering(blend.rgb + blend.transmittance[..., None] * background, alpha, depth)
+    return Rendering(*composite(splats, tiles, camera.width, camera.height, background, options))
 
 
 def _kernel_arrays(gaussians: Gaussians) -> Gaussians:

@@ -1,11 +1,16 @@
 """What the kernels need to know of a camera, and the constants of a rasterizer."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
+
+
+TILE = 16
+"""Pixels along a tile's side."""
 
 
 class RasterizerOptions(NamedTuple):
@@ -42,6 +47,9 @@ class View(NamedTuple):
     near_plane: float
     eps2d: float
     alpha_min: float
+    log2_alpha_min: float
+    tile_columns: int
+    tile_rows: int
 
 
 def view_of(camera: Camera, options: RasterizerOptions) -> View:
@@ -66,6 +74,9 @@ def view_of(camera: Camera, options: RasterizerOptions) -> View:
         near_plane=float(options.near_plane),
         eps2d=float(options.eps2d),
         alpha_min=float(options.alpha_min),
+        log2_alpha_min=math.log2(options.alpha_min),
+        tile_columns=-(-int(camera.width) // TILE),
+        tile_rows=-(-int(camera.height) // TILE),
     )
 
 
