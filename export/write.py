@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from export import plans
 from export.bake import Baked, bake
+from export.plans import build
 from export.verify import TIMES, TOLERANCE, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
@@ -74,7 +74,7 @@ def _beside(output: Path) -> Iterator[Path]:
 
 def _write(path: Path, baked: Baked) -> None:
     with path.open("wb") as file:
-        file.write(plans.network(baked).SerializeToString())
+        file.write(build("network", baked).SerializeToString())
         file.flush()
         os.fsync(file.fileno())
 

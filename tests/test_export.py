@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from export.bake import ModelNotExportable, bake, starting_cameras
-from export.plans import network
+from export.plans import build
 from export.to_onnx import main
 from export.verify import VerificationFailed, times_to_verify, verify
 from export.write import export_scene
@@ -145,7 +145,7 @@ def test_a_file_is_no_larger_than_what_it_stores():
     model = random_model(2000)
     gaussian = 4 * (48 + 1 + 3 + 3 + 4 + 3) + 8  # SH, opacity, mean, log-scale, quaternion, modulation; id
     weights = 4 * sum(p.numel() for p in model.deformation.parameters())
-    size = len(network(bake(model, SCENE, "0" * 64)).SerializeToString())
+    size = len(build("network", bake(model, SCENE, "0" * 64)).SerializeToString())
     assert 2000 * gaussian + weights < size < 2000 * gaussian + weights + 30_000
 
 

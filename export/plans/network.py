@@ -1,21 +1,13 @@
-"""Plans: ways to compute a scene's deformation in an ONNX graph. All keep the contract `msdgs/1`.
-
-`network`, the one here, computes all layers in float32 as the model does.
-
-A graph deforms the ids that it is given in one go; the loop over chunks of ids, which keeps memory independent of the
-scene's size, is in the reader (`msdgs_serve.deformation`), where the chunks also run side by side.
-"""
+"""Plan `network`: all layers in float32 as the model computes them."""
 
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto
 
 from export.bake import Baked, Layer, Moving
 from export.graph import GraphBuilder, to_numpy
 from export.plane_graph import plane_heads
-from msdgs_serve.scene.baked import BakedScene
-from msdgs_serve.scene.quaternion import MIN_NORM
+from export.plans.scene_graph import finished, new_graph, unit_quats
 from msdgs_train.layers import MLPLayer
 from msdgs_train.model import LOG_SCALE_LIMIT
 
@@ -23,27 +15,11 @@ DELTA_COLUMNS = 10
 """Means 3, log_scales 3, quats 4: the order of `MLPLayer.heads`, whose last column is the weight."""
 
 
-def network(baked: Baked) -> onnx.ModelProto:
-    """The scene with all its layers, exactly as trained. Without moving Gaussians the graph has no nodes at all."""
-    graph = GraphBuilder()
-    graph.constant("ids", np.arange(len(baked.moving), dtype=np.int64))
-    if len(baked.moving):
-        _deform(graph, baked.moving, baked.layers)
-    else:
-        for name, columns in (("means", 3), ("quats", 4), ("scales", 3)):
-            graph.constant(name, np.empty((0, columns), np.float32))
-    return _finish(graph, baked.scene)
-
-
-def _finish(graph: GraphBuilder, scene: BakedScene) -> onnx.ModelProto:
-    count: int | str = "M" if scene.moving_count else 0
-    outputs: dict[str, list[int | str]] = {"means": [count, 3], "quats": [count, 4], "scales": [count, 3]}
-    for name in ("static_means", "static_quats", "static_scales", "opacities", "sh"):
-        array = getattr(scene, name)
-        graph.constant(name, array)
-        outputs[name] = list(array.shape)
-    inputs = {"t": (TensorProto.FLOAT, [1]), "ids": (TensorProto.INT64, ["M"])}
-    return graph.model(inputs, outputs, scene.metadata.to_properties())
+def network(baked: Baked, plan: str = "network") -> onnx.ModelProto:
+    """The scene with all its layers, exactly as trained."""
+    graph = new_graph(baked)
+    _deform(graph, baked.moving, baked.layers)
+    return finished(graph, baked, plan)
 
 
 def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...]) -> None:
@@ -75,7 +51,7 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...]) -> N
     ]
     bounded = graph.node("Clip", [log_scales, *limits], "log_scales.bounded")
     graph.node("Exp", [bounded], "scales")
-    _unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
+    unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
 
 
 def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str) -> str:
@@ -128,13 +104,3 @@ def _linear(graph: GraphBuilder, name: str, linear: torch.nn.Module, value: str)
     weight = graph.constant(f"{name}.weight", to_numpy(linear.weight))
     bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
     return graph.node("Gemm", [value, weight, bias], f"{name}.out", transB=1)
-
-
-def _unit_quats(graph: GraphBuilder, raw: str) -> None:
-    """Unit length; identity where the norm is under 1e-8: `msdgs_train.model.unit_quats`."""
-    axis = graph.constant("quats.axis", np.array([1], np.int64))
-    least = graph.constant("quats.min_norm", np.array(MIN_NORM, np.float32))
-    identity = graph.constant("quats.identity", np.array([[1, 0, 0, 0]], np.float32))
-    norms = graph.node("ReduceL2", [raw, axis], "quats.norms", keepdims=1)
-    scaled = graph.node("Div", [raw, graph.node("Max", [norms, least], "quats.divisors")], "quats.scaled")
-    graph.node("Where", [graph.node("Less", [norms, least], "quats.tiny"), identity, scaled], "quats")
