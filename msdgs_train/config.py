@@ -55,6 +55,10 @@ class TrainConfig:
     """Of the mean squared second difference along time of the grids of plane layers."""
     plane_slopes_weight: float = 1e-4
     """Of the mean squared first difference along space."""
+    plane_space_bends_weight: float = 0.0
+    """Of the mean squared second difference along space, which 4DGS has instead."""
+    plane_time_l1_weight: float = 0.0
+    """Of the mean distance of the planes over time from 1, where they change nothing; 4DGS has it."""
 
     means_rate_start: float = 8e-4
     """Learning rate of the canonical centres, in scene units; Adam moves a centre by about this much a step."""
@@ -121,7 +125,8 @@ class TrainConfig:
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
         self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
-        for name in ("rigidity_weight", "plane_bends_weight", "plane_slopes_weight"):
+        more = ("plane_space_bends_weight", "plane_time_l1_weight")
+        for name in ("rigidity_weight", "plane_bends_weight", "plane_slopes_weight", *more):
             self._require(name, "finite and 0 or above", lambda v: 0 <= v < math.inf)
         for name in ("densify_gradient", "split_scale", "prune_scale"):
             self._require(name, "finite and above 0", lambda v: 0 < v < math.inf)

@@ -52,8 +52,8 @@ def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
 def make_optimizer(model: DynamicGaussians, config: TrainConfig) -> torch.optim.Adam:
     """One Adam; a group for each attribute of the Gaussians, one for the deformation, one for the modulation."""
     named: dict[str, list[nn.Parameter]] = {name: [p] for name, p in model.gaussians.named_parameters()}
-    named["grids"] = [grid for layer in model.plane_layers() for grid in (layer.space, layer.time)]
-    grids = {id(grid) for grid in named["grids"]}
+    named["grids"] = [planes for grid in model.plane_grids() for planes in (grid.space, grid.time)]
+    grids = {id(planes) for planes in named["grids"]}
     named["deformation"] = [p for p in model.deformation.parameters() if id(p) not in grids]
     if model.modulation is not None:
         named["modulation"] = list(model.modulation.parameters())

@@ -176,16 +176,21 @@ class Trainer:
             means = self.model.gaussians.means
             stretched = stretch(means, posed.means, self._half_extent, self._pairs_generator)
             total = total + c.rigidity_weight * stretched
-        for layer in self.model.plane_layers():
-            bends, slopes = layer.roughness()
-            total = total + c.plane_bends_weight * bends + c.plane_slopes_weight * slopes
+        for grid in self.model.plane_grids():
+            for weight, roughness in (
+                (c.plane_bends_weight, grid.time_bends),
+                (c.plane_time_l1_weight, grid.time_offsets),
+                (c.plane_slopes_weight, grid.space_slopes),
+                (c.plane_space_bends_weight, grid.space_bends),
+            ):
+                total = total + weight * roughness() if weight else total
         return total
 
     def _widen_window(self) -> None:
         before, after = self._window(self.step_count - 1), self._window(self.step_count)
         if before < after:
-            for layer in self.model.plane_layers():
-                layer.carry_outwards(before, after)
+            for grid in self.model.plane_grids():
+                grid.carry_outwards(before, after)
 
     def _next_frame(self) -> Frame:
         """From a shuffled pass over the photographs of the time window, one pass after the other.

@@ -9,20 +9,20 @@ from export.graph import GraphBuilder, to_numpy
 from export.plane_graph import plane_heads
 from export.plans.scene_graph import finished, new_graph, unit_quats
 from msdgs_train.layers import MLPLayer
-from msdgs_train.model import LOG_SCALE_LIMIT
+from msdgs_train.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
 
 DELTA_COLUMNS = 10
-"""Means 3, log_scales 3, quats 4: the order of `MLPLayer.heads`, whose last column is the weight."""
+"""Means 3, scales 3, quats 4: the order of `Heads.sizes`, whose last column, if there is one, is the weight."""
 
 
 def network(baked: Baked, plan: str = "network") -> onnx.ModelProto:
     """The scene with all its layers, exactly as trained."""
     graph = new_graph(baked)
-    _deform(graph, baked.moving, baked.layers)
+    _deform(graph, baked.moving, baked.layers, baked.scene.metadata.delta_space)
     return finished(graph, baked, plan)
 
 
-def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...]) -> None:
+def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...], delta_space: str) -> None:
     """Canonical values of the ids, moved by each layer in turn, then activated: `DynamicGaussians.pose`."""
     means = graph.node("Gather", [graph.constant("canonical_means", moving.means), "ids"], "ids.means")
     log_scales = graph.node(
@@ -36,60 +36,90 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...]) -> N
         name = f"layer{k}"
         step = _layer(graph, name, layer, moved, time)  # equation 7
         deltas = graph.node("Add", [deltas, step], f"{name}.deltas") if deltas else step  # equation 9
-        parts = graph.split(deltas, [f"{name}.means", f"{name}.log_scales", f"{name}.quats"], [3, 3, 4])
-        moved = graph.node("Add", [means, parts[0]], f"{name}.moved" if k < len(layers) else "means")  # equation 8
+        parts = graph.split(deltas, [f"{name}.means", f"{name}.scales", f"{name}.quats"], [3, 3, 4])
+        if k < len(layers):
+            moved = graph.node("Add", [means, parts[0]], f"{name}.moved")  # equation 8
 
-    _, delta_log_scales, delta_quats = parts
-    if moving.scale_modulation is not None:
-        modulation = graph.constant("scale_modulation", moving.scale_modulation)
-        factors = graph.node("Gather", [modulation, "ids"], "ids.scale_modulation")
-        delta_log_scales = graph.node("Mul", [factors, delta_log_scales], "modulated")  # equation 12
-    log_scales = graph.node("Add", [log_scales, delta_log_scales], "log_scales")
+    delta_means = _modulated(graph, "mean_modulation", moving.mean_modulation, parts[0])
+    delta_scales = _modulated(graph, "scale_modulation", moving.scale_modulation, parts[1])
+    delta_quats = _modulated(graph, "quat_modulation", moving.quat_modulation, parts[2])
+    graph.node("Add", [means, delta_means], "means")
+    _scales(graph, log_scales, delta_scales, delta_space)
+    unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
+
+
+def _modulated(graph: GraphBuilder, name: str, factors: np.ndarray | None, deltas: str) -> str:
+    """Equation 12: the summed deltas times the factors of the ids, if there are any."""
+    if factors is None:
+        return deltas
+    rows = graph.node("Gather", [graph.constant(name, factors), "ids"], f"ids.{name}")
+    return graph.node("Mul", [rows, deltas], f"{name}.applied")
+
+
+def _scales(graph: GraphBuilder, log_scales: str, deltas: str, delta_space: str) -> None:
+    """The output `scales`: deltas are added before or after the exponential."""
     limits = [
         graph.constant(f"log_scales.{name}", np.array(limit, np.float32))
         for name, limit in (("min", -LOG_SCALE_LIMIT), ("max", LOG_SCALE_LIMIT))
     ]
-    bounded = graph.node("Clip", [log_scales, *limits], "log_scales.bounded")
-    graph.node("Exp", [bounded], "scales")
-    unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
+    if delta_space == "raw":
+        log_scales = graph.node("Add", [log_scales, deltas], "log_scales")
+        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "scales")
+    else:
+        canonical = graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "ids.scales")
+        least = graph.constant("scales.min", np.array(SMALLEST_SCALE, np.float32))
+        graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], "scales")
 
 
 def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str) -> str:
-    """One layer at the means [M, 3]: its deltas, [M, 10], times its weight."""
+    """One layer at the means [M, 3]: its deltas, [M, 10], times its weight if it predicts one."""
     if isinstance(layer, MLPLayer):
         heads = _mlp_heads(graph, name, layer, means, time)
     else:
         heads = plane_heads(graph, name, layer, means, time)
+    if not layer.outputs.weight:
+        return heads
     deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [DELTA_COLUMNS, 1])
     weight = graph.node("Sigmoid", [logit], f"{name}.weight")
     return graph.node("Mul", [weight, deltas], f"{name}.weighted")
 
 
 def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str) -> str:
-    """[M, 11] what the heads of one layer say of means [M, 3]: deltas, and the weight before its sigmoid."""
-    encoded = _encode(graph, f"{name}.xyz", means, layer.xyz_octaves)
-    first = to_numpy(layer.first.weight)
-    weight_xyz = graph.constant(f"{name}.first.weight_xyz", first[:, : layer.xyz_features])
-    hidden = graph.node(
-        "Gemm", [encoded, weight_xyz, _time_bias(graph, name, layer, time)], f"{name}.first.out", transB=1
-    )
+    """[M, 10 or 11] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
+    encoded, code = _encode(graph, f"{name}.xyz", means, layer.xyz_octaves), _time_code(graph, name, layer, time)
+    hidden = _read_input(graph, f"{name}.first", layer, layer.first, encoded, code)
     hidden = graph.node("Relu", [hidden], f"{name}.first.relu")
     for i, linear in enumerate(layer.trunk):
-        hidden = _linear(graph, f"{name}.trunk{i}", linear, hidden)
-        hidden = graph.node("Relu", [hidden], f"{name}.trunk{i}.relu")
+        trunk = f"{name}.trunk{i}"
+        if i + 1 == layer.skip:
+            read = _read_input(graph, trunk, layer, linear, encoded, code)
+            weight = graph.constant(f"{trunk}.weight", to_numpy(linear.weight)[:, layer.input_features :])
+            out = graph.node("Gemm", [hidden, weight, read], f"{trunk}.out", transB=1)
+        else:
+            out = _linear(graph, trunk, linear, hidden)
+        hidden = graph.node("Relu", [out], f"{trunk}.relu")
     return _linear(graph, f"{name}.heads", layer.heads, hidden)
 
 
-def _time_bias(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:
-    """[1, width] what time adds to the first Linear, its bias included: one row a call, whatever the number of ids."""
+def _time_code(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:
+    """[1, time_features] what the layer knows of the time: one row a call, whatever the number of ids."""
     encoded = _encode(graph, f"{name}.time", time, layer.time_octaves)
     hidden = graph.node(
         "Relu", [_linear(graph, f"{name}.time_hidden", layer.time_hidden, encoded)], f"{name}.time_relu"
     )
-    features = _linear(graph, f"{name}.time_output", layer.time_output, hidden)
-    weight = graph.constant(f"{name}.first.weight_time", to_numpy(layer.first.weight)[:, layer.xyz_features :])
-    bias = graph.constant(f"{name}.first.bias", to_numpy(layer.first.bias))
-    return graph.node("Gemm", [features, weight, bias], f"{name}.time_bias", transB=1)
+    return _linear(graph, f"{name}.time_output", layer.time_output, hidden)
+
+
+def _read_input(
+    graph: GraphBuilder, name: str, layer: MLPLayer, linear: torch.nn.Module, encoded: str, code: str
+) -> str:
+    """[M, width] the part of a Linear that reads encoded means and, as a bias of one row a call, time."""
+    weight = to_numpy(linear.weight)
+    weight_time = graph.constant(f"{name}.weight_time", weight[:, layer.xyz_features : layer.input_features])
+    bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
+    time_bias = graph.node("Gemm", [code, weight_time, bias], f"{name}.time_bias", transB=1)
+    weight_xyz = graph.constant(f"{name}.weight_xyz", weight[:, : layer.xyz_features])
+    return graph.node("Gemm", [encoded, weight_xyz, time_bias], f"{name}.read", transB=1)
 
 
 def _encode(graph: GraphBuilder, name: str, value: str, octaves: torch.Tensor) -> str:
