@@ -11,10 +11,14 @@ from typing import Any
 
 from export.bake import Baked, bake
 from export.plans import build
+from export.precision.assess import assess
 from export.verify import TIMES, TOLERANCE, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_train.checkpoint import load_model
+
+PLAN = "network"
+STABILITY_TIMES = 8
 
 
 @dataclass(frozen=True)
@@ -43,12 +47,13 @@ def export_scene(
     """Bake `checkpoint`, write it beside `output`, compare that file with the model, and only then move it there.
 
     Whatever goes wrong before, `output` stays as it was. Raises `CheckpointInvalid`, `ModelNotExportable`,
-    `VerificationFailed`, or `SceneFileInvalid` where the written file breaks its contract.
+    `PlanUnsafe`, `VerificationFailed`, or `SceneFileInvalid` where the written file breaks its contract.
     """
     loaded = load_model(checkpoint)
     with checkpoint.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     baked = bake(loaded.model, loaded.scene, sha256)
+    assess(loaded.model, loaded.scene, times=STABILITY_TIMES).require(PLAN)
     with _beside(output) as temporary:
         _write(temporary, baked)
         measured = verify(
@@ -74,7 +79,7 @@ def _beside(output: Path) -> Iterator[Path]:
 
 def _write(path: Path, baked: Baked) -> None:
     with path.open("wb") as file:
-        file.write(build("network", baked).SerializeToString())
+        file.write(build(PLAN, baked).SerializeToString())
         file.flush()
         os.fsync(file.fileno())
 
