@@ -1,5 +1,6 @@
 """`msdgs-train`: fit a moving scene to photographs, judge and look at what came out, or make a scene to try it on."""
 
+import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,13 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.config import TrainConfig
+from msdgs_train.presets import DEFAULT, preset
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from msdgs_train.evaluation import Evaluation
+
+PresetName = Literal["msdgs-small", "msdgs-mlp", "msdgs-plane", "deformgs", "4dgs", "static"]
+"""Written out, so that `--help` and shells know them."""
 
 EXIT_INVALID = 2
 EXIT_INTERRUPTED = 130  # as a shell reports a program that Ctrl-C has stopped
@@ -32,12 +37,19 @@ class Fit:
     the same bits as if it had never stopped; more --steps, another --max-minutes and the like may be given then.
 
     A first look, in a few minutes:  msdgs-train fit data/scene runs/first --size 200 --steps 3000
+
+    The paper's system with two layers:  msdgs-train fit data/scene runs/paper --preset msdgs-mlp --model.layers mlp mlp
+
+    What a preset holds:  msdgs-train fit --preset deformgs --help
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """A dataset folder in the layout of D-NeRF, nerfstudio, COLMAP, Neu3D or HyperNeRF, seen from the files in it."""
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The folder of this run; new, or one to --resume."""
+    preset: PresetName = DEFAULT
+    """Settings to begin with; options given beside it change them. msdgs-small is for two cores; msdgs-mlp and
+    msdgs-plane are the paper's, deformgs and 4dgs what it compares with; static has no motion. docs/training.md"""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the run in RUN, with the settings it was begun with."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -134,14 +146,27 @@ def _run(command: Fit | Synthetic | Evaluate | Steps) -> int:
             return _steps(command)
 
 
-def _parse(arguments: Sequence[str]) -> Fit | Synthetic | Evaluate | Steps:
-    command = tyro.cli(Command, args=arguments, prog="msdgs-train", description=__doc__)  # type: ignore[arg-type]
-    if isinstance(command, Fit) and command.resume:
+def _parse(arguments: Sequence[str]) -> Command:  # type: ignore[valid-type]
+    if arguments[:1] == ["fit"]:
+        return _parse_fit(arguments[1:])
+    return tyro.cli(Command, args=arguments, prog="msdgs-train", description=__doc__)  # type: ignore[arg-type]
+
+
+def _parse_fit(arguments: Sequence[str]) -> Fit:
+    """Options change the settings of the preset, or of the run that is resumed, and those are what --help shows."""
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset")
+    name = early.parse_known_args(arguments)[0].preset
+    default = Fit(tyro.MISSING, tyro.MISSING, preset=name or DEFAULT, config=preset(name or DEFAULT))
+    command = tyro.cli(Fit, args=arguments, prog="msdgs-train fit", default=default)
+    if command.resume:
+        if name is not None:
+            raise InvalidInput("preset", "left out: a run goes on with the settings that it began with", name)
         from msdgs_train.fit import stored_config
 
         # parsed again with the run's own settings as defaults, so that only what is given now differs from them
         stored = Fit(command.data, command.run, config=stored_config(command.run))
-        command = tyro.cli(Fit, args=arguments[1:], prog="msdgs-train fit", default=stored)
+        command = tyro.cli(Fit, args=arguments, prog="msdgs-train fit", default=stored)
     return command
 
 

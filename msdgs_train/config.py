@@ -31,8 +31,7 @@ class TrainConfig:
     """What is behind the scene. With `random` every step draws a colour, and evaluation is on white."""
 
     model: ModelConfig = field(default_factory=lambda: SMALL_MODEL)
-    """The multi-step deformation: number of layers, their sizes, the scale modulation. The defaults suit two cores;
-    the paper's are width 256, depth 4, xyz_frequencies 10, time_width 256, sh_degree 3."""
+    """The multi-step deformation: number of layers, their sizes, the modulation."""
 
     init_count: int = 8_000
     """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
