@@ -86,24 +86,34 @@ class TrainConfig:
     quats_rate: float = 1e-3
     """Of the quaternions."""
 
+    densify_strategy: Literal["gradient", "mcmc"] = "gradient"
+    """Density control: `gradient` clones and splits where the picture pulls hardest on the Gaussians, and prunes;
+    `mcmc` moves faint ones beside opaque ones, and grows by 5 % a round up to `max_gaussians`."""
     densify_every: int = 100
-    """Density control: clone and split where the picture pulls hardest on the Gaussians; 0 switches it off."""
+    """Steps between rounds of density control; 0 switches it off."""
     densify_from: int = 500
     """The first step of density control."""
     densify_until_fraction: float = 0.7
     """Density control ends after this part of the run."""
     densify_gradient: float = 4e-4
-    """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified."""
+    """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified. This and
+    what follows, but for `max_gaussians` and `prune_opacity`, is of `gradient`."""
     split_scale: float = 0.01
     """One with a larger standard deviation than this part of the scene's extent is split, a smaller one is cloned."""
     max_gaussians: int = 10_000
-    """Densification stops here; the strongest gradients come first."""
+    """There are never more; the strongest gradients come first."""
     prune_opacity: float = 0.005
-    """Fainter Gaussians are removed."""
+    """Fainter Gaussians are removed, or moved."""
     prune_scale: float = 0.1
     """Ones larger than this part of the scene's extent are removed, once opacities have been reset."""
     opacity_reset_every: int = 0
     """All opacities are cut to 0.01 each so many steps, while densification lasts; 0 switches it off."""
+    mcmc_noise: float = 5e5
+    """How far faint Gaussians wander a step, in learning rates of the means times their covariance."""
+    mcmc_opacity_weight: float = 1e-2
+    """Of the mean opacity, added to the loss; what isn't needed fades and is moved."""
+    mcmc_scale_weight: float = 1e-2
+    """Of the mean scale in scene units, added to the loss."""
 
     log_every: int = 20
     """Steps between lines in metrics.jsonl."""
@@ -124,7 +134,13 @@ class TrainConfig:
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
         self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
-        more = ("plane_space_bends_weight", "plane_time_l1_weight")
+        more = (
+            "plane_space_bends_weight",
+            "plane_time_l1_weight",
+            "mcmc_noise",
+            "mcmc_opacity_weight",
+            "mcmc_scale_weight",
+        )
         for name in ("rigidity_weight", "plane_bends_weight", "plane_slopes_weight", *more):
             self._require(name, "finite and 0 or above", lambda v: 0 <= v < math.inf)
         for name in ("densify_gradient", "split_scale", "prune_scale"):
@@ -132,6 +148,7 @@ class TrainConfig:
         for name in ("size", "half_extent", "max_minutes"):
             self._require(name, "above 0, or left out", lambda v: v is None or 0 < v < math.inf)
         self._require("max_gaussians", "init_count or more", lambda v: v >= self.init_count)
+        self._require("densify_strategy", "gradient or mcmc", lambda v: v in ("gradient", "mcmc"))
         self._require("background", f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
 
     def _require(self, name: str, expected: str, holds: Any) -> None:
@@ -148,6 +165,14 @@ class TrainConfig:
     def densify_until(self) -> int:
         """The last step of density control."""
         return round(self.densify_until_fraction * self.steps)
+
+    def densifies_after(self, step: int) -> bool:
+        """Whether a round of density control is due after this step, counted from 1."""
+        return (
+            self.densify_every > 0
+            and self.densify_from <= step <= self.densify_until
+            and step % self.densify_every == 0
+        )
 
     @property
     def evaluation_background(self) -> tuple[float, float, float]:

@@ -76,6 +76,13 @@ class FitProgress(Observer):
             f"step {step:,}: {split} PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}", soft_wrap=True
         )
 
+    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+        self._console.print(
+            f"{reason}; going back to step {step:,} with learning rates times {rate_factor:g}",
+            style="yellow",
+            soft_wrap=True,
+        )
+
     def should_stop(self) -> bool:
         return self._stop.is_set()
 
