@@ -13,8 +13,9 @@ from urllib.parse import quote
 import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Path, Query, Request, Response
+from starlette.requests import ClientDisconnect
 
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import ClientGone, Refused
 from msdgs_serve.api.openapi import SCENE_BODY, problems
 from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList
 from msdgs_serve.api.service import Service, SharedService
@@ -126,6 +127,8 @@ async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
                 yield await anext(stream)
         except StopAsyncIteration:
             return
+        except ClientDisconnect:
+            raise ClientGone("the client closed the connection") from None
         except TimeoutError:
             detail = f"The next part of the body must come within {seconds:g} s."
             raise Refused(HTTPStatus.REQUEST_TIMEOUT, "slow_body", detail, field="body") from None
