@@ -11,8 +11,8 @@ FIRST_AXES = np.array([0, 0, 1], np.int64)  # of the planes xy, xz, yz
 SECOND_AXES = np.array([1, 2, 2], np.int64)
 
 
-def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str) -> str:
-    """[M, 10 or 11] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
+def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str, rows: np.ndarray) -> str:
+    """[M, len(rows)] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
     read = [_features(graph, f"{name}.grid{i}", grid, means, time) for i, grid in enumerate(layer.plane_grids())]
     features = graph.node("Concat", read, f"{name}.features", axis=1) if len(read) > 1 else read[0]
     hidden = _affine(graph, f"{name}.features.linear", features, layer.features.weight, layer.features.bias)
@@ -24,9 +24,8 @@ def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, t
     heads = torch.block_diag(
         *(head.get_parameter("weight") for head in layer.heads)
     )  # each head reads its own hidden units
-    return _affine(
-        graph, f"{name}.heads", hidden, heads, torch.cat([head.get_parameter("bias") for head in layer.heads])
-    )
+    bias = torch.cat([head.get_parameter("bias") for head in layer.heads])
+    return _affine(graph, f"{name}.heads", hidden, heads[rows], bias[rows])
 
 
 def _features(graph: GraphBuilder, name: str, grid: PlaneGrid, means: str, time: str) -> str:

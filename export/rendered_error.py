@@ -60,13 +60,17 @@ class ExactFrames:
         self.views = within_memory(views, len(model.gaussians))
         self._frames: list[FloatArray] = []
         self._means: dict[float, FloatArray] = {}
-        double = copy.deepcopy(model).double()
+        self._model = copy.deepcopy(model).double()
         for t, views_then in by_time(self.views):
-            gaussians = posed(double, t)
+            gaussians = self.pose(t)
             self._means[t] = gaussians.means
             for view in views_then:
                 self._frames.append(shown(gaussians, view.camera, background).astype(np.float32))
                 on_frame()
+
+    def pose(self, t: float) -> Gaussians:
+        """All Gaussians of the model in float64."""
+        return posed(self._model, t)
 
     def measure(
         self,

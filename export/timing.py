@@ -10,7 +10,7 @@ from export.job import Candidate
 from export.views import View
 from msdgs_serve.rasterizer import rasterize
 
-REPEATS = 9
+REPEATS = 15
 SECONDS_A_CANDIDATE = 6.0
 """Where frames take longer, there are fewer repeats, though never under `FEWEST_REPEATS`."""
 

@@ -11,8 +11,8 @@ from export.plans.scene_graph import finished, new_graph, unit_quats
 from msdgs_train.layers import MLPLayer
 from msdgs_train.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
 
-DELTA_COLUMNS = 10
-"""Means 3, scales 3, quats 4: the order of `Heads.sizes`, whose last column, if there is one, is the weight."""
+DELTAS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
+"""Columns of the heads, in the order of `Heads.sizes`, whose last column, if there is one, is the weight."""
 
 
 def network(baked: Baked, plan: str = "network") -> onnx.ModelProto:
@@ -31,38 +31,60 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...], delt
     quats = graph.node("Gather", [graph.constant("canonical_quats", moving.quats), "ids"], "ids.quats")
     time = graph.node("Reshape", ["t", graph.constant("time_shape", np.array([1, 1], np.int64))], "time")
 
-    deltas, moved, parts = "", means, [""] * 3
+    used = used_heads(layers)
+    sizes = [DELTAS[part].stop - DELTAS[part].start for part in used]
+    deltas, moved, parts = "", means, dict[str, str]()
     for k, layer in enumerate(layers, start=1):
         name = f"layer{k}"
-        step = _layer(graph, name, layer, moved, time)  # equation 7
+        step = _layer(graph, name, layer, moved, time, used)  # equation 7
         deltas = graph.node("Add", [deltas, step], f"{name}.deltas") if deltas else step  # equation 9
-        parts = graph.split(deltas, [f"{name}.means", f"{name}.scales", f"{name}.quats"], [3, 3, 4])
-        if k < len(layers):
-            moved = graph.node("Add", [means, parts[0]], f"{name}.moved")  # equation 8
+        parts = dict(zip(used, graph.split(deltas, [f"{name}.{part}" for part in used], sizes), strict=True))
+        if k < len(layers) and "means" in parts:
+            moved = graph.node("Add", [means, parts["means"]], f"{name}.moved")  # equation 8
 
-    delta_means = _modulated(graph, "mean_modulation", moving.mean_modulation, parts[0])
-    delta_scales = _modulated(graph, "scale_modulation", moving.scale_modulation, parts[1])
-    delta_quats = _modulated(graph, "quat_modulation", moving.quat_modulation, parts[2])
-    graph.node("Add", [means, delta_means], "means")
-    _scales(graph, log_scales, delta_scales, delta_space)
-    unit_quats(graph, graph.node("Add", [quats, delta_quats], "raw_quats"))
+    factors = {"means": moving.mean_modulation, "scales": moving.scale_modulation, "quats": moving.quat_modulation}
+    parts = {part: _modulated(graph, part, factors[part], value) for part, value in parts.items()}
+    graph.node(*(("Add", [means, parts["means"]]) if "means" in parts else ("Identity", [means])), "means")
+    _scales(graph, log_scales, parts.get("scales"), delta_space)
+    unit_quats(graph, graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats)
 
 
-def _modulated(graph: GraphBuilder, name: str, factors: np.ndarray | None, deltas: str) -> str:
+def used_heads(layers: tuple[Layer, ...]) -> list[str]:
+    """Those of the heads that are not all zeros in all layers; one at least."""
+    used = [name for name, columns in DELTAS.items() if any(_changes(layer, columns) for layer in layers)]
+    return used or ["means"]
+
+
+def _changes(layer: Layer, columns: slice) -> bool:
+    if isinstance(layer, MLPLayer):
+        return bool(layer.heads.weight[columns].any() or layer.heads.bias[columns].any())
+    return any(bool(p.any()) for p in layer.heads[list(DELTAS.values()).index(columns)].parameters())
+
+
+def _rows(layer: Layer, used: list[str]) -> np.ndarray:
+    """Columns of the heads' output that are computed."""
+    deltas = [np.arange(10)[DELTAS[part]] for part in used]
+    return np.concatenate([*deltas, [10]] if layer.outputs.weight else deltas)
+
+
+def _modulated(graph: GraphBuilder, part: str, factors: np.ndarray | None, deltas: str) -> str:
     """Equation 12: the summed deltas times the factors of the ids, if there are any."""
     if factors is None:
         return deltas
+    name = f"{part.removesuffix('s')}_modulation"
     rows = graph.node("Gather", [graph.constant(name, factors), "ids"], f"ids.{name}")
     return graph.node("Mul", [rows, deltas], f"{name}.applied")
 
 
-def _scales(graph: GraphBuilder, log_scales: str, deltas: str, delta_space: str) -> None:
-    """The output `scales`: deltas are added before or after the exponential."""
+def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_space: str) -> None:
+    """The output `scales`: deltas, if there are any, are added before or after the exponential."""
     limits = [
         graph.constant(f"log_scales.{name}", np.array(limit, np.float32))
         for name, limit in (("min", -LOG_SCALE_LIMIT), ("max", LOG_SCALE_LIMIT))
     ]
-    if delta_space == "raw":
+    if deltas is None:
+        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "scales")
+    elif delta_space == "raw":
         log_scales = graph.node("Add", [log_scales, deltas], "log_scales")
         graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "scales")
     else:
@@ -71,21 +93,22 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str, delta_space: str)
         graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], "scales")
 
 
-def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str) -> str:
-    """One layer at the means [M, 3]: its deltas, [M, 10], times its weight if it predicts one."""
+def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str, used: list[str]) -> str:
+    """One layer at the means [M, 3]: the deltas of the heads that are used, times its weight if it predicts one."""
+    rows = _rows(layer, used)
     if isinstance(layer, MLPLayer):
-        heads = _mlp_heads(graph, name, layer, means, time)
+        heads = _mlp_heads(graph, name, layer, means, time, rows)
     else:
-        heads = plane_heads(graph, name, layer, means, time)
+        heads = plane_heads(graph, name, layer, means, time, rows)
     if not layer.outputs.weight:
         return heads
-    deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [DELTA_COLUMNS, 1])
+    deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [len(rows) - 1, 1])
     weight = graph.node("Sigmoid", [logit], f"{name}.weight")
     return graph.node("Mul", [weight, deltas], f"{name}.weighted")
 
 
-def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str) -> str:
-    """[M, 10 or 11] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
+def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str, rows: np.ndarray) -> str:
+    """[M, len(rows)] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
     encoded, code = _encode(graph, f"{name}.xyz", means, layer.xyz_octaves), _time_code(graph, name, layer, time)
     hidden = _read_input(graph, f"{name}.first", layer, layer.first, encoded, code)
     hidden = graph.node("Relu", [hidden], f"{name}.first.relu")
@@ -98,7 +121,9 @@ def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time
         else:
             out = _linear(graph, trunk, linear, hidden)
         hidden = graph.node("Relu", [out], f"{trunk}.relu")
-    return _linear(graph, f"{name}.heads", layer.heads, hidden)
+    weight = graph.constant(f"{name}.heads.weight", to_numpy(layer.heads.weight)[rows])
+    bias = graph.constant(f"{name}.heads.bias", to_numpy(layer.heads.bias)[rows])
+    return graph.node("Gemm", [hidden, weight, bias], f"{name}.heads.out", transB=1)
 
 
 def _time_code(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:

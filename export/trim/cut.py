@@ -31,7 +31,7 @@ class Network:
     modulated: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cut:
     """What is left of a model."""
 
@@ -51,7 +51,7 @@ class Cut:
         return replace(changed, moves=changed.moves & changed.kept)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrimmedModel:
     """A smaller model of Gaussians that move, beside ones that don't."""
 

@@ -8,8 +8,8 @@ import numpy as np
 from export.trim.cut import HEADS, Cut, Network
 from export.trim.evidence import Evidence
 
-HALVINGS = 9
-"""Of the interval in which the number of Gaussians to leave out is searched for: to 1 in 500."""
+HALVINGS = 7
+"""Of the interval in which the number of Gaussians to leave out is searched for: to 1 in 128."""
 
 HOPELESS = 1.0
 """Pixels. What moves the visible Gaussians by more than this on average is needed, and isn't tried."""
