@@ -113,11 +113,53 @@ class Steps:
     """Name of a camera that the model holds; left out: the one whose photograph is nearest in time."""
 
 
+@dataclass(frozen=True)
+class Compare:
+    """Train every system on every scene with every seed under one budget, and put them side by side: a table
+    (comparison.md), all numbers (comparison.json), error against training time (time.png) and against the number of
+    layers (layers.png).
+
+    A system is a preset, or a table of a TOML file: the settings of `fit`, changed from a `preset`. What Ctrl-C has
+    stopped goes on with the same command; finished runs aren't trained again.
+
+    Example:  msdgs-train compare deformgs 4dgs mine.toml --data data/a data/b --out runs/all --steps 3000 --size 200
+    --init-count 5000 --max-gaussians 10000
+
+    where mine.toml holds:  [k2]  preset = "msdgs-small"  [k4]  model.layers = ["mlp", "mlp", "mlp", "mlp"]
+    """
+
+    systems: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG...")]
+    """Presets and TOML files."""
+    data: tuple[Path, ...]
+    """Dataset folders, one or more."""
+    out: Path
+    """The folder for all runs and the results; new, or one of the same comparison."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Each is a run of its own; the table shows mean and spread."""
+    steps: int = 3000
+    """The budget of each run in optimiser steps, whatever a preset says. Schedules that are parts of a run shrink with
+    it; those in steps (sh_interval, densify_from, opacity_reset_every) don't."""
+    minutes: float | None = None
+    """A run also ends after so many minutes. Learning rates fall over --steps, so choose these to be just reached."""
+    size: int | None = None
+    """Width in pixels of all photographs."""
+    init_count: int | None = None
+    """Gaussians at the start, for all systems; left out: each its own."""
+    max_gaussians: int | None = None
+    """Gaussians at most, for all systems; left out: each its own."""
+    threads: int = 1
+    """Of each run."""
+    jobs: int | None = None
+    """Runs side by side; left out: as many as have their threads' cores. Times of runs side by side disturb each other
+    somewhat; those of frames are taken at the end, one after the other."""
+
+
 Command = (
     Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Steps, tyro.conf.subcommand("steps")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
 )
 
 
@@ -134,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INVALID
 
 
-def _run(command: Fit | Synthetic | Evaluate | Steps) -> int:
+def _run(command: Fit | Synthetic | Evaluate | Steps | Compare) -> int:
     match command:
         case Fit():
             return _fit(command)
@@ -144,6 +186,8 @@ def _run(command: Fit | Synthetic | Evaluate | Steps) -> int:
             return _evaluate(command)
         case Steps():
             return _steps(command)
+        case Compare():
+            return _compare(command)
 
 
 def _parse(arguments: Sequence[str]) -> Command:  # type: ignore[valid-type]
@@ -236,12 +280,49 @@ def _table(evaluation: "Evaluation") -> "Table":
     return table
 
 
+def _rich_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> "Table":
+    from rich.table import Table
+
+    shown = Table()
+    for i, heading in enumerate(headings):
+        shown.add_column(heading, justify="left" if i < 2 else "right")
+    for row in rows:
+        shown.add_row(*row)
+    return shown
+
+
 def _steps(command: Steps) -> int:
     from msdgs_train.steps import write_steps
 
     pictures = write_steps(command.model, command.out, t=command.t, size=command.size, camera=command.camera)
     console.print(f"wrote {command.out}: k = 0 to {len(pictures) - 1}", soft_wrap=True)
     return 0
+
+
+def _compare(command: Compare) -> int:
+    from msdgs_serve.threads import thread_count
+    from msdgs_train.comparison.matrix import Budget, make_runs, read_systems
+    from msdgs_train.comparison.report import HEADINGS, table, write_comparison
+    from msdgs_train.comparison.results import collect
+    from msdgs_train.comparison.runner import train_all
+    from msdgs_train.progress import ComparisonProgress
+
+    budget = Budget(
+        command.steps, command.minutes, command.size, command.threads, command.init_count, command.max_gaussians
+    )
+    runs = make_runs(read_systems(command.systems, budget), command.data, command.seeds, command.out)
+    jobs = command.jobs or max(1, thread_count() // command.threads)
+    with ComparisonProgress(console, len(runs)) as progress:
+        complete = train_all(runs, jobs, progress.ended)
+    results = collect(runs)
+    if results:
+        paths = write_comparison(command.out, results, len(runs) - len(results))
+        console.print(_rich_table(HEADINGS, table(results)))
+        console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+    if not complete:
+        console.print("interrupted; the same command goes on", soft_wrap=True)
+        return EXIT_INTERRUPTED
+    return 0 if len(results) == len(runs) else EXIT_INVALID
 
 
 if __name__ == "__main__":

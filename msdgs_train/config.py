@@ -189,7 +189,11 @@ class TrainConfig:
         unknown = sorted(set(values) - {item.name for item in dataclasses.fields(cls)})
         if unknown:
             raise InvalidInput("config", "made of known settings", f"`{unknown[0]}`")
-        return cls(**{**values, "model": ModelConfig(**values.get("model", {}))})
+        model = values.get("model", {})
+        strange = sorted(set(model) - {item.name for item in dataclasses.fields(ModelConfig)})
+        if strange:
+            raise InvalidInput("config.model", "made of known settings", f"`{strange[0]}`")
+        return cls(**{**values, "model": ModelConfig(**model)})
 
 
 RESUMABLE_CHANGES = frozenset({"steps", "threads", "max_minutes", "log_every", "eval_every", "checkpoint_every"})
