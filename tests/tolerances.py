@@ -72,9 +72,12 @@ TABLE = (
         2.0,
         "a first-order bound, each layer's error measured once; roundings of the sum of deltas come on top",
     ),
+    Row("stability.spectral_norm.relative", 1e-12, "a root of a cubic in float64, of matrices whose entries are alike"),
     Row("stability.none", 0.0, "a count of what must not be there"),
     Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
     Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
+    Row("export.float32_db", 90.0, "worst frame, float32 against float64: at a few pixels a splat is at its cut-off"),
+    Row("trim.elsewhere_db", 3.0, "half as much error again at times and places that trimming has not looked at"),
     # datasets
     Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
     Row("composite_of_8bit", 1.001 / 255, "half a step of colour and half a step of alpha, each rounded once"),

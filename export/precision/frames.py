@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from export.bake import starting_cameras
-from export.precision.gap import PosedArrays, finite_rows
+from export.precision.gap import PosedArrays, usable_rows
 from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.camera import orbit
@@ -39,7 +39,7 @@ class View:
     def draw(self, posed: PosedArrays, camera: Camera, keep: np.ndarray | None = None) -> np.ndarray:
         """[H, W, 3] in [0, 1], drawn in float32; of the Gaussians `keep`, [N] bool, where given. Those that have no
         finite pose are left out."""
-        usable = finite_rows(posed)
+        usable = usable_rows(posed)
         usable[usable] &= np.abs(posed["means"][usable]).max(axis=1, initial=0) < np.finfo(np.float32).max
         chosen = usable if keep is None else usable & keep
         gaussians = Gaussians(**{name: array[chosen].astype(np.float32) for name, array in posed.items()})
@@ -79,6 +79,11 @@ def image_gap(got: np.ndarray, expected: np.ndarray) -> ImageGap:
     """Of two pictures [H, W, 3]."""
     difference = got.astype(np.float64) - expected
     return ImageGap(psnr_from_mse(float(np.square(difference).mean())), float(np.abs(difference).max(initial=0)))
+
+
+def in_picture(means: np.ndarray, camera: Camera) -> np.ndarray:
+    """[N] whether a Gaussian's centre is inside of the picture and beyond the near plane."""
+    return _project(means, camera)[1]
 
 
 def _to_camera(means: np.ndarray, camera: Camera) -> np.ndarray:

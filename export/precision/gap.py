@@ -12,6 +12,9 @@ from msdgs_train.model import DynamicGaussians
 SMALLEST_VISIBLE = 1e-3
 """Scales below this part of the scene's half diagonal are less than a pixel; their errors are relative to this size."""
 
+UNIT_TOLERANCE = 1e-3
+"""Of the norm of a quaternion, as `Gaussians.validate` has it."""
+
 PosedArrays = dict[str, np.ndarray]
 """`means` [M, 3], `quats` [M, 4], `scales` [M, 3], and where they are drawn `opacities` [M] and `sh` [M, C, 3]."""
 
@@ -21,7 +24,7 @@ def pose_arrays(model: DynamicGaussians, t: float, ids: np.ndarray | None = None
     scene file takes it."""
     with torch.no_grad():
         posed = model.pose(float(np.float32(t)), ids=None if ids is None else torch.from_numpy(ids))
-    return {name: array.numpy() for name, array in posed._asdict().items()}
+    return {name: array.detach().numpy() for name, array in posed._asdict().items()}
 
 
 def half_diagonal(bounds: object) -> float:
@@ -54,6 +57,8 @@ def largest_error(errors: PosedArrays) -> np.ndarray:
     return np.max([*errors.values()], axis=0)
 
 
-def finite_rows(posed: PosedArrays) -> np.ndarray:
-    """[M] whether a Gaussian's pose is."""
-    return np.all([np.isfinite(array.reshape(len(array), -1)).all(axis=1) for array in posed.values()], axis=0)
+def usable_rows(posed: PosedArrays) -> np.ndarray:
+    """[M] whether a Gaussian can be drawn: finite, and its quaternion unit, which one that overflows isn't."""
+    finite = np.all([np.isfinite(array.reshape(len(array), -1)).all(axis=1) for array in posed.values()], axis=0)
+    norms = np.linalg.norm(np.where(finite[:, None], posed["quats"], 1), axis=1)
+    return finite & (np.abs(norms - 1) < UNIT_TOLERANCE)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from export.precision.amplification import UNIT_ROUNDOFF
-from export.precision.assess import StabilityReport
+from export.precision.stability_report import StabilityReport
 from msdgs_train.files import replacing, write_text
 from msdgs_train.metrics import MAX_PSNR
 
@@ -25,6 +25,8 @@ def print_report(report: StabilityReport, console: Console) -> None:
         console.print(f"healed: with the worst 0.1 % in float64. Red: under {report.max_error:g} dB", style="dim")
     if report.worst is not None:
         _print_worst(report, console)
+    for what, count in report.limits.items():
+        console.print(f"{count:,} Gaussians: {what}", markup=False)
     console.print(report.verdict, style="bold green" if report.steady else "bold red", markup=False)
 
 
