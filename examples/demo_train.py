@@ -39,7 +39,7 @@ def main() -> None:
     folder.mkdir(parents=True)
     step("a small moving scene, photographed", TRAIN, "synthetic", data, "--size", arguments.size)
     step("training", TRAIN, "fit", data, run, *fit_flags(arguments))
-    step("export", sys.executable, EXPORT, run / "model.pt", "--output", scene)
+    step("export", sys.executable, EXPORT, run / "model.pt", "--quick", "--output", scene)
     with serving(scene, arguments.port) as url:
         compare(url, load_scene(data).splits["test"], folder / "frames", arguments.out)
         if not arguments.once:

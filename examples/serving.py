@@ -31,7 +31,7 @@ def serving(scene: Path, port: int, environment: Path = Path(sys.prefix)) -> Ite
     url = f"http://{HOST}:{port}"
     process = subprocess.Popen(command)
     try:
-        _wait_until_healthy(url, process)
+        _wait_until_ready(url, process)
         yield url
     finally:
         process.terminate()
@@ -70,12 +70,12 @@ def _fetch(request: urllib.request.Request) -> bytes:
         raise SystemExit(f"{request.full_url} answered {error.code}: {error.read().decode()}") from None
 
 
-def _wait_until_healthy(url: str, process: subprocess.Popen[bytes]) -> None:
+def _wait_until_ready(url: str, process: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + START_SECONDS
     while time.monotonic() < deadline:
         if process.poll() is not None:
             raise SystemExit(f"the service ended with exit code {process.returncode}")
-        with contextlib.suppress(OSError), urllib.request.urlopen(f"{url}/healthz", timeout=5):
+        with contextlib.suppress(OSError), urllib.request.urlopen(f"{url}/ready", timeout=5):
             return
         time.sleep(0.1)
     raise SystemExit(f"the service did not answer within {START_SECONDS:.0f} s")

@@ -33,6 +33,8 @@ class Moving:
     log_scales: FloatArray  # [M, 3]
     quats: FloatArray  # [M, 4] wxyz, unit
     scale_modulation: FloatArray | None  # [M, 3] factors of equation 12; None where the model has none
+    mean_modulation: FloatArray | None = None  # [M, 3]
+    quat_modulation: FloatArray | None = None  # [M, 4]
 
     def __len__(self) -> int:
         return len(self.means)
@@ -50,8 +52,10 @@ class Baked:
 def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Baked:
     """Everything that doesn't depend on time, evaluated in float32. The model isn't changed.
 
-    Without deformation layers, or without Gaussians, all of the scene is static.
+    Without deformation layers, or without Gaussians, all of the scene is static. Raises `ModelNotExportable` naming
+    what `msdgs/1` has no place for.
     """
+    _refuse_heads(model)
     with torch.no_grad():
         canonical = model.pose(info.time_range[0], deform=False)
         moves = bool(len(model.deformation)) and len(model.gaussians) > 0
@@ -71,8 +75,17 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
 
 def _moving(model: DynamicGaussians) -> Moving:
     g = model.gaussians
-    modulation = None if model.modulation is None else _array(model.modulation(g.embeddings))
-    return Moving(_array(g.means), _array(g.log_scales), _array(unit_quats(g.raw_quats)), modulation)
+    factors = {"means": None, "scales": None, "quats": None}
+    if model.modulation is not None:
+        factors |= {name: _array(values) for name, values in model.modulation(g.embeddings).present().items()}
+    return Moving(
+        _array(g.means),
+        _array(g.log_scales),
+        _array(unit_quats(g.raw_quats)),
+        scale_modulation=factors["scales"],
+        mean_modulation=factors["means"],
+        quat_modulation=factors["quats"],
+    )
 
 
 def _nothing_moving() -> Moving:
@@ -110,6 +123,15 @@ def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
         return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)
     except (InvalidInput, ValueError, KeyError, TypeError) as error:
         raise ModelNotExportable(f"a camera of the model's scene can't be used: {error}") from error
+
+
+def _refuse_heads(model: DynamicGaussians) -> None:
+    for option, stored in (("opacity_head", "opacities"), ("sh_head", "sh")):
+        if getattr(model.config, option) and len(model.deformation):
+            raise ModelNotExportable(
+                f"model.{option} is on, so `{stored}` change with time, and {CONTRACT} holds them as constants; "
+                "train without that head to export"
+            )
 
 
 def _checked_layer(layer: torch.nn.Module) -> Layer:

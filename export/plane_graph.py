@@ -5,24 +5,16 @@ import torch
 from onnx import TensorProto
 
 from export.graph import GraphBuilder, to_numpy
-from msdgs_train.plane_layer import PlaneLayer
+from msdgs_train.plane_layer import PlaneGrid, PlaneLayer
 
 FIRST_AXES = np.array([0, 0, 1], np.int64)  # of the planes xy, xz, yz
 SECOND_AXES = np.array([1, 2, 2], np.int64)
 
 
-def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str) -> str:
-    """[M, 11] what the heads of one layer say of means [M, 3]: deltas, and the weight before its sigmoid."""
-    size, channels = layer.space.shape[1], layer.space.shape[3]
-    scaled = graph.node("Mul", [means, graph.constant(f"{name}.cells", to_numpy(layer.cells))], f"{name}.scaled")
-    middle = graph.constant(f"{name}.middle", np.array((size - 1) / 2, np.float32))
-    positions = graph.node("Add", [scaled, middle], f"{name}.positions")
-    cells, parts = _cells(graph, f"{name}.xyz", positions, size)
-    lines = _lines(graph, name, layer, time)
-    over_time = _interpolated_lines(graph, name, lines, cells, parts, size)
-    table = graph.constant(f"{name}.space", to_numpy(layer.space).reshape(-1, channels))
-    over_space = _interpolated_planes(graph, name, table, cells, parts, size)
-    features = graph.node("Mul", [over_space, over_time], f"{name}.features")
+def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str, rows: np.ndarray) -> str:
+    """[M, len(rows)] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
+    read = [_features(graph, f"{name}.grid{i}", grid, means, time) for i, grid in enumerate(layer.plane_grids())]
+    features = graph.node("Concat", read, f"{name}.features", axis=1) if len(read) > 1 else read[0]
     hidden = _affine(graph, f"{name}.features.linear", features, layer.features.weight, layer.features.bias)
     hidden = graph.node("Relu", [hidden], f"{name}.features.relu")
     weights, biases = (
@@ -32,9 +24,22 @@ def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, t
     heads = torch.block_diag(
         *(head.get_parameter("weight") for head in layer.heads)
     )  # each head reads its own hidden units
-    return _affine(
-        graph, f"{name}.heads", hidden, heads, torch.cat([head.get_parameter("bias") for head in layer.heads])
-    )
+    bias = torch.cat([head.get_parameter("bias") for head in layer.heads])
+    return _affine(graph, f"{name}.heads", hidden, heads[rows], bias[rows])
+
+
+def _features(graph: GraphBuilder, name: str, grid: PlaneGrid, means: str, time: str) -> str:
+    """[M, C] the features of one grid at the means [M, 3]."""
+    size, channels = grid.space.shape[1], grid.space.shape[3]
+    scaled = graph.node("Mul", [means, graph.constant(f"{name}.cells", to_numpy(grid.cells))], f"{name}.scaled")
+    middle = graph.constant(f"{name}.middle", np.array((size - 1) / 2, np.float32))
+    positions = graph.node("Add", [scaled, middle], f"{name}.positions")
+    cells, parts = _cells(graph, f"{name}.xyz", positions, size)
+    lines = _lines(graph, name, grid, time)
+    over_time = _interpolated_lines(graph, name, lines, cells, parts, size)
+    table = graph.constant(f"{name}.space", to_numpy(grid.space).reshape(-1, channels))
+    over_space = _interpolated_planes(graph, name, table, cells, parts, size)
+    return graph.node("Mul", [over_space, over_time], f"{name}.features")
 
 
 def _cells(graph: GraphBuilder, name: str, positions: str, nodes: int) -> tuple[str, str]:
@@ -50,14 +55,14 @@ def _cells(graph: GraphBuilder, name: str, positions: str, nodes: int) -> tuple[
     return graph.node("Cast", [below], f"{name}.cell", to=TensorProto.INT64), parts
 
 
-def _lines(graph: GraphBuilder, name: str, layer: PlaneLayer, time: str) -> str:
+def _lines(graph: GraphBuilder, name: str, grid: PlaneGrid, time: str) -> str:
     """[3 S, C] the planes over time at `time`, [1, 1]: one lookup a call, whatever the number of ids."""
-    nodes, channels = layer.time.shape[1], layer.time.shape[3]
-    first = graph.constant(f"{name}.first_time", to_numpy(layer.first_time))
-    rate = graph.constant(f"{name}.time_cells", to_numpy(layer.time_cells))
+    nodes, channels = grid.time.shape[1], grid.time.shape[3]
+    first = graph.constant(f"{name}.first_time", to_numpy(grid.first_time))
+    rate = graph.constant(f"{name}.time_cells", to_numpy(grid.time_cells))
     since = graph.node("Sub", [time, first], f"{name}.since")
     cell, part = _cells(graph, f"{name}.t", graph.node("Mul", [since, rate], f"{name}.t.position"), nodes)
-    rows = to_numpy(layer.time).transpose(1, 0, 2, 3).reshape(nodes, -1)
+    rows = to_numpy(grid.time).transpose(1, 0, 2, 3).reshape(nodes, -1)
     table = graph.constant(f"{name}.time", rows)
     one = graph.constant(f"{name}.t.one", np.array(1, np.int64))
     flat = graph.constant(f"{name}.t.flat", np.array([1], np.int64))

@@ -1,4 +1,4 @@
-"""`python export/to_onnx.py model.pt`: one ONNX scene file from a trained model, compared with it before it counts."""
+"""`python export/to_onnx.py model.pt`: one ONNX scene file from a trained model, as fast as its error may be."""
 
 import sys
 from pathlib import Path
@@ -12,26 +12,35 @@ try:
     import torch  # noqa: F401
     import tyro
     from rich.console import Console
-    from rich.progress import Progress
-    from rich.table import Table
 except ModuleNotFoundError as error:
     raise SystemExit(f"to_onnx.py needs {error.name}, which serving alone does not: pip install '.[export]'") from None
 
 from msdgs_serve.scene.errors import MsdgsError
 
+Off = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
 
 def main(
     model: Annotated[Path, tyro.conf.Positional],
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
+    max_error: float = 50.0,
+    plan: str | None = None,
+    quick: Off = False,
+    data: Path | None = None,
+    no_unseen: Off = False,
+    no_still: Off = False,
+    no_layers: Off = False,
+    no_heads: Off = False,
+    no_modulation: Off = False,
+    no_bands: Off = False,
     tolerance: float = 1e-4,
     times: int = 50,
 ) -> int:
     """Turn a trained model into one self-contained ONNX scene file (contract msdgs/1, described in docs/contract.md).
 
-    The scale modulation is computed once and stored, SH and opacities are stored as they are drawn, and the
-    deformation becomes a graph: t and ids in, posed Gaussians out. The written file is then loaded in onnxruntime and
-    compared with the model in float32 and float64 at many times, both ends and between frames. Only a file that
-    passes replaces an older one.
+    Ways to compute the motion (plans) and things that the scene could do without (trimming) are tried together. Frames
+    of each are compared with those of the exact network in float64, and timed. The fastest whose worst frame is within
+    --max-error is written, and beside it a report as .json, .md and .png: error against run time.
 
     Type this:
 
@@ -39,16 +48,44 @@ def main(
 
     msdgs-serve scenes/ball.onnx
 
+    In seconds instead of minutes, all layers as trained, without what isn't seen:
+
+    python export/to_onnx.py runs/ball/model.pt --quick
+
     Args:
         model: The `model.pt` of a training run.
         output: The scene file to write; by default beside the model, ending in .onnx.
-        tolerance: Largest relative error allowed for positions, rotations and scales.
-        times: At how many times to compare.
+        max_error: PSNR in dB that the worst frame must have against the exact network; differences are invisible from
+            about 50. Lower is faster and less exact.
+        plan: Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all.
+        quick: No sweep and no report: the plan `network`, trimmed.
+        data: The folder of the photographs. Its training cameras are measured at, and held-out photographs compared.
+        no_unseen: Keep Gaussians that never contribute to a frame.
+        no_still: Keep in the graph Gaussians that never move visibly.
+        no_layers: Keep layers whose weighted step is invisible.
+        no_heads: Keep heads that change nothing.
+        no_modulation: Keep scale modulation that is 1.
+        no_bands: Keep SH bands that change nothing.
+        tolerance: Largest relative error of positions, rotations and scales that the plan `network` may have against
+            the layers that it computes.
+        times: At how many times to compare these.
     """
     output = model.with_suffix(".onnx") if output is None else output
     console = Console(stderr=True, soft_wrap=True, highlight=False)
+    switched_off = {
+        "unseen": no_unseen,
+        "still": no_still,
+        "layers": no_layers,
+        "heads": no_heads,
+        "modulation": no_modulation,
+        "bands": no_bands,
+    }
     try:
-        _export(model, output, tolerance, times, console)
+        with console.status("loading torch and onnxruntime"):
+            from export.command import Settings, export  # heavy: a second or more, so not before --help
+        off = frozenset(rule for rule, is_off in switched_off.items() if is_off)
+        plan = "network" if quick and plan is None else plan
+        export(Settings(model, output, max_error, plan, data, off, tolerance, times), console)
     except KeyboardInterrupt:
         console.print(f"stopped; {output} is as it was", markup=False)
         return 130
@@ -58,32 +95,5 @@ def main(
     return 0
 
 
-def _export(model: Path, output: Path, tolerance: float, times: int, console: Console) -> None:
-    with console.status("loading torch and onnxruntime"):
-        from export.write import export_scene  # heavy: a second or more, so not before --help
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("comparing with the model", total=times)
-        exported = export_scene(model, output, tolerance=tolerance, times=times, on_time=lambda: progress.advance(task))
-    error = exported.measured_error
-    table = Table("max error against the model", "float64", "float32", box=None)
-    for name, how in (
-        ("means", "relative to the scene's size"),
-        ("quats", "absolute"),
-        ("scales", "relative to each Gaussian's size"),
-    ):
-        table.add_row(f"{name}, {how}", f"{error[name]:.2e}", f"{error['against_float32'][name]:.2e}")
-    console.print(table)
-    if error["unstable"]["count"]:
-        console.print(
-            f"{error['unstable']['count']:,} Gaussians left out of these errors: there the model's own float32 differs "
-            f"from its float64. The worst is off by {error['unstable']['error']:.2e}"
-        )
-    console.print(
-        f"{error['times']} times, tolerance {tolerance:g}: passed\n"
-        f"{exported.path}: {exported.size / 1e6:.2f} MB, {exported.moving_count:,} moving and "
-        f"{exported.static_count:,} static Gaussians, {len(exported.metadata.layers)} layers"
-    )
-
-
 if __name__ == "__main__":
-    sys.exit(tyro.cli(main, config=(tyro.conf.FlagConversionOff,)))
+    sys.exit(tyro.cli(main))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from export.precision.gap import PosedArrays, half_diagonal, largest_error, pose_arrays, pose_errors
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import MsdgsError
@@ -18,17 +19,12 @@ TIMES = 50
 GAUSSIANS_A_TIME = 5_000
 """Of a larger scene every n-th Gaussian is compared at a time, beginning with another at each next time."""
 
-SMALLEST_VISIBLE = 1e-3
-"""Scales below this part of the scene's half diagonal are less than a pixel; their errors are relative to this size."""
-
 UNSTABLE = 0.25
 """A Gaussian is unstable where the model's own float32 is off from its float64 by more than this part of the
 tolerance: a chain of layers multiplies round-off. No file in float32 can be held to the tolerance there."""
 
 UNSTABLE_ALLOWED = 0.01
 """Part of the Gaussians that may be unstable."""
-
-PosedArrays = dict[str, np.ndarray]
 
 
 class VerificationFailed(MsdgsError):
@@ -45,6 +41,7 @@ def verify(
 ) -> dict[str, Any]:
     """The largest errors against the model in float64 and float32, as `measured_error` stores them.
 
+    The file may hold more Gaussians than the model, static ones after all others; they aren't compared.
     Errors of means are relative to the scene's half diagonal or, further out, to the largest coordinate; those
     of scales to the Gaussian's largest scale; those of quaternions are absolute. Raises `VerificationFailed` where one
     is above `tolerance` for a stable Gaussian, or too many Gaussians are unstable.
@@ -54,17 +51,17 @@ def verify(
     stride = max(1, math.ceil(count / GAUSSIANS_A_TIME))
     unstable, unstable_worst = np.zeros(count, bool), 0.0
     worst: dict[str, dict[str, float]] = {p: dict.fromkeys(MOVING_OUTPUTS, 0.0) for p in ("float64", "float32")}
-    _check_opacities_and_sh(session, double, tolerance)
+    _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # stored as they are under every plan
     for i, t in enumerate(times_to_verify(*session.scene.metadata.time_range, times)):
         ids = np.arange(i % stride, count, stride)
         got = _posed_by_file(session, t, ids)
-        posed = {"float64": _posed_by_model(double, t, ids), "float32": _posed_by_model(model, t, ids)}
-        size = _scene_size(session)
-        own = np.max([*_errors(posed["float32"], posed["float64"], size).values()], axis=0)
+        posed = {"float64": pose_arrays(double, t, ids), "float32": pose_arrays(model, t, ids)}
+        size = half_diagonal(session.scene.metadata.bounds)
+        own = largest_error(pose_errors(posed["float32"], posed["float64"], size))
         stable = own <= UNSTABLE * tolerance
         unstable[ids[~stable]] = True
         for precision, reference in posed.items():
-            for name, errors in _errors(got, reference, size).items():
+            for name, errors in pose_errors(got, reference, size).items():
                 unstable_worst = max(unstable_worst, float(errors[~stable].max(initial=0)))
                 error = float(errors[stable].max(initial=0))
                 worst[precision][name] = max(worst[precision][name], error)
@@ -104,32 +101,11 @@ def _posed_by_file(session: DeformationSession, t: float, ids: np.ndarray) -> Po
     return dict(zip(MOVING_OUTPUTS, (np.concatenate(pair) for pair in parts), strict=True))
 
 
-def _posed_by_model(model: DynamicGaussians, t: float, ids: np.ndarray) -> PosedArrays:
-    with torch.no_grad():
-        posed = model.pose(float(np.float32(t)), ids=torch.from_numpy(ids))
-    return {name: getattr(posed, name).numpy() for name in MOVING_OUTPUTS}
-
-
-def _scene_size(session: DeformationSession) -> float:
-    """Half the diagonal of the scene's bounds."""
-    low, high = np.array(session.scene.metadata.bounds)
-    return max(float(np.linalg.norm(high - low)) / 2, 1e-30)
-
-
-def _errors(got: PosedArrays, expected: PosedArrays, scene_size: float) -> PosedArrays:
-    """[M] the largest error of each Gaussian, by output."""
-    sizes = {
-        "means": np.maximum(np.abs(expected["means"]).max(axis=1), scene_size),
-        "quats": 1.0,
-        "scales": np.maximum(expected["scales"].max(axis=1), SMALLEST_VISIBLE * scene_size),
-    }
-    return {name: np.abs(got[name] - expected[name]).max(axis=1) / sizes[name] for name in MOVING_OUTPUTS}
-
-
 def _check_opacities_and_sh(session: DeformationSession, model: DynamicGaussians, tolerance: float) -> None:
     with torch.no_grad():
         expected = model.pose(session.scene.metadata.time_range[0], deform=False)
     for name in ("opacities", "sh"):
-        got, reference = getattr(session.scene, name), getattr(expected, name).numpy()
+        reference = getattr(expected, name).numpy()
+        got = getattr(session.scene, name)[: len(reference)]
         if not np.allclose(got, reference, rtol=tolerance, atol=tolerance):
             raise VerificationFailed(f"`{name}` differs from the model's")

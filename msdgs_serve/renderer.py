@@ -1,23 +1,40 @@
 """A scene, a camera and a time → an image. No HTTP here."""
 
-import threading
-import weakref
-from collections import OrderedDict
-from concurrent.futures import Future
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.imaging import Image
+from msdgs_serve.imaging import Image, average
+from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
+from msdgs_serve.watch import Watch
 
 Color = tuple[float, float, float]
 Background = Color | Literal["scene", "transparent"]
 
-DEFAULT_CACHED_POSES = 16
+DEFAULT_CACHE_BYTES = 256 << 20
 
-PoseKey = tuple[weakref.ref[DeformationSession], float]
+
+@dataclass(frozen=True)
+class Shutter:
+    """When the light comes in: from `t + open` to `t + close`, in the scene's units of time."""
+
+    open: float
+    close: float
+    samples: int  # moments, in the middles of equal parts of that time
+
+    def __post_init__(self) -> None:
+        if not self.open < self.close:
+            raise InvalidInput("shutter.close", f"after shutter.open, {self.open}", self.close)
+        if self.samples < 1:
+            raise InvalidInput("shutter.samples", "at least 1", self.samples)
+
+    def times(self, t: float) -> list[float]:
+        """The moments, about the time `t` of the frame."""
+        step = (self.close - self.open) / self.samples
+        return [t + self.open + (number + 0.5) * step for number in range(self.samples)]
 
 
 @dataclass(frozen=True)
@@ -25,6 +42,7 @@ class RenderOptions:
     """How a frame is drawn."""
 
     background: Background = "scene"  # an sRGB-encoded colour, what the scene was trained on, or none
+    shutter: Shutter | None = None  # motion blur; None: one moment
     rasterizer: RasterizerOptions = GSPLAT
 
 
@@ -37,50 +55,61 @@ class Renderer:
     Requests for the same scene and time that arrive together pose its Gaussians once.
     """
 
-    def __init__(self, cached_poses: int = DEFAULT_CACHED_POSES) -> None:
-        if cached_poses < 1:
-            raise InvalidInput("cached_poses", "at least 1", cached_poses)
-        self._capacity = cached_poses
-        self._poses: OrderedDict[PoseKey, Future[Gaussians]] = OrderedDict()
-        self._lock = threading.Lock()
+    def __init__(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
+        self.cache = PoseCache(cache_bytes)
 
     def render(
-        self, session: DeformationSession, camera: Camera, t: float, options: RenderOptions = DEFAULT_OPTIONS
+        self,
+        session: DeformationSession,
+        camera: Camera,
+        t: float,
+        options: RenderOptions = DEFAULT_OPTIONS,
+        watch: Watch | None = None,
     ) -> Image:
         """The frame that `camera` sees at `t`. The same arguments give the same pixels, whatever else runs.
 
+        `watch` times the stages `pose` and `draw` and may end the work between them.
+
         Raises:
-            InvalidInput: if `t` is outside of the scene's time range.
+            InvalidInput: if `t` or a moment of the shutter is outside of the scene's time range.
+            Interrupted: if the watch was stopped.
         """
-        transparent = options.background == "transparent"
-        background = resolve_background(session, options.background)
-        gaussians = self.posed(session, t)
-        rendering = rasterize(gaussians, camera, background=background, options=options.rasterizer)
-        return Image(rendering.rgb, rendering.alpha, rendering.depth, transparent)
+        watch = watch or Watch()
+        check_times(session, t, options.shutter)
+        if options.shutter is None:
+            return self._moment(session, camera, t, t, options, watch)
+        moments = options.shutter.times(t)
+        return average(self._moment(session, camera, t, moment, options, watch) for moment in moments)
 
-    def posed(self, session: DeformationSession, t: float) -> Gaussians:
+    def posed(self, session: DeformationSession, t: float, watch: Watch | None = None) -> Gaussians:
         """The scene's Gaussians at `t`, from the cache where it has them."""
-        key = (weakref.ref(session), t)  # a scene that was replaced is not kept alive
-        with self._lock:
-            future = self._poses.get(key)
-            waiting = future is not None
-            if future is None:
-                future = self._poses[key] = Future()
-                if len(self._poses) > self._capacity:
-                    self._poses.popitem(last=False)
-            self._poses.move_to_end(key)
-        if not waiting:
-            self._compute(session, t, key, future)
-        return future.result()
+        return self.cache.get(session, t, watch or Watch())
 
-    def _compute(self, session: DeformationSession, t: float, key: PoseKey, future: Future[Gaussians]) -> None:
-        try:
-            future.set_result(session.gaussians(t))
-        except BaseException as error:
-            with self._lock:
-                if self._poses.get(key) is future:
-                    del self._poses[key]
-            future.set_exception(error)
+    def _moment(
+        self, session: DeformationSession, camera: Camera, t: float, moment: float, options: RenderOptions, watch: Watch
+    ) -> Image:
+        gaussians = self.posed(session, moment, watch)
+        with watch.stage("draw"):
+            background = resolve_background(session, options.background)
+            rendering = rasterize(gaussians, camera, background=background, options=options.rasterizer)
+            transparent = options.background == "transparent"
+            return Image(rendering.rgb, rendering.alpha, rendering.depth, transparent, camera, t)
+
+
+def check_times(session: DeformationSession, t: float, shutter: Shutter | None = None) -> None:
+    """Raise `InvalidInput`, naming the field, for a time that the scene doesn't have."""
+    first, last = session.scene.metadata.time_range
+    for field, time in _times(t, shutter):
+        if not first <= time <= last:
+            expected = f"in the scene's range [{first}, {last}]"
+            raise InvalidInput(field, expected if field == "t" else f"such that t + {field} is {expected}", time)
+
+
+def _times(t: float, shutter: Shutter | None) -> Iterator[tuple[str, float]]:
+    yield "t", t
+    if shutter is not None:
+        yield "shutter.open", t + shutter.open
+        yield "shutter.close", t + shutter.close
 
 
 def resolve_background(session: DeformationSession, background: Background) -> Color:

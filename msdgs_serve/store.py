@@ -1,5 +1,6 @@
-"""The scenes on disk: found by name, opened when first asked for, reloaded when their file changes."""
+"""The scenes on disk: found by name, opened when first asked for, swapped when their file changes."""
 
+import hashlib
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -7,12 +8,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene import InvalidInput, SceneFileInvalid, SceneNotFound
+from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
 
 SUFFIX = ".onnx"
+INCOMING_PREFIX = ".incoming-"
 MAX_NAME_LENGTH = 200
+OPEN_TRIES = 5
 
 Signature = tuple[Path, int, int, int]
+
+
+class SceneExists(MsdgsError):
+    """There is a scene of this name, and it was not to be replaced."""
+
+
+@dataclass(frozen=True)
+class ServedScene:
+    """One version of a scene, in memory."""
+
+    name: str
+    session: DeformationSession
+    sha256: str  # of its file
 
 
 @dataclass(frozen=True)
@@ -28,7 +44,7 @@ class SceneStatus:
 class _Entry:
     lock: threading.Lock = field(default_factory=threading.Lock)  # held by the thread that loads
     tried: Signature | None = None
-    session: DeformationSession | None = None
+    served: ServedScene | None = None
     problem: SceneFileInvalid | None = None
 
 
@@ -36,8 +52,8 @@ class SceneStore:
     """Scenes in files and folders, named by the files' stems. Safe to use from several threads.
 
     Folders are looked at again with every call, so that files may come, change and go. A file that changes is loaded
-    by the next call that asks for it, while other threads still get the scene as it was; a file that breaks is
-    reported by `status` and the scene as it was stays.
+    by `refresh`, while others still get the scene as it was; a file that breaks is reported by `status` and the scene
+    as it was stays.
     """
 
     def __init__(
@@ -47,10 +63,16 @@ class SceneStore:
         self._open_scene = open_scene
         self._entries: dict[str, _Entry] = {}
         self._lock = threading.Lock()
+        self._writing = threading.Lock()  # held while files are put in or taken out
         by_name: dict[str, Path] = {}
         for file in self._scan():
             if by_name.setdefault(file.stem, file) != file:
                 raise InvalidInput("paths", "scenes of different names", f"{by_name[file.stem]} and {file}")
+
+    @property
+    def folder(self) -> Path | None:
+        """Where scenes are added and removed: the first folder among the paths."""
+        return next((path for path in self._paths if path.is_dir()), None)
 
     def names(self) -> list[str]:
         """Of all scenes, sorted; whether they can be opened is not known yet."""
@@ -58,47 +80,134 @@ class SceneStore:
 
     def status(self, name: str) -> SceneStatus:
         """Raises `SceneNotFound`."""
-        files = self._files()
-        if name not in files:
-            raise SceneNotFound(name, sorted(files))
-        entry = self._entry(name)
-        return SceneStatus(name, entry.session is not None, str(entry.problem) if entry.problem else None)
+        self._file(name)
+        return self._status(name)
 
-    def get(self, name: str) -> DeformationSession:
-        """The scene, from its newest file that could be loaded.
+    def statuses(self) -> list[SceneStatus]:
+        """Of all scenes, sorted by name."""
+        return [self._status(name) for name in self.names()]
+
+    def get(self, name: str) -> ServedScene:
+        """The scene as it was last loaded; the first call for it loads it.
 
         Raises:
             SceneNotFound: if there is no file of this name.
             SceneFileInvalid: if it breaks the contract and no earlier version of it is being served.
         """
+        file = self._file(name)
+        entry = self._entry(name)
+        if entry.served is None:
+            self._update(entry, file)
+        if entry.served is None:
+            raise entry.problem or SceneNotFound(name, [])
+        return entry.served
+
+    def refresh(self) -> None:
+        """Load anew what changed on disk since it was loaded or tried. Scenes nobody asked for yet stay closed."""
+        for name, file in self._files().items():
+            with self._lock:
+                entry = self._entries.get(name)
+            if entry is not None:
+                self._update(entry, file)
+
+    def incoming(self, token: str) -> Path:
+        """Where the file of a scene to be added is written first; no scene yet, as its name is hidden."""
+        return self._writable_folder() / f"{INCOMING_PREFIX}{token}"
+
+    def clear_incoming(self) -> None:
+        """Remove what a process that died left of files to be added."""
+        for file in self._writable_folder().glob(f"{INCOMING_PREFIX}*"):
+            file.unlink(missing_ok=True)
+
+    def add(self, name: str, incoming: Path, *, replace: bool = False) -> ServedScene:
+        """Open a file from `incoming`, and make it the scene `name` if it is one. All or nothing.
+
+        Raises:
+            InvalidInput: if the name isn't a plain one.
+            SceneExists: if there is one and it was not to be replaced.
+            SceneFileInvalid: if the file breaks the contract.
+        """
+        if not is_servable_name(name) or "/" in name:
+            raise InvalidInput("name", f"plain text of at most {MAX_NAME_LENGTH} letters, no separators", repr(name))
+        target = self._writable_folder() / f"{name}{SUFFIX}"
+        with self._writing:
+            present = self._files().get(name, target)
+            if present != target or (present.exists() and not replace):
+                raise SceneExists(f"there is a scene `{name}` already")
+            session, sha256 = self._open(incoming)
+            _write_through(incoming)
+            entry = self._entry(name)
+            with entry.lock:
+                os.replace(incoming, target)
+                _write_through(target.parent)
+                entry.served, entry.problem = ServedScene(name, session, sha256), None
+                entry.tried = _signature(target)
+            return entry.served
+
+    def remove(self, name: str) -> None:
+        """Delete a scene's file; who draws it at this moment is not disturbed.
+
+        Raises `SceneNotFound`, and `InvalidInput` for a scene that lies elsewhere.
+        """
+        folder = self._writable_folder()
+        with self._writing:
+            file = self._file(name)
+            if file.parent != folder:
+                raise InvalidInput("name", "that of a scene in the folder for uploads", name)
+            file.unlink(missing_ok=True)
+            _write_through(folder)
+
+    def _status(self, name: str) -> SceneStatus:
+        entry = self._entry(name)
+        return SceneStatus(name, entry.served is not None, str(entry.problem) if entry.problem else None)
+
+    def _writable_folder(self) -> Path:
+        if self.folder is None:
+            raise InvalidInput(
+                "paths", "with a folder, as scenes are added to one", [str(path) for path in self._paths]
+            )
+        return self.folder
+
+    def _file(self, name: str) -> Path:
         files = self._files()
         if name not in files:
             raise SceneNotFound(name, sorted(files))
-        entry = self._entry(name)
-        try:
-            signature = _signature(files[name])
-        except FileNotFoundError:
-            raise SceneNotFound(name, sorted(set(files) - {name})) from None
-        if entry.tried != signature and entry.lock.acquire(blocking=entry.session is None):
-            try:
-                if entry.tried != signature:
-                    self._load(entry, signature)
-            finally:
-                entry.lock.release()
-        if entry.session is None:
-            assert entry.problem is not None
-            raise entry.problem
-        return entry.session
+        return files[name]
 
-    def _load(self, entry: _Entry, signature: Signature) -> None:
-        path = signature[0]
+    def _update(self, entry: _Entry, file: Path) -> None:
+        """Load `file` where it isn't what was tried last; one thread does, those that have a scene don't wait."""
         try:
-            entry.session, entry.problem = self._open_scene(path), None
+            signature = _signature(file)
+        except FileNotFoundError:
+            return
+        if entry.tried == signature or not entry.lock.acquire(blocking=entry.served is None):
+            return
+        try:
+            if entry.tried != signature:
+                self._load(entry, file, signature)
+        finally:
+            entry.lock.release()
+
+    def _load(self, entry: _Entry, file: Path, signature: Signature) -> None:
+        try:
+            session, sha256 = self._open(file)
+            entry.served, entry.problem = ServedScene(file.stem, session, sha256), None
         except SceneFileInvalid as error:
             entry.problem = error
         except OSError as error:
-            entry.problem = SceneFileInvalid(str(path), "file", f"can't be read: {error.strerror}")
+            entry.problem = SceneFileInvalid(str(file), "file", f"can't be read: {error.strerror}")
         entry.tried = signature
+
+    def _open(self, file: Path) -> tuple[DeformationSession, str]:
+        """The scene in a file and the file's SHA-256; both of one version, though the file may change meanwhile."""
+        for _ in range(OPEN_TRIES):
+            before = _signature(file)
+            with file.open("rb") as stream:
+                sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            session = self._open_scene(file)
+            if _signature(file) == before:
+                return session, sha256
+        raise SceneFileInvalid(file.name, "file", "changes while it is read")
 
     def _entry(self, name: str) -> _Entry:
         with self._lock:
@@ -124,6 +233,11 @@ class SceneStore:
         return found
 
 
+def is_servable_name(name: str) -> bool:
+    """Not hidden (files being written are), and printable text without separators."""
+    return bool(name) and name[0] != "." and name.isprintable() and len(name) <= MAX_NAME_LENGTH and "\\" not in name
+
+
 def _checked(path: Path) -> Path:
     if path.is_dir():
         return path
@@ -132,20 +246,24 @@ def _checked(path: Path) -> Path:
     if path.suffix != SUFFIX:
         hint = "; `python export/to_onnx.py model.pt` turns a checkpoint into a scene" if path.suffix == ".pt" else ""
         raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}{hint}")
-    if not _servable_name(path.stem):
+    if not is_servable_name(path.stem):
         raise InvalidInput("paths", "files with plain names", repr(path.name))
     return path
 
 
 def _is_scene(file: Path) -> bool:
-    return file.suffix == SUFFIX and _servable_name(file.stem) and file.is_file()
-
-
-def _servable_name(name: str) -> bool:
-    """Not hidden (files being written are), and printable text without separators."""
-    return not name.startswith(".") and name.isprintable() and len(name) <= MAX_NAME_LENGTH and "\\" not in name
+    return file.suffix == SUFFIX and is_servable_name(file.stem) and file.is_file()
 
 
 def _signature(path: Path) -> Signature:
     status = os.stat(path)
     return path, status.st_mtime_ns, status.st_size, status.st_ino
+
+
+def _write_through(path: Path) -> None:
+    """Onto the disk, so that a loss of power doesn't undo it."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

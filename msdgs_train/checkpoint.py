@@ -72,6 +72,7 @@ def load_model(path: str | Path) -> LoadedModel:
         _refuse_not_finite(path, state)
         model = _build(ModelConfig(**contents["config"]), state)
         scene = SceneInfo(**contents["scene"])
+        _refuse_unusable_scene(path, scene)
         return LoadedModel(model, scene, int(contents["step"]))
     except (InvalidInput, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise CheckpointInvalid(path, f"isn't a complete model: {error}") from error
@@ -116,8 +117,19 @@ def _refuse_not_finite(path: str | Path, state: dict[str, Tensor]) -> None:
         raise CheckpointInvalid(path, f"holds values that are NaN or infinite: {', '.join(bad)}")
 
 
+def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
+    for name, shape in (("time_range", (2,)), ("background", (3,)), ("bounds", (2, 3))):
+        try:
+            values = torch.tensor(getattr(scene, name), dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            values = torch.empty(0)
+        if values.shape != shape or not torch.isfinite(values).all():
+            expected = " × ".join(map(str, shape))
+            raise CheckpointInvalid(path, f"scene.{name} must be {expected} finite numbers, got {getattr(scene, name)}")
+
+
 def _not_finite(state: dict[str, Tensor]) -> Iterator[tuple[str, int, int]]:
     for name, tensor in state.items():
-        count = int((~torch.isfinite(tensor)).sum())
+        count = int((~torch.isfinite(tensor.to(torch.float32))).sum())  # of float64 also what float32 can't hold
         if count:
             yield name, count, tensor.numel()

@@ -1,5 +1,6 @@
 """`msdgs-train`: fit a moving scene to photographs, judge and look at what came out, or make a scene to try it on."""
 
+import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,13 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.config import TrainConfig
+from msdgs_train.presets import DEFAULT, preset
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from msdgs_train.evaluation import Evaluation
+
+PresetName = Literal["msdgs-small", "msdgs-mlp", "msdgs-plane", "deformgs", "4dgs", "static"]
+"""Written out, so that `--help` and shells know them."""
 
 EXIT_INVALID = 2
 EXIT_INTERRUPTED = 130  # as a shell reports a program that Ctrl-C has stopped
@@ -32,12 +37,19 @@ class Fit:
     the same bits as if it had never stopped; more --steps, another --max-minutes and the like may be given then.
 
     A first look, in a few minutes:  msdgs-train fit data/scene runs/first --size 200 --steps 3000
+
+    The paper's system with two layers:  msdgs-train fit data/scene runs/paper --preset msdgs-mlp --model.layers mlp mlp
+
+    What a preset holds:  msdgs-train fit --preset deformgs --help
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """A dataset folder in the layout of D-NeRF, nerfstudio, COLMAP, Neu3D or HyperNeRF, seen from the files in it."""
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The folder of this run; new, or one to --resume."""
+    preset: PresetName = DEFAULT
+    """Settings to begin with; options given beside it change them. msdgs-small is for two cores; msdgs-mlp and
+    msdgs-plane are the paper's, deformgs and 4dgs what it compares with; static has no motion. docs/training.md"""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the run in RUN, with the settings it was begun with."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -101,11 +113,53 @@ class Steps:
     """Name of a camera that the model holds; left out: the one whose photograph is nearest in time."""
 
 
+@dataclass(frozen=True)
+class Compare:
+    """Train every system on every scene with every seed under one budget, and put them side by side: a table
+    (comparison.md), all numbers (comparison.json), error against training time (time.png) and against the number of
+    layers (layers.png).
+
+    A system is a preset, or a table of a TOML file: the settings of `fit`, changed from a `preset`. What Ctrl-C has
+    stopped goes on with the same command; finished runs aren't trained again.
+
+    Example:  msdgs-train compare deformgs 4dgs mine.toml --data data/a data/b --out runs/all --steps 3000 --size 200
+    --init-count 5000 --max-gaussians 10000
+
+    where mine.toml holds:  [k2]  preset = "msdgs-small"  [k4]  model.layers = ["mlp", "mlp", "mlp", "mlp"]
+    """
+
+    systems: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG...")]
+    """Presets and TOML files."""
+    data: tuple[Path, ...]
+    """Dataset folders, one or more."""
+    out: Path
+    """The folder for all runs and the results; new, or one of the same comparison."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Each is a run of its own; the table shows mean and spread."""
+    steps: int = 3000
+    """The budget of each run in optimiser steps, whatever a preset says. Schedules that are parts of a run shrink with
+    it; those in steps (sh_interval, densify_from, opacity_reset_every) don't."""
+    minutes: float | None = None
+    """A run also ends after so many minutes. Learning rates fall over --steps, so choose these to be just reached."""
+    size: int | None = None
+    """Width in pixels of all photographs."""
+    init_count: int | None = None
+    """Gaussians at the start, for all systems; left out: each its own."""
+    max_gaussians: int | None = None
+    """Gaussians at most, for all systems; left out: each its own."""
+    threads: int = 1
+    """Of each run."""
+    jobs: int | None = None
+    """Runs side by side; left out: as many as have their threads' cores. Times of runs side by side disturb each other
+    somewhat; those of frames are taken at the end, one after the other."""
+
+
 Command = (
     Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Steps, tyro.conf.subcommand("steps")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
 )
 
 
@@ -122,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INVALID
 
 
-def _run(command: Fit | Synthetic | Evaluate | Steps) -> int:
+def _run(command: Fit | Synthetic | Evaluate | Steps | Compare) -> int:
     match command:
         case Fit():
             return _fit(command)
@@ -132,16 +186,31 @@ def _run(command: Fit | Synthetic | Evaluate | Steps) -> int:
             return _evaluate(command)
         case Steps():
             return _steps(command)
+        case Compare():
+            return _compare(command)
 
 
-def _parse(arguments: Sequence[str]) -> Fit | Synthetic | Evaluate | Steps:
-    command = tyro.cli(Command, args=arguments, prog="msdgs-train", description=__doc__)  # type: ignore[arg-type]
-    if isinstance(command, Fit) and command.resume:
+def _parse(arguments: Sequence[str]) -> Command:  # type: ignore[valid-type]
+    if arguments[:1] == ["fit"]:
+        return _parse_fit(arguments[1:])
+    return tyro.cli(Command, args=arguments, prog="msdgs-train", description=__doc__)  # type: ignore[arg-type]
+
+
+def _parse_fit(arguments: Sequence[str]) -> Fit:
+    """Options change the settings of the preset, or of the run that is resumed, and those are what --help shows."""
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset")
+    name = early.parse_known_args(arguments)[0].preset
+    default = Fit(tyro.MISSING, tyro.MISSING, preset=name or DEFAULT, config=preset(name or DEFAULT))
+    command = tyro.cli(Fit, args=arguments, prog="msdgs-train fit", default=default)
+    if command.resume:
+        if name is not None:
+            raise InvalidInput("preset", "left out: a run goes on with the settings that it began with", name)
         from msdgs_train.fit import stored_config
 
         # parsed again with the run's own settings as defaults, so that only what is given now differs from them
         stored = Fit(command.data, command.run, config=stored_config(command.run))
-        command = tyro.cli(Fit, args=arguments[1:], prog="msdgs-train fit", default=stored)
+        command = tyro.cli(Fit, args=arguments, prog="msdgs-train fit", default=stored)
     return command
 
 
@@ -211,12 +280,49 @@ def _table(evaluation: "Evaluation") -> "Table":
     return table
 
 
+def _rich_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> "Table":
+    from rich.table import Table
+
+    shown = Table()
+    for i, heading in enumerate(headings):
+        shown.add_column(heading, justify="left" if i < 2 else "right")
+    for row in rows:
+        shown.add_row(*row)
+    return shown
+
+
 def _steps(command: Steps) -> int:
     from msdgs_train.steps import write_steps
 
     pictures = write_steps(command.model, command.out, t=command.t, size=command.size, camera=command.camera)
     console.print(f"wrote {command.out}: k = 0 to {len(pictures) - 1}", soft_wrap=True)
     return 0
+
+
+def _compare(command: Compare) -> int:
+    from msdgs_serve.threads import thread_count
+    from msdgs_train.comparison.matrix import Budget, make_runs, read_systems
+    from msdgs_train.comparison.report import HEADINGS, table, write_comparison
+    from msdgs_train.comparison.results import collect
+    from msdgs_train.comparison.runner import train_all
+    from msdgs_train.progress import ComparisonProgress
+
+    budget = Budget(
+        command.steps, command.minutes, command.size, command.threads, command.init_count, command.max_gaussians
+    )
+    runs = make_runs(read_systems(command.systems, budget), command.data, command.seeds, command.out)
+    jobs = command.jobs or max(1, thread_count() // command.threads)
+    with ComparisonProgress(console, len(runs)) as progress:
+        complete = train_all(runs, jobs, progress.ended)
+    results = collect(runs)
+    if results:
+        paths = write_comparison(command.out, results, len(runs) - len(results))
+        console.print(_rich_table(HEADINGS, table(results)))
+        console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+    if not complete:
+        console.print("interrupted; the same command goes on", soft_wrap=True)
+        return EXIT_INTERRUPTED
+    return 0 if len(results) == len(runs) else EXIT_INVALID
 
 
 if __name__ == "__main__":

@@ -31,8 +31,7 @@ class TrainConfig:
     """What is behind the scene. With `random` every step draws a colour, and evaluation is on white."""
 
     model: ModelConfig = field(default_factory=lambda: SMALL_MODEL)
-    """The multi-step deformation: number of layers, their sizes, the scale modulation. The defaults suit two cores;
-    the paper's are width 256, depth 4, xyz_frequencies 10, time_width 256, sh_degree 3."""
+    """The multi-step deformation: number of layers, their sizes, the modulation."""
 
     init_count: int = 8_000
     """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
@@ -55,6 +54,10 @@ class TrainConfig:
     """Of the mean squared second difference along time of the grids of plane layers."""
     plane_slopes_weight: float = 1e-4
     """Of the mean squared first difference along space."""
+    plane_space_bends_weight: float = 0.0
+    """Of the mean squared second difference along space, which 4DGS has instead."""
+    plane_time_l1_weight: float = 0.0
+    """Of the mean distance of the planes over time from 1, where they change nothing; 4DGS has it."""
 
     means_rate_start: float = 8e-4
     """Learning rate of the canonical centres, in scene units; Adam moves a centre by about this much a step."""
@@ -83,24 +86,34 @@ class TrainConfig:
     quats_rate: float = 1e-3
     """Of the quaternions."""
 
+    densify_strategy: Literal["gradient", "mcmc"] = "gradient"
+    """Density control: `gradient` clones and splits where the picture pulls hardest on the Gaussians, and prunes;
+    `mcmc` moves faint ones beside opaque ones, and grows by 5 % a round up to `max_gaussians`."""
     densify_every: int = 100
-    """Density control: clone and split where the picture pulls hardest on the Gaussians; 0 switches it off."""
+    """Steps between rounds of density control; 0 switches it off."""
     densify_from: int = 500
     """The first step of density control."""
     densify_until_fraction: float = 0.7
     """Density control ends after this part of the run."""
     densify_gradient: float = 4e-4
-    """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified."""
+    """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified. This and
+    what follows, but for `max_gaussians` and `prune_opacity`, is of `gradient`."""
     split_scale: float = 0.01
     """One with a larger standard deviation than this part of the scene's extent is split, a smaller one is cloned."""
     max_gaussians: int = 10_000
-    """Densification stops here; the strongest gradients come first."""
+    """There are never more; the strongest gradients come first."""
     prune_opacity: float = 0.005
-    """Fainter Gaussians are removed."""
+    """Fainter Gaussians are removed, or moved."""
     prune_scale: float = 0.1
     """Ones larger than this part of the scene's extent are removed, once opacities have been reset."""
     opacity_reset_every: int = 0
     """All opacities are cut to 0.01 each so many steps, while densification lasts; 0 switches it off."""
+    mcmc_noise: float = 5e5
+    """How far faint Gaussians wander a step, in learning rates of the means times their covariance."""
+    mcmc_opacity_weight: float = 1e-2
+    """Of the mean opacity, added to the loss; what isn't needed fades and is moved."""
+    mcmc_scale_weight: float = 1e-2
+    """Of the mean scale in scene units, added to the loss."""
 
     log_every: int = 20
     """Steps between lines in metrics.jsonl."""
@@ -121,13 +134,21 @@ class TrainConfig:
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
         self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
-        for name in ("rigidity_weight", "plane_bends_weight", "plane_slopes_weight"):
+        more = (
+            "plane_space_bends_weight",
+            "plane_time_l1_weight",
+            "mcmc_noise",
+            "mcmc_opacity_weight",
+            "mcmc_scale_weight",
+        )
+        for name in ("rigidity_weight", "plane_bends_weight", "plane_slopes_weight", *more):
             self._require(name, "finite and 0 or above", lambda v: 0 <= v < math.inf)
         for name in ("densify_gradient", "split_scale", "prune_scale"):
             self._require(name, "finite and above 0", lambda v: 0 < v < math.inf)
         for name in ("size", "half_extent", "max_minutes"):
             self._require(name, "above 0, or left out", lambda v: v is None or 0 < v < math.inf)
         self._require("max_gaussians", "init_count or more", lambda v: v >= self.init_count)
+        self._require("densify_strategy", "gradient or mcmc", lambda v: v in ("gradient", "mcmc"))
         self._require("background", f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
 
     def _require(self, name: str, expected: str, holds: Any) -> None:
@@ -145,6 +166,14 @@ class TrainConfig:
         """The last step of density control."""
         return round(self.densify_until_fraction * self.steps)
 
+    def densifies_after(self, step: int) -> bool:
+        """Whether a round of density control is due after this step, counted from 1."""
+        return (
+            self.densify_every > 0
+            and self.densify_from <= step <= self.densify_until
+            and step % self.densify_every == 0
+        )
+
     @property
     def evaluation_background(self) -> tuple[float, float, float]:
         """RGB in [0, 1] that held-out photographs are judged on, and that the model is saved with."""
@@ -160,7 +189,11 @@ class TrainConfig:
         unknown = sorted(set(values) - {item.name for item in dataclasses.fields(cls)})
         if unknown:
             raise InvalidInput("config", "made of known settings", f"`{unknown[0]}`")
-        return cls(**{**values, "model": ModelConfig(**values.get("model", {}))})
+        model = values.get("model", {})
+        strange = sorted(set(model) - {item.name for item in dataclasses.fields(ModelConfig)})
+        if strange:
+            raise InvalidInput("config.model", "made of known settings", f"`{strange[0]}`")
+        return cls(**{**values, "model": ModelConfig(**model)})
 
 
 RESUMABLE_CHANGES = frozenset({"steps", "threads", "max_minutes", "log_every", "eval_every", "checkpoint_every"})

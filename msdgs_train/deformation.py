@@ -8,11 +8,13 @@ from torch import Tensor, nn
 
 
 class Deltas(NamedTuple):
-    """Weighted sums over the layers of what each Gaussian changes by at one time (equation 9)."""
+    """Weighted sums over the layers of what each Gaussian changes by at one time (equation 9), before modulation."""
 
     means: Tensor  # [N, 3] scene units
-    log_scales: Tensor  # [N, 3] before modulation
+    scales: Tensor  # [N, 3] of logarithms or of scales, as the model's `delta_space` says
     quats: Tensor  # [N, 4] wxyz, added to the normalised canonical quaternion
+    opacities: Tensor | None = None  # [N] of logits; None without that head
+    sh: Tensor | None = None  # [N, (degree + 1)², 3]; None without that head
 
 
 class MultiStepDeformation(nn.Module):
@@ -32,7 +34,15 @@ class MultiStepDeformation(nn.Module):
             step = layer(means + deltas.means, t)  # equations 7 and 8
             deltas = Deltas(
                 torch.addcmul(deltas.means, step.weight, step.delta_means),
-                torch.addcmul(deltas.log_scales, step.weight, step.delta_log_scales),
+                torch.addcmul(deltas.scales, step.weight, step.delta_scales),
                 torch.addcmul(deltas.quats, step.weight, step.delta_quats),
+                _sum(deltas.opacities, step.weight[:, 0], step.delta_opacities),
+                _sum(deltas.sh, step.weight[:, :, None], step.delta_sh),
             )
         return deltas
+
+
+def _sum(total: Tensor | None, weight: Tensor, delta: Tensor | None) -> Tensor | None:
+    if delta is None:
+        return total
+    return weight * delta if total is None else torch.addcmul(total, weight, delta)

@@ -52,10 +52,20 @@ class DensityControl:
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
 
-    def is_due(self, step: int) -> bool:
-        """Whether `densify` is to run after this step (counted from 1)."""
-        c = self.config
-        return c.densify_every > 0 and c.densify_from <= step <= c.densify_until and step % c.densify_every == 0
+    def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
+        """`densify` and `reset_opacities` where they are due."""
+        if self.config.densifies_after(step):
+            self.densify(gaussians, optimizer, step)
+        if self.is_reset_due(step):
+            self.reset_opacities(gaussians, optimizer)
+
+    def state(self) -> tuple[Tensor, ...]:
+        """What has been gathered."""
+        return self.gradients, self.counts
+
+    def load_state(self, state: tuple[Tensor, ...]) -> None:
+        """Go on from it."""
+        self.gradients, self.counts = state
 
     def is_reset_due(self, step: int) -> bool:
         """Whether `reset_opacities` is to run after this step (counted from 1)."""

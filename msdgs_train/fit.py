@@ -13,7 +13,7 @@ from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.metrics import Quality, mean_quality
 from msdgs_train.report import MetricsLog, draw_curve, write_side_by_side
 from msdgs_train.run_record import Best, RunRecord, read_record, write_record
-from msdgs_train.trainer import StepResult, Trainer
+from msdgs_train.trainer import StepResult, Trainer, TrainingDiverged
 
 CONFIG = "config.json"
 CHECKPOINT = "checkpoint.pt"
@@ -23,6 +23,7 @@ FINAL_METRICS = "metrics.json"
 EVALUATED_SPLITS = ("test", "val")
 CHOOSING_SPLITS = ("val", "test")  # the first that the dataset has decides which model is the best
 RENDERS_WHILE_TRAINING = 4
+MAX_ROLLBACKS = 3
 
 Status = Literal["finished", "interrupted", "out of time"]
 
@@ -46,6 +47,9 @@ class Observer:
 
     def evaluation(self, step: int, split: str, quality: Quality) -> None:
         """After a split has been evaluated."""
+
+    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+        """After training has diverged and gone back to `step`, with the settings' learning rates times a factor."""
 
     def should_stop(self) -> bool:
         """Asked after every step; the run then saves a checkpoint and returns."""
@@ -107,6 +111,7 @@ class _Run:
         record: RunRecord,
     ) -> None:
         self.config = config
+        self.scene = scene
         self.folder = folder
         self.trainer = trainer
         self.observer = observer
@@ -119,7 +124,11 @@ class _Run:
     def execute(self) -> Outcome:
         status: Status = "finished"
         while self.trainer.step_count < self.config.steps and status == "finished":
-            result = self.trainer.step()
+            try:
+                result = self.trainer.step()
+            except TrainingDiverged as error:
+                self._roll_back(error)
+                continue
             self._after_step(result)
             if result.step < self.config.steps:
                 status = self._reason_to_stop()
@@ -132,6 +141,22 @@ class _Run:
             self._write_final_metrics(qualities)
         count = len(self.trainer.model.gaussians)
         return Outcome(status, self.trainer.step_count, qualities, count, self._seconds(), self.record.best)
+
+    def _roll_back(self, error: TrainingDiverged) -> None:
+        """Go on from the last checkpoint, or anew where there is none yet, with lower learning rates."""
+        diverged = self.trainer
+        if diverged.rollbacks >= MAX_ROLLBACKS:
+            raise TrainingDiverged(
+                f"{error}, after {MAX_ROLLBACKS} returns to a checkpoint with half the learning rates each; "
+                "begin a new run with lower ones"
+            ) from error
+        self.trainer = Trainer(self.config, self.scene)
+        if (self.folder / CHECKPOINT).exists():
+            self.trainer.load_checkpoint(self.folder / CHECKPOINT)
+        self.trainer.retry_after(diverged)
+        self.log = MetricsLog(self.folder, keep_until=self.trainer.step_count)
+        self._save()
+        self.observer.rolled_back(str(error), self.trainer.step_count, self.trainer.rate_factor)
 
     def _reason_to_stop(self) -> Status:
         if self.observer.should_stop():
@@ -148,7 +173,7 @@ class _Run:
                 for split in self.splits:
                     self._evaluate(split, renders=RENDERS_WHILE_TRAINING)
                 draw_curve(self.folder)
-            if _is_due(result.step, self.config.checkpoint_every):
+            if _is_due(result.step, self.config.checkpoint_every) and not self.trainer.is_skipping:
                 self._save()
 
     def _evaluate(self, split: str, *, renders: int | None) -> Quality:

@@ -1,4 +1,4 @@
-"""One step of deformation: a small MLP over encoded position and time, with four heads (paper, equations 7 and 10)."""
+"""One step of deformation: a small MLP over encoded position and time, with its heads (paper, equations 7 and 10)."""
 
 from typing import Any, NamedTuple
 
@@ -6,20 +6,43 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-HEAD_SIZES = (3, 3, 4, 1)
-"""Columns of `MLPLayer.heads`: delta_means, delta_log_scales, delta_quats, weight before its sigmoid."""
-
 SILENCE, PLACE_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
 """Of a new layer: bias of the hidden units, and what the first Linear's columns are multiplied by."""
+
+
+class Heads(NamedTuple):
+    """What a layer predicts besides deltas of means, scales and quaternions."""
+
+    weight: bool = True  # without it every step counts in full, w = 1
+    opacity: bool = False
+    sh: int = 0  # coefficients (degree + 1)² a channel; 0: none
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Columns of: means, scales, quats, opacity, sh, weight before its sigmoid. 0 for what isn't there."""
+        return (3, 3, 4, int(self.opacity), 3 * self.sh, int(self.weight))
+
+
+PAPER_HEADS = Heads()
 
 
 class LayerStep(NamedTuple):
     """What one layer proposes for N Gaussians at one time; the deltas aren't yet multiplied by the weight."""
 
     delta_means: Tensor  # [N, 3] scene units
-    delta_log_scales: Tensor  # [N, 3] natural logarithm
+    delta_scales: Tensor  # [N, 3] of logarithms or of scales, as the model's `delta_space` says
     delta_quats: Tensor  # [N, 4] wxyz
-    weight: Tensor  # [N, 1] in (0, 1)
+    weight: Tensor  # [N, 1] in (0, 1); 1 without the head
+    delta_opacities: Tensor | None = None  # [N] of logits
+    delta_sh: Tensor | None = None  # [N, (degree + 1)², 3]
+
+    @classmethod
+    def of_columns(cls, columns: Tensor, heads: Heads) -> "LayerStep":
+        """From the heads' columns side by side, [N, sum of `heads.sizes`]."""
+        means, scales, quats, opacity, sh, logit = columns.split(heads.sizes, dim=1)
+        weight = logit.sigmoid() if heads.weight else columns.new_ones(len(columns), 1)
+        opacities = opacity[:, 0] if heads.opacity else None
+        return cls(means, scales, quats, weight, opacities, sh.unflatten(1, (heads.sh, 3)) if heads.sh else None)
 
 
 def octaves(dimensions: int, frequencies: int) -> Tensor:
@@ -53,10 +76,11 @@ class PositionalEncoding(torch.autograd.Function):
 
 
 class MLPLayer(nn.Module):
-    """D_k of equation 7: encoded means and time through `depth` Linear–ReLU, then one Linear for all four heads.
+    """D_k of equation 7: encoded means and time through `depth` Linear–ReLU, then one Linear for all heads.
 
     Time has its own small network whose output is the same for all Gaussians. It runs once a call, and its part of
-    the first Linear is a vector added to the bias. At the default sizes the layer has 235,561 parameters.
+    a Linear that reads it is a vector added to the bias. At the default sizes the layer has 235,561 parameters. With
+    depth 8, `skip` 5 and no weight it is the network of DeformGS, 522,280 parameters.
     """
 
     kind = "mlp"
@@ -71,17 +95,23 @@ class MLPLayer(nn.Module):
         time_frequencies: int = 6,
         time_width: int = 256,
         time_features: int = 30,
+        skip: int = 0,
+        outputs: Heads = PAPER_HEADS,
     ) -> None:
+        """`skip`: after so many hidden layers the input is read once more, beside their output; 0: never."""
         super().__init__()
+        self.outputs = outputs
+        self.skip = skip
         self.register_buffer("xyz_octaves", octaves(3, xyz_frequencies), persistent=False)
         self.register_buffer("time_octaves", octaves(1, time_frequencies), persistent=False)
         self.xyz_features = 3 * (1 + 2 * xyz_frequencies)
+        self.input_features = self.xyz_features + time_features
         self.time_hidden = nn.Linear(1 + 2 * time_frequencies, time_width)
         self.time_output = nn.Linear(time_width, time_features)
-        self.first = nn.Linear(self.xyz_features + time_features, width)  # columns: encoded xyz, then time features
-        trunk = [nn.Linear(width, width) for _ in range(depth - 1)]
-        self.trunk = nn.ModuleList(trunk)
-        self.heads = nn.Linear(width, sum(HEAD_SIZES))
+        self.first = nn.Linear(self.input_features, width)  # columns: encoded xyz, then time features
+        trunk = [nn.Linear(width + (self.input_features if i == skip else 0), width) for i in range(1, depth)]
+        self.trunk = nn.ModuleList(trunk)  # columns of the one after the skip: as `first`, then hidden units
+        self.heads = nn.Linear(width, sum(outputs.sizes))
         self._initialize(trunk)
 
     @torch.no_grad()
@@ -101,24 +131,33 @@ class MLPLayer(nn.Module):
         nn.init.zeros_(self.time_output.bias)
         self.first.weight[:, : self.xyz_features] *= PLACE_GAIN
         self.first.weight[:, self.xyz_features :] *= TIME_GAIN
-        self.heads.weight[:-1] = 0  # a new layer moves nothing; its weight keeps a random direction to learn from
+        deltas = sum(self.outputs.sizes[:-1])
+        self.heads.weight[:deltas] = 0  # a new layer moves nothing; its weight keeps a random direction to learn from
         self.heads.bias[:] = 0
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
         """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""
-        weight_xyz = self.first.weight[:, : self.xyz_features]
-        encoded = PositionalEncoding.apply(means, self.xyz_octaves)
-        hidden = torch.addmm(self.time_bias(t), encoded, weight_xyz.t()).relu_()
-        for linear in self.trunk:
-            hidden = linear(hidden).relu_()
-        delta_means, delta_log_scales, delta_quats, weight = self.heads(hidden).split(HEAD_SIZES, dim=1)
-        return LayerStep(delta_means, delta_log_scales, delta_quats, weight.sigmoid())
+        encoded, code = PositionalEncoding.apply(means, self.xyz_octaves), self.time_code(t)
+        hidden = self._read_input(self.first, encoded, code).relu_()
+        for i, linear in enumerate(self.trunk, start=1):
+            if i == self.skip:
+                read = self._read_input(linear, encoded, code)
+                weight = linear.get_parameter("weight")[:, self.input_features :]
+                hidden = torch.addmm(read, hidden, weight.t()).relu_()
+            else:
+                hidden = linear(hidden).relu_()
+        return LayerStep.of_columns(self.heads(hidden), self.outputs)
 
-    def time_bias(self, t: Tensor) -> Tensor:
-        """[width] what the first Linear adds at time `t`: its bias and its columns for the time features."""
+    def time_code(self, t: Tensor) -> Tensor:
+        """[time_features] of time `t`, the same for all Gaussians."""
         encoded = PositionalEncoding.apply(t.reshape(1, 1), self.time_octaves)
-        features = self.time_output(self.time_hidden(encoded).relu_())
-        return torch.addmv(self.first.bias, self.first.weight[:, self.xyz_features :], features[0])
+        return self.time_output(self.time_hidden(encoded).relu_())[0]
+
+    def _read_input(self, linear: nn.Module, encoded: Tensor, code: Tensor) -> Tensor:
+        """[N, width] the part of a Linear that reads encoded means and time, its bias included."""
+        weight, bias = linear.get_parameter("weight"), linear.get_parameter("bias")
+        at_time = torch.addmv(bias, weight[:, self.xyz_features : self.input_features], code)
+        return torch.addmm(at_time, encoded, weight[:, : self.xyz_features].t())
 
     def extra_repr(self) -> str:
         return f"{sum(p.numel() for p in self.parameters()):,} parameters"

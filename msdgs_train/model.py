@@ -1,7 +1,7 @@
-"""The whole model: canonical Gaussians, their deformation in time, and the modulation of its scaling."""
+"""The whole model: canonical Gaussians, their deformation in time, and its modulation."""
 
-from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple, get_args
+import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -9,70 +9,19 @@ from torch import Tensor, nn
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.deformation import MultiStepDeformation
+from msdgs_train.deformation import Deltas, MultiStepDeformation
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.layers import MLPLayer
-from msdgs_train.modulation import ScaleModulation
-from msdgs_train.plane_layer import PlaneLayer
+from msdgs_train.model_config import LayerKind, ModelConfig
+from msdgs_train.modulation import Factors, Modulation
+from msdgs_train.plane_layer import PlaneGrid, PlaneLayer
 
 LOG_SCALE_LIMIT = 20.0
 """Scales stay within e^-20 and e^20: where a layer flings a Gaussian away its scale may vanish or overflow, and 0 · inf
 is NaN."""
 
-LayerKind = Literal["mlp", "plane"]
-LEAST = {
-    "width": 1,
-    "depth": 1,
-    "time_width": 1,
-    "time_features": 1,
-    "plane_channels": 1,
-    "plane_space_nodes": 2,
-    "plane_time_nodes": 2,
-    "plane_width": 1,
-}
-"""The smallest sizes that make sense; the others may be 0."""
-
-
-@dataclass(frozen=True)
-class ModelConfig:
-    """Sizes of a model. The defaults are the paper's, with K = 2 layers; K = 0 is a static scene."""
-
-    sh_degree: int = 3
-    layers: tuple[LayerKind, ...] = ("mlp", "mlp")
-    """The kind of each of the K layers, in order; kinds may be mixed."""
-    width: int = 256
-    depth: int = 4
-    xyz_frequencies: int = 10
-    time_frequencies: int = 6
-    time_width: int = 256
-    time_features: int = 30
-    plane_channels: int = 16
-    """This and the following are sizes of layers of kind `plane`, those above of kind `mlp`."""
-    plane_space_nodes: int = 32
-    plane_time_nodes: int = 50
-    plane_width: int = 32
-    embedding_size: int = 32
-    """0: no modulation."""
-    delta_space: Literal["raw"] = "raw"
-    """Where deltas are added: to log_scales and quaternions before exp and normalisation."""
-    detach_means: bool = True
-    """Photometric gradients through the positional encoding don't reach the canonical means, as in DeformGS."""
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.layers, tuple | list):
-            raise InvalidInput("model.layers", f"a list of kinds out of {list(get_args(LayerKind))}", self.layers)
-        object.__setattr__(self, "layers", tuple(self.layers))
-        unknown = [kind for kind in self.layers if kind not in get_args(LayerKind)]
-        if unknown:
-            raise InvalidInput("model.layers", f"kinds out of {list(get_args(LayerKind))}", unknown[0])
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.type is int and not (type(value) is int and value >= LEAST.get(field.name, 0)):
-                raise InvalidInput(f"model.{field.name}", f"an integer of {LEAST.get(field.name, 0)} or more", value)
-        if self.sh_degree > 3:
-            raise InvalidInput("model.sh_degree", "0, 1, 2 or 3", self.sh_degree)
-        if self.delta_space != "raw":
-            raise InvalidInput("model.delta_space", '"raw"', self.delta_space)
+SMALLEST_SCALE = math.exp(-LOG_SCALE_LIMIT)
+"""Where deltas are added to scales themselves, a scale may come out negative; it becomes this, far below a pixel."""
 
 
 class Domain(NamedTuple):
@@ -104,11 +53,13 @@ class DynamicGaussians(nn.Module):
         self.config = config
         self.gaussians = gaussians
         self.deformation = MultiStepDeformation(_new_layer(kind, config, domain) for kind in config.layers)
-        self.modulation = ScaleModulation(config.embedding_size) if config.embedding_size else None
+        size = config.embedding_size
+        self.modulation = Modulation(size, targets=config.modulate) if size else None
 
-    def plane_layers(self) -> list[PlaneLayer]:
-        """Those of the layers that are grids."""
-        return [layer for layer in self.deformation.layers if isinstance(layer, PlaneLayer)]
+    def plane_grids(self) -> list[PlaneGrid]:
+        """Those of all plane layers."""
+        layers = [layer for layer in self.deformation.layers if isinstance(layer, PlaneLayer)]
+        return [grid for layer in layers for grid in layer.plane_grids()]
 
     def pose(
         self,
@@ -124,20 +75,42 @@ class DynamicGaussians(nn.Module):
         `sh_degree` leaves out the SH bands above it, and `ids`, int64 [M], poses only these Gaussians.
         """
         g = self.gaussians if ids is None else self.gaussians.rows(ids)
-        means, log_scales, quats = g.means, g.log_scales, unit_quats(g.raw_quats)
-        if deform and len(self.deformation) and steps != 0:
-            time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
-            deltas = self.deformation(means.detach() if self.config.detach_means else means, time, steps)
-            means = means + deltas.means
-            delta_log_scales = deltas.log_scales
-            if self.modulation is not None:
-                delta_log_scales = self.modulation(g.embeddings) * delta_log_scales  # equation 12
-            log_scales = log_scales + delta_log_scales
-            quats = unit_quats(quats + deltas.quats)
         degree = self.config.sh_degree if sh_degree is None else sh_degree
         sh = torch.cat([g.sh_dc, g.sh_rest[:, : sh_coefficients(degree) - 1]], dim=1)
-        scales = log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
-        return PosedGaussians(means, quats, scales, g.raw_opacities.sigmoid(), sh)
+        means, quats, raw_opacities = g.means, unit_quats(g.raw_quats), g.raw_opacities
+        if not (deform and len(self.deformation) and steps != 0):
+            return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)
+        time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
+        deltas = self.deformation(means.detach() if self.config.detach_means else means, time, steps)
+        deltas = self._modulated(deltas, g.embeddings)
+        if deltas.opacities is not None:
+            raw_opacities = raw_opacities + deltas.opacities
+        if deltas.sh is not None:
+            sh = sh + deltas.sh[:, : sh.shape[1]]
+        return PosedGaussians(
+            means + deltas.means,
+            unit_quats(quats + deltas.quats),
+            self._deformed_scales(g.log_scales, deltas.scales),
+            raw_opacities.sigmoid(),
+            sh,
+        )
+
+    def _modulated(self, deltas: Deltas, embeddings: Tensor | None) -> Deltas:
+        """Equation 12, of the sums over all layers."""
+        if self.modulation is None:
+            return deltas
+        factors: Factors = self.modulation(embeddings)
+        return deltas._replace(**{name: f * getattr(deltas, name) for name, f in factors.present().items()})
+
+    def _deformed_scales(self, log_scales: Tensor, deltas: Tensor) -> Tensor:
+        if self.config.delta_space == "raw":
+            return activated_scales(log_scales + deltas)
+        return (activated_scales(log_scales) + deltas).clamp_min(SMALLEST_SCALE)
+
+
+def activated_scales(log_scales: Tensor) -> Tensor:
+    """Standard deviations of their logarithms, within e^±20."""
+    return log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
 
 
 def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer | PlaneLayer:
@@ -149,6 +122,8 @@ def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer
             config.time_frequencies,
             config.time_width,
             config.time_features,
+            config.skip,
+            config.heads,
         )
     return PlaneLayer(
         config.plane_channels,
@@ -156,6 +131,8 @@ def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer
         config.plane_time_nodes,
         config.plane_width,
         *domain,
+        config.plane_scales,
+        config.heads,
     )
 
 

@@ -14,6 +14,9 @@ from msdgs_train.model import DynamicGaussians
 
 Moments = Callable[[Tensor], Tensor]
 
+MOMENTS = frozenset({"exp_avg", "exp_avg_sq"})
+"""Of Adam's state, those with a row for each row of a parameter."""
+
 EPSILON = 1e-15
 """Adam's own default, 1e-8, is as large as the gradients of small Gaussians."""
 
@@ -52,8 +55,8 @@ def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
 def make_optimizer(model: DynamicGaussians, config: TrainConfig) -> torch.optim.Adam:
     """One Adam; a group for each attribute of the Gaussians, one for the deformation, one for the modulation."""
     named: dict[str, list[nn.Parameter]] = {name: [p] for name, p in model.gaussians.named_parameters()}
-    named["grids"] = [grid for layer in model.plane_layers() for grid in (layer.space, layer.time)]
-    grids = {id(grid) for grid in named["grids"]}
+    named["grids"] = [planes for grid in model.plane_grids() for planes in (grid.space, grid.time)]
+    grids = {id(planes) for planes in named["grids"]}
     named["deformation"] = [p for p in model.deformation.parameters() if id(p) not in grids]
     if model.modulation is not None:
         named["modulation"] = list(model.modulation.parameters())
@@ -81,6 +84,14 @@ def replace_rows(
         _replace(optimizer, gaussians, name, new, lambda moment, rows=added[name]: _extended(moment, kept, rows))
 
 
+def forget_rows(optimizer: torch.optim.Optimizer, gaussians: nn.Module, rows: Tensor) -> None:
+    """Set the moments of some rows, [M] indices, of every parameter of `gaussians` to zero."""
+    for parameter in gaussians.parameters():
+        state = optimizer.state.get(parameter, {})  # empty before the first gradient
+        for moment in MOMENTS & state.keys():
+            state[moment][rows] = 0
+
+
 def replace_values(optimizer: torch.optim.Optimizer, gaussians: nn.Module, name: str, values: Tensor) -> None:
     """Set one parameter to `values`, of the same shape, and its moments to zero."""
     _replace(optimizer, gaussians, name, nn.Parameter(values), torch.zeros_like)
@@ -99,6 +110,6 @@ def _replace(
     group["params"] = [new]
     state = optimizer.state.pop(old, None)
     if state is not None:
-        for moment in ("exp_avg", "exp_avg_sq"):
+        for moment in MOMENTS:
             state[moment] = on_moments(state[moment])
         optimizer.state[new] = state

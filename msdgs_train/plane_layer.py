@@ -9,34 +9,26 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.threads import run_parallel, split_evenly
-from msdgs_train.layers import HEAD_SIZES, LayerStep
+from msdgs_train.layers import PAPER_HEADS, Heads, LayerStep
 from msdgs_train.plane_kernels import plane_features, plane_gradients
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
 SPACE_INIT = (0.1, 0.5)
 
 
-class PlaneLayer(nn.Module):
-    """D_k of equation 11: xy, xz, yz, xt, yt, zt planes, their features multiplied, then one small MLP a head.
+class PlaneGrid(nn.Module):
+    """xy, xz, yz, xt, yt, zt planes of features, interpolated and multiplied.
 
-    A simplification of 4DGS's HexPlane to one resolution. At the default sizes it has 131,083 parameters. Planes over
-    time begin as ones, so that a new layer knows space only. The grid spans the whole of the time range and a cube
+    Planes over time begin as ones, so that a new grid knows space only. It spans the whole of the time range and a cube
     of space; beyond its border a Gaussian reads the border's features.
     """
 
-    kind = "plane"
     cells: Tensor
     first_time: Tensor
     time_cells: Tensor
 
     def __init__(
-        self,
-        channels: int = 16,
-        space_nodes: int = 32,
-        time_nodes: int = 50,
-        width: int = 32,
-        half_extent: float = 1.0,
-        time_range: tuple[float, float] = (0.0, 1.0),
+        self, channels: int, space_nodes: int, time_nodes: int, half_extent: float, time_range: tuple[float, float]
     ) -> None:
         super().__init__()
         self.space = nn.Parameter(torch.empty(3, space_nodes, space_nodes, channels).uniform_(*SPACE_INIT))
@@ -45,22 +37,11 @@ class PlaneLayer(nn.Module):
         first, last = time_range
         self.register_buffer("first_time", torch.tensor(first))
         self.register_buffer("time_cells", torch.tensor((time_nodes - 1) / ((last - first) or 1.0)))  # a unit of time
-        self.features = nn.Linear(channels, width)
-        self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in HEAD_SIZES)
-        self.heads = nn.ModuleList(nn.Linear(width, size) for size in HEAD_SIZES)
-        with torch.no_grad():
-            for name, parameter in self.heads.named_parameters():
-                if name.endswith("bias") or name != f"{len(HEAD_SIZES) - 1}.weight":
-                    parameter.zero_()  # a new layer moves nothing; its weight keeps a random direction to learn from
 
-    def forward(self, means: Tensor, t: Tensor) -> LayerStep:
-        """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""
+    def forward(self, means: Tensor, t: Tensor) -> Tensor:
+        """Features [N, C] of means, [N, 3], at time `t`, a scalar tensor."""
         positions = means * self.cells + (self.space.shape[1] - 1) / 2
-        features = self.features(_PlaneFeatures.apply(self.space, self.lines(t), positions)).relu()
-        delta_means, delta_log_scales, delta_quats, logits = (
-            head(hidden(features).relu()) for hidden, head in zip(self.hidden, self.heads, strict=True)
-        )
-        return LayerStep(delta_means, delta_log_scales, delta_quats, logits.sigmoid())
+        return _PlaneFeatures.apply(self.space, self.lines(t), positions)
 
     def lines(self, t: Tensor) -> Tensor:
         """[3, S, C] the planes over time at time `t`; the ends of the range hold beyond them."""
@@ -85,14 +66,84 @@ class PlaneLayer(nn.Module):
         self.time[:, new_low:low] = self.time[:, low : low + 1]
         self.time[:, high + 1 : new_high + 1] = self.time[:, high : high + 1]
 
-    def roughness(self) -> tuple[Tensor, Tensor]:
-        """Mean squared second difference along time, and first difference along the axes of space."""
-        bend = self.time[:, 2:] - 2 * self.time[:, 1:-1] + self.time[:, :-2]
-        slopes = self.space.diff(dim=1).square().mean() + self.space.diff(dim=2).square().mean()
-        return bend.square().mean(), slopes
+    def time_bends(self) -> Tensor:
+        """Mean squared second difference along time."""
+        return self.time.diff(n=2, dim=1).square().mean()
+
+    def time_offsets(self) -> Tensor:
+        """Mean distance of the planes over time from 1, at which they change nothing."""
+        return (1 - self.time).abs().mean()
+
+    def space_slopes(self) -> Tensor:
+        """Mean squared first difference along space, the sum of both axes of a plane."""
+        return self.space.diff(dim=1).square().mean() + self.space.diff(dim=2).square().mean()
+
+    def space_bends(self) -> Tensor:
+        """Mean squared second difference along space, the sum of both axes of a plane."""
+        return self.space.diff(n=2, dim=1).square().mean() + self.space.diff(n=2, dim=2).square().mean()
+
+
+class PlaneLayer(nn.Module):
+    """D_k of equation 11: features of planes over space and time, then one small MLP a head.
+
+    The paper's has one grid, a simplification of 4DGS's HexPlane: 131,083 parameters at the default sizes. With
+    `scales` (1, 2), 32 channels, 64 and 75 nodes, width 64 and no weight it is the network of 4DGS, 3,365,770
+    parameters, but for its heads of opacity and SH, which 4DGS itself leaves out unless asked for.
+    """
+
+    kind = "plane"
+
+    def __init__(
+        self,
+        channels: int = 16,
+        space_nodes: int = 32,
+        time_nodes: int = 50,
+        width: int = 32,
+        half_extent: float = 1.0,
+        time_range: tuple[float, float] = (0.0, 1.0),
+        scales: tuple[int, ...] = (1,),
+        outputs: Heads = PAPER_HEADS,
+    ) -> None:
+        """`scales`: a grid each, with so many times `space_nodes`; their features are put side by side."""
+        super().__init__()
+        self.outputs = outputs
+        self.grids = nn.ModuleList(
+            PlaneGrid(channels, space_nodes * scale, time_nodes, half_extent, time_range) for scale in scales
+        )
+        self.features = nn.Linear(channels * len(scales), width)
+        sizes = [size for size in outputs.sizes if size]
+        self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in sizes)
+        self.heads = nn.ModuleList(nn.Linear(width, size) for size in sizes)
+        self.register_load_state_dict_pre_hook(_name_the_grid)
+        with torch.no_grad():
+            for i, head in enumerate(self.heads):
+                head.get_parameter(
+                    "bias"
+                ).zero_()  # a new layer moves nothing; its weight learns from a random direction
+                if not (outputs.weight and i == len(sizes) - 1):
+                    head.get_parameter("weight").zero_()
+
+    def plane_grids(self) -> list[PlaneGrid]:
+        """From the coarsest to the finest, as `scales` has them."""
+        return [grid for grid in self.grids if isinstance(grid, PlaneGrid)]
+
+    def forward(self, means: Tensor, t: Tensor) -> LayerStep:
+        """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""
+        read = torch.cat([grid(means, t) for grid in self.grids], dim=1)
+        features = self.features(read).relu()
+        heads = zip(self.hidden, self.heads, strict=True)
+        columns = torch.cat([head(hidden(features).relu()) for hidden, head in heads], dim=1)
+        return LayerStep.of_columns(columns, self.outputs)
 
     def extra_repr(self) -> str:
         return f"{sum(p.numel() for p in self.parameters()):,} parameters"
+
+
+def _name_the_grid(layer: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Models of before there were several grids hold the only one's tensors under the layer's own name."""
+    for name in ("space", "time", "cells", "first_time", "time_cells"):
+        if prefix + name in state:
+            state[f"{prefix}grids.0.{name}"] = state.pop(prefix + name)
 
 
 class _PlaneFeatures(torch.autograd.Function):

@@ -11,6 +11,8 @@ from typing import Any, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from msdgs_train.comparison.matrix import Run
+from msdgs_train.comparison.runner import Ended
 from msdgs_train.fit import Observer
 from msdgs_train.metrics import Quality
 from msdgs_train.trainer import StepResult
@@ -76,6 +78,13 @@ class FitProgress(Observer):
             f"step {step:,}: {split} PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}", soft_wrap=True
         )
 
+    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+        self._console.print(
+            f"{reason}; going back to step {step:,} with learning rates times {rate_factor:g}",
+            style="yellow",
+            soft_wrap=True,
+        )
+
     def should_stop(self) -> bool:
         return self._stop.is_set()
 
@@ -83,6 +92,31 @@ class FitProgress(Observer):
         if self._stop.is_set():
             raise KeyboardInterrupt
         self._stop.set()
+
+
+class ComparisonProgress:
+    """A bar over the runs of a comparison, and a line for each that has ended."""
+
+    def __init__(self, console: Console, total: int) -> None:
+        self._console = console
+        self._bar = Progress(
+            BarColumn(None), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+            console=console, disable=not console.is_terminal,
+        )  # fmt: skip
+        self._task = self._bar.add_task("runs", total=total)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def ended(self, run: Run, ended: Ended) -> None:
+        """A run is over, one way or another."""
+        self._bar.advance(self._task)
+        line = f"{run.name}: {ended.status}" + (f", {ended.message}" if ended.message else "")
+        self._console.print(line, soft_wrap=True, markup=False, style="red" if ended.status == "failed" else None)
 
 
 @contextlib.contextmanager

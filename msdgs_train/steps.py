@@ -38,7 +38,7 @@ def write_steps(
     if not first <= t <= last:
         raise InvalidInput("t", f"in the scene's time range, [{first:g}, {last:g}]", t)
     entry = _stored_camera(loaded, t, camera)
-    pictures = render_steps(loaded, t, _camera_of(entry, size))
+    pictures = render_steps(loaded, t, camera_of(entry, size))
     captions = ["k = 0, canonical", *(f"k = {k}" for k in range(1, len(pictures)))]
     panels = [Panel(pixels, caption) for pixels, caption in zip(pictures, captions, strict=True)]
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -65,7 +65,8 @@ def _stored_camera(loaded: LoadedModel, t: float, name: str | None) -> dict[str,
     return cameras[name]
 
 
-def _camera_of(entry: dict[str, Any], width: int) -> Camera:
+def camera_of(entry: dict[str, Any], width: int) -> Camera:
+    """A camera that a model holds, with pictures `width` pixels wide."""
     if width < 1:
         raise InvalidInput("size", "a width of 1 pixel or more", width)
     values = {name: entry[name] for name in ("fx", "fy", "cx", "cy", "width", "height")}

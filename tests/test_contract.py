@@ -11,15 +11,15 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from export.bake import bake
-from export.plans import network
+from export.plans import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, MOVING_OUTPUTS, SceneMetadata
 from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.models import SCENE, random_model
 
 FIELDS = tuple(SceneMetadata.__dataclass_fields__)
-SCENE_BYTES = network(bake(random_model(20), SCENE, "0" * 64)).SerializeToString()
-STATIC_BYTES = network(bake(random_model(20, layers=()), SCENE, "0" * 64)).SerializeToString()
+SCENE_BYTES = build("network", bake(random_model(20), SCENE, "0" * 64)).SerializeToString()
+STATIC_BYTES = build("network", bake(random_model(20, layers=()), SCENE, "0" * 64)).SerializeToString()
 FLOATS = [
     (name, contents)
     for contents in (SCENE_BYTES, STATIC_BYTES)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from export.bake import bake
-from export.plans import network
+from export.plans import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.checkpoint import SceneInfo
@@ -22,7 +22,7 @@ from tests.tolerances import tolerance
 
 
 def written(path: Path, model: DynamicGaussians, **scene: Any) -> Path:
-    path.write_bytes(network(bake(model, SceneInfo(**scene), "0" * 64)).SerializeToString())
+    path.write_bytes(build("network", bake(model, SceneInfo(**scene), "0" * 64)).SerializeToString())
     return path
 
 

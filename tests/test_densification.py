@@ -153,10 +153,10 @@ def test_schedule() -> None:
         steps=100, densify_from=10, densify_every=10, densify_until_fraction=0.5, opacity_reset_every=20
     )
     control = DensityControl.start(config, EXTENT, 1)
-    assert [s for s in range(1, 101) if control.is_due(s)] == [10, 20, 30, 40, 50]
+    assert [s for s in range(1, 101) if config.densifies_after(s)] == [10, 20, 30, 40, 50]
     assert [s for s in range(1, 101) if control.is_reset_due(s)] == [20, 40]
     off = DensityControl.start(small_config(densify_every=0, opacity_reset_every=0), EXTENT, 1)
-    assert not any(off.is_due(s) or off.is_reset_due(s) for s in range(1, 101))
+    assert not any(off.config.densifies_after(s) or off.is_reset_due(s) for s in range(1, 101))
 
 
 def test_rotation() -> None:

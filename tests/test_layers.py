@@ -1,12 +1,14 @@
 """The deformation layers against the paper's sizes and a plain float64 reading of its equations."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from msdgs_train.deformation import MultiStepDeformation
-from msdgs_train.layers import MLPLayer, PositionalEncoding, octaves
-from msdgs_train.modulation import ScaleModulation
+from msdgs_train.layers import Heads, MLPLayer, PositionalEncoding, octaves
+from msdgs_train.modulation import Modulation
 from tests.tolerances import assert_close, tolerance
 
 PAPER_LAYER_PARAMETERS = 235_561
@@ -17,9 +19,10 @@ def parameters(module: torch.nn.Module) -> int:
     return sum(p.numel() for p in module.parameters())
 
 
-def random_layer(seed: int, **sizes: int) -> MLPLayer:
+def random_layer(seed: int, **sizes: Any) -> MLPLayer:
     torch.manual_seed(seed)
-    layer = MLPLayer(**({"width": 16, "depth": 3, "time_width": 8, "time_features": 5} | sizes)).double()
+    defaults: dict[str, Any] = {"width": 16, "depth": 3, "time_width": 8, "time_features": 5}
+    layer = MLPLayer(**(defaults | sizes)).double()
     with torch.no_grad():
         for parameter in layer.parameters():
             parameter.normal_(std=0.2)
@@ -40,9 +43,11 @@ def plain_step(layer: MLPLayer, means: np.ndarray, t: float) -> tuple[np.ndarray
 
     time = np.maximum(linear(layer.time_hidden, plain_encoding(np.array([[t]]), layer.time_octaves.shape[1])), 0)
     features = np.repeat(linear(layer.time_output, time), len(means), axis=0)
-    hidden = np.concatenate([plain_encoding(means, layer.xyz_octaves.shape[1] // 3), features], axis=1)
-    for module in [layer.first, *layer.trunk]:
-        hidden = np.maximum(linear(module, hidden), 0)
+    inputs = np.concatenate([plain_encoding(means, layer.xyz_octaves.shape[1] // 3), features], axis=1)
+    hidden = np.maximum(linear(layer.first, inputs), 0)
+    for i, module in enumerate(layer.trunk, start=1):
+        read = np.concatenate([inputs, hidden], axis=1) if i == layer.skip else hidden
+        hidden = np.maximum(linear(module, read), 0)
     heads = linear(layer.heads, hidden)
     return heads[:, :10], 1 / (1 + np.exp(-heads[:, 10:]))
 
@@ -53,22 +58,25 @@ def test_a_layer_has_the_papers_number_of_parameters():
 
 
 def test_the_modulation_has_the_papers_number_of_parameters_and_starts_at_one():
-    modulation = ScaleModulation()
+    modulation = Modulation()
     assert parameters(modulation) == PAPER_MODULATION_PARAMETERS
-    assert torch.equal(modulation(torch.randn(7, 32)), torch.ones(7, 3))
+    factors = modulation(torch.randn(7, 32))
+    assert torch.equal(factors.present()["scales"], torch.ones(7, 3))
+    assert list(factors.present()) == ["scales"]
 
 
 def test_the_modulation_stays_bounded():
-    modulation = ScaleModulation()
+    modulation = Modulation()
     with torch.no_grad():
         modulation.output.bias[:] = torch.tensor([200.0, -200.0, 1.0])
-    torch.testing.assert_close(modulation(torch.randn(7, 32)), torch.tensor([2.0, -2.0, 1.0]).exp().expand(7, 3))
+    scales = modulation(torch.randn(7, 32)).scales
+    torch.testing.assert_close(scales, torch.tensor([2.0, -2.0, 1.0]).exp().expand(7, 3))
 
 
 def test_a_new_layer_moves_nothing_but_has_weights():
     torch.manual_seed(0)
     step = MLPLayer(depth=2)(torch.randn(9, 3), torch.tensor(0.3))
-    for delta in (step.delta_means, step.delta_log_scales, step.delta_quats):
+    for delta in (step.delta_means, step.delta_scales, step.delta_quats):
         assert not delta.any()
     assert step.weight.shape == (9, 1)
     assert ((step.weight > 0) & (step.weight < 1)).all()
@@ -94,22 +102,74 @@ def test_encoding_gradient():
     assert torch.autograd.gradcheck(PositionalEncoding.apply, (x, octaves(3, 4).double()))
 
 
-@pytest.mark.parametrize("sizes", [{}, {"depth": 1}, {"width": 1}, {"xyz_frequencies": 2, "time_frequencies": 1}])
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {},
+        {"depth": 1},
+        {"width": 1},
+        {"xyz_frequencies": 2, "time_frequencies": 1},
+        {"skip": 1},
+        {"depth": 5, "skip": 3},
+    ],
+)
 def test_layer_agrees_with_a_plain_reading(sizes: dict[str, int]):
     layer = random_layer(1, **sizes)
     means = torch.randn(20, 3, dtype=torch.float64)
     step = layer(means, torch.tensor(0.7, dtype=torch.float64))
     deltas, weight = plain_step(layer, means.numpy(), 0.7)
-    got = torch.cat([step.delta_means, step.delta_log_scales, step.delta_quats], dim=1)
+    got = torch.cat([step.delta_means, step.delta_scales, step.delta_quats], dim=1)
     assert_close(got.detach(), deltas, "network.float64")
     assert_close(step.weight.detach(), weight, "network.float64")
+
+
+def test_without_a_weight_every_step_counts_in_full():
+    """Under a wrong wiring (a weight that is 1 but still learned, or a step that is halved) these would differ."""
+    torch.manual_seed(3)
+    weighted = MLPLayer(width=16, depth=2).double()
+    full = MLPLayer(width=16, depth=2, outputs=Heads(weight=False)).double()
+    with torch.no_grad():
+        weighted.heads.weight.normal_()
+        full.load_state_dict(weighted.state_dict() | {
+            "heads.weight": weighted.heads.weight[:-1], "heads.bias": weighted.heads.bias[:-1],
+        })  # fmt: skip
+    assert parameters(weighted) - parameters(full) == 16 + 1
+    means, t = torch.randn(9, 3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)
+    steps = [MultiStepDeformation([layer])(means, t).means for layer in (weighted, full)]
+    weight = weighted(means, t).weight
+    assert torch.equal(full(means, t).weight, torch.ones(9, 1, dtype=torch.float64))
+    assert_close(steps[0].detach(), (weight * steps[1]).detach(), "network.float64")
+    gradients = [
+        torch.autograd.grad(s.sum(), layer.heads.bias)[0] for s, layer in zip(steps, (weighted, full), strict=True)
+    ]
+    assert_close(gradients[1], [9.0] * 3 + [0.0] * 7, "network.float64")  # a step moves a mean by all of its delta
+    assert_close(gradients[0][:3], [weight.detach().sum()] * 3, "network.float64")
+    assert gradients[0][-1] != 0  # and the weight learns
+
+
+def test_heads_of_opacity_and_sh_change_only_these():
+    torch.manual_seed(4)
+    layer = MLPLayer(width=16, depth=2, outputs=Heads(opacity=True, sh=4)).double()
+    assert layer.heads.out_features == 10 + 1 + 12 + 1
+    with torch.no_grad():
+        layer.heads.bias[10] = 0.5
+        layer.heads.bias[11:23] = torch.arange(12.0)
+    deltas = MultiStepDeformation([layer, layer])(torch.randn(5, 3).double(), torch.tensor(0.3).double())
+    weight = layer(torch.randn(5, 3).double(), torch.tensor(0.3).double()).weight
+    assert deltas.opacities is not None
+    assert deltas.sh is not None
+    assert deltas.sh.shape == (5, 4, 3)
+    assert not any(delta.any() for delta in deltas[:3])
+    assert_close((deltas.sh[:, 0, 1] / deltas.opacities).detach(), [2.0] * 5, "network.float64")
+    assert ((deltas.opacities > 0) & (deltas.opacities < 1)).all()
+    assert ((weight > 0) & (weight < 1)).all()
 
 
 def test_layer_gradients():
     layer = random_layer(2, width=4, depth=2, time_width=3, time_features=2, xyz_frequencies=1, time_frequencies=1)
     means = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
     t = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda *x: tuple(layer(*x[:2])), (means, t, *layer.parameters()))
+    assert torch.autograd.gradcheck(lambda *x: tuple(layer(*x[:2])[:4]), (means, t, *layer.parameters()))
 
 
 @pytest.mark.parametrize("steps", [None, 0, 1, 2, 3])
@@ -122,14 +182,14 @@ def test_steps_are_weighted_and_summed(steps: int | None):
         step, weight = plain_step(layer, moved, 0.2)  # equation 7
         moved = moved + weight * step[:, :3]  # equation 8
         total = total + weight * step  # equation 9
-    assert_close(torch.cat(deltas, dim=1).detach(), total, "network.float64")
+    assert_close(torch.cat(deltas[:3], dim=1).detach(), total, "network.float64")
     assert np.abs(moved - means.numpy() - total[:, :3]).max() < tolerance("network.float64")
 
 
 def test_no_layers_and_no_gaussians():
     for deformation in (MultiStepDeformation([]), MultiStepDeformation([MLPLayer(width=8)])):
         deltas = deformation(torch.empty(0, 3), torch.tensor(0.0))
-        assert [tuple(d.shape) for d in deltas] == [(0, 3), (0, 3), (0, 4)]
+        assert [tuple(d.shape) for d in deltas[:3]] == [(0, 3), (0, 3), (0, 4)]
 
 
 def last_features(layer: MLPLayer, places: torch.Tensor, t: float) -> torch.Tensor:
@@ -144,7 +204,7 @@ def last_features(layer: MLPLayer, places: torch.Tensor, t: float) -> torch.Tens
 @pytest.mark.parametrize(
     "sizes", [{}, {"depth": 8}, {"width": 96, "depth": 2, "time_width": 64}, {"width": 64, "depth": 3}]
 )
-def test_some_last_unit_answers_everywhere(sizes: dict[str, int]):
+def test_some_last_unit_answers_everywhere(sizes: dict[str, Any]):
     places = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 2.6 - 1.3
     torch.manual_seed(0)
     layer = MLPLayer(**sizes)

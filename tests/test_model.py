@@ -7,7 +7,7 @@ import torch
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians import CanonicalGaussians, neighbour_distances
-from msdgs_train.model import DynamicGaussians, ModelConfig, unit_quats
+from msdgs_train.model import SMALLEST_SCALE, DynamicGaussians, ModelConfig, unit_quats
 from tests.models import random_model, small_config
 from tests.tolerances import assert_close
 
@@ -29,13 +29,89 @@ def test_deltas_are_added_before_activation():
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     quats = g.raw_quats / g.raw_quats.norm(dim=1, keepdim=True) + deltas.quats
     assert model.modulation is not None
-    log_scales = g.log_scales + model.modulation(g.embeddings) * deltas.log_scales  # equation 12
+    log_scales = g.log_scales + model.modulation(g.embeddings).scales * deltas.scales  # equation 12
     for got, want in (
         (posed.means, g.means + deltas.means),
         (posed.scales, log_scales.exp()),
         (posed.quats, quats / quats.norm(dim=1, keepdim=True)),
     ):
         assert_close(got.detach(), want.detach(), "network.float64")
+
+
+def changed(config: dict[str, Any]) -> set[str]:
+    """What a modulation by other embeddings changes."""
+    model = random_model(**config)
+    before = model.pose(0.3)
+    with torch.no_grad():
+        assert model.gaussians.embeddings is not None
+        model.gaussians.embeddings.add_(1.0)
+    after = model.pose(0.3)
+    return {name for name in before._fields if not torch.equal(getattr(before, name), getattr(after, name))}
+
+
+@pytest.mark.parametrize(
+    "targets", [("means",), ("scales",), ("quats",), ("means", "quats"), ("quats", "scales", "means")]
+)
+@pytest.mark.parametrize("delta_space", ["raw", "activated"])
+def test_modulation_changes_its_targets_only(targets: tuple[str, ...], delta_space: str):
+    assert changed({"modulate": targets, "delta_space": delta_space}) == set(targets)
+
+
+@pytest.mark.parametrize("targets", [("means",), ("scales",), ("quats",), ("means", "scales", "quats")])
+def test_modulation_multiplies_the_sums_once(targets: tuple[Any, ...]):
+    model = random_model(modulate=targets).double()
+    g, posed = model.gaussians, model.pose(0.3)
+    deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
+    assert model.modulation is not None
+    factors = model.modulation(g.embeddings).present()
+    assert list(factors) == [name for name in ("means", "scales", "quats") if name in targets]
+    assert all((f - 1).abs().max() > 1e-3 for f in factors.values())
+    means, scales, quats = (factors.get(name, 1.0) * getattr(deltas, name) for name in ("means", "scales", "quats"))
+    assert_close(posed.means.detach(), (g.means + means).detach(), "network.float64")
+    assert_close(posed.scales.detach(), (g.log_scales + scales).exp().detach(), "network.float64")
+    assert_close(posed.quats.detach(), unit_quats(unit_quats(g.raw_quats) + quats).detach(), "network.float64")
+
+
+def test_deltas_may_be_added_to_scales_themselves():
+    model = random_model(delta_space="activated", noise=0.2).double()
+    g, posed = model.gaussians, model.pose(0.3)
+    deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
+    assert model.modulation is not None
+    wanted = g.log_scales.exp() + model.modulation(g.embeddings).scales * deltas.scales
+    floored = wanted < SMALLEST_SCALE
+    assert 0 < floored.sum() < floored.numel() / 2
+    assert_close(posed.scales[~floored].detach(), wanted[~floored].detach(), "network.float64")
+    assert (posed.scales[floored] == SMALLEST_SCALE).all()
+    assert (random_model(delta_space="raw", noise=0.2).pose(0.3).scales.double() - posed.scales).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("heads", [{"opacity_head": True}, {"sh_head": True}, {"opacity_head": True, "sh_head": True}])
+@pytest.mark.parametrize("layers", [("mlp", "mlp"), ("plane",), ("plane", "mlp")])
+def test_heads_of_opacity_and_colour(heads: dict[str, bool], layers: tuple[str, ...]):
+    model = random_model(layers=layers, **heads)
+    early, late, canonical = model.pose(0.1), model.pose(0.9), model.pose(0.1, deform=False)
+    for name, head in (("opacities", "opacity_head"), ("sh", "sh_head")):
+        moves = not torch.equal(getattr(early, name), getattr(late, name))
+        assert moves == heads.get(head, False)
+        assert torch.equal(getattr(early, name), getattr(canonical, name)) != moves
+    assert ((late.opacities > 0) & (late.opacities < 1)).all()
+    assert torch.equal(model.pose(0.1, sh_degree=1).sh, early.sh[:, :4])
+
+
+def test_a_model_without_weights_has_none():
+    with_weights, without = random_model(), random_model(weights=False)
+    fewer = sum(p.numel() for p in with_weights.parameters()) - sum(p.numel() for p in without.parameters())
+    assert fewer == 2 * (32 + 1)
+
+
+@pytest.mark.parametrize("count", [1, 3, 10])
+def test_any_number_of_layers(count: int):
+    model = random_model(layers=("mlp",) * count, noise=0.02)
+    assert len(model.deformation) == count
+    before = model.pose(0.4).means
+    with torch.no_grad():
+        model.get_parameter(f"deformation.layers.{count - 1}.heads.bias")[:3] += 1.0
+    assert not torch.equal(model.pose(0.4).means, before), "the last layer counts"
 
 
 def test_stopping_after_a_step_is_a_model_of_fewer_layers():
@@ -125,7 +201,14 @@ def test_quaternions_without_direction_become_identity():
         ("layers", "mlp"),
         ("plane_space_nodes", 1),
         ("plane_channels", 0),
-        ("delta_space", "activated"),
+        ("delta_space", "linear"),
+        ("skip", 4),
+        ("weights", 1),
+        ("modulate", ()),
+        ("modulate", ("scales", "scales")),
+        ("modulate", ("opacities",)),
+        ("plane_scales", ()),
+        ("plane_scales", (1, 0)),
     ],
 )
 def test_impossible_sizes_are_refused_by_name(field: str, value: Any):

@@ -11,10 +11,12 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import INRIA, rasterize
 from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
+from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.camera import orbit
 from tests.scene_files import UP, metadata, write_scene
 
 SIZE = 64
+POSE_BYTES = 2 * 10 * 4  # two Gaussians: means, quats, scales
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +32,8 @@ def level_camera(width: int = SIZE, height: int = SIZE) -> Camera:
 class CountingSession(DeformationSession):
     """Stands for a scene: says how often and with which times it was posed, and can be made slow or to fail."""
 
-    def __init__(self, gaussians: Gaussians) -> None:
+    def __init__(self, gaussians: Gaussians, scene: BakedScene) -> None:
+        self.scene = scene
         self._gaussians = gaussians
         self.times: list[float] = []
         self.release = threading.Event()
@@ -47,7 +50,7 @@ class CountingSession(DeformationSession):
 
 @pytest.fixture
 def counting(session: DeformationSession) -> CountingSession:
-    return CountingSession(session.gaussians(0.0))
+    return CountingSession(session.gaussians(0.0), session.scene)
 
 
 @pytest.mark.parametrize(("t", "row"), [(0.0, "below"), (1.0, "above")])
@@ -65,7 +68,7 @@ def test_the_frame_shows_the_scene_at_its_time(session: DeformationSession, t: f
 
 
 def test_the_image_is_what_the_rasterizer_draws(session: DeformationSession):
-    image = Renderer().render(session, level_camera(), 0.3, RenderOptions((0.1, 0.2, 0.3), INRIA))
+    image = Renderer().render(session, level_camera(), 0.3, RenderOptions((0.1, 0.2, 0.3), rasterizer=INRIA))
     drawn = rasterize(session.gaussians(0.3), level_camera(), background=(0.1, 0.2, 0.3), options=INRIA)
     np.testing.assert_array_equal(image.rgb, drawn.rgb)
     np.testing.assert_array_equal(image.alpha, drawn.alpha)
@@ -101,14 +104,14 @@ def test_one_computation_for_all_who_ask_together(counting: CountingSession):
 
 
 def test_the_pose_asked_for_longest_ago_is_forgotten_first(counting: CountingSession):
-    renderer = Renderer(cached_poses=2)
+    renderer = Renderer(cache_bytes=2 * POSE_BYTES)
     for t in (0.0, 0.1, 0.0, 0.2, 0.0, 0.1):  # 0.2 drives out 0.1
         renderer.posed(counting, t)
     assert counting.times == [0.0, 0.1, 0.2, 0.1]
 
 
 def test_scenes_do_not_share_poses(session: DeformationSession, counting: CountingSession):
-    renderer, other = Renderer(), CountingSession(session.gaussians(1.0))
+    renderer, other = Renderer(), CountingSession(session.gaussians(1.0), session.scene)
     assert renderer.posed(counting, 0.0) is not renderer.posed(other, 0.0)
 
 
@@ -134,7 +137,7 @@ def test_eight_threads_get_the_bytes_that_one_gets(session: DeformationSession):
         return image.rgb.tobytes() + image.alpha.tobytes() + image.depth.tobytes()
 
     alone = [draw(Renderer(), number) for number in range(8)]
-    shared = Renderer(cached_poses=2)
+    shared = Renderer(cache_bytes=2 * POSE_BYTES)
     with ThreadPoolExecutor(8) as pool:
         together = list(pool.map(lambda number: draw(shared, number % 8), range(32)))
     assert together == alone * 4
@@ -146,7 +149,7 @@ def test_a_scene_without_motion(tmp_path: Path):
     assert image.rgb[SIZE // 2, SIZE // 2].argmax() == 0
 
 
-def test_a_cache_of_nothing_is_refused():
+def test_a_cache_of_less_than_nothing_is_refused():
     with pytest.raises(InvalidInput) as error:
-        Renderer(cached_poses=0)
-    assert error.value.field == "cached_poses"
+        Renderer(cache_bytes=-1)
+    assert error.value.field == "cache_bytes"

@@ -52,7 +52,7 @@ def test_it_says_where_it_listens_and_what_to_paste_and_stops_at_ctrl_c(process:
     printed = read_until(process, r"-d '")
     match = re.search(r"Listening on (http://127\.0\.0\.1:\d+)", printed)
     assert match
-    assert httpx.get(f"{match[1]}/healthz").status_code == 200
+    assert httpx.get(f"{match[1]}/ready").status_code == 200
     words = shlex.split(printed[printed.index("curl") :])
     body, headers = words[words.index("-d") + 1], dict([words[words.index("-H") + 1].split(": ")])
     response = httpx.post(words[1], content=body, headers=headers)

@@ -1,5 +1,6 @@
 """Scenes on disk: found, opened once, reloaded when they change, kept when the new file is broken."""
 
+import hashlib
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +11,7 @@ import pytest
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid, SceneNotFound
-from msdgs_serve.store import SceneStore
+from msdgs_serve.store import SceneExists, SceneStore
 from tests.scene_files import write_scene
 
 
@@ -55,8 +56,13 @@ def test_a_changed_file_is_loaded_anew(tmp_path: Path):
     store = SceneStore([path])
     before = store.get("walk")
     change(path, plan="prefix:1")
+    assert store.get("walk") is before
+    store.refresh()
     after = store.get("walk")
-    assert (before.scene.metadata.plan, after.scene.metadata.plan) == ("network", "prefix:1")
+    plans = [served.session.scene.metadata.plan for served in (before, after)]
+    assert plans == ["network", "prefix:1"]
+    assert before.sha256 != after.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    store.refresh()
     assert store.get("walk") is after
 
 
@@ -65,12 +71,14 @@ def test_a_broken_file_leaves_the_old_scene_and_is_reported(tmp_path: Path):
     store = SceneStore([path])
     before = store.get("walk")
     path.write_bytes(path.read_bytes()[:100])
+    store.refresh()
     assert store.get("walk") is before
     status = store.status("walk")
     assert status.loaded
     assert "walk.onnx" in str(status.problem)
     change(path, plan="prefix:1")
-    assert store.get("walk").scene.metadata.plan == "prefix:1"
+    store.refresh()
+    assert store.get("walk").session.scene.metadata.plan == "prefix:1"
     assert store.status("walk").problem is None
 
 
@@ -116,11 +124,14 @@ def test_others_are_served_the_old_scene_while_one_loads_the_new(tmp_path: Path)
     store_has_scene = True
     change(path, plan="prefix:1")
     with ThreadPoolExecutor(1) as pool:
-        slow = pool.submit(store.get, "walk")
+        slow = pool.submit(store.refresh)
         assert loading.wait(10)
         assert store.get("walk") is before
+        store.refresh()
+        assert store.get("walk") is before
         go_on.set()
-        assert slow.result(10).scene.metadata.plan == "prefix:1"
+        slow.result(10)
+    assert store.get("walk").session.scene.metadata.plan == "prefix:1"
 
 
 def test_files_come_and_go(tmp_path: Path):
@@ -172,3 +183,71 @@ def test_paths_that_are_no_scenes_are_refused_with_a_reason(tmp_path: Path, name
     with pytest.raises(InvalidInput, match=hint) as error:
         SceneStore([tmp_path / name])
     assert error.value.field == "paths"
+
+
+def incoming(store: SceneStore, **changes: Any) -> Path:
+    """A scene file on its way in."""
+    return write_scene(store.incoming("token"), **changes)
+
+
+def test_a_scene_is_added_and_replaced_as_a_whole(tmp_path: Path):
+    store = SceneStore([tmp_path])
+    added = store.add("walk", incoming(store))
+    assert store.get("walk") is added
+    assert store.names() == ["walk"]
+    with pytest.raises(SceneExists, match="walk"):
+        store.add("walk", incoming(store, plan="prefix:1"))
+    assert store.get("walk") is added
+    replaced = store.add("walk", incoming(store, plan="prefix:1"), replace=True)
+    assert store.get("walk") is replaced
+    assert replaced.sha256 == hashlib.sha256((tmp_path / "walk.onnx").read_bytes()).hexdigest()
+
+
+def test_a_broken_file_takes_nobodys_place(tmp_path: Path):
+    store = SceneStore([tmp_path])
+    before = store.add("walk", incoming(store))
+    path = incoming(store)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(SceneFileInvalid):
+        store.add("walk", path, replace=True)
+    assert store.get("walk") is before
+    assert store.status("walk").problem is None
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", ".hidden", "a/b", "../walk", "a\\b", "a\0b", "a\nb", "x" * 201])
+def test_names_that_are_no_plain_text_are_refused(tmp_path: Path, name: str):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    store = SceneStore([folder])
+    with pytest.raises(InvalidInput) as error:
+        store.add(name, incoming(store))
+    assert error.value.field == "name"
+    assert [file.name for file in tmp_path.iterdir()] == ["scenes"]
+
+
+def test_what_an_upload_left_is_no_scene_and_is_cleared(tmp_path: Path):
+    store = SceneStore([tmp_path])
+    path = incoming(store)
+    assert store.names() == []
+    store.clear_incoming()
+    assert not path.exists()
+
+
+def test_a_scene_that_is_removed_is_gone(tmp_path: Path):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    alone = write_scene(tmp_path / "alone.onnx")
+    store = SceneStore([folder, alone])
+    store.add("walk", incoming(store))
+    store.remove("walk")
+    assert store.names() == ["alone"]
+    with pytest.raises(SceneNotFound):
+        store.remove("walk")
+    with pytest.raises(InvalidInput, match="folder for uploads"):
+        store.remove("alone")
+    assert alone.exists()
+
+
+def test_scenes_are_added_to_folders_only(tmp_path: Path):
+    with pytest.raises(InvalidInput, match="folder"):
+        SceneStore([write_scene(tmp_path / "walk.onnx")]).incoming("token")

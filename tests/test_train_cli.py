@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -40,6 +41,8 @@ def test_wrong_input_is_one_line_and_code_2(data: Path, tmp_path: Path, capsys: 
     cases = {
         "`config.steps`": ["fit", str(data), str(tmp_path / "run"), "--steps", "0"],
         "`run`": ["fit", str(data), str(tmp_path / "run"), "--resume"],
+        "`preset`": ["fit", str(data), str(tmp_path / "run"), "--preset", "hexplane"],
+        "`preset` must be left out": ["fit", str(data), str(tmp_path / "run"), "--preset", "static", "--resume"],
         "does not exist": ["fit", str(tmp_path / "nowhere"), str(tmp_path / "run")],
     }
     for word, arguments in cases.items():
@@ -89,3 +92,21 @@ def _wait_for_lines(path: Path, process: subprocess.Popen, lines: int = 3, secon
         assert process.poll() is None, process.communicate()[0]
         assert time.monotonic() < deadline, "no step in time"
         time.sleep(0.05)
+
+
+def test_a_preset_gives_way_to_what_is_given_beside_it(data: Path, tmp_path: Path) -> None:
+    options = ["--preset", "static", "--steps", "2", "--init-count", "60", "--max-gaussians=90", "--threads=1"]
+    assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["model"]["layers"], config["init_count"], config["window_until_fraction"]) == ([], 60, 0.0)
+
+
+def test_help_shows_the_settings_of_a_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = {}
+    for name in get_args(cli.PresetName):
+        with pytest.raises(SystemExit):
+            cli.main(["fit", "--preset", name, "--help"])
+        shown[name] = " ".join(capsys.readouterr().out.split())
+    assert "default: 40000" in shown["deformgs"]
+    assert "default: 16000" in shown["msdgs-small"]
+    assert len(set(shown.values())) == len(shown)

@@ -20,7 +20,7 @@ from msdgs_train.fit import Observer, fit
 from msdgs_train.model import ModelConfig
 from msdgs_train.optimizers import exponential, learning_rates
 from msdgs_train.report import MetricsLog, read_metrics
-from msdgs_train.trainer import Trainer, TrainingDiverged
+from msdgs_train.trainer import StepResult, Trainer, TrainingDiverged
 from tests.training_scene import SIZE, small_config, write_scene
 
 
@@ -184,6 +184,83 @@ def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.Mo
         _steps(trainer, 19)
 
 
+class _Rollbacks(Observer):
+    def __init__(self) -> None:
+        self.seen: list[tuple[int, float]] = []
+        self.steps: list[int] = []
+
+    def step(self, result: StepResult, seconds: float) -> None:
+        self.steps.append(result.step)
+
+    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+        assert "not finite" in reason
+        self.seen.append((step, rate_factor))
+
+
+def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
+    """Not finite in those calls, counted over all trainers, and as they are in the others."""
+    calls, whole = iter(range(10**6)), trainer_module.photometric_loss
+
+    def loss(rgb: torch.Tensor, truth: torch.Tensor, weight: float) -> torch.Tensor:
+        return whole(rgb, truth, weight) * (float("nan") if next(calls) in broken else 1.0)
+
+    monkeypatch.setattr(trainer_module, "photometric_loss", loss)
+
+
+@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.parametrize(("start", "back_to"), [(13, 10), (25, 20), (4, 0)])
+def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: int, back_to: int
+) -> None:
+    """Also where the next checkpoint would be due while steps are skipped: at 20 of the first case."""
+    _break_losses(monkeypatch, range(start, start + 20))
+    run, watched = tmp_path / "run", _Rollbacks()
+    outcome = fit(small_config(steps=50, checkpoint_every=10, eval_every=0), data, run, observer=watched)
+    assert (outcome.status, outcome.step) == ("finished", 50)
+    assert watched.seen == [(back_to, 0.5)]
+    assert watched.steps == [*range(1, start + 20), *range(back_to + 1, 51)]
+    assert [line["step"] for line in read_metrics(run) if line["kind"] == "train"] == list(range(1, 51))
+    last = [line for line in read_metrics(run) if line["kind"] == "train"][-1]
+    assert (last["skipped"], last["step"]) == (20, 50)
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert state["rollbacks"] == 1
+    rates = {group["name"]: group["lr"] for group in state["optimizer"]["param_groups"]}
+    assert rates["means"] == pytest.approx(0.5 * learning_rates(small_config(steps=50), 49)["means"])
+    load_model(run / "model.pt")
+
+
+@pytest.mark.usefixtures("_no_curve")
+def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _break_losses(monkeypatch, range(15, 10**6))
+    watched = _Rollbacks()
+    config = small_config(steps=200, checkpoint_every=10, eval_every=0)
+    with pytest.raises(TrainingDiverged, match=r"after 3 returns .* lower ones"):
+        fit(config, data, tmp_path / "run", observer=watched)
+    assert watched.seen == [(10, 0.5), (10, 0.25), (10, 0.125)]
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step_count"] == 10
+    load_model(tmp_path / "run" / "model.pt")
+
+
+def test_another_way_is_taken_after_a_rollback(data: Path) -> None:
+    diverged, again = (Trainer(small_config(window_until_fraction=0.0), load_scene(data)) for _ in range(2))
+    first = [diverged._next_frame().name for _ in range(7)]
+    again.retry_after(diverged)
+    assert [again._next_frame().name for _ in range(7)] != first
+    assert (again.rollbacks, again.rate_factor) == (1, 0.5)
+
+
+def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
+    model = dataclasses.replace(small_config().model, delta_space="activated")
+    trainer = Trainer(small_config(model=model, warmup_fraction=0.0), load_scene(data))
+    assert trainer.step().floored == 0
+    with torch.no_grad():
+        trainer.model.get_parameter("deformation.layers.0.heads.bias")[4] = -1e3
+    result = trainer.step()
+    assert result.floored == result.gaussians
+
+
 def test_an_outlier_of_a_gradient_is_cut(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(small_config(steps=100, warmup_fraction=0.0), load_scene(data))
     monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, weight: 1e9 * (rgb - truth).sum() ** 2)
@@ -252,7 +329,7 @@ def test_learning_rates() -> None:
     [
         ("steps", 0), ("l1_weight", 1.5), ("l1_weight", float("nan")), ("means_rate_start", 0.0),
         ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("densify_every", -1),
-        ("quats_rate", float("inf")), ("size", 0),
+        ("quats_rate", float("inf")), ("size", 0), ("densify_strategy", "none"), ("mcmc_noise", -1.0),
     ],
 )  # fmt: skip
 def test_settings_out_of_range_are_named(field: str, value: object) -> None:

@@ -58,9 +58,26 @@ TABLE = (
     Row("encoding.float64", 1e-12, "sines of phases up to 1024, each rounded once"),
     Row("encoding.float32", 1e-5, "phases are exact products; what is left is the sine's own rounding"),
     Row("network.float64", 1e-11, "matrix products in another order, five deep, through frequencies up to 512"),
+    Row("share.relative", 1e-9, "alternating float64 sums, the terms up to 500 times the result"),
+    Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
     Row("neighbour_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
     Row("served_frame", 1e-3, "of a float pixel; onnxruntime's exponentials and products are not torch's to the bit"),
+    # stability: made cases, docs/stability.md
+    Row(
+        "stability.accepted_db", 50.0, "what the export promises by default; a model let through must keep it anywhere"
+    ),
+    Row(
+        "stability.foretold",
+        2.0,
+        "a first-order bound, each layer's error measured once; roundings of the sum of deltas come on top",
+    ),
+    Row("stability.spectral_norm.relative", 1e-12, "a root of a cubic in float64, of matrices whose entries are alike"),
+    Row("stability.none", 0.0, "a count of what must not be there"),
+    Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
+    Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
+    Row("export.float32_db", 90.0, "worst frame, float32 against float64: at a few pixels a splat is at its cut-off"),
+    Row("trim.elsewhere_db", 3.0, "half as much error again at times and places that trimming has not looked at"),
     # datasets
     Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
     Row("composite_of_8bit", 1.001 / 255, "half a step of colour and half a step of alpha, each rounded once"),

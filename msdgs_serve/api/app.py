@@ -1,13 +1,16 @@
 """The application: routes, error handlers and what they share, put together."""
 
-import anyio
 from fastapi import FastAPI
+from starlette.middleware.cors import CORSMiddleware
 
 from msdgs_serve import __version__
 from msdgs_serve.api.body_limit import BodyLimit
 from msdgs_serve.api.errors import install_error_handlers
-from msdgs_serve.api.openapi import install_openapi, render_examples
-from msdgs_serve.api.routes import Service, router
+from msdgs_serve.api.keys import KeyCheck, read_keys
+from msdgs_serve.api.observe import REQUEST_ID, Observe
+from msdgs_serve.api.openapi import install_openapi
+from msdgs_serve.api.routes import batch, health, render, scenes
+from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
@@ -15,16 +18,37 @@ from msdgs_serve.store import SceneStore
 DESCRIPTION = """Frames of moving scenes, for any camera and any time.
 
 World and cameras have OpenCV axes: x right, y down, z forward. Angles are degrees. Every error is
-`application/problem+json` (RFC 9457) and names the fields that are wrong."""
+`application/problem+json` (RFC 9457) and names the fields that are wrong. Every answer has an `X-Request-ID`, the
+client's own where it sends a plain one."""
+
+STREAMED = (("POST", "/scenes"),)
+EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", "Msdgs-Scene", "Msdgs-Plan", "Msdgs-Channels", "Retry-After")
 
 
 def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> FastAPI:
-    """The service over the scenes of `store`. Loads the first of them, for the examples at /docs."""
-    app = FastAPI(title="msdgs", version=__version__, description=DESCRIPTION)
-    slots = anyio.CapacityLimiter(settings.concurrent_renders)
-    app.state.service = Service(store, renderer, settings.max_pixels, slots)
-    app.include_router(router)
+    """The service over the scenes of `store`, which are loaded when it starts.
+
+    Raises `InvalidInput` where the file of keys can't be used.
+    """
+    keys = None if settings.api_keys_file is None else read_keys(settings.api_keys_file)
+    service = Service(store, renderer, settings)
+    app = FastAPI(title="msdgs", version=__version__, description=DESCRIPTION, lifespan=service.lifespan)
+    app.state.service = service
+    for calls in (render, batch, scenes, health):
+        app.include_router(calls.router)
     install_error_handlers(app)
-    install_openapi(app, render_examples(store))
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
+    install_openapi(app, store, keys=keys is not None)
+    # the last is the outermost
+    app.add_middleware(BodyLimit, settings.max_body_bytes, settings.body_seconds, STREAMED)
+    if keys is not None:
+        app.add_middleware(KeyCheck, keys)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["*"],
+            allow_headers=["*"],
+            expose_headers=EXPOSED_HEADERS,
+        )
+    app.add_middleware(Observe, service.metrics)
     return app

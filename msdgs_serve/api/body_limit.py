@@ -1,34 +1,47 @@
-"""Refuse bodies that are too large, without keeping them in memory."""
+"""Refuse bodies that are too large or too slow, without keeping them in memory."""
 
+import asyncio
+from collections.abc import Collection
 from http import HTTPStatus
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from msdgs_serve.api.errors import FieldError, problem_response
+from msdgs_serve.api.errors import KIND, FieldError, problem_response
 
 DRAINED_BYTES = 64 << 20
 """Of a body that is too large this much is read and thrown away: most clients look for an answer only after sending."""
 
 
 class BodyLimit:
-    """ASGI middleware: 413 for a body of more than `max_bytes`, whether its length is announced or not."""
+    """ASGI middleware: 413 for a body of more than `max_bytes`, announced or not; 408 for one not here in `seconds`.
 
-    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
+    Calls in `streamed`, as (method, path), read their body themselves, with limits of their own.
+    """
+
+    def __init__(
+        self, app: ASGIApp, max_bytes: int, seconds: float, streamed: Collection[tuple[str, str]] = ()
+    ) -> None:
         self._app = app
         self._max_bytes = max_bytes
+        self._seconds = seconds
+        self._streamed = streamed
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
+        if scope["type"] != "http" or (scope["method"], scope["path"]) in self._streamed:
             await self._app(scope, receive, send)
             return
-        body = await self._read(receive)
+        try:
+            async with asyncio.timeout(self._seconds):
+                body = await self._read(receive)
+        except TimeoutError:
+            message = f"must be complete after {self._seconds:g} s"
+            await _refuse(HTTPStatus.REQUEST_TIMEOUT, message, "slow_body", scope, receive, send)
+            return
         if isinstance(body, bytes):
             await self._app(scope, _replay(body, receive), send)
         elif body:
             message = f"must be at most {self._max_bytes} bytes"
-            errors = [FieldError(field="body", message=message)]
-            response = problem_response(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"The body {message}.", errors)
-            await response(scope, receive, send)
+            await _refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, message, "large_body", scope, receive, send)
 
     async def _read(self, receive: Receive) -> bytes | bool:
         """The body; True where it is too large; False where the client went away."""
@@ -47,6 +60,13 @@ class BodyLimit:
             if not message.get("more_body", False):
                 break
         return b"".join(parts) if size <= self._max_bytes else True
+
+
+async def _refuse(status: HTTPStatus, message: str, kind: str, scope: Scope, receive: Receive, send: Send) -> None:
+    scope[KIND] = kind
+    errors = [FieldError(field="body", message=message)]
+    headers = {"Connection": "close"} if status == HTTPStatus.REQUEST_TIMEOUT else None
+    await problem_response(status, f"The body {message}.", errors, headers)(scope, receive, send)
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:

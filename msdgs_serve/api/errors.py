@@ -9,17 +9,22 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, ValidationError
 from starlette.exceptions import HTTPException
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
+from msdgs_serve.store import SceneExists
 
 STATUS_OF: dict[type[MsdgsError], HTTPStatus] = {
     InvalidInput: HTTPStatus.UNPROCESSABLE_ENTITY,
     SceneNotFound: HTTPStatus.NOT_FOUND,
+    SceneExists: HTTPStatus.CONFLICT,
     SceneFileInvalid: HTTPStatus.SERVICE_UNAVAILABLE,
 }
+KIND = "msdgs.problem"
+"""Key of an ASGI scope: what kind of problem it was answered with, for the metrics."""
+
+CLIENT_CLOSED_REQUEST = 499  # nginx's
 
 MEDIA_TYPE = "application/problem+json"
 MAX_BODY_BYTES = 8192
@@ -28,6 +33,32 @@ MAX_FIELD_LENGTH = 100
 MAX_MESSAGE_LENGTH = 200
 
 logger = logging.getLogger("msdgs_serve")
+
+
+class Refused(MsdgsError):
+    """A request that is not carried out for another reason than its values; knows its own status."""
+
+    def __init__(
+        self, status: HTTPStatus, kind: str, detail: str, *, field: str | None = None, retry_after: int | None = None
+    ) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.kind = kind  # one word for the metrics
+        self.field = field
+        self.headers = {} if retry_after is None else {"Retry-After": str(retry_after)}
+
+
+class ClientGone(MsdgsError):
+    """The client closed the connection before its answer was ready."""
+
+
+KINDS: dict[type[Exception], str] = {
+    InvalidInput: "invalid",
+    SceneNotFound: "not_found",
+    SceneExists: "conflict",
+    SceneFileInvalid: "broken_scene",
+    ClientGone: "client_gone",
+}
 
 
 class FieldError(BaseModel):
@@ -69,44 +100,41 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(MsdgsError, _on_domain_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_error)
-    app.add_middleware(UnexpectedErrors)
 
 
-class UnexpectedErrors:
-    """ASGI middleware: an error that nothing else handles is logged and answered with 500.
-
-    In place of a handler for `Exception`, after which the connection is closed under a client that may be using it.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        answering = False
-
-        async def watched(message: Message) -> None:
-            nonlocal answering
-            answering = True
-            await send(message)
-
-        try:
-            await self._app(scope, receive, watched)
-        except Exception as error:
-            if answering or scope["type"] != "http":
-                raise
-            logger.error("%s %s failed", scope["method"], scope["path"], exc_info=error)
-            await _server_error()(scope, receive, send)
-
-
-def _server_error() -> Response:
+def server_error() -> Response:
+    """The answer to what nothing else handles."""
     return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The server failed; its log says why.")
 
 
-async def _on_domain_error(_: Request, error: Exception) -> Response:
+def problem_of(error: Exception) -> tuple[int, bytes]:
+    """Status and body for one frame of a batch."""
+    if isinstance(error, ValidationError):
+        response = _invalid([{**item, "loc": ("body", *item["loc"])} for item in error.errors()])
+    elif isinstance(error, MsdgsError):
+        response = _domain_problem(error)
+    else:
+        logger.error("a frame of a batch failed", exc_info=error)
+        response = server_error()
+    return response.status_code, bytes(response.body)
+
+
+async def _on_domain_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, MsdgsError)
+    request.scope[KIND] = error.kind if isinstance(error, Refused) else KINDS.get(type(error), "internal")
+    return _domain_problem(error)
+
+
+def _domain_problem(error: MsdgsError) -> Response:
+    if isinstance(error, ClientGone):
+        return Response(status_code=CLIENT_CLOSED_REQUEST)  # nobody reads it; the metrics and the log do
+    if isinstance(error, Refused):
+        errors = [FieldError(field=error.field, message=str(error))] if error.field else []
+        return problem_response(error.status, str(error), errors, error.headers)
     status = next((status for kind, status in STATUS_OF.items() if isinstance(error, kind)), None)
     if status is None:
         logger.error("unexpected domain error", exc_info=error)
-        return _server_error()
+        return server_error()
     if isinstance(error, SceneFileInvalid):
         logger.error("%s", error)
         return problem_response(status, f"The scene's file is broken at `{error.field}`; the server's log says how.")
@@ -114,9 +142,14 @@ async def _on_domain_error(_: Request, error: Exception) -> Response:
     return problem_response(status, str(error), [FieldError(field=field, message=str(error))])
 
 
-async def _on_validation_error(_: Request, error: Exception) -> Response:
+async def _on_validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    errors = [_field_error(item) for item in error.errors()[:MAX_ERRORS]]
+    request.scope[KIND] = "invalid"
+    return _invalid(error.errors())
+
+
+def _invalid(items: Sequence[Any]) -> Response:
+    errors = [_field_error(item) for item in items[:MAX_ERRORS]]
     detail = f"`{_cut(errors[0].field, MAX_FIELD_LENGTH)}`: {errors[0].message}"
     return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, detail, errors)
 
@@ -144,7 +177,7 @@ def _field_error(item: dict[str, Any]) -> FieldError:
 def _field_name(location: Sequence[str | int]) -> str:
     """`("body", "camera", "orbit", "azimuth")` → `camera.azimuth`: unions put the chosen member's name third."""
     where, *path = location
-    if len(path) > 1 and path[0] in ("camera", "background"):
+    if len(path) > 1 and path[0] in ("camera", "background", "t"):
         del path[1]
     if not path or (len(path) == 1 and isinstance(path[0], int)):  # no body, or the offset of a JSON error
         return str(where)

@@ -9,8 +9,9 @@ from fastapi.openapi.utils import get_openapi
 
 from msdgs_serve.api.cameras import framing
 from msdgs_serve.api.errors import MEDIA_TYPE, FieldError, Problem
+from msdgs_serve.api.keys import OPEN_PATHS
+from msdgs_serve.api.schemas import BatchItem
 from msdgs_serve.imaging import FORMATS
-from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_serve.scene.camera import orbit
 from msdgs_serve.store import SceneStore
@@ -20,10 +21,38 @@ Examples = dict[str, dict[str, Any]]
 
 IMAGE_RESPONSE: Responses = {
     200: {
-        "description": "The frame",
+        "description": "The frame, or a ZIP file of the frames of several times",
         "content": {
-            traits.media_type: {"schema": {"type": "string", "format": "binary"}} for traits in FORMATS.values()
+            media_type: {"schema": {"type": "string", "format": "binary"}}
+            for media_type in (*(traits.media_type for traits in FORMATS.values()), "application/zip")
         },
+        "headers": {
+            name: {"description": text, "schema": {"type": "string"}}
+            for name, text in {
+                "ETag": "of the scene's file and the request",
+                "Server-Timing": "milliseconds by stage: queue, pose (from the cache or not), draw, encode",
+                "Msdgs-Scene": "the scene's name, percent-encoded",
+                "Msdgs-Plan": "how the scene's motion is computed",
+                "Msdgs-Channels": "of the file, in order",
+            }.items()
+        },
+    }
+}
+NOT_MODIFIED: Responses = {304: {"description": "The client has this frame"}}
+BATCH_RESPONSE: Responses = {
+    200: {
+        "description": "A frame or a problem a line, or a part",
+        "content": {
+            "application/x-ndjson": {"schema": {"$ref": "#/components/schemas/BatchItem"}},
+            "multipart/mixed": {"schema": {"type": "string", "format": "binary"}},
+        },
+    }
+}
+SCENE_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "a scene file, contract `msdgs/1`",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
 
@@ -34,17 +63,22 @@ def problems(*statuses: HTTPStatus) -> Responses:
     return {status.value: {"description": status.phrase, "content": content} for status in statuses}
 
 
-def install_openapi(app: FastAPI, examples: Examples) -> None:
-    """Replace the application's OpenAPI document by one that holds `examples` for `POST /render`."""
+def install_openapi(app: FastAPI, store: SceneStore, *, keys: bool) -> None:
+    """Replace the application's OpenAPI document by one with examples that work on the scenes that are loaded."""
 
     def build() -> dict[str, Any]:
         if app.openapi_schema is None:
             document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-            for model in (Problem, FieldError):
+            for model in (Problem, FieldError, BatchItem):
                 schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
                 schema.pop("$defs", None)
                 document["components"]["schemas"][model.__name__] = schema
+            if keys:
+                _add_keys(document)
+            examples = render_examples(store)
             document["paths"]["/render"]["post"]["requestBody"]["content"]["application/json"]["examples"] = examples
+            if not examples:
+                return document  # made anew once a scene is loaded
             app.openapi_schema = document
         return app.openapi_schema
 
@@ -52,15 +86,27 @@ def install_openapi(app: FastAPI, examples: Examples) -> None:
 
 
 def render_examples(store: SceneStore) -> Examples:
-    """Bodies for `POST /render` that work on the first scene that can be loaded."""
-    names = store.names()
-    for name in names:
-        try:
-            metadata = store.get(name).scene.metadata
-        except SceneFileInvalid:
-            continue
-        return _examples(metadata, {"scene": name} if len(names) > 1 else {})
-    return {}
+    """Bodies for `POST /render` that work on the first scene that is loaded; none where none is."""
+    statuses = store.statuses()
+    loaded = next((status.name for status in statuses if status.loaded), None)
+    if loaded is None:
+        return {}
+    return _examples(store.get(loaded).session.scene.metadata, {"scene": loaded} if len(statuses) > 1 else {})
+
+
+def _add_keys(document: dict[str, Any]) -> None:
+    """That every call but the health checks needs a key."""
+    schemes = {
+        "bearer": {"type": "http", "scheme": "bearer"},
+        "key": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
+    }
+    document["components"]["securitySchemes"] = schemes
+    refusal = problems(HTTPStatus.UNAUTHORIZED)[HTTPStatus.UNAUTHORIZED.value]
+    for path, calls in document["paths"].items():
+        if path not in OPEN_PATHS:
+            for call in calls.values():
+                call["security"] = [{name: []} for name in schemes]
+                call["responses"][str(HTTPStatus.UNAUTHORIZED.value)] = refusal
 
 
 def _examples(metadata: SceneMetadata, scene: dict[str, str]) -> Examples:
@@ -79,6 +125,10 @@ def _examples(metadata: SceneMetadata, scene: dict[str, str]) -> Examples:
             "camera": around, "t": t, **size, "format": "webp", "quality": 80, "background": "transparent"
         },
         "Linear colour, alpha and depth, EXR": {"camera": around, "t": t, **size, "format": "exr"},
+        "Depth as a picture": {"camera": around, "t": t, **size, "channels": ["depth"]},
+        "Colour and depth as a NumPy array": {
+            "camera": around, "t": t, **size, "format": "npy", "channels": ["rgb", "depth"]
+        },
     }  # fmt: skip
     if metadata.cameras:
         bodies["A camera of the scene"] = {"camera": {"type": "scene", "index": 0}, "t": t, "width": 400}

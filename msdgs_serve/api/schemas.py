@@ -4,20 +4,25 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag
 
-from msdgs_serve.imaging import ImageFormat
+from msdgs_serve.imaging import Channel, ImageFormat
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
 from msdgs_serve.store import MAX_NAME_LENGTH
+
+MAX_TIMES = 1000
+MAX_BATCH = 1000
 
 # Bounds far beyond any sensible value, within which single precision neither overflows nor underflows
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
 Focal = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e8)]
 FieldOfView = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.01, le=179.0)]
 Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_PIXELS_PER_SIDE)]
-Channel = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
+Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
 Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME_LENGTH)]
+LaxNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+LaxPixels = Annotated[int, Field(ge=1, le=MAX_PIXELS_PER_SIDE)]
 Vector = tuple[Number, Number, Number]
 Row = tuple[Number, Number, Number, Number]
-Color = tuple[Channel, Channel, Channel]
+Color = tuple[Unit, Unit, Unit]
 
 
 def _not_tiny(vector: Vector) -> Vector:
@@ -109,12 +114,37 @@ Background = Annotated[
 ]
 
 
+def _kind_of_time(value: Any) -> str:
+    return "list" if isinstance(value, list | tuple) else "one"
+
+
+Times = Annotated[
+    Annotated[Number, Tag("one")] | Annotated[list[Number], Field(min_length=1, max_length=MAX_TIMES), Tag("list")],
+    Discriminator(_kind_of_time),
+]
+Channels = Annotated[list[Channel], Field(min_length=1, max_length=8)]
+
+
+class ShutterSpec(Strict):
+    """Motion blur: light from `t + open` to `t + close`, taken at the middles of `samples` equal parts of it."""
+
+    open: Number = Field(description="scene time, relative to `t`", examples=[-0.01])
+    close: Number = Field(description="scene time, relative to `t`; after `open`", examples=[0.01])
+    samples: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
+        default=8, description="moments drawn and averaged in linear light; the service has a limit"
+    )
+
+
 class RenderRequest(Strict):
-    """A frame to draw."""
+    """A frame to draw, or one for each time."""
 
     scene: Name | None = Field(default=None, description="which scene; may be left out where only one is served")
     camera: CameraSpec
-    t: Number = Field(description="time, within the scene's `time_range`")
+    t: Times = Field(
+        description="time, within the scene's `time_range`; or a list of them, answered with a ZIP file of one image "
+        "each, or for `npy` with one array [T, H, W, C]",
+        examples=[0.5],
+    )
     width: Pixels | None = Field(
         default=None,
         description="pixels. Default of width and height: those of the camera asked for, else of the scene's first "
@@ -124,8 +154,18 @@ class RenderRequest(Strict):
     format: ImageFormat = Field(
         default="png",
         description="`png`: 8-bit sRGB. `jpeg`, `webp`: the same, lossy. `exr`: 32-bit float scene-linear Rec.709 "
-        "R G B A, premultiplied, and depth Z along the camera axis in scene units, infinite where nothing is",
+        "R G B A, premultiplied, and depth Z along the camera axis in scene units, infinite where nothing is. `npy`: "
+        "a NumPy array [H, W, C], float32, as rendered: sRGB-encoded colour, premultiplied where transparent",
     )
+    channels: Channels | None = Field(
+        default=None,
+        description="`rgb`, `alpha`, `depth`, in the order of the file. Default: all of them for `exr` and `npy`. The "
+        "others hold a single one as a picture; depth is lighter the nearer it is",
+    )
+    depth_range: tuple[Number, Number] | None = Field(
+        default=None, description="depths drawn white and darkest in a picture of depth; default: those of the frame"
+    )
+    shutter: ShutterSpec | None = Field(default=None, description="motion blur; default: a single moment")
     quality: Annotated[int, Field(strict=True, ge=1, le=100)] | None = Field(
         default=None, description="for `jpeg` and `webp` only; default 90"
     )
@@ -135,6 +175,51 @@ class RenderRequest(Strict):
         "has an alpha channel (not in `jpeg`). `[r, g, b]`: sRGB-encoded, 0 to 1. `auto`: `transparent` for `exr`, "
         "`scene` for the others. An opaque frame has no alpha, or alpha 1 in `exr`",
     )
+
+
+class RenderQuery(BaseModel):
+    """The same as a link that a browser opens. Lists are written with commas."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scene: Name | None = Field(default=None, description="may be left out where only one is served")
+    t: LaxNumber | None = Field(default=None, description="default: the scene's first time")
+    width: LaxPixels | None = Field(default=None, description="pixels")
+    height: LaxPixels | None = Field(default=None, description="pixels")
+    format: ImageFormat = Field(default="png", description="as in `POST /render`")
+    quality: Annotated[int, Field(ge=1, le=100)] | None = Field(default=None, description="of `jpeg` and `webp`")
+    channels: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["depth"])
+    background: Annotated[str, Field(max_length=100)] | None = Field(
+        default=None, description="`scene`, `transparent` or `r,g,b`", examples=["1,1,1"]
+    )
+    camera: Name | None = Field(default=None, description="a camera of the scene, by name")
+    index: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(default=None, description="or by number")
+    azimuth: LaxNumber | None = Field(default=None, description="degrees; default 30")
+    elevation: LaxNumber | None = Field(default=None, description="degrees; default 20")
+    distance: LaxNumber | None = Field(default=None, description="scene units")
+    eye: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["4,0,1"])
+    target: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["0,0,0"])
+    up: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["0,0,1"])
+    fov_y: LaxNumber | None = Field(default=None, description="vertical field of view, degrees")
+
+
+class BatchRequest(Strict):
+    """Frames to draw, each with an answer of its own."""
+
+    frames: Annotated[list[dict[str, Any]], Field(min_length=1, max_length=MAX_BATCH)] = Field(
+        description="bodies of `POST /render`, each with a single `t`",
+        examples=[[{"camera": {"type": "orbit", "azimuth": 30, "elevation": 20}, "t": 0.0}]],
+    )
+
+
+class BatchItem(BaseModel):
+    """A line of the answer to a batch; lines come as frames are ready, `index` says which one it is."""
+
+    index: int = Field(description="in `frames`, from 0")
+    status: int = Field(description="as `POST /render` would answer it")
+    media_type: str | None = Field(default=None, description="of `data`")
+    data: str | None = Field(default=None, description="the image file in base64")
+    problem: dict[str, Any] | None = Field(default=None, description="instead, where it failed")
 
 
 class SceneEntry(BaseModel):
@@ -149,6 +234,13 @@ class SceneList(BaseModel):
     """All scenes, by name."""
 
     scenes: list[SceneEntry]
+
+
+class SceneAdded(BaseModel):
+    """A scene that was added."""
+
+    name: str
+    sha256: str = Field(description="of its file")
 
 
 class GaussianCounts(BaseModel):
@@ -177,10 +269,17 @@ class SceneDetail(SceneEntry):
     left_out: list[Any] = Field(description="what the exporter took out of the trained model")
     package_version: str
     checkpoint_sha256: str
+    sha256: str = Field(description="of the scene's file")
 
 
-class Health(BaseModel):
-    """That the service runs."""
+class Live(BaseModel):
+    """That the process answers."""
 
     status: Literal["ok"] = "ok"
     version: str
+
+
+class Ready(BaseModel):
+    """That scenes are loaded and kernels compiled."""
+
+    status: Literal["ready"] = "ready"

@@ -37,13 +37,30 @@ class Settings(BaseSettings):
     )
     host: str = Field(default="127.0.0.1", description="address to listen on; 0.0.0.0 for all networks")
     port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
-    max_pixels: int = Field(default=4096 * 2160, ge=1, description="largest width × height of a frame")
+    max_pixels: int = Field(
+        default=4096 * 2160, ge=1, description="largest width × height of a frame; × times, where there are several"
+    )
     max_body_bytes: int = Field(default=1 << 20, ge=1024, description="largest request body")
     concurrent_renders: int = Field(default=4, ge=1, le=64, description="frames in work at once; others wait")
-    cached_poses: int = Field(default=16, ge=1, description="posed scenes kept in memory, one for each scene and time")
+    queued_renders: int = Field(default=16, ge=0, le=10_000, description="frames that may wait; others get a 503")
+    render_seconds: float = Field(default=30.0, gt=0, le=3600, description="time limit of a frame, waiting included")
+    cache_megabytes: int = Field(default=256, ge=0, description="memory for Gaussians posed before")
+    max_samples: int = Field(default=64, ge=1, description="most moments of a frame's motion blur")
+    max_batch: int = Field(default=256, ge=1, le=1000, description="most frames of a batch, and times of a frame")
+    max_scene_megabytes: int = Field(default=1024, ge=1, description="largest scene file that is taken in")
+    uploads: bool = Field(default=False, description="let clients add and delete scenes, in the first folder given")
+    header_seconds: float = Field(default=10.0, gt=0, description="time limit for a request's headers")
+    body_seconds: float = Field(default=10.0, gt=0, description="time limit for a request's body; for uploads, idle")
+    read_seconds: float = Field(default=10.0, gt=0, description="how long a client may take no bytes of its answer")
+    drain_seconds: float = Field(default=30.0, ge=0, description="how long a stopping service finishes what it has")
+    watch_seconds: float = Field(default=1.0, gt=0, description="how often files are looked at for changes")
+    frame_max_age: int = Field(default=0, ge=0, description="seconds that caches may keep a frame without asking")
+    api_keys_file: Path | None = Field(default=None, description="keys, one a line; without one no request is answered")
+    cors_origins: list[str] = Field(default=[], description="web pages that may call, as https://example.org; or *")
     threads: int | None = Field(
         default=None, ge=1, le=256, description="threads that compute; default: one for each core"
     )
+    log_format: Literal["text", "json"] = Field(default="text", description="`json`: one object a line")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="warning", description="`info` logs every request"
     )
@@ -58,5 +75,6 @@ class Settings(BaseSettings):
 
 class _Environment(EnvSettingsSource):
     def decode_complex_value(self, field_name: str, field: FieldInfo, value: Any) -> Any:
-        """A list of paths is written as PATH is, not as JSON."""
-        return [part for part in value.split(os.pathsep) if part]
+        """A list of paths is written as PATH is, one of web pages with commas; not as JSON."""
+        separator = os.pathsep if field_name == "scenes" else ","
+        return [part for part in value.split(separator) if part]

@@ -1,16 +1,19 @@
-"""Image → bytes of a file, through OpenImageIO. Equal images give equal bytes."""
+"""Image → bytes of a file, through OpenImageIO and NumPy. Equal images give equal bytes."""
 
+import io
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import BinaryIO
 
 import numpy as np
 import OpenImageIO as oiio
 
-from msdgs_serve.imaging.formats import DEFAULT_QUALITY, FORMATS, ImageFormat
+from msdgs_serve.imaging.exr_header import camera_attributes
+from msdgs_serve.imaging.formats import CHANNELS, DEFAULT_QUALITY, FORMATS, Channel, ImageFormat, default_channels
 from msdgs_serve.imaging.image import Image
+from msdgs_serve.imaging.pictures import DepthRange, picture
 from msdgs_serve.scene import InvalidInput, MsdgsError
 
 Attributes = dict[str, int | float | str]
@@ -31,57 +34,113 @@ EXR_ATTRIBUTES: Attributes = {
 }
 # CIE xy of red, green, blue and white
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+EXR_NAMES: dict[Channel, tuple[str, ...]] = {"rgb": ("R", "G", "B"), "alpha": ("A",), "depth": ("Z",)}
 
 
 class EncodingFailed(MsdgsError):
     """The image library refused to write an image."""
 
 
-def encode(image: Image, image_format: ImageFormat, quality: int | None = None) -> bytes:
+def encode(
+    image: Image,
+    image_format: ImageFormat,
+    quality: int | None = None,
+    channels: Sequence[Channel] | None = None,
+    depth_range: DepthRange | None = None,
+) -> bytes:
     """The image as a file of `image_format`.
 
-    PNG, JPEG and WebP hold 8-bit sRGB, with straight alpha where the image is transparent (JPEG can't be). EXR holds
-    32-bit float scene-linear Rec.709 premultiplied R, G, B, A and depth Z. `quality` in [1, 100] is for JPEG and WebP.
-    Raises `InvalidInput` naming `format`, `quality`, `width` or `height`.
+    PNG, JPEG and WebP hold an 8-bit picture: sRGB with straight alpha where the image is transparent (JPEG can't be),
+    or a single channel. EXR holds any channels as 32-bit floats: scene-linear Rec.709 premultiplied R, G, B, A and
+    depth Z, with the camera and the time in its header. NPY holds float32 [H, W, C] as rendered: sRGB-encoded colour.
+    `quality` in [1, 100] is for JPEG and WebP. Raises `InvalidInput` naming the parameter.
     """
-    check_encodable(image.width, image.height, image.transparent, image_format, quality)
+    check_encodable(image.width, image.height, image.transparent, image_format, quality, channels)
+    channels, traits = channels or default_channels(image_format), FORMATS[image_format]
+    if image_format == "npy":
+        return npy(numbers(image, channels))
     if image_format == "exr":
-        return _write(image.linear_pixels(), _exr_spec(image), image_format)
-    pixels = image.display_pixels()
+        return _write(_exr_pixels(image, channels), _exr_spec(image, channels), image_format)
+    pixels = picture(image, channels[0], depth_range)
+    if pixels.shape[2] == 1 and not traits.holds_grey:
+        pixels = np.repeat(pixels, 3, axis=2)
     spec = oiio.ImageSpec(image.width, image.height, pixels.shape[2], oiio.UINT8)
     _set(spec, DISPLAY_ATTRIBUTES)
     if image_format == "png":
         _set(spec, PNG_ATTRIBUTES)
     if image_format == "webp":
         _set(spec, WEBP_ATTRIBUTES)
-    if FORMATS[image_format].takes_quality:
+    if traits.takes_quality:
         spec.attribute("Compression", f"{image_format}:{quality or DEFAULT_QUALITY}")
     return _write(pixels, spec, image_format)
 
 
-def check_encodable(width: int, height: int, transparent: bool, image_format: ImageFormat, quality: int | None) -> None:
+def check_encodable(
+    width: int,
+    height: int,
+    transparent: bool,
+    image_format: ImageFormat,
+    quality: int | None,
+    channels: Sequence[Channel] | None = None,
+) -> None:
     """Raise `InvalidInput` for what `encode` would refuse, so that nothing is rendered in vain."""
     if image_format not in FORMATS:
         raise InvalidInput("format", f"one of {', '.join(FORMATS)}", image_format)
     traits = FORMATS[image_format]
-    if transparent and not traits.holds_alpha:
+    if transparent and not traits.holds_alpha and "rgb" in (channels or ("rgb",)):
         raise InvalidInput("background", f"opaque for {image_format}", "transparent")
     if quality is not None and not traits.takes_quality:
         raise InvalidInput("quality", f"left out for {image_format}", quality)
     if quality is not None and not 1 <= quality <= 100:
         raise InvalidInput("quality", "in [1, 100]", quality)
+    if channels is not None:
+        _check_channels(channels, image_format)
     for name, side in (("width", width), ("height", height)):
         if side > traits.max_side:
             raise InvalidInput(name, f"at most {traits.max_side} for {image_format}", side)
 
 
-def _exr_spec(image: Image) -> oiio.ImageSpec:
-    spec = oiio.ImageSpec(image.width, image.height, 5, oiio.FLOAT)
-    spec.channelnames = ("R", "G", "B", "A", "Z")
-    spec.alpha_channel = 3
-    spec.z_channel = 4
+def numbers(image: Image, channels: Sequence[Channel]) -> np.ndarray:
+    """[H, W, C] float32: the channels as rendered, in the order asked for; colour sRGB-encoded."""
+    parts = [getattr(image, channel) for channel in channels]
+    return np.dstack(parts).astype(np.float32, copy=False)
+
+
+def npy(array: np.ndarray) -> bytes:
+    """The array as a .npy file."""
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+    return file.getvalue()
+
+
+def _check_channels(channels: Sequence[Channel], image_format: ImageFormat) -> None:
+    for channel in channels:
+        if channel not in CHANNELS:
+            raise InvalidInput("channels", f"of {', '.join(CHANNELS)}", channel)
+    if not channels or len(set(channels)) < len(channels):
+        raise InvalidInput("channels", "a list of different channels", list(channels))
+    if len(channels) > 1 and not FORMATS[image_format].holds_float:
+        raise InvalidInput("channels", f"a single one for {image_format}", list(channels))
+
+
+def _exr_pixels(image: Image, channels: Sequence[Channel]) -> np.ndarray:
+    """[H, W, C] float32. Alpha is 1 everywhere unless the image is transparent."""
+    parts = {"rgb": image.linear_rgb, "depth": lambda: image.depth}
+    parts["alpha"] = lambda: image.alpha if image.transparent else np.ones_like(image.alpha)
+    return np.dstack([parts[channel]() for channel in channels]).astype(np.float32, copy=False)
+
+
+def _exr_spec(image: Image, channels: Sequence[Channel]) -> oiio.ImageSpec:
+    names = [name for channel in channels for name in EXR_NAMES[channel]]
+    spec = oiio.ImageSpec(image.width, image.height, len(names), oiio.FLOAT)
+    spec.channelnames = tuple(names)
+    spec.alpha_channel = names.index("A") if "A" in names else -1
+    spec.z_channel = names.index("Z") if "Z" in names else -1
     _set(spec, EXR_ATTRIBUTES)
     spec.attribute("chromaticities", "float[8]", REC709_CHROMATICITIES)
+    if image.camera is not None and image.t is not None:
+        for name, (kind, value) in camera_attributes(image.camera, image.t).items():
+            spec.attribute(name, kind, value)
     return spec
 
 
@@ -91,7 +150,7 @@ def _set(spec: oiio.ImageSpec, attributes: Attributes) -> None:
 
 
 def _write(pixels: np.ndarray, spec: oiio.ImageSpec, image_format: ImageFormat) -> bytes:
-    output = oiio.ImageOutput.create(FORMATS[image_format].plugin)
+    output = oiio.ImageOutput.create(FORMATS[image_format].plugin or "")
     if output is None:
         raise EncodingFailed(f"no writer for {image_format}: {oiio.geterror()}")
     with _scratch_file() as (path, file):

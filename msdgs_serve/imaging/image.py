@@ -1,10 +1,11 @@
 """An image of named float channels, and the colour arithmetic its encoders need."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msdgs_serve.scene import InvalidInput
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.gaussians import FloatArray
 
 
@@ -20,6 +21,8 @@ class Image:
     alpha: FloatArray  # [H, W] coverage by Gaussians in [0, 1], whatever the background
     depth: FloatArray  # [H, W] along the camera axis, scene units; infinite where alpha is 0
     transparent: bool = False
+    camera: Camera | None = None  # that saw it, for formats that can say so
+    t: float | None = None  # when, in the scene's time
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3:
@@ -39,27 +42,42 @@ class Image:
     def display_pixels(self) -> np.ndarray:
         """8-bit sRGB, rounded to nearest: [H, W, 3], or [H, W, 4] with straight alpha where `transparent`."""
         if not self.transparent:
-            return _to_8_bits(self.rgb)
+            return to_8_bits(self.rgb)
         pixels = np.empty((self.height, self.width, 4), np.uint8)
-        pixels[..., :3] = _to_8_bits(_straight(self.rgb, self.alpha))
-        pixels[..., 3] = _to_8_bits(self.alpha)
+        pixels[..., :3] = to_8_bits(_straight(self.rgb, self.alpha))
+        pixels[..., 3] = to_8_bits(self.alpha)
         return pixels
 
-    def linear_pixels(self) -> FloatArray:
-        """[H, W, 5] float32: scene-linear Rec.709 R, G, B premultiplied by A, and the depth Z.
+    def linear_rgb(self) -> FloatArray:
+        """[H, W, 3] scene-linear Rec.709, premultiplied by alpha where `transparent`.
 
-        A is 1 everywhere unless `transparent`. The transfer function is not linear, so that it is undone on straight
-        colour, between taking alpha out and putting it back.
+        The transfer function is not linear, so that it is undone on straight colour, between taking alpha out and
+        putting it back.
         """
-        pixels = np.empty((self.height, self.width, 5), np.float32)
-        if self.transparent:
-            np.multiply(srgb_to_linear(_straight(self.rgb, self.alpha)), self.alpha[..., None], out=pixels[..., :3])
-            pixels[..., 3] = self.alpha
-        else:
-            pixels[..., :3] = srgb_to_linear(self.rgb)
-            pixels[..., 3] = 1
-        pixels[..., 4] = self.depth
-        return pixels
+        if not self.transparent:
+            return srgb_to_linear(self.rgb)
+        return srgb_to_linear(_straight(self.rgb, self.alpha)) * self.alpha[..., None]
+
+
+def average(images: Iterable[Image]) -> Image:
+    """The mean of frames of one camera: colour in linear light, depth weighted by alpha. Keeps one frame at a time."""
+    count, first = 0, None
+    light = coverage = depth = np.zeros(())
+    for image in images:
+        first = first or image
+        count += 1
+        light = light + image.linear_rgb().astype(np.float64)
+        coverage = coverage + image.alpha.astype(np.float64)
+        depth = depth + np.where(image.alpha > 0, image.depth, 0).astype(np.float64) * image.alpha
+    if first is None:
+        raise InvalidInput("images", "at least one", 0)
+    alpha = coverage / count
+    linear = light / count
+    rgb = linear_to_srgb(_straight(linear, alpha)) * alpha[..., None] if first.transparent else linear_to_srgb(linear)
+    mean_depth = np.full(alpha.shape, np.inf)
+    np.divide(depth, coverage, out=mean_depth, where=coverage > 0)
+    dtype = first.rgb.dtype
+    return replace(first, rgb=rgb.astype(dtype), alpha=alpha.astype(dtype), depth=mean_depth.astype(dtype))
 
 
 def srgb_to_linear(encoded: FloatArray) -> FloatArray:
@@ -67,10 +85,16 @@ def srgb_to_linear(encoded: FloatArray) -> FloatArray:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
+def linear_to_srgb(linear: FloatArray) -> FloatArray:
+    """The sRGB transfer function (IEC 61966-2-1); values above 1 follow the same power."""
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def to_8_bits(values: FloatArray) -> np.ndarray:
+    """0 to 1 as 0 to 255, rounded to nearest and cut."""
+    return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 def _straight(premultiplied: FloatArray, alpha: FloatArray) -> FloatArray:
     """[H, W, 3] colour with alpha taken out; where alpha is 0, premultiplied colour is 0 and stays so."""
     return premultiplied / np.where(alpha > 0, alpha, 1)[..., None]
-
-
-def _to_8_bits(values: FloatArray) -> np.ndarray:
-    return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -1,0 +1,174 @@
+"""One model file, and what all its exports share: exact frames, evidence for trimming, and candidates by plan."""
+
+import hashlib
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from export.plans import build
+from export.precision.assess import MAX_ERROR, StabilityReport, assess
+from export.rendered_error import ExactFrames, RenderedError
+from export.trim import RULES, Evidence, TrimmedModel, trim, trimmed_model
+from export.trim.bake import bake_trimmed
+from export.trim.cut import untrimmed, with_sh_degree
+from export.views import cameras_of, deciding_views, measuring_views
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
+from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.checkpoint import load_model
+
+MEASURING_TIMES, CAMERAS_A_TIME = 16, 3
+DECIDING_TIMES = 33
+BACK_OFFS = 4
+"""How often trimming is repeated more carefully where its parts together are worse than each promised."""
+
+BACK_OFF_DB = 0.5
+STABILITY_TIMES = 8
+Progress = Callable[[str, int], Callable[[], object]]
+"""Called with what begins and how many steps it has; returns what is to be called after each."""
+
+
+class Unreachable(InvalidInput):
+    """No export of this model is as close to it as was asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A scene file that could be the export, and how it was made."""
+
+    plan: str
+    trim_db: float | None  # what trimming alone may cost, dB on the worst frame; None: nothing was left out
+    trimmed: TrimmedModel
+    path: Path
+    options: RasterizerOptions = GSPLAT  # what it is drawn with; no file sets it
+
+    @cached_property
+    def session(self) -> DeformationSession:
+        """The file, opened when it is first asked for."""
+        return DeformationSession(self.path)
+
+    def close(self) -> None:
+        """Give back the memory of the open file."""
+        self.__dict__.pop("session", None)
+
+    @property
+    def sh_degree(self) -> int:
+        """Of its colours."""
+        return self.trimmed.moving.config.sh_degree
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk."""
+        return self.path.stat().st_size
+
+
+def no_progress(what: str, steps: int) -> Callable[[], object]:
+    """Tell nobody."""
+    return lambda: None
+
+
+class Job:
+    """Exports of one model file; candidates are written into `folder`."""
+
+    def __init__(
+        self,
+        checkpoint: Path,
+        folder: Path,
+        *,
+        max_error: float = MAX_ERROR,
+        rules: Collection[str] = tuple(RULES),
+        training: Sequence[Camera] = (),
+        progress: Progress = no_progress,
+    ) -> None:
+        """`training` are the cameras of the training photographs, where at hand. Raises `CheckpointInvalid`."""
+        self.folder, self.max_error, self.rules, self.progress = folder, max_error, rules, progress
+        self.model, self.info, _ = load_model(checkpoint)
+        with checkpoint.open("rb") as file:
+            self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        self.cameras = cameras_of(self.info, training)
+        self._files = 0
+        self._trimmed: dict[float | None, TrimmedModel] = {None: untrimmed(self.model)}
+        self._stability: StabilityReport | None = None
+        self._evidence: Evidence | None = None
+        self._exact: ExactFrames | None = None
+
+    @property
+    def exact(self) -> ExactFrames:
+        """Frames in float64, computed when they are first asked for."""
+        if self._exact is None:
+            views = measuring_views(self.cameras, self.info.time_range, MEASURING_TIMES, CAMERAS_A_TIME)
+            on_frame = self.progress("exact frames in float64", len(views))
+            self._exact = ExactFrames(self.model, views, self.info.background, on_frame)
+        return self._exact
+
+    @property
+    def evidence(self) -> Evidence:
+        """What trimming decides by, computed when it is first asked for."""
+        if self._evidence is None:
+            views = deciding_views(self.cameras, self.info.time_range, DECIDING_TIMES)
+            on_time = self.progress("what moves, and what is seen", DECIDING_TIMES)
+            self._evidence = Evidence(self.model, views, self.info.background, on_time)
+        return self._evidence
+
+    def trimmed(self, trim_db: float | None) -> TrimmedModel:
+        """The model without what `trim_db` dB on the worst frame allow to leave out.
+
+        Frames of all rules together, at other times than those that decided, are held to it as well; where they
+        are worse, trimming is repeated more carefully.
+        """
+        if trim_db not in self._trimmed:
+            assert trim_db is not None
+            self._trimmed[trim_db] = self._checked_trim(trim_db) if self.rules else self._trimmed[None]
+        return self._trimmed[trim_db]
+
+    def candidate(self, plan: str, trim_db: float | None, sh_degree: int | None = None) -> Candidate:
+        """Write a scene file. Raises `InvalidInput` for a plan that this scene can't have, `PlanUnsafe` for one whose
+        round-off would be seen."""
+        self.stability.require(plan)
+        trimmed = self.trimmed(trim_db)
+        if sh_degree is not None:
+            trimmed = with_sh_degree(trimmed, sh_degree)
+        return self._written(plan, trim_db, trimmed)
+
+    @property
+    def stability(self) -> StabilityReport:
+        """How far float32 is from float64 where layers run when a frame is served."""
+        if self._stability is None:
+            on_time = self.progress("stability of the layers", STABILITY_TIMES)
+            found = assess(self.model, self.info, max_error=self.max_error, times=STABILITY_TIMES, on_time=on_time)
+            self._stability = found
+        return self._stability
+
+    def exact_pose(self, t: float) -> Gaussians:
+        """All Gaussians of the model in float64."""
+        return self.exact.pose(t)
+
+    def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
+        """How far its frames are from exact ones; all of those kept, or every n-th."""
+        pose, ids = candidate.session.gaussians, candidate.trimmed.ids
+        return self.exact.measure(pose, ids, options=candidate.options, every=every)
+
+    def _checked_trim(self, trim_db: float) -> TrimmedModel:
+        least_db = trim_db
+        for _ in range(BACK_OFFS):
+            on_rule = self.progress(f"trimming to {trim_db:g} dB", len(self.rules))
+            cut, left_out = trim(self.evidence, least_db, self.rules, on_rule)
+            if not left_out:
+                break
+            trimmed = trimmed_model(self.evidence, cut, left_out)
+            checked = self._written("network", trim_db, trimmed)
+            error = self.error(checked)
+            checked.path.unlink()
+            if error.psnr_worst >= trim_db:
+                return trimmed
+            least_db += trim_db - error.psnr_worst + BACK_OFF_DB
+        return self._trimmed[None]
+
+    def _written(self, plan: str, trim_db: float | None, trimmed: TrimmedModel) -> Candidate:
+        self._files += 1
+        path = self.folder / f"{self._files}.onnx"
+        path.write_bytes(build(plan, bake_trimmed(trimmed, self.info, self.sha256)).SerializeToString())
+        return Candidate(plan, trim_db, trimmed, path)

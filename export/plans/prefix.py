@@ -1,0 +1,16 @@
+"""Plan `prefix:k`: the first k layers as trained, where the rest moves nothing visible."""
+
+from dataclasses import replace
+
+import onnx
+
+from export.bake import Baked
+from export.plans.network import network
+from msdgs_serve.scene.errors import InvalidInput
+
+
+def prefix(baked: Baked, count: int) -> onnx.ModelProto:
+    """The scene with its first `count` layers. Raises `InvalidInput` where it hasn't as many."""
+    if count > len(baked.layers):
+        raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
+    return network(replace(baked, layers=baked.layers[:count]), f"prefix:{count}")

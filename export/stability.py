@@ -1,0 +1,96 @@
+"""`python export/stability.py model.pt`: does float32, or less, show what the model itself would show in float64?"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+if __name__ == "__main__":  # as a file, from any folder: the checkout's packages, not this folder's modules
+    folder = Path(__file__).resolve().parent
+    sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
+
+try:
+    import torch  # noqa: F401
+    import tyro
+    from rich.console import Console
+    from rich.progress import Progress
+except ModuleNotFoundError as error:
+    raise SystemExit(f"stability.py needs {error.name}, which serving alone doesn't: pip install '.[export]'") from None
+
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+
+UNSTEADY = 3
+"""Exit status where the model is flagged; 1 is an error."""
+
+
+def main(
+    model: Annotated[Path, tyro.conf.Positional],
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    times: int = 20,
+    max_error: float = 50.0,
+) -> int:
+    """Measure how stable a trained model's deformation is in float32 and in less.
+
+    A chain of layers multiplies round-off: each layer sees the means that the layers before it have moved. For
+    Gaussians spread over the scene, at times between the frames as well, this measures how much a small displacement
+    grows on its way, and how far the pose is off from float64 in float32, bfloat16 and float16; then it draws the worst
+    moments both ways. docs/stability.md tells how to read the table.
+
+    Type this:
+
+    python export/stability.py runs/ball/model.pt --plot stability.png
+
+    The status is 0 where float32 is as good as float64, 3 where it is not, and 1 where the file can't be read.
+
+    Args:
+        model: The `model.pt` of a training run.
+        json: Write the figures to this file.
+        plot: Draw growth, amplification and errors into this PNG.
+        times: At how many times to compare, both ends of the scene's time among them.
+        max_error: PSNR in dB of the worst frame against float64, below which an error counts as visible.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    try:
+        return _report(model, json, plot, times, max_error, console, errors)
+    except KeyboardInterrupt:
+        errors.print("stopped; nothing was written", markup=False)
+        return 130
+    except (MsdgsError, OSError) as error:
+        errors.print(f"error: {error}", style="red", markup=False)
+        return 1
+
+
+def _report(
+    model: Path, json: Path | None, plot: Path | None, times: int, max_error: float, console: Console, errors: Console
+) -> int:
+    if times < 2:
+        raise InvalidInput("times", "2 or more", times)
+    if not 0 < max_error < 100:
+        raise InvalidInput("max_error", "between 0 and 100 dB", max_error)
+    with errors.status("loading torch and the kernels"):
+        from export.precision.assess import assess  # heavy: seconds, so not before --help
+        from export.precision.formats import FORMATS
+        from export.precision.show import draw, print_report, write_json
+        from msdgs_train.checkpoint import load_model
+    loaded = load_model(model)
+    with Progress(console=errors, transient=True) as progress:
+        task = progress.add_task("comparing with float64", total=times)
+        report = assess(
+            loaded.model,
+            loaded.scene,
+            max_error=max_error,
+            times=times,
+            formats=FORMATS,
+            on_time=lambda: progress.advance(task),
+        )
+    print_report(report, console)
+    if json is not None:
+        write_json(report, json)
+    if plot is not None:
+        draw(report, plot)
+    return 0 if report.steady else UNSTEADY
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main, config=(tyro.conf.FlagConversionOff,)))

@@ -1,0 +1,167 @@
+"""What trimming decides by: how much of each Gaussian is seen, how far it moves in pixels, and frames to compare."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from export.rendered_error import as_gaussians, shown
+from export.trim.cut import Cut, Network, rows, whole, with_network
+from export.views import View
+from msdgs_serve.rasterizer import GSPLAT
+from msdgs_serve.scene.gaussians import FloatArray, Gaussians
+from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
+from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
+from msdgs_train.metrics import psnr_from_mse
+from msdgs_train.model import DynamicGaussians
+from msdgs_train.rasterization import rasterize
+
+SAMPLED_GAUSSIANS, SAMPLED_TIMES = 1000, 5
+"""For the quick look at what a part of the network does."""
+
+
+class Poses(NamedTuple):
+    """All Gaussians at the deciding times, and as they would best stand still."""
+
+    at: dict[float, Gaussians]
+    still: Gaussians
+
+
+class Evidence:
+    """Frames of the whole model at the deciding views, and what a cut changes in them. All in float32."""
+
+    def __init__(
+        self,
+        model: DynamicGaussians,
+        views: Sequence[View],
+        background: Sequence[float],
+        on_time: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.model, self.background = model, background
+        self._views = views
+        self._order = list(range(len(views)))
+        self._last: tuple[Network, Poses] | None = None
+        network = whole(model).network
+        self._whole = network, self._posed(network, on_time)
+        self._frames = [shown(self._whole[1].at[view.t], view.camera, background) for view in views]
+        self.peaks, self.amounts = self._seen()
+
+    def poses(self, network: Network) -> Poses:
+        """All Gaussians as this part of the network moves them."""
+        if network == self._whole[0]:
+            return self._whole[1]
+        if self._last is None or self._last[0] != network:
+            self._last = network, self._posed(network)
+        return self._last[1]
+
+    def worst_db(self, cut: Cut, enough: float = -np.inf) -> float:
+        """PSNR in dB of the worst deciding frame; where one is under `enough`, that of the first that is."""
+        poses, worst = self.poses(cut.network), np.inf
+        moving, still = np.flatnonzero(cut.moves), np.flatnonzero(cut.kept & ~cut.moves)
+        opacities, sh = poses.still.opacities[cut.ids], poses.still.sh[cut.ids, : sh_coefficients(cut.sh_degree)]
+        constants = poses.still.means[still], poses.still.quats[still], poses.still.scales[still]
+        for i in list(self._order):
+            view = self._views[i]
+            at = poses.at[view.t]
+            changing = at.means[moving], at.quats[moving], at.scales[moving]
+            means, quats, scales = (np.concatenate(pair) for pair in zip(changing, constants, strict=True))
+            frame = shown(Gaussians(means, quats, scales, opacities, sh), view.camera, self.background)
+            db = psnr_from_mse(float(np.mean(np.square(frame - self._frames[i], dtype=np.float64))))
+            worst = min(worst, db)
+            if worst < enough:
+                self._order.remove(i)  # most likely the one that decides next time too
+                self._order.insert(0, i)
+                break
+        return worst
+
+    def motion(self, network: Network) -> FloatArray:
+        """[N] pixels by which the ends of a Gaussian's axes are at most off where it stands still: its position,
+        rotation and scales, in the nearest camera."""
+        poses = self.poses(network)
+        still_axes = half_axes(poses.still)
+        furthest = np.zeros(len(poses.still), np.float32)
+        for at in poses.at.values():
+            moved = np.linalg.norm(at.means - poses.still.means, axis=1)
+            turned = np.linalg.norm(half_axes(at) - still_axes, axis=1).max(axis=1, initial=0)
+            np.maximum(furthest, moved + turned, out=furthest)
+        return furthest * self.pixels_a_unit(poses.still.means)
+
+    @torch.no_grad()
+    def change(self, network: Network, smaller: Network) -> float:
+        """Pixels by which a few Gaussians, at a few times, are elsewhere on average if part of a network is missing;
+        faint ones count less."""
+        poses = self.poses(network)
+        ids = np.arange(0, len(poses.still), max(1, len(poses.still) // SAMPLED_GAUSSIANS))
+        model, change = with_network(self.model, smaller), 0.0
+        for t in list(poses.at)[:: max(1, len(poses.at) // SAMPLED_TIMES)]:
+            before = rows(poses.at[t], ids, self.model.config.sh_degree)
+            after = as_gaussians(model.pose(t, ids=torch.from_numpy(ids)))
+            moved = np.linalg.norm(after.means - before.means, axis=1)
+            turned = np.linalg.norm(half_axes(after) - half_axes(before), axis=1).max(axis=1, initial=0)
+            pixels = (moved + turned) * self.pixels_a_unit(before.means) * self.peaks[ids]
+            change = max(change, float(pixels.sum() / max(self.peaks[ids].sum(), 1e-12)))
+        return change
+
+    def pixels_a_unit(self, means: FloatArray) -> FloatArray:
+        """[N] pixels a scene unit where each point is, in the camera in which that is most."""
+        most = np.zeros(len(means), np.float32)
+        for camera in {id(view.camera): view.camera for view in self._views}.values():
+            distances = np.linalg.norm(means - camera.position, axis=1)
+            np.maximum(most, max(camera.fx, camera.fy) / np.maximum(distances, GSPLAT.near_plane), out=most)
+        return most
+
+    @torch.no_grad()
+    def _posed(self, network: Network, on_time: Callable[[], object] = lambda: None) -> Poses:
+        model = with_network(self.model, network)
+        at = {}
+        for t in dict.fromkeys(view.t for view in sorted(self._views, key=lambda view: view.t)):
+            at[t] = as_gaussians(model.pose(t))
+            on_time()
+        first = next(iter(at.values()))
+        opacities, sh = first.opacities, first.sh
+        at = {t: Gaussians(g.means, g.quats, g.scales, opacities, sh) for t, g in at.items()}
+        return Poses(at, standing_still(list(at.values())))
+
+    def _seen(self) -> tuple[FloatArray, FloatArray]:
+        """[N] the most that a Gaussian covers of a pixel under its middle, and of how many pixels, over the views."""
+        poses = self.poses(self._whole[0])
+        peaks, amounts = np.zeros((2, len(poses.still)), np.float32)
+        for view in self._views if len(peaks) else ():
+            g = poses.at[view.t]
+            weights = blending_weights(g, view)
+            # pixels that a Gaussian of these two largest axes fills; 0.3 px² is what the rasterizer adds
+            sizes = np.sort(g.scales, axis=1)[:, 1:] * self.pixels_a_unit(g.means)[:, None]
+            np.maximum(peaks, weights / (2 * np.pi * (sizes.prod(axis=1) + GSPLAT.eps2d)), out=peaks)
+            np.maximum(amounts, weights, out=amounts)
+        return np.minimum(peaks, 1), amounts
+
+
+def blending_weights(gaussians: Gaussians, view: View) -> FloatArray:
+    """[N] how much each Gaussian adds to a frame: its alpha times what reaches it, summed over the pixels."""
+    means, quats, scales, opacities = (
+        torch.from_numpy(array) for array in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    )
+    grey = torch.zeros(len(means), 1, 3, requires_grad=True)
+    rgb, _, _ = rasterize(means, quats, scales, opacities, grey, view.camera, torch.zeros(3))
+    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), grey)
+    return (gradient[:, 0, 0] / SH_C0).numpy()
+
+
+def half_axes(gaussians: Gaussians) -> FloatArray:
+    """[N, 3, 3] whose columns are the half-axes of the Gaussians, scene units."""
+    return to_matrix(gaussians.quats) * gaussians.scales[:, None, :]
+
+
+def standing_still(poses: list[Gaussians]) -> Gaussians:
+    """Each Gaussian where it is on average: means, logarithms of scales, quaternions of one hemisphere."""
+    first = poses[0]
+    quats = np.zeros_like(first.quats)
+    for pose in poses:
+        same = np.where((pose.quats * first.quats).sum(axis=1, keepdims=True) < 0, -1, 1)
+        quats += same * pose.quats
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = np.where(norms < MIN_NORM, first.quats, quats / np.maximum(norms, MIN_NORM)).astype(np.float32)
+    means = np.asarray(np.mean([pose.means for pose in poses], axis=0, dtype=np.float64), np.float32)
+    log_scales = np.mean([np.log(pose.scales) for pose in poses], axis=0, dtype=np.float64)
+    return Gaussians(means, quats, np.exp(log_scales).astype(np.float32), first.opacities, first.sh)

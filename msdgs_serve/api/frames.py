@@ -1,0 +1,154 @@
+"""A request for a frame, from its values to the bytes of a file and what the answer's headers say of it."""
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from urllib.parse import quote
+
+import numpy as np
+
+from msdgs_serve import __version__
+from msdgs_serve.api.cameras import resolve_camera
+from msdgs_serve.api.schemas import RenderRequest
+from msdgs_serve.api.service import Service
+from msdgs_serve.imaging import FORMATS, Channel, DepthRange, Image, encode
+from msdgs_serve.imaging.encode import check_encodable, npy, numbers
+from msdgs_serve.imaging.formats import default_channels
+from msdgs_serve.renderer import Background, RenderOptions, Shutter, check_times
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.store import ServedScene
+from msdgs_serve.watch import Watch
+
+ZIP = "application/zip"
+ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the first that a ZIP file can hold; equal requests give equal bytes
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """All that a frame needs, checked."""
+
+    request: RenderRequest
+    scene: ServedScene
+    camera: Camera
+    times: Sequence[float]
+    options: RenderOptions
+    channels: Sequence[Channel]
+    depth_range: DepthRange | None
+    etag: str
+
+    @property
+    def media_type(self) -> str:
+        """Of the answer."""
+        several = isinstance(self.request.t, list) and self.request.format != "npy"
+        return ZIP if several else FORMATS[self.request.format].media_type
+
+    def headers(self, max_age: int) -> dict[str, str]:
+        """What was used, whatever it took."""
+        return {
+            "ETag": self.etag,
+            "Cache-Control": f"public, max-age={max_age}" if max_age else "no-cache",
+            "Msdgs-Scene": quote(self.scene.name),
+            "Msdgs-Plan": self.scene.session.scene.metadata.plan,
+            "Msdgs-Channels": ",".join(self.channels),
+        }
+
+
+def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
+    """Check everything that can be wrong with a request; may load its scene. Raises the domain's errors."""
+    scene = service.scene(request.scene)
+    camera = resolve_camera(request, scene.session.scene.metadata)
+    times = request.t if isinstance(request.t, list) else [request.t]
+    _check_amounts(service, request, camera, len(times))
+    background = _background(request)
+    transparent = background == "transparent"
+    check_encodable(camera.width, camera.height, transparent, request.format, request.quality, request.channels)
+    shutter = None
+    if request.shutter is not None:
+        shutter = Shutter(request.shutter.open, request.shutter.close, request.shutter.samples)
+    for t in times:
+        check_times(scene.session, t, shutter)
+    channels = request.channels or default_channels(request.format)
+    options = RenderOptions(background, shutter)
+    etag = _etag(scene, request)
+    return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
+
+
+def draw_frame(service: Service, plan: FramePlan, watch: Watch) -> bytes:
+    """The file of a plan. The watch has the stages `pose`, `draw` and `encode`."""
+
+    def draw(t: float) -> Image:
+        return service.renderer.render(plan.scene.session, plan.camera, t, plan.options, watch)
+
+    def encoded(image: Image) -> bytes:
+        with watch.stage("encode"):
+            return encode(image, plan.request.format, plan.request.quality, plan.channels, plan.depth_range)
+
+    if not isinstance(plan.request.t, list):
+        return encoded(draw(plan.times[0]))
+    if plan.request.format == "npy":
+        frames = [numbers(draw(t), plan.channels) for t in plan.times]
+        with watch.stage("encode"):
+            return npy(np.stack(frames))
+    return _zipped([encoded(draw(t)) for t in plan.times], FORMATS[plan.request.format].extension)
+
+
+def server_timing(watch: Watch) -> str:
+    """The `Server-Timing` header: milliseconds by stage, and whether poses came from the cache."""
+    notes = {stage: f';desc="{note}"' for stage, note in watch.notes.items()}
+    return ", ".join(f"{stage};dur={1000 * s:.2f}{notes.get(stage, '')}" for stage, s in watch.seconds.items())
+
+
+def is_unchanged(if_none_match: str | None, etag: str) -> bool:
+    """Whether the client says that it has this version."""
+    if if_none_match is None:
+        return False
+    known = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
+    return etag in known or "*" in known
+
+
+def _etag(scene: ServedScene, request: RenderRequest) -> str:
+    """Of the scene's file, the request and this version of the program."""
+    asked = request.model_dump(mode="json", exclude={"scene"}, exclude_defaults=True)
+    text = json.dumps([__version__, scene.sha256, asked], sort_keys=True)
+    return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
+
+
+def _zipped(files: Sequence[bytes], extension: str) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
+        for number, file in enumerate(files):
+            archive.writestr(zipfile.ZipInfo(f"frame_{number:05d}{extension}", ZIP_DATE), file)
+    return packed.getvalue()
+
+
+def _check_amounts(service: Service, request: RenderRequest, camera: Camera, frames: int) -> None:
+    limits = service.settings
+    if frames > limits.max_batch:
+        raise InvalidInput("t", f"a list of at most {limits.max_batch} times", frames)
+    if request.shutter is not None and request.shutter.samples > limits.max_samples:
+        raise InvalidInput("shutter.samples", f"at most {limits.max_samples}", request.shutter.samples)
+    pixels, size = camera.width * camera.height, f"{camera.width} × {camera.height}"
+    if pixels > limits.max_pixels:
+        larger = "width" if camera.width >= camera.height else "height"
+        raise InvalidInput(larger, f"such that width × height is at most {limits.max_pixels} pixels", size)
+    if pixels * frames > limits.max_pixels:
+        expected = f"so few that width × height × times is at most {limits.max_pixels} pixels"
+        raise InvalidInput("t", expected, f"{frames} times {size}")
+
+
+def _background(request: RenderRequest) -> Background:
+    if request.background == "auto":
+        return "transparent" if FORMATS[request.format].holds_float else "scene"
+    return request.background or "transparent"
+
+
+def _depth_range(request: RenderRequest) -> DepthRange | None:
+    if request.depth_range is None:
+        return None
+    near, far = request.depth_range
+    if not near < far:
+        raise InvalidInput("depth_range", "two depths, the nearer first", [near, far])
+    return DepthRange(near, far)

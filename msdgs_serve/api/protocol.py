@@ -1,0 +1,102 @@
+"""HTTP/1.1 as uvicorn speaks it, with the time limits that it lacks: on headers, and on clients that don't read."""
+
+import asyncio
+import http
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import h11
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from msdgs_serve.api.errors import MEDIA_TYPE, problem_response
+
+
+class LimitedProtocol(H11Protocol):
+    """Closes connections whose headers don't come within `header_seconds`, or that take no bytes for `read_seconds`."""
+
+    def __init__(self, *arguments: Any, header_seconds: float, read_seconds: float, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        self._header_seconds = header_seconds
+        self._read_seconds = read_seconds
+        self._header_timer: asyncio.TimerHandle | None = None
+        self._read_timer: asyncio.TimerHandle | None = None
+        self._unsent = 0
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Headers are awaited from now on."""
+        super().connection_made(transport)
+        self._watch_headers()
+
+    def data_received(self, data: bytes) -> None:
+        """Headers are complete once h11 has left its idle state; what comes after the answer may begin new ones."""
+        super().data_received(data)
+        if self.conn.their_state is not h11.IDLE:
+            self._header_timer = _cancelled(self._header_timer)
+        elif self._header_timer is None and not self.transport.is_closing():
+            self._watch_headers()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Nothing is awaited any more."""
+        self._header_timer = _cancelled(self._header_timer)
+        self._read_timer = _cancelled(self._read_timer)
+        super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """The client reads more slowly than is written: look at it again and again."""
+        super().pause_writing()
+        self._watch_reading()
+
+    def resume_writing(self) -> None:
+        """It has read nearly all."""
+        self._read_timer = _cancelled(self._read_timer)
+        super().resume_writing()
+
+    def timeout_keep_alive_handler(self) -> None:
+        """The answer has been given and nothing more is asked; a client that didn't read all of it is let go too."""
+        super().timeout_keep_alive_handler()
+        self._watch_reading()
+
+    def send_400_response(self, msg: str) -> None:
+        """A problem like any other, for what is no HTTP."""
+        self._send_problem(http.HTTPStatus.BAD_REQUEST, "That is no HTTP/1.1 request, or its headers are too long.")
+
+    def _watch_headers(self) -> None:
+        self._header_timer = self.loop.call_later(self._header_seconds, self._headers_late)
+
+    def _headers_late(self) -> None:
+        self._header_timer = None
+        if not self.transport.is_closing() and self.conn.their_state is h11.IDLE:
+            detail = f"The headers must be complete after {self._header_seconds:g} s."
+            self._send_problem(http.HTTPStatus.REQUEST_TIMEOUT, detail)
+
+    def _watch_reading(self) -> None:
+        self._unsent = self.transport.get_write_buffer_size()
+        if self._unsent and self._read_timer is None:
+            self._read_timer = self.loop.call_later(self._read_seconds, self._look_at_reading)
+
+    def _look_at_reading(self) -> None:
+        self._read_timer = None
+        if self.transport.get_write_buffer_size() >= self._unsent:
+            self.transport.abort()
+        else:
+            self._watch_reading()
+
+    def _send_problem(self, status: http.HTTPStatus, detail: str) -> None:
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            body = problem_response(status, detail).body
+            head = f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: {MEDIA_TYPE}\r\n"
+            head += f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+            self.transport.write(head.encode() + bytes(body))
+        self.transport.close()
+        self._watch_reading()
+
+
+def limited_protocol(header_seconds: float, read_seconds: float) -> Callable[..., LimitedProtocol]:
+    """What uvicorn makes a connection's protocol with."""
+    return partial(LimitedProtocol, header_seconds=header_seconds, read_seconds=read_seconds)
+
+
+def _cancelled(timer: asyncio.TimerHandle | None) -> None:
+    if timer is not None:
+        timer.cancel()

@@ -1,0 +1,64 @@
+"""From a link's query to a request for a frame."""
+
+from typing import Any
+
+from pydantic import ValidationError
+
+from msdgs_serve.api.schemas import RenderQuery, RenderRequest
+from msdgs_serve.scene import InvalidInput
+from msdgs_serve.scene.baked import SceneMetadata
+
+DEFAULT_VIEW = {"azimuth": 30.0, "elevation": 20.0}
+ORBIT_FIELDS = ("azimuth", "elevation", "distance")
+LOOK_AT_FIELDS = ("target", "up", "fov_y")
+PASSED_ON = ("scene", "width", "height", "format", "quality")
+
+
+def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:
+    """The request that a link means. Raises `InvalidInput` naming the parameter."""
+    given = query.model_dump(exclude_none=True)
+    body = {name: given[name] for name in PASSED_ON if name in given}
+    body |= {"camera": _camera(given), "t": given.get("t", metadata.time_range[0])}
+    if "channels" in given:
+        body["channels"] = given["channels"].split(",")
+    if "background" in given:
+        text = given["background"]
+        body["background"] = _numbers("background", text) if "," in text else text
+    try:
+        return RenderRequest.model_validate(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise InvalidInput(_parameter(first["loc"]), f"as in POST /render ({first['msg']})", "another value") from None
+
+
+def _camera(given: dict[str, Any]) -> dict[str, Any]:
+    by_name, orbit = [name for name in ("camera", "index") if name in given], [n for n in ORBIT_FIELDS if n in given]
+    if by_name:
+        camera = {"type": "scene", **{{"camera": "name"}.get(name, name): given[name] for name in by_name}}
+        unused = [*orbit, *(name for name in ("eye", *LOOK_AT_FIELDS) if name in given)]
+        kind = by_name[0]
+    elif "eye" in given:
+        camera = {"type": "look_at", "eye": _numbers("eye", given["eye"])}
+        unused, kind = orbit, "eye"
+    else:
+        camera = {"type": "orbit", **DEFAULT_VIEW, **{name: given[name] for name in orbit}}
+        unused, kind = [], ""
+    if unused:
+        raise InvalidInput(unused[0], f"left out where {kind} is given", given[unused[0]])
+    if not by_name:
+        for name in LOOK_AT_FIELDS:
+            if name in given:
+                camera[name] = given[name] if name == "fov_y" else _numbers(name, given[name])
+    return camera
+
+
+def _numbers(name: str, text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InvalidInput(name, "numbers with commas between them", repr(text[:20])) from None
+
+
+def _parameter(location: tuple[str | int, ...]) -> str:
+    texts = [part for part in location if isinstance(part, str)]
+    return texts[2] if texts[0] == "camera" and len(texts) > 2 else str(texts[0])

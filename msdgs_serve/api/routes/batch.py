@@ -1,0 +1,132 @@
+"""Many frames in one call, each with an answer of its own."""
+
+import base64
+import json
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import aclosing
+from http import HTTPStatus
+from typing import Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Header
+from fastapi.responses import StreamingResponse
+from pydantic import ValidationError
+
+from msdgs_serve.api.errors import problem_of
+from msdgs_serve.api.frames import FramePlan, draw_frame, plan_frame, server_timing
+from msdgs_serve.api.openapi import BATCH_RESPONSE, problems
+from msdgs_serve.api.schemas import BatchItem, BatchRequest, RenderRequest
+from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.scene import InvalidInput, MsdgsError
+from msdgs_serve.watch import Watch
+
+BOUNDARY = "msdgs-frame"
+NDJSON = "application/x-ndjson"
+MULTIPART = "multipart/mixed"
+
+router = APIRouter(tags=["frames"])
+
+
+class Item:
+    """One frame of a batch, or what is wrong with it."""
+
+    def __init__(self, index: int, status: int, *, plan: FramePlan | None = None, body: bytes = b"") -> None:
+        self.index = index
+        self.status = status
+        self.plan = plan
+        self.body = body  # the image, or the problem where there is no plan
+        self.timing = ""
+
+
+@router.post(
+    "/render/batch",
+    summary="Many frames",
+    response_class=StreamingResponse,
+    responses={
+        **BATCH_RESPONSE,
+        **problems(
+            HTTPStatus.BAD_REQUEST,
+            HTTPStatus.REQUEST_TIMEOUT,
+            HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+            HTTPStatus.UNPROCESSABLE_ENTITY,
+            HTTPStatus.SERVICE_UNAVAILABLE,
+        ),
+    },
+)
+async def render_batch(
+    body: BatchRequest, service: SharedService, accept: Annotated[str | None, Header(max_length=1000)] = None
+) -> StreamingResponse:
+    """Streams the frames as they are ready, one JSON object a line, or as `multipart/mixed` where that is accepted.
+
+    A frame that fails has its problem in its place; the others are drawn. Equal frames are drawn once, and frames of
+    one time share its Gaussians. The time limit holds for each frame.
+    """
+    if len(body.frames) > service.settings.max_batch:
+        raise InvalidInput("frames", f"at most {service.settings.max_batch}", len(body.frames))
+    service.queue.check_open()
+    multipart = MULTIPART in (accept or "")
+    media_type = f"{MULTIPART}; boundary={BOUNDARY}" if multipart else NDJSON
+    return StreamingResponse(_written(service, body.frames, multipart), media_type=media_type)
+
+
+async def _written(service: Service, frames: list[dict[str, Any]], multipart: bool) -> AsyncIterator[bytes]:
+    async with aclosing(_items(service, frames)) as items:
+        async for item in items:
+            yield _part(item) if multipart else _line(item)
+    if multipart:
+        yield f"--{BOUNDARY}--\r\n".encode()
+
+
+async def _items(service: Service, frames: list[dict[str, Any]]) -> AsyncGenerator[Item]:
+    """First those that are wrong, then equal ones together, in the order of scenes and times."""
+    planned: dict[str, list[tuple[int, FramePlan]]] = {}
+    for index, frame in enumerate(frames):
+        try:
+            plan = await anyio.to_thread.run_sync(_plan, service, frame)
+        except (MsdgsError, ValidationError) as error:
+            yield _failed(index, error)
+        else:
+            planned.setdefault(plan.etag, []).append((index, plan))
+    for same in sorted(planned.values(), key=lambda plans: (plans[0][1].scene.name, plans[0][1].times[0])):
+        plan, watch = same[0][1], Watch()
+        try:
+            image = await service.queue.run(lambda p=plan, w=watch: draw_frame(service, p, w), watch, admitted=True)
+        except Exception as error:
+            for index, _ in same:
+                yield _failed(index, error)
+            continue
+        service.metrics.count_stages(watch.seconds)
+        for index, _ in same:
+            item = Item(index, HTTPStatus.OK, plan=plan, body=image)
+            item.timing = server_timing(watch)
+            yield item
+
+
+def _plan(service: Service, frame: dict[str, Any]) -> FramePlan:
+    request = RenderRequest.model_validate(frame)
+    if isinstance(request.t, list):
+        raise InvalidInput("t", "a single time; a batch has a frame for each", "a list")
+    return plan_frame(service, request)
+
+
+def _failed(index: int, error: Exception) -> Item:
+    status, body = problem_of(error)
+    return Item(index, status, body=body)
+
+
+def _line(item: Item) -> bytes:
+    line = BatchItem(index=item.index, status=item.status)
+    if item.plan is None:
+        line.problem = json.loads(item.body)
+    else:
+        line.media_type, line.data = item.plan.media_type, base64.b64encode(item.body).decode()
+    return line.model_dump_json(exclude_none=True).encode() + b"\n"
+
+
+def _part(item: Item) -> bytes:
+    head = {"Content-Type": "application/problem+json", "Content-Length": str(len(item.body))}
+    if item.plan is not None:
+        head |= {**item.plan.headers(0), "Content-Type": item.plan.media_type, "Server-Timing": item.timing}
+    head |= {"Msdgs-Index": str(item.index), "Msdgs-Status": str(item.status)}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
+    return f"--{BOUNDARY}\r\n{lines}\r\n".encode() + item.body + b"\r\n"

@@ -1,0 +1,80 @@
+"""One frame, or one for each time."""
+
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Annotated
+
+import anyio.to_thread
+from fastapi import APIRouter, Header, Query, Request
+from fastapi.responses import Response
+
+from msdgs_serve.api.frames import FramePlan, draw_frame, is_unchanged, plan_frame, server_timing
+from msdgs_serve.api.openapi import IMAGE_RESPONSE, NOT_MODIFIED, problems
+from msdgs_serve.api.queries import request_of
+from msdgs_serve.api.schemas import RenderQuery, RenderRequest
+from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.api.work import unless_gone
+from msdgs_serve.watch import Watch
+
+IfNoneMatch = Annotated[
+    str | None, Header(max_length=8192, description="`ETag`s of frames that the client has", examples=['"0123"'])
+]
+RESPONSES = {
+    **IMAGE_RESPONSE,
+    **NOT_MODIFIED,
+    **problems(
+        HTTPStatus.BAD_REQUEST,
+        HTTPStatus.NOT_FOUND,
+        HTTPStatus.REQUEST_TIMEOUT,
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+        HTTPStatus.UNPROCESSABLE_ENTITY,
+        HTTPStatus.SERVICE_UNAVAILABLE,
+        HTTPStatus.GATEWAY_TIMEOUT,
+    ),
+}
+
+router = APIRouter(tags=["frames"])
+
+
+@router.post("/render", summary="A frame, for any camera and any time", response_class=Response, responses=RESPONSES)
+async def render(
+    body: RenderRequest, service: SharedService, request: Request, if_none_match: IfNoneMatch = None
+) -> Response:
+    """Draws the scene as `camera` sees it at `t` and answers with the image file.
+
+    The same body gives the same bytes, as long as the scene's file stays the same; `ETag` says whether it did.
+    `Server-Timing` says what took how long, `Msdgs-Plan` how the scene's motion is computed.
+    """
+    return await answer(service, request, lambda: plan_frame(service, body), if_none_match)
+
+
+@router.get("/render", summary="A frame as a link", response_class=Response, responses=RESPONSES)
+async def render_link(
+    query: Annotated[RenderQuery, Query()],
+    service: SharedService,
+    request: Request,
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """The same for browsers and proxies: `/render?azimuth=30&t=0.5`. Without a camera the scene is seen from aside."""
+
+    def plan() -> FramePlan:
+        metadata = service.scene(query.scene).session.scene.metadata
+        return plan_frame(service, request_of(query, metadata))
+
+    return await answer(service, request, plan, if_none_match)
+
+
+async def answer(
+    service: Service, request: Request, make_plan: Callable[[], FramePlan], if_none_match: str | None
+) -> Response:
+    """Draw what is planned, unless the client has it already or goes away."""
+    plan = await anyio.to_thread.run_sync(make_plan)
+    headers = plan.headers(service.settings.frame_max_age)
+    if is_unchanged(if_none_match, plan.etag):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    watch = Watch()
+    work = service.queue.run(lambda: draw_frame(service, plan, watch), watch)
+    image = await unless_gone(request, work)
+    service.metrics.count_stages(watch.seconds)
+    headers["Server-Timing"] = server_timing(watch)
+    return Response(image, media_type=plan.media_type, headers=headers)

@@ -1,0 +1,164 @@
+"""The scenes that are served: listed, described, added, deleted."""
+
+import asyncio
+import hashlib
+import hmac
+import uuid
+from collections.abc import AsyncIterator
+from http import HTTPStatus
+from pathlib import Path as FilePath
+from typing import Annotated
+from urllib.parse import quote
+
+import anyio
+import anyio.to_thread
+from fastapi import APIRouter, Path, Query, Request, Response
+from starlette.requests import ClientDisconnect
+
+from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.openapi import SCENE_BODY, problems
+from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList
+from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.store import MAX_NAME_LENGTH, SceneStore
+
+SceneName = Annotated[str, Path(max_length=MAX_NAME_LENGTH, description="as in `GET /scenes`", examples=["toybench"])]
+NewName = Annotated[
+    str, Query(min_length=1, max_length=MAX_NAME_LENGTH, description="plain text, no separators", examples=["walk"])
+]
+Sha256 = Annotated[str | None, Query(pattern="^[0-9a-f]{64}$", description="of the file; checked where it is given")]
+
+router = APIRouter(tags=["scenes"])
+
+
+@router.get("/scenes", summary="The scenes that are served", responses=problems(HTTPStatus.UNPROCESSABLE_ENTITY))
+def list_scenes(service: SharedService) -> SceneList:
+    """Names, without loading anything."""
+    statuses = service.store.statuses()
+    return SceneList(
+        scenes=[SceneEntry(name=each.name, loaded=each.loaded, problem=each.problem is not None) for each in statuses]
+    )
+
+
+@router.get(
+    "/scenes/{name}",
+    summary="What a scene is",
+    responses=problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
+)
+def describe_scene(name: SceneName, service: SharedService) -> SceneDetail:
+    """Time range, cameras to start from, plan, counts and measured error. Loads the scene if it isn't yet."""
+    return _describe(service.store, name)
+
+
+@router.post(
+    "/scenes",
+    summary="Add a scene",
+    status_code=HTTPStatus.CREATED,
+    openapi_extra=SCENE_BODY,
+    responses=problems(
+        HTTPStatus.BAD_REQUEST,
+        HTTPStatus.FORBIDDEN,
+        HTTPStatus.REQUEST_TIMEOUT,
+        HTTPStatus.CONFLICT,
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+        HTTPStatus.UNPROCESSABLE_ENTITY,
+    ),
+)
+async def add_scene(
+    name: NewName,
+    service: SharedService,
+    request: Request,
+    response: Response,
+    replace: Annotated[bool, Query(description="whether a scene of this name may be replaced")] = False,
+    sha256: Sha256 = None,
+) -> SceneAdded:
+    """Takes a scene file as the body. It is opened and checked before it takes its place; who draws the scene that it
+    replaces is not disturbed. Only where the service was started with `--uploads`."""
+    service.check_uploads()
+    incoming = service.store.incoming(uuid.uuid4().hex)
+    try:
+        digest = await _receive(request, incoming, service)
+        if sha256 is not None and not hmac.compare_digest(digest, sha256):
+            raise InvalidInput("sha256", "that of the file", "another")
+        added = await anyio.to_thread.run_sync(lambda: service.store.add(name, incoming, replace=replace))
+    except SceneFileInvalid as error:
+        service.log_problem(error)
+        detail = f"The file breaks the contract msdgs/1 at `{error.field}`; docs/contract.md says what belongs there."
+        raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
+    finally:
+        incoming.unlink(missing_ok=True)
+    response.headers["Location"] = f"/scenes/{quote(name, safe='')}"
+    return SceneAdded(name=added.name, sha256=added.sha256)
+
+
+@router.delete(
+    "/scenes/{name}",
+    summary="Delete a scene",
+    status_code=HTTPStatus.NO_CONTENT,
+    responses=problems(HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY),
+)
+def delete_scene(name: SceneName, service: SharedService) -> None:
+    """Deletes its file; frames in work are finished. Only where the service was started with `--uploads`."""
+    service.check_uploads()
+    service.store.remove(name)
+
+
+async def _receive(request: Request, target: FilePath, service: Service) -> str:
+    """Write the body to a file, and return its SHA-256."""
+    limit = service.settings.max_scene_megabytes << 20
+    digest, size = hashlib.sha256(), 0
+    async with await anyio.open_file(target, "xb") as file:
+        async for part in _parts(request, service.settings.body_seconds):
+            size += len(part)
+            if size > limit:
+                detail = f"A scene file must be at most {service.settings.max_scene_megabytes} MiB."
+                raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "large_body", detail, field="body")
+            digest.update(part)
+            await file.write(part)
+    return digest.hexdigest()
+
+
+async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
+    """The body as it comes; each part within the time."""
+    stream = aiter(request.stream())
+    while True:
+        try:
+            async with asyncio.timeout(seconds):
+                yield await anext(stream)
+        except StopAsyncIteration:
+            return
+        except ClientDisconnect:
+            raise ClientGone("the client closed the connection") from None
+        except TimeoutError:
+            detail = f"The next part of the body must come within {seconds:g} s."
+            raise Refused(HTTPStatus.REQUEST_TIMEOUT, "slow_body", detail, field="body") from None
+
+
+def _describe(store: SceneStore, name: str) -> SceneDetail:
+    served = store.get(name)
+    scene = served.session.scene
+    status = store.status(name)
+    metadata = scene.metadata
+    low, high = metadata.bounds
+    counts = GaussianCounts(moving=scene.moving_count, static=scene.static_count, total=len(scene))
+    return SceneDetail(
+        name=name,
+        loaded=status.loaded,
+        problem=status.problem is not None,
+        contract=metadata.contract,
+        plan=metadata.plan,
+        layers=list(metadata.layers),
+        gaussians=counts,
+        sh_degree=metadata.sh_degree,
+        time_range=metadata.time_range,
+        bounds=(list(low), list(high)),
+        background=metadata.background,
+        antialiasing=metadata.antialiasing,
+        delta_space=metadata.delta_space,
+        cameras=[camera.to_plain() for camera in metadata.cameras],
+        measured_error=metadata.measured_error,
+        left_out=list(metadata.left_out),
+        package_version=metadata.package_version,
+        checkpoint_sha256=metadata.checkpoint_sha256,
+        sha256=served.sha256,
+    )

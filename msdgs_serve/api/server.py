@@ -1,0 +1,70 @@
+"""uvicorn with limits on slow connections, and an end that finishes what was begun."""
+
+import asyncio
+import socket
+import time
+from types import FrameType
+
+import uvicorn
+from fastapi import FastAPI
+
+from msdgs_serve.api.protocol import limited_protocol
+from msdgs_serve.api.service import Phase, Service
+from msdgs_serve.api.settings import Settings
+
+CLOSING_SECONDS = 5  # for what is still being sent when the work is done
+POLL_SECONDS = 0.05
+
+
+class Server(uvicorn.Server):
+    """Serves an application from `create_app`. The first signal drains it, the second ends it at once.
+
+    While it drains, /ready answers 503 on new connections too, so that who balances loads sends requests elsewhere.
+    """
+
+    def __init__(self, app: FastAPI, settings: Settings) -> None:
+        config = uvicorn.Config(
+            app,
+            http=limited_protocol(settings.header_seconds, settings.read_seconds),  # pyright: ignore[reportArgumentType]
+            log_config=None,
+            access_log=False,
+            timeout_graceful_shutdown=CLOSING_SECONDS,
+            server_header=False,
+        )
+        super().__init__(config)
+        self.service: Service = app.state.service
+        self._drain_seconds = settings.drain_seconds
+        self._drained_by = 0.0
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen at once, so that /live answers; `on_ready` follows when scenes are loaded."""
+        await super().startup(sockets)
+        self._announcement = asyncio.ensure_future(self._announce())
+
+    async def on_tick(self, counter: int) -> bool:
+        """Whether to stop now."""
+        if self.service.phase is Phase.FAILED:
+            return True
+        if self.service.phase is Phase.DRAINING and (self._is_idle() or time.monotonic() > self._drained_by):
+            return True
+        return await super().on_tick(counter)
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """A signal came."""
+        if self.service.phase is Phase.DRAINING:
+            self.should_exit = self.force_exit = True
+        self._drained_by = time.monotonic() + self._drain_seconds
+        self.service.drain()
+
+    def on_ready(self) -> None:
+        """Called once, when the service can be used."""
+
+    def _is_idle(self) -> bool:
+        """Whether nothing is in work or being sent."""
+        return not self.server_state.tasks
+
+    async def _announce(self) -> None:
+        while self.service.phase is Phase.STARTING:
+            await asyncio.sleep(POLL_SECONDS)
+        if self.service.phase is Phase.READY:
+            self.on_ready()

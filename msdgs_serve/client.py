@@ -1,0 +1,288 @@
+"""A client of the service that returns NumPy arrays. Needs httpx: `pip install 'msdgs[client]'`.
+
+    with Client("http://localhost:8000") as client:
+        frame = client.render(Orbit(azimuth=30, elevation=20), t=0.5, width=400, height=400)
+        frame.rgb, frame.alpha, frame.depth
+
+ClientError
+├── Problem         the service refused: `status`, `detail` and the `errors` by field
+└── Unreachable     no answer came
+"""
+
+import base64
+import io
+import json
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+from urllib.parse import quote
+
+import httpx
+import numpy as np
+import numpy.typing as npt
+
+Channel = Literal["rgb", "alpha", "depth"]
+Format = Literal["png", "jpeg", "webp", "exr", "npy"]
+Color = tuple[float, float, float]
+Background = Color | Literal["auto", "scene", "transparent"]
+FloatArray = npt.NDArray[np.floating]
+
+CHANNELS: tuple[Channel, ...] = ("rgb", "alpha", "depth")
+WIDTHS: dict[str, int] = {"rgb": 3, "alpha": 1, "depth": 1}
+DEFAULT_SECONDS = 60.0
+TRIES = 4
+OVERLOADED = 503
+
+
+class ClientError(Exception):
+    """Base of what this module raises."""
+
+
+class Unreachable(ClientError):
+    """No answer came: nobody listens there, or the time was over."""
+
+
+class Problem(ClientError):
+    """The service refused (RFC 9457)."""
+
+    def __init__(self, status: int, detail: str, errors: Sequence[Mapping[str, str]] = ()) -> None:
+        super().__init__(f"{status}: {detail}")
+        self.status = status
+        self.detail = detail
+        self.errors = {each["field"]: each["message"] for each in errors}
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """A camera on a sphere around `target`. Angles in degrees; what is None comes from the scene."""
+
+    azimuth: float
+    elevation: float
+    distance: float | None = None
+    target: Sequence[float] | None = None  # [3] world
+    up: Sequence[float] | None = None  # [3] world
+    fov_y: float | None = None  # vertical, degrees
+    type: str = field(default="orbit", init=False)
+
+
+@dataclass(frozen=True)
+class LookAt:
+    """A camera at `eye` that sees `target` in the middle."""
+
+    eye: Sequence[float]  # [3] world
+    target: Sequence[float] | None = None
+    up: Sequence[float] | None = None
+    fov_y: float | None = None
+    type: str = field(default="look_at", init=False)
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """A pose and intrinsics: `fov_y` in degrees, or `fx` and perhaps the others in pixels."""
+
+    camera_to_world: npt.ArrayLike  # [4, 4]
+    axes: Literal["opencv", "opengl"] = "opencv"
+    fov_y: float | None = None
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    type: str = field(default="matrix", init=False)
+
+
+@dataclass(frozen=True)
+class SceneCamera:
+    """A camera that the scene was made with, by `name` or `index`."""
+
+    name: str | None = None
+    index: int | None = None
+    type: str = field(default="scene", init=False)
+
+
+Camera = Orbit | LookAt | Matrix | SceneCamera
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """Motion blur from `t + open` to `t + close`."""
+
+    open: float
+    close: float
+    samples: int = 8
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What was drawn, as float32; channels that were not asked for are None."""
+
+    rgb: FloatArray | None  # [H, W, 3] sRGB-encoded; premultiplied by alpha where the background is transparent
+    alpha: FloatArray | None  # [H, W]
+    depth: FloatArray | None  # [H, W] along the camera's axis, scene units, infinite where nothing is
+    plan: str  # how the scene's motion is computed
+    milliseconds: dict[str, float]  # by stage: queue, pose, draw, encode
+
+
+class Client:
+    """A connection to a service. Safe to use from several threads."""
+
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8000",
+        *,
+        api_key: str | None = None,
+        seconds: float = DEFAULT_SECONDS,
+        tries: int = TRIES,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        """`seconds` is the time limit of a call; where the service is overloaded, a call is made up to `tries` times
+        and waits in between as long as the service says."""
+        headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+        self._http = httpx.Client(base_url=url, headers=headers, timeout=seconds, transport=transport)
+        self._tries = tries
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self._http.close()
+
+    def render(
+        self,
+        camera: Camera,
+        t: float,
+        *,
+        scene: str | None = None,
+        width: int | None = None,
+        height: int | None = None,
+        channels: Sequence[Channel] = CHANNELS,
+        background: Background = "auto",
+        shutter: Shutter | None = None,
+    ) -> Frame:
+        """A frame as arrays. Raises `Problem` or `Unreachable`."""
+        body = request_body(
+            camera, t, scene=scene, width=width, height=height, channels=channels, background=background,
+            shutter=shutter, format="npy",
+        )  # fmt: skip
+        response = self._call("POST", "/render", json=body)
+        pixels = _array(response.content)
+        return _frame(pixels, channels, response.headers)
+
+    def render_file(self, camera: Camera, t: float, *, format: Format = "png", **options: Any) -> bytes:
+        """A frame as an image file; `options` are those of `request_body`."""
+        return self._call("POST", "/render", json=request_body(camera, t, format=format, **options)).content
+
+    def render_many(self, bodies: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, bytes | Problem]]:
+        """The files of many frames as they are ready, with their places; bodies are those of `request_body`.
+
+        A frame that fails is a `Problem` in its place; the others are drawn.
+        """
+        with self._http.stream("POST", "/render/batch", json={"frames": [dict(body) for body in bodies]}) as response:
+            if response.is_error:
+                response.read()
+                raise _problem(response)
+            for text in response.iter_lines():
+                line = json.loads(text)
+                if "data" in line:
+                    yield line["index"], base64.b64decode(line["data"])
+                else:
+                    problem = line["problem"]
+                    yield line["index"], Problem(line["status"], problem["detail"], problem["errors"])
+
+    def scenes(self) -> list[str]:
+        """Names of the scenes that are served."""
+        return [scene["name"] for scene in self._call("GET", "/scenes").json()["scenes"]]
+
+    def scene(self, name: str) -> dict[str, Any]:
+        """What a scene says of itself: time range, cameras, plan, measured error."""
+        return self._call("GET", f"/scenes/{quote(name, safe='')}").json()
+
+    def add_scene(self, name: str, file: Path, *, replace: bool = False) -> str:
+        """Add a scene file where the service takes them; returns its SHA-256."""
+        query = {"name": name, "replace": str(replace).lower()}
+        return self._call("POST", "/scenes", params=query, content=file.read_bytes()).json()["sha256"]
+
+    def delete_scene(self, name: str) -> None:
+        """Delete a scene where the service lets."""
+        self._call("DELETE", f"/scenes/{quote(name, safe='')}")
+
+    def ready(self) -> bool:
+        """Whether frames can be asked for."""
+        try:
+            return self._http.get("/ready").is_success
+        except httpx.TransportError:
+            return False
+
+    def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        for number in range(self._tries):
+            try:
+                response = self._http.request(method, path, **arguments)
+            except httpx.TransportError as error:
+                raise Unreachable(f"{self._http.base_url}: {error or type(error).__name__}") from error
+            wait = response.headers.get("Retry-After")
+            if response.status_code != OVERLOADED or wait is None or number == self._tries - 1:
+                break
+            time.sleep(float(wait))
+        if response.is_error:
+            raise _problem(response)
+        return response
+
+
+def request_body(
+    camera: Camera,
+    t: float | Sequence[float],
+    *,
+    scene: str | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    format: Format = "png",
+    quality: int | None = None,
+    channels: Sequence[Channel] | None = None,
+    background: Background = "auto",
+    shutter: Shutter | None = None,
+) -> dict[str, Any]:
+    """The JSON of `POST /render`; what is None is left out."""
+    values = {
+        "scene": scene, "camera": _plain(camera), "t": t, "width": width, "height": height, "format": format,
+        "quality": quality, "channels": None if channels is None else list(channels), "background": background,
+        "shutter": None if shutter is None else _plain(shutter),
+    }  # fmt: skip
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _plain(value: Camera | Shutter) -> dict[str, Any]:
+    plain = {each.name: getattr(value, each.name) for each in fields(value)}
+    for name, each in plain.items():
+        if each is not None and not isinstance(each, str | int | float):
+            plain[name] = np.asarray(each, dtype=np.float64).tolist()
+    return {name: each for name, each in plain.items() if each is not None}
+
+
+def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Headers) -> Frame:
+    edges = np.cumsum([WIDTHS[channel] for channel in channels])[:-1]
+    parts = dict(zip(channels, np.split(pixels, edges, axis=2), strict=True))
+    found = {name: part if name == "rgb" else part[..., 0] for name, part in parts.items()}
+    stages = [stage.split(";") for stage in headers.get("Server-Timing", "").split(", ") if stage]
+    milliseconds = {name: float(duration.removeprefix("dur=")) for name, duration, *_ in stages}
+    rgb, alpha, depth = (found.get(name) for name in CHANNELS)
+    return Frame(rgb, alpha, depth, headers.get("Msdgs-Plan", ""), milliseconds)
+
+
+def _array(content: bytes) -> np.ndarray:
+    return np.load(io.BytesIO(content), allow_pickle=False)
+
+
+def _problem(response: httpx.Response) -> Problem:
+    try:
+        problem = response.json()
+        return Problem(response.status_code, problem["detail"], problem["errors"])
+    except (ValueError, KeyError, TypeError):  # a proxy in between may answer in its own words
+        return Problem(response.status_code, response.reason_phrase)

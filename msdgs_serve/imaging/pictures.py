@@ -1,0 +1,39 @@
+"""A channel of an image as a picture that people look at."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.imaging.formats import Channel
+from msdgs_serve.imaging.image import Image, to_8_bits
+
+FARTHEST_GREY = 0.15
+"""Of the farthest depth, so that it differs from nothing at all, which is black."""
+
+
+class DepthRange(NamedTuple):
+    """The depths that are drawn white and darkest."""
+
+    near: float
+    far: float
+
+
+def picture(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
+    """8 bits: [H, W, 3], [H, W, 4] with straight alpha for transparent colour, or [H, W, 1] for alpha and depth.
+
+    Depth is lighter the nearer it is, over `depth_range` or, where None, over the depths of this very image.
+    """
+    if channel == "rgb":
+        return image.display_pixels()
+    if channel == "alpha":
+        return to_8_bits(image.alpha)[..., None]
+    near, far = depth_range or depths_of(image)
+    seen = np.isfinite(image.depth)
+    place = np.clip((np.where(seen, image.depth, far) - near) / max(far - near, 1e-12), 0, 1)
+    return to_8_bits(np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0))[..., None]
+
+
+def depths_of(image: Image) -> DepthRange:
+    """The nearest and farthest depth of an image; 0 and 1 where there is nothing."""
+    depths = image.depth[np.isfinite(image.depth)]
+    return DepthRange(float(depths.min()), float(depths.max())) if depths.size else DepthRange(0.0, 1.0)

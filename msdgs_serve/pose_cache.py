@@ -1,0 +1,109 @@
+"""Posed Gaussians by scene and time: computed once for all who ask together, kept as long as the memory allows."""
+
+import threading
+import weakref
+from collections import OrderedDict
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene import Gaussians, InvalidInput
+from msdgs_serve.watch import Interrupted, Watch
+
+PoseKey = tuple[weakref.ref[DeformationSession], float]
+
+STAGE = "pose"
+
+
+@dataclass(frozen=True)
+class CacheUse:
+    """What the cache holds and did so far."""
+
+    poses: int
+    bytes: int
+    hits: int
+    misses: int
+
+
+class PoseCache:
+    """At most `capacity` bytes of posed Gaussians, used last stay. Safe to use from several threads.
+
+    Opacities and colours don't depend on time and are shared with the scene, so that they don't count.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        if capacity < 0:
+            raise InvalidInput("cache_bytes", "0 or more", capacity)
+        self._capacity = capacity
+        self._poses: OrderedDict[PoseKey, Future[Gaussians]] = OrderedDict()
+        self._sizes: dict[PoseKey, int] = {}
+        self._lock = threading.Lock()
+        self._hits = self._misses = 0
+
+    @property
+    def use(self) -> CacheUse:
+        """As of now."""
+        with self._lock:
+            return CacheUse(len(self._sizes), sum(self._sizes.values()), self._hits, self._misses)
+
+    def get(self, session: DeformationSession, t: float, watch: Watch) -> Gaussians:
+        """The scene's Gaussians at `t`; notes `hit` or `miss` with the watch."""
+        key = (weakref.ref(session), t)  # a scene that was replaced is not kept alive
+        with watch.stage(STAGE):
+            while True:
+                future, mine = self._claim(key)
+                watch.notes[STAGE] = "miss" if mine else "hit"
+                if mine:
+                    self._compute(session, t, key, future, watch)
+                try:
+                    return future.result()
+                except Interrupted:
+                    watch.check()  # not this one's: who computed it gave up, so it is claimed anew
+
+    def _claim(self, key: PoseKey) -> tuple[Future[Gaussians], bool]:
+        """The pose, perhaps still being computed, and whether the caller is to compute it."""
+        with self._lock:
+            future = self._poses.get(key)
+            mine = future is None
+            if future is None:
+                future = self._poses[key] = Future()
+            self._poses.move_to_end(key)
+            self._hits += not mine
+            self._misses += mine
+            return future, mine
+
+    def _compute(
+        self, session: DeformationSession, t: float, key: PoseKey, future: Future[Gaussians], watch: Watch
+    ) -> None:
+        try:
+            gaussians = session.gaussians(t)
+        except BaseException as error:
+            with self._lock:
+                self._forget(key)
+            future.set_exception(error)
+            return
+        with self._lock:
+            self._sizes[key] = _own_bytes(gaussians, session)
+            self._make_room()
+        future.set_result(gaussians)
+
+    def _make_room(self) -> None:
+        for key in [key for key in self._sizes if key[0]() is None]:
+            self._forget(key)
+        total = sum(self._sizes.values())
+        for key in [key for key in self._poses if key in self._sizes]:
+            if total <= self._capacity:
+                break
+            total -= self._sizes[key]
+            self._forget(key)
+
+    def _forget(self, key: PoseKey) -> None:
+        self._poses.pop(key, None)
+        self._sizes.pop(key, None)
+
+
+def _own_bytes(gaussians: Gaussians, session: DeformationSession) -> int:
+    """Of the arrays that are not the scene's own."""
+    if gaussians.means is session.scene.static_means:
+        return 0
+    return gaussians.means.nbytes + gaussians.quats.nbytes + gaussians.scales.nbytes

@@ -1,0 +1,43 @@
+"""A watch over one piece of work: how long its stages take, and whether anybody still waits for it."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from msdgs_serve.scene import MsdgsError
+
+
+class Interrupted(MsdgsError):
+    """Nobody waits for the work any more."""
+
+
+class Watch:
+    """Times stages by name and ends the work between them once `stop` was called. One thread works, any may stop it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}  # by stage; one that comes again adds to its time
+        self.notes: dict[str, str] = {}  # what there is to say of a stage, as in pose: "hit"
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End the work at its next check."""
+        self._stopped = True
+
+    def check(self) -> None:
+        """Raises `Interrupted` once `stop` was called."""
+        if self._stopped:
+            raise Interrupted("nobody waits for this any more")
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Check, and time what is done inside."""
+        self.check()
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.add(name, time.perf_counter() - started)
+
+    def add(self, name: str, seconds: float) -> None:
+        """Count time to a stage."""
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds

@@ -1,0 +1,135 @@
+"""What is to be trained: systems × scenes × seeds, each a run with its settings and its folder."""
+
+import dataclasses
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.config import TrainConfig
+from msdgs_train.presets import DEFAULT, PRESETS, preset
+
+EVALUATIONS = 10  # of the held-out photographs while training: points of a curve
+LOG_LINES = 100
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What is the same for all systems. None leaves it to the system's own settings."""
+
+    steps: int
+    minutes: float | None = None
+    size: int | None = None
+    threads: int = 1
+    init_count: int | None = None
+    max_gaussians: int | None = None
+
+    def settings(self) -> dict[str, Any]:
+        """Fields of `TrainConfig`."""
+        every = max(self.steps // EVALUATIONS, 1)
+        given = {
+            "steps": self.steps,
+            "max_minutes": self.minutes,
+            "threads": self.threads,
+            "eval_every": every,
+            "checkpoint_every": every,
+            "log_every": max(self.steps // LOG_LINES, 1),
+        }
+        optional = {name: getattr(self, name) for name in ("size", "init_count", "max_gaussians")}
+        return given | {name: value for name, value in optional.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class System:
+    """Settings by name."""
+
+    name: str
+    config: TrainConfig
+
+
+@dataclass(frozen=True)
+class Run:
+    """One cell of the matrix."""
+
+    system: str
+    scene: str
+    seed: int
+    data: Path
+    folder: Path
+    config: TrainConfig
+
+    @property
+    def name(self) -> str:
+        return f"{self.system}, {self.scene}, seed {self.seed}"
+
+
+def read_systems(sources: Sequence[str], budget: Budget) -> list[System]:
+    """Of names of presets and of TOML files, in which each table is a system: a `preset` and what differs from it.
+
+    Raises `InvalidInput` naming the file, the system and the setting that can't be used.
+    """
+    tables = [pair for source in sources for pair in _tables(source)]
+    systems = [System(name, _config(name, table, budget)) for name, table in tables]
+    _require_unique("system", (system.name for system in systems))
+    return systems
+
+
+def make_runs(systems: Sequence[System], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
+    """Seed by seed, so that a comparison that is stopped early has something of every system."""
+    _require_unique("scene", (scene.resolve().name for scene in scenes))
+    _require_unique("seed", map(str, seeds))
+    return [
+        Run(
+            system.name,
+            scene.resolve().name,
+            seed,
+            scene.resolve(),
+            out / system.name / f"{scene.resolve().name}_{seed}",
+            dataclasses.replace(system.config, seed=seed),
+        )
+        for seed in seeds
+        for scene in scenes
+        for system in systems
+    ]
+
+
+def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
+    if source in PRESETS:
+        return [(source, {"preset": source})]
+    path = Path(source)
+    if path.suffix != ".toml":
+        raise InvalidInput("config", f"a preset ({', '.join(PRESETS)}) or a .toml file", source)
+    try:
+        contents = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InvalidInput("config", "a file that can be read", f"{path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InvalidInput("config", "a TOML file", f"{path}: {error}") from error
+    for name, table in contents.items():
+        if not isinstance(table, dict) or not re.fullmatch(r"\w[\w .+=-]*", name):
+            raise InvalidInput("config", "tables named with letters, digits, spaces and .+=-", f"{path}: `{name}`")
+    return list(contents.items())
+
+
+def _config(name: str, table: Mapping[str, Any], budget: Budget) -> TrainConfig:
+    values = preset(table.get("preset", DEFAULT)).to_dict()
+    changes = {key: value for key, value in table.items() if key not in ("preset", "model")}
+    model = values["model"] | dict(table.get("model", {}))
+    try:
+        return TrainConfig.from_dict(values | changes | budget.settings() | {"model": model})
+    except (InvalidInput, TypeError, ValueError) as error:
+        raise InvalidInput("config", "made of settings that can be used", f"system `{name}`: {error}") from error
+
+
+def _require_unique(kind: str, given: Iterable[str]) -> None:
+    names = list(given)
+    if not names:
+        raise InvalidInput(kind, "given, one or more", "none")
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InvalidInput(kind, "named once", f"`{name}` twice")
+        seen.add(name)

@@ -1,0 +1,157 @@
+"""The table and the plots of a comparison."""
+
+import dataclasses
+import json
+import os
+import platform
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from msdgs_train.comparison.results import Result, Spread
+from msdgs_train.files import replacing, write_text
+
+TABLE, NUMBERS, TIME_PLOT, LAYERS_PLOT = "comparison.md", "comparison.json", "time.png", "layers.png"
+HEADINGS = (
+    "system", "scene", "seeds", "PSNR, dB", "SSIM", "deformation parameters", "with modulation", "Gaussians",
+    "training, s", "frame, ms",
+)  # fmt: skip
+
+
+def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list[Path]:
+    """Write the table, its numbers and the plots into the folder `out`, each atomically; returns their paths.
+
+    `missing`: runs that aren't finished.
+    """
+    write_text(out / TABLE, as_markdown(results, missing))
+    write_text(out / NUMBERS, json.dumps(as_json(results, missing), indent=2) + "\n")
+    _save(draw_time(results), out / TIME_PLOT)
+    _save(draw_layers(results), out / LAYERS_PLOT)
+    return [out / name for name in (TABLE, NUMBERS, TIME_PLOT, LAYERS_PLOT)]
+
+
+def table(results: Sequence[Result]) -> list[list[str]]:
+    """A row for each system and scene, in the order of `HEADINGS`; mean ± sample standard deviation over seeds."""
+    return [_row(group) for group in _groups(results, lambda r: (r.run.system, r.run.scene))]
+
+
+def _row(group: list[Result]) -> list[str]:
+    first = group[0]
+
+    def shown(values: list[float], digits: int) -> str:
+        return Spread.of(values).shown(digits)
+
+    return [
+        first.run.system,
+        first.run.scene,
+        str(len(group)),
+        shown([r.psnr for r in group], 2),
+        shown([r.ssim for r in group], 4),
+        f"{first.deformation_parameters:,}",
+        shown([r.deformation_parameters + r.modulation_parameters for r in group], 0),
+        shown([r.gaussians for r in group], 0),
+        shown([r.seconds for r in group], 0),
+        shown([r.frame_ms for r in group], 1),
+    ]
+
+
+def as_markdown(results: Sequence[Result], missing: int) -> str:
+    """The table, and under what it was measured."""
+    lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
+    lines += ["| " + " | ".join(row) + " |" for row in table(results)]
+    budget = results[0].run.config
+    limit = f", at most {budget.max_minutes:g} minutes a run" if budget.max_minutes is not None else ""
+    under = f"{budget.steps:,} steps{limit}; {budget.threads} thread(s) a run; held-out photographs of "
+    under += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
+    notes = [under, f"Measured on {date.today().isoformat()}: {machine}."]
+    skipped = sum(result.skipped for result in results)
+    if skipped:
+        notes.append(f"{skipped} steps were skipped because their loss was not finite.")
+    if missing:
+        notes.append(f"{missing} runs are not finished and are not in the table.")
+    return "\n".join([*lines, "", *notes]) + "\n"
+
+
+def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
+    """All numbers of all runs."""
+
+    def plain(result: Result) -> dict[str, Any]:
+        values = {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
+        run = {"system": result.run.system, "scene": result.run.scene, "seed": result.run.seed}
+        return run | values | {"run": str(result.run.folder), "curve": [point._asdict() for point in result.curve]}
+
+    return {"missing": missing, "runs": [plain(result) for result in results]}
+
+
+def draw_time(results: Sequence[Result]) -> Figure:
+    """Error on held-out photographs against training time: a line a system, the mean of its seeds and scenes."""
+    figure = Figure(figsize=(8, 5.5), layout="constrained")
+    axes = figure.subplots()
+    for group in _groups(results, lambda r: r.run.system):
+        shortest = min(len(result.curve) for result in group)
+        seconds, psnr = (
+            np.array([[getattr(point, name) for point in result.curve[:shortest]] for result in group])
+            for name in ("seconds", "psnr")
+        )
+        errors = rms_error(psnr)
+        (line,) = axes.plot(seconds.mean(axis=0), errors.mean(axis=0), marker="o", ms=3, label=group[0].run.system)
+        if len(group) > 1:
+            low, high = errors.min(axis=0), errors.max(axis=0)
+            axes.fill_between(seconds.mean(axis=0), low, high, color=line.get_color(), alpha=0.15, lw=0)
+    _finish(axes, "seconds of training")
+    return figure
+
+
+def draw_layers(results: Sequence[Result]) -> Figure:
+    """Error against K. Systems that differ in nothing but their number of layers of a kind are joined by a line."""
+    figure = Figure(figsize=(8, 5.5), layout="constrained")
+    axes = figure.subplots()
+    for family in _groups(results, _family):
+        points = []
+        for group in _groups(family, lambda r: len(r.run.config.model.layers)):
+            errors = rms_error(np.array([result.psnr for result in group]))
+            points.append((len(group[0].run.config.model.layers), errors.mean(), errors.min(), errors.max()))
+        count, mean, low, high = np.array(sorted(points)).T
+        name = ", ".join(dict.fromkeys(result.run.system for result in family))
+        axes.errorbar(count, mean, [mean - low, high - mean], marker="o", ms=4, capsize=3, label=name)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _finish(axes, "K, layers of the deformation")
+    return figure
+
+
+def rms_error(psnr: np.ndarray) -> np.ndarray:
+    """Root mean square error of pixels in [0, 1] of a PSNR in dB."""
+    return 10 ** (-psnr / 20)
+
+
+def _family(result: Result) -> str:
+    config = result.run.config
+    kinds = "+".join(sorted(set(config.model.layers)))
+    rest = dataclasses.replace(config, seed=0, model=dataclasses.replace(config.model, layers=())).to_dict()
+    return kinds + json.dumps(rest)
+
+
+def _finish(axes: Any, label: str) -> None:
+    axes.set(xlabel=label, ylabel="root mean square error of held-out pixels in [0, 1]", yscale="log")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize="small")
+
+
+def _groups(results: Sequence[Result], key: Any) -> list[list[Result]]:
+    """In the order in which each first comes."""
+    groups: dict[Any, list[Result]] = {}
+    for result in results:
+        groups.setdefault(key(result), []).append(result)
+    return list(groups.values())
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

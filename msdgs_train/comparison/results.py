@@ -1,0 +1,121 @@
+"""What the runs of a comparison have come to: quality, sizes, and the time that training and one frame take."""
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.checkpoint import LoadedModel, load_model
+from msdgs_train.comparison.matrix import Run
+from msdgs_train.comparison.runner import final_metrics, is_finished
+from msdgs_train.fit import CHOOSING_SPLITS, MODEL
+from msdgs_train.rasterization import rasterize
+from msdgs_train.report import read_metrics
+from msdgs_train.steps import camera_of
+
+TIMED_FRAMES = 8
+FIRST_SPLIT = "test"
+
+
+class CurvePoint(NamedTuple):
+    """The quality on held-out photographs at one moment of training."""
+
+    step: int
+    seconds: float
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Result:
+    """One finished run; qualities are those of the last model, which has had the whole budget."""
+
+    run: Run
+    split: str
+    psnr: float  # dB
+    ssim: float
+    deformation_parameters: int
+    modulation_parameters: int  # embeddings included
+    gaussians: int
+    seconds: float  # of training, evaluations included
+    skipped: int
+    frame_ms: float  # posing and drawing one held-out camera's view, median
+    curve: list[CurvePoint]
+
+
+class Spread(NamedTuple):
+    """Mean and sample standard deviation; the latter is None of one value."""
+
+    mean: float
+    deviation: float | None
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Spread":
+        return cls(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
+
+    def shown(self, digits: int) -> str:
+        """As in a table: mean ± deviation."""
+        return f"{self.mean:,.{digits}f}" + ("" if self.deviation is None else f" ± {self.deviation:,.{digits}f}")
+
+
+def collect(runs: Sequence[Run]) -> list[Result]:
+    """The finished ones, timed one after the other while nothing else of the comparison runs."""
+    return [_result(run) for run in runs if is_finished(run)]
+
+
+def _result(run: Run) -> Result:
+    metrics = final_metrics(run) or {}
+    split = next((name for name in (FIRST_SPLIT, *CHOOSING_SPLITS) if name in metrics["splits"]), None)
+    if split is None:
+        raise InvalidInput("data", "scenes with held-out photographs", run.data)
+    lines = read_metrics(run.folder)
+    loaded = load_model(run.folder / MODEL)
+    return Result(
+        run=run,
+        split=split,
+        psnr=metrics["splits"][split]["psnr"],
+        ssim=metrics["splits"][split]["ssim"],
+        deformation_parameters=sum(p.numel() for p in loaded.model.deformation.parameters()),
+        modulation_parameters=_modulation_parameters(loaded),
+        gaussians=metrics["gaussians"],
+        seconds=metrics["seconds"],
+        skipped=max((line["skipped"] for line in lines if line["kind"] == "train"), default=0),
+        frame_ms=frame_milliseconds(loaded, run.config.threads),
+        curve=_curve(lines, split),
+    )
+
+
+def _modulation_parameters(loaded: LoadedModel) -> int:
+    model, embeddings = loaded.model, loaded.model.gaussians.embeddings
+    if model.modulation is None or embeddings is None:
+        return 0
+    return embeddings.numel() + sum(p.numel() for p in model.modulation.parameters())
+
+
+@torch.no_grad()
+def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
+    """Median over some of the model's cameras, each after one that doesn't count; `threads` of torch."""
+    torch.set_num_threads(threads)
+    background = torch.tensor(loaded.scene.background)
+    took = []
+    for i, entry in enumerate([loaded.scene.cameras[0], *loaded.scene.cameras[:TIMED_FRAMES]]):
+        camera = camera_of(entry, entry["width"])
+        start = time.perf_counter()
+        rasterize(*loaded.model.pose(entry["t"]), camera, background)
+        if i:
+            took.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(took)
+
+
+def _curve(lines: list[dict[str, Any]], split: str) -> list[CurvePoint]:
+    train = [line for line in lines if line["kind"] == "train"]
+    steps, seconds = ([line[key] for line in train] for key in ("step", "seconds"))
+    return [
+        CurvePoint(line["step"], float(np.interp(line["step"], steps, seconds)), line["psnr"])
+        for line in lines
+        if line["kind"] == "eval" and line["split"] == split
+    ]

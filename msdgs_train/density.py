@@ -1,0 +1,43 @@
+"""What a strategy of density control is to the trainer, and which one the settings ask for."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from msdgs_train.config import TrainConfig
+from msdgs_train.densification import DensityControl
+from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.relocation import Relocation
+
+
+class DensityStrategy(Protocol):
+    """Adds, removes and moves Gaussians while they are trained."""
+
+    @property
+    def generator(self) -> torch.Generator:
+        """All of its randomness."""
+        ...
+
+    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Hear of one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
+        ...
+
+    def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
+        """Do what is due after this optimiser step, counted from 1."""
+        ...
+
+    def state(self) -> tuple[Tensor, ...]:
+        """What has been gathered, besides the generator, for a bit-exact continuation."""
+        ...
+
+    def load_state(self, state: tuple[Tensor, ...]) -> None:
+        """Go on from it."""
+        ...
+
+
+def start_density_control(config: TrainConfig, extent: float, count: int) -> DensityStrategy:
+    """The strategy of the settings, for `count` Gaussians; `extent` is the radius of the cameras' positions."""
+    if config.densify_strategy == "mcmc":
+        return Relocation.start(config)
+    return DensityControl.start(config, extent, count)

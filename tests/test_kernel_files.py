@@ -1,0 +1,102 @@
+"""Machine code on disk that is damaged, or that can't be written, costs a compilation and never a call."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from msdgs_serve.rasterizer.kernel_files import copy_kernels, is_writable
+from tests.processes import ROOT, run_python
+
+KERNEL = """
+from msdgs_serve.rasterizer.jit import kernel
+
+@kernel
+def double(x):
+    return 2 * x
+"""
+
+CALL = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from room.caller import double
+print(double(21.0), len(double.stats.cache_misses))
+"""
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "caller.py").write_text(KERNEL)
+    return tmp_path
+
+
+def call(room: Path, cache: Path | str) -> tuple[float, bool]:
+    """Result of the kernel in a process of its own, and whether that process compiled it."""
+    value, misses = run_python(CALL, room, NUMBA_CACHE_DIR=str(cache)).split()
+    return float(value), misses != "0"
+
+
+def cut(contents: bytes) -> bytes:
+    return contents[: len(contents) // 2]
+
+
+def flip(contents: bytes) -> bytes:
+    middle = len(contents) // 2
+    return contents[:middle] + bytes([contents[middle] ^ 1]) + contents[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "damage"),
+    [(".nbi", cut), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", lambda _: b""), (".nbc", flip)],
+    ids=["index cut", "index empty", "code cut", "code empty", "code flipped"],
+)
+def test_a_damaged_file_is_compiled_anew_and_mended(room: Path, suffix: str, damage: Callable[[bytes], bytes]):
+    cache = room / "cache"
+    assert call(room, cache) == (42.0, True)
+    assert call(room, cache) == (42.0, False)
+    (file,) = cache.rglob(f"*.double-*{suffix}")
+    file.write_bytes(damage(file.read_bytes()))
+    assert call(room, cache) == (42.0, True)
+    assert call(room, cache) == (42.0, False)
+
+
+def test_a_folder_that_cannot_be_written_is_no_obstacle(room: Path):
+    (room / "file").touch()
+    assert not is_writable(room / "file" / "cache")
+    assert call(room, room / "file" / "cache") == (42.0, True)
+
+
+def test_nothing_that_can_be_written_is_no_obstacle(room: Path):
+    (room / "file").touch()
+    value = run_python(
+        "import tempfile; tempfile.tempdir = '/nonexistent'\n" + CALL.replace(", len(double.stats.cache_misses)", ""),
+        room,
+        NUMBA_CACHE_DIR=str(room / "file" / "cache"),
+    )
+    assert float(value) == 42.0
+
+
+def test_what_was_compiled_beside_the_sources_is_used_from_the_copy(tmp_path: Path):
+    """As in a container with a read-only root: compiled at build, copied at start."""
+    package = tmp_path / "msdgs_serve"
+    shutil.copytree(ROOT / "msdgs_serve", package, ignore=shutil.ignore_patterns("__pycache__"))
+    run = f"""
+import sys
+sys.path.insert(0, {str(tmp_path)!r})
+import msdgs_serve
+assert msdgs_serve.__file__.startswith({str(tmp_path)!r})
+import numpy as np
+from msdgs_serve.rasterizer.harmonics import basis_into
+basis_into(np.empty(1), 0.0, 0.0, 1.0)
+print(len(basis_into.stats.cache_misses))
+"""
+    assert run_python(run, NUMBA_CACHE_DIR="").split() == ["1"]
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    copy_kernels(package, copy, nested=True)
+    assert run_python(run, NUMBA_CACHE_DIR=str(copy)).split() == ["0"]
+    again = tmp_path / "again"
+    copy_kernels(copy, again, nested=False)
+    assert run_python(run, NUMBA_CACHE_DIR=str(again)).split() == ["0"]
