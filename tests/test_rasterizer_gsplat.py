@@ -60,7 +60,9 @@ def test_projection(name: str, dtype: type):
     assert_close(got.records[drawn][:, [RED, GREEN, BLUE]], want.colors.numpy()[drawn], f"color.{row}")
     pixels = want.means2d.numpy()[drawn]
     size = np.maximum(np.abs(pixels), max(camera.width, camera.height))  # float32 has so many digits after the point
-    assert_close((got.records[drawn][:, [X, Y]] - pixels) / size + 1, np.ones_like(pixels), f"projection.{row}.relative")
+    assert_close(
+        (got.records[drawn][:, [X, Y]] - pixels) / size + 1, np.ones_like(pixels), f"projection.{row}.relative"
+    )
     inverse = want.conics.numpy()[drawn]
     size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])  # of xy: the most that a covariance allows
     assert_close((conics(got)[drawn] - inverse) / size + 1, np.ones_like(inverse), f"conic.{row}.relative")

@@ -24,6 +24,15 @@ TABLE = (
     Row("sh_basis.gsplat", 1e-12, "as sh_basis; gsplat keeps some constants to 14 digits"),
     Row("float32.relative", 1e-6, "a handful of float32 operations"),
     Row("pixel", 1e-9, "projecting a known point through float64 matrices, in pixels"),
+    # 16 numbers at once
+    Row(
+        "lanes.float32", 2e-6, "one or two roundings of numbers up to 10, and sums of 16; NumPy rounds a product first"
+    ),
+    Row("lanes.float64", 2e-14, "as in float32"),
+    Row("exp2.float32", 4e-7, "the polynomial's own 2e-7, and some roundings of float32"),
+    Row("exp2.float64", 2e-15, "some roundings of float64"),
+    Row("log2.float32", 8e-6, "a rounding of 100"),
+    Row("log2.float64", 3e-14, "a rounding of 100, and a series of 11 terms"),
     # rasterizer against the float64 oracle, pixels where no decision is in doubt; colours are of size 1
     Row("rgb.float32", 5e-6, "hundreds of blended splats, each alpha off by a few 1e-6 from the rounding of sigma"),
     Row("alpha.float32", 5e-6, "as rgb"),

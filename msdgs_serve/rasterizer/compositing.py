@@ -115,7 +115,6 @@ def _composite_tiles(
     frame: Frame,
 ) -> None:
     """Draw tiles, `TILES_A_TURN` of them at each turn, until all have been."""
-    real = records.dtype.type
     count = len(tiles.offsets) - 1
     state = np.empty(5 * PIXELS, records.dtype)
     batch = np.zeros((BATCH + 1) * RECORD, records.dtype)

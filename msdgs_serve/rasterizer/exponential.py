@@ -20,12 +20,18 @@ ATANH_SERIES = tuple(2 / math.log(2) / n for n in range(21, 0, -2))
 
 
 def exp2_polynomial(degree: int) -> tuple[float, ...]:
-    """Coefficients, highest power first, of the polynomial that meets 2^r at the Chebyshev nodes of [-1/2, 1/2].
+    """Coefficients, highest power first, of 1 + r p(r) for 2^r: p meets (2^r - 1) / r at Chebyshev's nodes of
+    [-1/2, 1/2], so that whole powers are exact.
 
-    Its relative error is 3e-6 for degree 4, 1.5e-7 for degree 5, 1e-15 for degree 11.
+    Its relative error is 6e-6 for degree 4, 3e-7 for degree 5, some roundings of float64 for degree 12.
     """
-    interpolated = np.polynomial.Chebyshev.interpolate(np.exp2, degree, domain=[-0.5, 0.5])
-    return tuple(interpolated.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist())
+
+    def slope(r: np.ndarray) -> np.ndarray:
+        whole = r == 0
+        return np.where(whole, math.log(2), np.expm1(r * math.log(2)) / np.where(whole, 1, r))
+
+    interpolated = np.polynomial.Chebyshev.interpolate(slope, degree - 1, domain=[-0.5, 0.5])
+    return (*interpolated.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist(), 1.0)
 
 
 @kernel

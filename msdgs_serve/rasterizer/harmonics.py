@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.scene.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
+from msdgs_serve.scene.spherical_harmonics import SH_C1, SH_C2, SH_C3
 
 C20, C21, C22, C23, C24 = SH_C2
 C30, C31, C32, C33, C34, C35, C36 = SH_C3

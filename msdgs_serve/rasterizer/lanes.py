@@ -22,6 +22,9 @@ Lanes = Any
 """16 numbers: an LLVM vector in kernels, an array [16] without the compiler."""
 Mask = Any
 """16 truth values."""
+Index = int | np.integer
+"""A place or a set of bits. Kernels use np.uint64 for them, or numba compiles a test for negative ones into every
+access: 3.5x."""
 
 
 class LanesType(types.Type):
@@ -252,7 +255,9 @@ def mantissa_of(a: Lanes) -> Lanes:
 
 _typed(exponent_of, lambda a: _same(a))
 _typed(mantissa_of, lambda a: _same(a))
-_typed(converted, lambda a, like: LanesType(like.dtype, a.count) if _same(a) and isinstance(like, types.Array) else None)
+_typed(
+    converted, lambda a, like: LanesType(like.dtype, a.count) if _same(a) and isinstance(like, types.Array) else None
+)
 
 
 def _layout(vector: ir.VectorType) -> tuple[ir.VectorType, Callable[[int], ir.Constant], int, int]:
@@ -300,7 +305,9 @@ def _lower_converted(context: Any, builder: Any, signature: Any, values: Any) ->
     return (builder.fpext if vector.element == ir.DoubleType() else builder.fptrunc)(values[0], vector)
 
 
-_lowered(fma, LanesType, LanesType, LanesType)(lambda b, x, y, z: _llvm(b, f"llvm.fma.{_suffix(x.type)}", x.type, x, y, z))
+_lowered(fma, LanesType, LanesType, LanesType)(
+    lambda b, x, y, z: _llvm(b, f"llvm.fma.{_suffix(x.type)}", x.type, x, y, z)
+)
 _lowered(minimum, LanesType, LanesType)(lambda b, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
 _lowered(maximum, LanesType, LanesType)(lambda b, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
 _lowered(square_root, LanesType)(lambda b, x: _llvm(b, f"llvm.sqrt.{_suffix(x.type)}", x.type, x))
@@ -346,7 +353,7 @@ for _either in (LanesType, MaskType):
     _lowered(second_of, _either)(lambda b, x: _shuffled(b, x, x, range(x.type.count // 2, x.type.count)))
 
 
-def bits_of(mask: Mask) -> int:
+def bits_of(mask: Mask) -> Any:
     """The mask as a number: lane 0 is bit 0."""
     return int(np.dot(mask, 1 << np.arange(LANES)))
 
@@ -355,18 +362,7 @@ _typed(bits_of, lambda mask: types.uint64 if mask == MASK else None)
 _lowered(bits_of, MASK)(lambda b, mask: b.zext(b.bitcast(mask, ir.IntType(LANES)), ir.IntType(64)))
 
 
-def mask_of(bits: int) -> Mask:
-    """The mask whose lane k is bit k."""
-    return (int(bits) >> np.arange(LANES)) & 1 != 0
-
-
-_typed(mask_of, lambda bits: MASK if bits == types.uint64 else None)
-_lowered(mask_of, types.uint64)(
-    lambda b, bits: b.bitcast(b.trunc(bits, ir.IntType(LANES)), ir.VectorType(ir.IntType(1), LANES))
-)
-
-
-def lowest_bit(bits: int) -> int:
+def lowest_bit(bits: Index) -> Any:
     """The place of the lowest set bit of a number that is not 0."""
     return (int(bits) & -int(bits)).bit_length() - 1
 
@@ -389,23 +385,23 @@ def _vector_at(context: Any, builder: Any, signature: Any, values: Any) -> tuple
     return builder.bitcast(place, vector.as_pointer()), kind.dtype.bitwidth // 8
 
 
-def load(array: np.ndarray, start: int) -> Lanes:
+def load(array: np.ndarray, start: Index) -> Lanes:
     """16 consecutive numbers of an array [n]."""
     return array[int(start) : int(start) + LANES].copy()
 
 
-def store(array: np.ndarray, start: int, lanes: Lanes) -> None:
+def store(array: np.ndarray, start: Index, lanes: Lanes) -> None:
     """Write 16 consecutive numbers of an array [n]."""
     array[int(start) : int(start) + LANES] = lanes
 
 
-def load_or(array: np.ndarray, start: int, otherwise: Lanes) -> Lanes:
+def load_or(array: np.ndarray, start: Index, otherwise: Lanes) -> Lanes:
     """The numbers of an array [n] from `start`; `otherwise` past its end."""
     found = array[int(start) : int(start) + LANES]
     return np.concatenate([found, otherwise[len(found) :]])
 
 
-def load_columns(array: np.ndarray, first_row: int, first_column: int) -> tuple[Lanes, ...]:
+def load_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tuple[Lanes, ...]:
     """16 columns of 16 rows of an array [n, m], as one `Lanes` a column; 0 past its rows and columns."""
     block = np.zeros((LANES, LANES), array.dtype)
     found = array[int(first_row) :, int(first_column) :][:LANES, :LANES]
@@ -413,7 +409,7 @@ def load_columns(array: np.ndarray, first_row: int, first_column: int) -> tuple[
     return tuple(block.T.copy())
 
 
-def store_rows(array: np.ndarray, first_row: int, columns: tuple[Lanes, ...]) -> None:
+def store_rows(array: np.ndarray, first_row: Index, columns: tuple[Lanes, ...]) -> None:
     """Write 16 columns into the rows of an array [n, 16] from `first_row`; what is past its end is dropped."""
     rows = array[int(first_row) : int(first_row) + LANES]
     rows[:] = np.stack(columns, axis=1)[: len(rows)]
@@ -550,7 +546,7 @@ def _lower_store_rows(context: Any, builder: Any, signature: Any, values: Any) -
     return context.get_dummy_value()
 
 
-def mark(columns: np.ndarray, place: int, mask: Mask) -> None:
+def mark(columns: np.ndarray, place: Index, mask: Mask) -> None:
     """Set bit `place` of those of 16 uint64 `columns` that the mask says: a row of a matrix of bits, by columns."""
     columns[:] |= np.where(mask, np.uint64(1) << np.uint64(place), np.uint64(0))
 
@@ -573,13 +569,13 @@ def _lower_mark(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     return context.get_dummy_value()
 
 
-def store_square(array: np.ndarray, start: int, stride: int, lanes: Lanes) -> None:
+def store_square(array: np.ndarray, start: Index, stride: Index, lanes: Lanes) -> None:
     """Write 4 × 4 numbers into an array [n]: 4 from `start`, the next 4 `stride` further, and so on."""
     for row, numbers in enumerate(np.reshape(lanes, (4, 4))):
         array[int(start) + row * int(stride) :][:4] = numbers
 
 
-def store_square_of_triples(array: np.ndarray, start: int, stride: int, a: Lanes, b: Lanes, c: Lanes) -> None:
+def store_square_of_triples(array: np.ndarray, start: Index, stride: Index, a: Lanes, b: Lanes, c: Lanes) -> None:
     """Write 4 × 4 triples (a, b, c) into an array [n], 4 of them from `start`, the next 4 `stride` further."""
     for row, triples in enumerate(np.stack([a, b, c], axis=1).reshape(4, 12)):
         array[int(start) + row * int(stride) :][:12] = triples
@@ -643,7 +639,7 @@ def _lower_store_square_of_triples(context: Any, builder: Any, signature: Any, v
     return _store_pieces(context, builder, signature, values, rows, write)
 
 
-def prefetch(array: np.ndarray, place: int) -> None:
+def prefetch(array: np.ndarray, place: Index) -> None:
     """Have the cache line of an element of an array [n] fetched meanwhile; nothing without the compiler."""
 
 

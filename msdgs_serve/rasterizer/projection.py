@@ -15,6 +15,7 @@ from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.lanes import (
     LANES,
     Lanes,
+    Mask,
     bits_of,
     converted,
     fma,
@@ -24,6 +25,7 @@ from msdgs_serve.rasterizer.lanes import (
     lowest_bit,
     maximum,
     minimum,
+    negative,
     select,
     spread,
     square_root,
@@ -57,6 +59,7 @@ class Splats(NamedTuple):
     records: np.ndarray  # [N, RECORD]
     rectangles: np.ndarray  # [N, 4] uint16: columns and rows of tiles, each first and past the last
     visible: np.ndarray  # [V] uint64: bits of the float32 depth above the index of each splat that is drawn
+    sound: bool  # whether `Gaussians.validate` has nothing to say; harmonics of what isn't drawn are not looked at
 
     @property
     def extents(self) -> np.ndarray:
@@ -66,24 +69,29 @@ class Splats(NamedTuple):
 
 def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) -> Splats:
     """Project N Gaussians into the camera's image."""
+    gaussians = _kernel_arrays(gaussians)
     count, dtype = len(gaussians), gaussians.means.dtype
     view = view_of(camera, options)
     records = np.empty((count, RECORD), dtype)
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
-    groups = split_evenly(-(-count // LANES), 2 * thread_count())
+    groups = split_evenly(-(-count // LANES), 2 * thread_count()) or [(0, 0)]
     ranges = [(first * LANES, min(past * LANES, count)) for first, past in groups]
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    sh = gaussians.sh.reshape(count, -1)
+    sh = gaussians.sh.reshape(count, 3 * gaussians.sh.shape[1])
     visible = run_parallel(
         _project_range,
-        [
-            (start, stop, view, *arrays, sh, records, rectangles, keys)
-            for start, stop in ranges
-        ],
+        [(start, stop, view, *arrays, sh, records, rectangles, keys) for start, stop in ranges],
     )
-    parts = [keys[start : start + found] for (start, _), found in zip(ranges, visible, strict=True)]
-    return Splats(records, rectangles, np.concatenate(parts))
+    parts = [keys[start : start + found] for (start, _), (found, _) in zip(ranges, visible, strict=True)]
+    return Splats(records, rectangles, np.concatenate(parts), all(sound for _, sound in visible))
+
+
+def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
+    """The same numbers in C order, writable and of one dtype: for each other combination numba would compile anew."""
+    dtype = np.float64 if gaussians.means.dtype == np.float64 else np.float32
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    return Gaussians(*(np.require(array, dtype, ("C", "W")) for array in arrays))
 
 
 @kernel
@@ -99,22 +107,27 @@ def _project_range(
     records: np.ndarray,
     rectangles: np.ndarray,
     keys: np.ndarray,
-) -> int:
-    """Splats `start` to `stop`; the number of those that are drawn, whose keys are written from `start`."""
+) -> tuple[int, bool]:
+    """Splats `start` to `stop`; the number of those that are drawn, whose keys are written from `start`, and whether
+    all that was read is what a Gaussian may have."""
     real = records.dtype.type
     zero = spread(real(0))
     double = np.empty(1, np.float64)
     boxes = np.empty(5 * LANES, records.dtype)
     scratch = np.empty(48 * LANES, sh.dtype)
     r, t = view.rotation, view.translation
-    found = start
+    found, sound = start, True
     for first in range(start, stop, LANES):
         columns = load_columns(means, first, 0)
         wx, wy, wz = converted(columns[0], double), converted(columns[1], double), converted(columns[2], double)
         opacity = converted(load_or(opacities, first, spread(opacities.dtype.type(0))), double)
+        qs, ss = load_columns(quats, first, 0), load_columns(scales, first, 0)
+        usable = _usable(columns, qs, ss, opacity)
         x = fma(spread(r[0, 0]), wx, fma(spread(r[0, 1]), wy, fma(spread(r[0, 2]), wz, spread(t[0]))))
         y = fma(spread(r[1, 0]), wx, fma(spread(r[1, 1]), wy, fma(spread(r[1, 2]), wz, spread(t[1]))))
         z = fma(spread(r[2, 0]), wx, fma(spread(r[2, 1]), wy, fma(spread(r[2, 2]), wz, spread(t[2]))))
+        past_end = np.uint64(0xFFFF) << np.uint64(min(stop - first, LANES))
+        sound = sound and (bits_of(usable) | past_end) & np.uint64(0xFFFF) == np.uint64(0xFFFF)
         drawn = (z > view.near_plane) & (opacity >= view.alpha_min)
         if bits_of(drawn) == np.uint64(0):
             _store_nothing(records, first)
@@ -124,10 +137,8 @@ def _project_range(
         j00, j11 = view.fx * per_z, view.fy * per_z
         j02 = -j00 * maximum(minimum(slope_x, spread(view.max_x)), spread(view.min_x))
         j12 = -j11 * maximum(minimum(slope_y, spread(view.max_y)), spread(view.min_y))
-        qs = load_columns(quats, first, 0)
         qw, qx = converted(qs[0], double), converted(qs[1], double)
         qy, qz = converted(qs[2], double), converted(qs[3], double)
-        ss = load_columns(scales, first, 0)
         mx0, my0 = _half_axis(
             r, j00, j02, j11, j12, 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
         )
@@ -168,7 +179,8 @@ def _project_range(
         dy = converted(wy - view.position[1], records)
         dz = converted(wz - view.position[2], records)
         per_distance = 1 / square_root(dx * dx + dy * dy + dz * dz)
-        red, green, blue = _colors(sh, first, scratch, dx * per_distance, dy * per_distance, dz * per_distance)
+        red, green, blue = _raw_colors(sh, first, scratch, dx * per_distance, dy * per_distance, dz * per_distance)
+        sound = sound and bits_of(drawn & (abs_sum(red, green, blue) < np.inf)) == bits
         store_rows(
             records,
             first,
@@ -179,9 +191,9 @@ def _project_range(
                 select(drawn, ROOT_SCALE * root_b, zero),
                 select(drawn, ROOT_SCALE * root_c, zero),
                 select(drawn, log2_opacity, zero),
-                select(drawn, red, zero),
-                select(drawn, green, zero),
-                select(drawn, blue, zero),
+                select(drawn, maximum(red, zero), zero),
+                select(drawn, maximum(green, zero), zero),
+                select(drawn, maximum(blue, zero), zero),
                 select(drawn, converted(z, records), zero),
                 select(drawn, slope_h, zero),
                 select(drawn, slope_v, zero),
@@ -206,7 +218,23 @@ def _project_range(
                 rectangles[i, side] = np.uint16(boxes[np.uint64(LANES) * side + lane])
             keys[np.uint64(found)] = (depth_bits(boxes[lane + np.uint64(64)]) << np.uint64(32)) | i
             found += 1
-    return found - start
+    return found - start, sound
+
+
+@kernel
+def abs_sum(a: Lanes, b: Lanes, c: Lanes) -> Lanes:
+    """|a| + |b| + |c|: less than infinity where all are finite."""
+    return -(negative(a) + negative(b) + negative(c))
+
+
+@kernel
+def _usable(means: tuple, quats: tuple, scales: tuple, opacities: Lanes) -> Mask:
+    """What `Gaussians.validate` asks of all but harmonics."""
+    squares = quats[0] * quats[0] + quats[1] * quats[1] + quats[2] * quats[2] + quats[3] * quats[3]
+    usable = (abs_sum(means[0], means[1], means[2]) < np.inf) & (abs_sum(scales[0], scales[1], scales[2]) < np.inf)
+    usable = usable & (scales[0] > 0) & (scales[1] > 0) & (scales[2] > 0)
+    usable = usable & (squares > 0.9981) & (squares < 1.0019)
+    return usable & (opacities >= 0) & (opacities <= 1)
 
 
 @kernel
@@ -237,10 +265,10 @@ def _half_axis(
 
 
 @kernel
-def _colors(
+def _raw_colors(
     sh: np.ndarray, first: int, scratch: np.ndarray, x: Lanes, y: Lanes, z: Lanes
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """SH + 0.5 towards the unit directions (x, y, z), cut at 0; `sh` is [N, 3 coefficients]."""
+    """SH + 0.5 towards the unit directions (x, y, z), before the cut at 0; `sh` is [N, 3 coefficients]."""
     width = sh.shape[1]
     for window in range(0, width, LANES):
         columns = load_columns(sh, first, window)
@@ -256,5 +284,4 @@ def _colors(
             red = fma(load(scratch, place), basis[k - 1], red)
             green = fma(load(scratch, place + np.uint64(16)), basis[k - 1], green)
             blue = fma(load(scratch, place + np.uint64(32)), basis[k - 1], blue)
-    zero = spread(sh.dtype.type(0))
-    return maximum(red, zero), maximum(green, zero), maximum(blue, zero)
+    return red, green, blue

@@ -36,17 +36,12 @@ def rasterize(
     Raises:
         InvalidInput: if an array of the Gaussians, the background or an option breaks its contract, by name.
     """
-    gaussians = _kernel_arrays(gaussians.validate())
+    gaussians.validate_shapes()
     background = np.asarray(background, dtype=gaussians.means.dtype)
     if background.shape != (3,) or not np.isfinite(background).all():
         raise InvalidInput("background", "3 finite numbers", background.tolist())
     splats = project(gaussians, camera, options)
+    if not splats.sound:
+        gaussians.validate()
     tiles = bin_into_tiles(splats, camera.width, camera.height)
     return Rendering(*composite(splats, tiles, camera.width, camera.height, background, options))
-
-
-def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
-    """The same numbers in C order, writable and of one dtype: for each other combination numba would compile anew."""
-    dtype = np.float64 if gaussians.means.dtype == np.float64 else np.float32
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    return Gaussians(*(np.require(array, dtype, ("C", "W")) for array in arrays))

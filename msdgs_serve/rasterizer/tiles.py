@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import prefetch
 from msdgs_serve.rasterizer.projection import Splats
 from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
@@ -78,7 +77,7 @@ def sorted_by_depth(keys: np.ndarray) -> np.ndarray:
 
 
 def _parts(count: int) -> list[tuple[int, int]]:
-    return split_evenly(count, min(thread_count(), 1 + count // SPLATS_A_PART))
+    return split_evenly(count, min(thread_count(), 1 + count // SPLATS_A_PART)) or [(0, 0)]
 
 
 @kernel

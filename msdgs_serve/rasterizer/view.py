@@ -8,7 +8,6 @@ import numpy as np
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 
-
 TILE = 16
 """Pixels along a tile's side."""
 

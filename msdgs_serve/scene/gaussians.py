@@ -28,8 +28,8 @@ class Gaussians:
     def sh_degree(self) -> int:
         return SH_DEGREES[self.sh.shape[1]]
 
-    def validate(self) -> "Gaussians":
-        """Return self if shapes agree and every value is usable, else raise `InvalidInput` naming the array."""
+    def validate_shapes(self) -> None:
+        """Raise `InvalidInput` naming the array if shapes disagree; doesn't look at values."""
         n = len(self.means)
         expected_shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
         for name, shape in expected_shapes.items():
@@ -38,6 +38,11 @@ class Gaussians:
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in SH_DEGREES or self.sh.shape[2] != 3:
             counts = [sh_coefficients(d) for d in range(4)]
             raise InvalidInput("gaussians.sh", f"of shape ({n}, one of {counts}, 3)", self.sh.shape)
+
+    def validate(self) -> "Gaussians":
+        """Return self if shapes agree and every value is usable, else raise `InvalidInput` naming the array."""
+        self.validate_shapes()
+        n = len(self.means)
         for name in ("means", "quats", "scales", "opacities", "sh"):
             bad = int(np.count_nonzero(~np.isfinite(getattr(self, name))))
             if bad:

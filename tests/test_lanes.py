@@ -1,0 +1,122 @@
+"""Lane-wise operations: the compiled ones against NumPy's, which are their definition."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from msdgs_serve.rasterizer import lanes
+from msdgs_serve.rasterizer.atomic import fetch_add
+from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial, log2
+from msdgs_serve.rasterizer.jit import kernel
+from tests.tolerances import assert_close
+
+DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float32", "float64"])
+
+
+@kernel
+def operations(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> tuple[int, int]:
+    """One row of `out` for each operation."""
+    x, y = lanes.load(a, 0), lanes.load(b, np.uint64(1))
+    two = lanes.pair(x, y)
+    both = lanes.minimum(two * 2 + 1, lanes.filled(0.5, two))
+    mask = (x < y) | (x >= 1.5) & ~(y <= -1)
+    wide = lanes.pair(two, both) > 0.25
+    rows = (
+        x + y,
+        x - 2,
+        3 * x,
+        x / y,
+        -x,
+        lanes.fma(x, y, lanes.spread(a[3])),
+        lanes.minimum(x, y),
+        lanes.maximum(x, y),
+        lanes.square_root(x * x),
+        lanes.negative(x),
+        lanes.select(mask, x, y),
+        lanes.first_of(both),
+        lanes.second_of(both),
+        lanes.select(lanes.second_of(lanes.first_of(wide)), x, y),
+        lanes.exponent_of(x * x + 0.125),
+        lanes.mantissa_of(x * x + 0.125),
+    )
+    for k in range(16):
+        lanes.store(out, 16 * k, rows[k])
+    lanes.store(out, 256, lanes.times_power_of_two(x, y + lanes.rounder(y)))
+    lanes.store(out, 272, lanes.load_or(a, 40, x))
+    lanes.store(out, 288, lanes.sums_of(rows))
+    bits = lanes.bits_of(mask)
+    return bits, lanes.lowest_bit(bits)
+
+
+@DTYPES
+def test_operations_are_what_numpy_says(dtype: type):
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=50).astype(dtype), rng.normal(size=50).astype(dtype)
+    b[5] = a[4]
+    got, want = np.zeros(304, dtype), np.zeros(304, dtype)
+    assert operations(a, b, got) == operations.py_func(a, b, want)
+    assert_close(got, want, f"lanes.{np.dtype(dtype).name}")
+
+
+@kernel
+def rows_and_columns(
+    matrix: np.ndarray, out: np.ndarray, squares: np.ndarray, triples: np.ndarray, columns: np.ndarray
+) -> None:
+    block = lanes.load_columns(matrix, 3, 2)
+    lanes.store_rows(out, 5, block)
+    lanes.store_square(squares, 2, 7, block[0])
+    lanes.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
+    for k in range(16):
+        lanes.mark(columns, np.uint64(k), block[0] > block[1])
+    lanes.prefetch(squares, 3)
+
+
+@DTYPES
+def test_memory(dtype: type):
+    """Loads stop at the end of an array, stores leave what is beside them."""
+    matrix = np.arange(70, dtype=dtype).reshape(10, 7)
+    got = [np.full((9, 16), -1, dtype), np.full(40, -1, dtype), np.full(60, -1, dtype), np.zeros(16, np.uint64)]
+    want = [array.copy() for array in got]
+    rows_and_columns(matrix, *got)
+    rows_and_columns.py_func(matrix, *want)
+    for array, expected in zip(got, want, strict=True):
+        np.testing.assert_array_equal(array, expected)
+    np.testing.assert_array_equal(got[0][5:, :5], matrix[3:7, 2:])
+    np.testing.assert_array_equal(got[0][:5], -1)
+
+
+@kernel
+def powers(x: np.ndarray, polynomial: tuple, out: np.ndarray, logarithms: np.ndarray) -> None:
+    for k in range(0, len(x), 16):
+        power = exp2(lanes.load(x, k), polynomial)
+        lanes.store(out, k, power)
+        lanes.store(logarithms, k, log2(power))
+
+
+@pytest.mark.parametrize(("dtype", "degree"), [(np.float32, 5), (np.float64, 12)])
+def test_powers_and_logarithms(dtype: type, degree: int):
+    x = np.linspace(-100, 1, 16_000).astype(dtype)
+    x[:16] = np.arange(-15, 1)
+    polynomial = tuple(map(dtype, exp2_polynomial(degree)))
+    power, logarithm = np.empty_like(x), np.empty_like(x)
+    powers(x, polynomial, power, logarithm)
+    name = np.dtype(dtype).name
+    np.testing.assert_array_equal(power[:16], np.exp2(x[:16]))
+    assert_close(power / np.exp2(x.astype(float)), np.ones_like(x), f"exp2.{name}")
+    assert_close(logarithm, np.log2(power.astype(float)), f"log2.{name}")
+
+
+@kernel
+def draw_numbers(counter: np.ndarray, count: int, drawn: np.ndarray) -> None:
+    for _ in range(count):
+        drawn[fetch_add(counter, 2)] += 1
+
+
+def test_every_number_is_drawn_once():
+    counter, drawn = np.zeros(1, np.int64), np.zeros(80_000, np.int64)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: draw_numbers(counter, 10_000, drawn), range(4)))
+    assert counter[0] == len(drawn)
+    assert (drawn[::2] == 1).all()
+    assert not drawn[1::2].any()
