@@ -29,9 +29,10 @@ FRAME_TIMES = 2
 FRAME_CAMERAS = 2
 """Pictures are drawn at the times and from the cameras where float32 is furthest off."""
 
-NEAR_WORST = 0.999
-WORST_PART = 1 - NEAR_WORST
+WORST_PART = 0.001
 """The Gaussians looked at one by one."""
+
+NEAR_WORST = 1 - WORST_PART
 
 
 def assess(

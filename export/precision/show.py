@@ -22,7 +22,11 @@ def print_report(report: StabilityReport, console: Console) -> None:
         console.print(_format_table(report))
         for gap in report.formats:
             console.print(f"{gap.name}: {gap.meaning}", style="dim", markup=False)
-        console.print(f"healed: with the worst 0.1 % in float64. Red: under {report.max_error:g} dB", style="dim")
+        console.print(
+            "median to largest: relative error of a pose. dB, value: the worst frame, and its worst pixel. "
+            f"Healed: with the worst 0.1 % in float64. Red: under {report.max_error:g} dB",
+            style="dim",
+        )
     if report.worst is not None:
         _print_worst(report, console)
     for what, count in report.limits.items():
@@ -38,19 +42,19 @@ def _growth_table(report: StabilityReport) -> Table:
 
 
 def _format_table(report: StabilityReport) -> Table:
-    columns = ("median", "99.9 %", "largest", "in pixels", "worst frame", "healed", "pixel value")
+    columns = ("median", "99.9 %", "largest", "pixels", "dB", "healed", "value")
     table = Table(Column("against float64", no_wrap=True), *columns, box=None)
     for gap in report.formats:
         table.add_row(
             gap.name,
             *(f"{value:.1e}" for value in (gap.median, gap.near_worst, gap.worst)),
             f"{gap.pixels:.1e}",
-            decibels(gap.psnr),
-            decibels(gap.psnr_without_worst),
+            decibels(gap.psnr, ""),
+            decibels(gap.psnr_without_worst, ""),
             f"{gap.worst_pixel:.1e}",
             style="" if gap.psnr >= report.max_error else "red",
         )
-    table.add_row("foretold", *[""] * 4, decibels(report.predicted_psnr), "", "")
+    table.add_row("foretold", *[""] * 4, decibels(report.predicted_psnr, ""), "", "")
     return table
 
 
@@ -67,9 +71,9 @@ def _print_worst(report: StabilityReport, console: Console) -> None:
     )
 
 
-def decibels(psnr: float) -> str:
+def decibels(psnr: float, unit: str = " dB") -> str:
     """PSNR is cut at 100."""
-    return f"{psnr:.1f} dB" if psnr < MAX_PSNR else f"≥ {MAX_PSNR:g} dB"
+    return (f"{psnr:.1f}" if psnr < MAX_PSNR else f"≥ {MAX_PSNR:g}") + unit
 
 
 def write_json(report: StabilityReport, path: Path) -> None:
