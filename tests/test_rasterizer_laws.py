@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import GSPLAT, INRIA, Rendering, rasterize
-from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 from tests import reference
 from tests.scenes import as_dtype, front_camera, gaussians_of, joined, random_scene, select, unit_quats
@@ -209,3 +209,29 @@ def test_depth_of_one_splat_is_its_own(dtype: type):
     assert 0 < seen.mean() < 1
     assert_close(picture.depth[seen], np.full(seen.sum(), 3.0), "depth.float32.relative")
     assert np.isinf(picture.depth[~seen]).all()
+
+
+@DTYPES
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_extra_channels_are_drawn_as_colors_are(channels: int, dtype: type):
+    """Each channel as the red of the same Gaussians, over black; depth is what the camera's axis says."""
+    gaussians, camera = scene(20, dtype)
+    extra = np.random.default_rng(0).uniform(-1, 1, size=(len(gaussians), channels)).astype(dtype)
+    got = rasterize(gaussians, camera, background=BACKGROUND, extra=extra)
+    plain = rasterize(gaussians, camera, background=BACKGROUND)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(plain, name))
+    assert plain.extra.shape == (camera.height, camera.width, 0)
+    assert got.extra.shape == (camera.height, camera.width, channels)
+    for channel in range(channels):
+        shifted = np.zeros((len(gaussians), 1, 3), dtype)
+        shifted[:, 0, 0] = (extra[:, channel] + 2 - 0.5) * np.sqrt(4 * np.pi)  # colours can't be below 0
+        red = rasterize(replace(gaussians, sh=shifted), camera).rgb[:, :, 0]
+        assert_close(got.extra[:, :, channel], red - 2 * plain.alpha, f"rgb.{np.dtype(dtype).name}")
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 1)), np.zeros(150), np.full((150, 1), np.nan)])
+def test_extra_channels_that_cannot_be(bad: np.ndarray):
+    gaussians, camera = scene(20, np.float32)
+    with pytest.raises(InvalidInput, match="extra"):
+        rasterize(gaussians, camera, extra=bad)
