@@ -21,6 +21,7 @@ from msdgs_train.model import ModelConfig
 from msdgs_train.optimizers import exponential, learning_rates
 from msdgs_train.report import MetricsLog, read_metrics
 from msdgs_train.trainer import StepResult, Trainer, TrainingDiverged
+from tests.tolerances import tolerance
 from tests.training_scene import SIZE, small_config, write_scene
 
 
@@ -249,6 +250,35 @@ def test_another_way_is_taken_after_a_rollback(data: Path) -> None:
     again.retry_after(diverged)
     assert [again._next_frame().name for _ in range(7)] != first
     assert (again.rollbacks, again.rate_factor) == (1, 0.5)
+
+
+def _plane_differences(planes: np.ndarray, order: int, axis: int) -> float:
+    return float(np.mean(np.diff(planes, n=order, axis=axis) ** 2))
+
+
+@pytest.mark.parametrize("mcmc", [False, True])
+def test_what_is_added_to_the_loss(data: Path, mcmc: bool) -> None:
+    model = dataclasses.replace(small_config().model, layers=("plane", "mlp"), plane_scales=(1, 2), plane_space_nodes=5)
+    weights = {"plane_bends_weight": 1.0, "plane_slopes_weight": 10.0, "plane_space_bends_weight": 100.0}
+    config = small_config(
+        model=model, warmup_fraction=0.0, densify_strategy="mcmc" if mcmc else "gradient", mcmc_opacity_weight=2e4,
+        mcmc_scale_weight=3e5, plane_time_l1_weight=1e3, **weights,
+    )  # fmt: skip
+    trainer = Trainer(config, load_scene(data))
+    expected = 0.0
+    with torch.no_grad():
+        for grid in trainer.model.plane_grids():
+            grid.time.add_(torch.randn(grid.time.shape, generator=torch.Generator().manual_seed(1)))
+            space, time = grid.space.double().numpy(), grid.time.double().numpy()
+            expected += _plane_differences(time, 2, 1) + 1e3 * np.abs(1 - time).mean()
+            expected += sum(
+                10 * _plane_differences(space, 1, a) + 100 * _plane_differences(space, 2, a) for a in (1, 2)
+            )
+        posed = trainer.model.pose(0.3)
+        if mcmc:
+            expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
+        assert len(trainer.model.plane_grids()) == 2
+        assert float(trainer._priors(posed)) == pytest.approx(float(expected), rel=tolerance("float32.relative"))
 
 
 def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
