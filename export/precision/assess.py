@@ -112,14 +112,12 @@ class _Assessment:
         if gap.overflowed:
             return [f"{gap.overflowed:,} Gaussians overflow in float32"]
         if gap.psnr < self.max_error:
-            return [
-                f"their float32 round-off is visible: {gap.psnr:.1f} dB in the worst frame, under {self.max_error:g}"
-            ]
+            return [f"float32 round-off is visible: {gap.psnr:.1f} dB in the worst frame, under {self.max_error:g}"]
         if predicted < self.max_error:
             seen = (
                 f"none was at the times tried ({gap.psnr:.1f} dB), but its amplification lets expect {predicted:.1f} dB"
             )
-            return [f"their float32 round-off may be visible: {seen}, under {self.max_error:g}"]
+            return [f"float32 round-off may be visible: {seen}, under {self.max_error:g}"]
         return []
 
     def _frames(self, moment: "_Moment", samples: Samples) -> tuple[dict[str, "_FrameGap"], float, WorstGaussians]:

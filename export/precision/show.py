@@ -30,7 +30,7 @@ def print_report(report: StabilityReport, console: Console) -> None:
     if report.worst is not None:
         _print_worst(report, console)
     for what, count in report.limits.items():
-        console.print(f"{count:,} Gaussians: {what}", markup=False)
+        console.print(f"{what}: {count:,} of the Gaussians", markup=False)
     console.print(report.verdict, style="bold green" if report.steady else "bold red", markup=False)
 
 

@@ -97,7 +97,7 @@ class StabilityReport:
         if self.broken:
             return "; ".join(self.broken)
         if plan.split(":")[0] in CHAINED_PLANS and self.unsteady:
-            return f"the plan `{plan}` computes the layers in float32 or less, and {'; '.join(self.unsteady)}. {REMEDY}"
+            return f"the plan `{plan}` computes the layers in float32 or less, and {'; '.join(self.unsteady)}; {REMEDY}"
         return None
 
     def require(self, plan: str) -> None:

@@ -14,11 +14,13 @@ from starlette.exceptions import HTTPException
 
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
 from msdgs_serve.store import SceneExists
+from msdgs_serve.video import VideoUnavailable
 
 STATUS_OF: dict[type[MsdgsError], HTTPStatus] = {
     InvalidInput: HTTPStatus.UNPROCESSABLE_ENTITY,
     SceneNotFound: HTTPStatus.NOT_FOUND,
     SceneExists: HTTPStatus.CONFLICT,
+    VideoUnavailable: HTTPStatus.NOT_IMPLEMENTED,
     SceneFileInvalid: HTTPStatus.SERVICE_UNAVAILABLE,
 }
 KIND = "msdgs.problem"
@@ -56,6 +58,7 @@ KINDS: dict[type[Exception], str] = {
     InvalidInput: "invalid",
     SceneNotFound: "not_found",
     SceneExists: "conflict",
+    VideoUnavailable: "unavailable",
     SceneFileInvalid: "broken_scene",
     ClientGone: "client_gone",
 }
@@ -138,6 +141,8 @@ def _domain_problem(error: MsdgsError) -> Response:
     if isinstance(error, SceneFileInvalid):
         logger.error("%s", error)
         return problem_response(status, f"The scene's file is broken at `{error.field}`; the server's log says how.")
+    if isinstance(error, VideoUnavailable):
+        return problem_response(status, str(error))
     field = error.field if isinstance(error, InvalidInput) else "scene"
     return problem_response(status, str(error), [FieldError(field=field, message=str(error))])
 

@@ -130,13 +130,18 @@ def _check_amounts(service: Service, request: RenderRequest, camera: Camera, fra
         raise InvalidInput("t", f"a list of at most {limits.max_batch} times", frames)
     if request.shutter is not None and request.shutter.samples > limits.max_samples:
         raise InvalidInput("shutter.samples", f"at most {limits.max_samples}", request.shutter.samples)
+    check_pixels(camera, frames, limits.max_pixels, limits.max_pixels, "t")
+
+
+def check_pixels(camera: Camera, frames: int, limit: int, total: int, field: str) -> None:
+    """Raise `InvalidInput` for a frame of more pixels than `limit`, and for frames of more than `total` together."""
     pixels, size = camera.width * camera.height, f"{camera.width} × {camera.height}"
-    if pixels > limits.max_pixels:
+    if pixels > limit:
         larger = "width" if camera.width >= camera.height else "height"
-        raise InvalidInput(larger, f"such that width × height is at most {limits.max_pixels} pixels", size)
-    if pixels * frames > limits.max_pixels:
-        expected = f"so few that width × height × times is at most {limits.max_pixels} pixels"
-        raise InvalidInput("t", expected, f"{frames} times {size}")
+        raise InvalidInput(larger, f"such that width × height is at most {limit} pixels", size)
+    if pixels * frames > total:
+        expected = f"so many that width × height × their number is at most {total} pixels"
+        raise InvalidInput(field, expected, f"{frames} of {size}")
 
 
 def _background(request: RenderRequest) -> Background:

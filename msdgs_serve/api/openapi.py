@@ -7,14 +7,15 @@ import numpy as np
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from msdgs_serve.api.cameras import framing
 from msdgs_serve.api.errors import MEDIA_TYPE, FieldError, Problem
 from msdgs_serve.api.keys import OPEN_PATHS
 from msdgs_serve.api.schemas import BatchItem
+from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS
 from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_serve.scene.camera import orbit
 from msdgs_serve.store import SceneStore
+from msdgs_serve.video import VIDEO_FORMATS
 
 Responses = dict[int | str, dict[str, Any]]
 Examples = dict[str, dict[str, Any]]
@@ -45,6 +46,14 @@ BATCH_RESPONSE: Responses = {
         "content": {
             "application/x-ndjson": {"schema": {"$ref": "#/components/schemas/BatchItem"}},
             "multipart/mixed": {"schema": {"type": "string", "format": "binary"}},
+        },
+    }
+}
+VIDEO_RESPONSE: Responses = {
+    200: {
+        "description": "The film",
+        "content": {
+            traits.media_type: {"schema": {"type": "string", "format": "binary"}} for traits in VIDEO_FORMATS.values()
         },
     }
 }

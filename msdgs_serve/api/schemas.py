@@ -7,6 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
 from msdgs_serve.imaging import Channel, ImageFormat
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
 from msdgs_serve.store import MAX_NAME_LENGTH
+from msdgs_serve.video import VideoFormat
 
 MAX_TIMES = 1000
 MAX_BATCH = 1000
@@ -220,6 +221,34 @@ class BatchItem(BaseModel):
     media_type: str | None = Field(default=None, description="of `data`")
     data: str | None = Field(default=None, description="the image file in base64")
     problem: dict[str, Any] | None = Field(default=None, description="instead, where it failed")
+
+
+class FilmFrame(Strict):
+    """A frame of a film."""
+
+    camera: CameraSpec
+    t: Number = Field(description="time, within the scene's `time_range`")
+
+
+class VideoRequest(Strict):
+    """A film to draw: give `frames`, or a `path` as nerfstudio writes it."""
+
+    scene: Name | None = Field(default=None, description="may be left out where only one is served")
+    frames: Annotated[list[FilmFrame], Field(min_length=1, max_length=MAX_TIMES)] | None = Field(
+        default=None, description="one camera and one time each"
+    )
+    path: dict[str, Any] | None = Field(
+        default=None,
+        description="the contents of nerfstudio's camera_path.json; `render_time` in [0, 1] of a camera is a part of "
+        "the scene's time, which otherwise runs evenly",
+    )
+    width: Pixels | None = Field(default=None, description="pixels; default: the path's, else the first camera's")
+    height: Pixels | None = Field(default=None, description="pixels; goes with `width`")
+    fps: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=240)] | None = Field(
+        default=None, description="frames a second; default: the path's, else 24"
+    )
+    format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9")
+    background: tuple[Unit, Unit, Unit] | Literal["scene"] = Field(default="scene", description="sRGB-encoded, 0 to 1")
 
 
 class SceneEntry(BaseModel):

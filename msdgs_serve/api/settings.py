@@ -47,6 +47,8 @@ class Settings(BaseSettings):
     cache_megabytes: int = Field(default=256, ge=0, description="memory for Gaussians posed before")
     max_samples: int = Field(default=64, ge=1, description="most moments of a frame's motion blur")
     max_batch: int = Field(default=256, ge=1, le=1000, description="most frames of a batch, and times of a frame")
+    max_video_frames: int = Field(default=300, ge=1, le=1000, description="most frames of a film")
+    max_video_pixels: int = Field(default=1 << 28, ge=1, description="largest width × height × frames of a film")
     max_scene_megabytes: int = Field(default=1024, ge=1, description="largest scene file that is taken in")
     uploads: bool = Field(default=False, description="let clients add and delete scenes, in the first folder given")
     header_seconds: float = Field(default=10.0, gt=0, description="time limit for a request's headers")

@@ -1,0 +1,101 @@
+"""A film along a camera path."""
+
+import io
+from http import HTTPStatus
+
+import anyio.to_thread
+import numpy as np
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
+
+from msdgs_serve.api.cameras import resolve_camera
+from msdgs_serve.api.frames import check_pixels
+from msdgs_serve.api.openapi import VIDEO_RESPONSE, problems
+from msdgs_serve.api.schemas import RenderRequest, VideoRequest
+from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.api.work import unless_gone
+from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_nerfstudio
+from msdgs_serve.renderer import RenderOptions, check_times
+from msdgs_serve.scene import InvalidInput
+from msdgs_serve.store import ServedScene
+from msdgs_serve.video import VIDEO_FORMATS, check_video, write_video
+from msdgs_serve.watch import Watch
+
+router = APIRouter(tags=["frames"])
+
+
+@router.post(
+    "/render/video",
+    summary="A film along a camera path",
+    response_class=Response,
+    responses={
+        **VIDEO_RESPONSE,
+        **problems(
+            HTTPStatus.BAD_REQUEST,
+            HTTPStatus.NOT_FOUND,
+            HTTPStatus.REQUEST_TIMEOUT,
+            HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+            HTTPStatus.UNPROCESSABLE_ENTITY,
+            HTTPStatus.NOT_IMPLEMENTED,
+            HTTPStatus.SERVICE_UNAVAILABLE,
+            HTTPStatus.GATEWAY_TIMEOUT,
+        ),
+    },
+)
+async def render_video(body: VideoRequest, service: SharedService, request: Request) -> Response:
+    """Draws every frame and answers with the film. The time limit holds for each frame, others draw in between.
+
+    For long films `msdgs-render` on the machine itself shows its progress and goes on where it was stopped.
+    """
+    check_video(body.format)
+    service.queue.check_open()
+    scene, path = await anyio.to_thread.run_sync(_path, service, body)
+    film = await unless_gone(request, _film(service, body, scene, path))
+    return Response(film, media_type=VIDEO_FORMATS[body.format].media_type)
+
+
+async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> bytes:
+    """Each frame takes its turn in the queue; so does putting them together."""
+    pictures: list[np.ndarray] = []
+    options, watch = RenderOptions(body.background), Watch()
+    for camera, t in path.frames:
+
+        def draw(camera=camera, t=t) -> np.ndarray:  # noqa: ANN001  # of this turn of the loop
+            return service.renderer.render(scene.session, camera, t, options, watch).display_pixels()
+
+        pictures.append(await service.queue.run(draw, watch, admitted=True))
+    file = io.BytesIO()
+    fps = body.fps or path.fps
+    await service.queue.run(lambda: write_video(pictures, fps, body.format, file), watch, admitted=True)
+    service.metrics.count_stages(watch.seconds)
+    return file.getvalue()
+
+
+def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath]:
+    scene = service.scene(body.scene)
+    metadata = scene.session.scene.metadata
+    if (body.frames is None) == (body.path is None):
+        raise InvalidInput("frames", "given, or path", "neither" if body.frames is None else "both")
+    if (body.width is None) != (body.height is None):
+        raise InvalidInput("width", "given together with height", "one of them")
+    size = None if body.width is None or body.height is None else (body.width, body.height)
+    if body.path is not None:
+        path = read_nerfstudio(body.path, metadata.time_range, size)
+    else:
+        width, height, given = body.width, body.height, body.frames or ()
+        requests = [RenderRequest(camera=each.camera, t=each.t, width=width, height=height) for each in given]
+        first = resolve_camera(requests[0], metadata)
+        asked = {"width": first.width, "height": first.height}
+        cameras = [resolve_camera(each.model_copy(update=asked), metadata) for each in requests]
+        path = CameraPath(tuple(zip(cameras, [each.t for each in given], strict=True)), DEFAULT_FPS)
+    if len(path.frames) > service.settings.max_video_frames:
+        raise InvalidInput("frames", f"at most {service.settings.max_video_frames}", len(path.frames))
+    camera = path.frames[0][0]
+    check_pixels(camera, len(path.frames), service.settings.max_pixels, service.settings.max_video_pixels, "frames")
+    for number, (_, t) in enumerate(path.frames):
+        try:
+            check_times(scene.session, t)
+        except InvalidInput as error:
+            first, last = metadata.time_range
+            raise InvalidInput(f"frames.{number}.t", f"in the scene's range [{first}, {last}]", t) from error
+    return scene, path

@@ -1,0 +1,121 @@
+"""Cameras along a path, each with its time: read from nerfstudio's files, or a turn around the scene."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.camera import orbit
+
+DEFAULT_FPS = 24.0
+MAX_FPS = 240.0
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """What is seen, frame by frame."""
+
+    frames: tuple[tuple[Camera, float], ...]  # camera and scene time
+    fps: float
+
+    def __post_init__(self) -> None:
+        if not self.frames:
+            raise InvalidInput("path", "of at least one frame", 0)
+        if not (math.isfinite(self.fps) and 0 < self.fps <= MAX_FPS):
+            raise InvalidInput("fps", f"in (0, {MAX_FPS:g}]", self.fps)
+
+
+def turn_around(
+    target: np.ndarray,
+    distance: float,
+    elevation: float,
+    up: np.ndarray,
+    fov_y: float,
+    size: tuple[int, int],
+    count: int,
+    time_range: tuple[float, float],
+) -> list[tuple[Camera, float]]:
+    """One turn in `count` steps, while the scene's time runs from its beginning to its end. Angles in degrees."""
+    times = spread_times(count, time_range)
+    poses = [orbit(target, distance, 360 * number / count, elevation, up) for number in range(count)]
+    return [(Camera.from_fov(pose, *size, fov_y), t) for pose, t in zip(poses, times, strict=True)]
+
+
+def spread_times(count: int, time_range: tuple[float, float]) -> list[float]:
+    """`count` times from the first to the last, evenly."""
+    return np.linspace(*time_range, count).tolist()
+
+
+def read_nerfstudio(
+    document: Mapping[str, Any], time_range: tuple[float, float], size: tuple[int, int] | None = None
+) -> CameraPath:
+    """A path from the contents of nerfstudio's camera_path.json, whose cameras have OpenGL axes.
+
+    Each camera's time is its `render_time`, a part of the scene's time in [0, 1]; where none has one, time runs evenly
+    over the path. `size` is used in place of the file's. Raises `InvalidInput` naming the key.
+    """
+    cameras = document.get("camera_path")
+    if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
+        raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
+    width, height = size or (_whole(document, "render_width"), _whole(document, "render_height"))
+    evenly = spread_times(len(cameras), time_range)
+    frames = []
+    for number, each in enumerate(cameras):
+        name = f"camera_path.{number}"
+        if not isinstance(each, Mapping):
+            raise InvalidInput(name, "an object", type(each).__name__)
+        pose = _numbers(each.get("camera_to_world"), 16, f"{name}.camera_to_world").reshape(4, 4)
+        (fov_y,) = _numbers([each.get("fov")], 1, f"{name}.fov")
+        if not 0 < fov_y < 180:
+            raise InvalidInput(f"{name}.fov", "in (0, 180) degrees", fov_y)
+        focal = 0.5 * height / math.tan(0.5 * math.radians(fov_y))
+        camera = Camera.from_opengl(pose, width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+        frames.append((camera, _time(each, evenly[number], time_range, name)))
+    return CameraPath(tuple(frames), _fps(document))
+
+
+def read_path_file(path: Path, time_range: tuple[float, float], size: tuple[int, int] | None = None) -> CameraPath:
+    """The path in a JSON file in nerfstudio's layout. Raises `InvalidInput`."""
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InvalidInput("path", "a JSON file that can be read", f"{path}: {error}") from None
+    if not isinstance(document, dict):
+        raise InvalidInput("path", "a JSON object, as nerfstudio writes it", f"{path}: {type(document).__name__}")
+    return read_nerfstudio(document, time_range, size)
+
+
+def _time(camera: Mapping[str, Any], evenly: float, time_range: tuple[float, float], name: str) -> float:
+    if camera.get("render_time") is None:
+        return evenly
+    (part,) = _numbers([camera["render_time"]], 1, f"{name}.render_time")
+    if not 0 <= part <= 1:
+        raise InvalidInput(f"{name}.render_time", "in [0, 1]", part)
+    first, last = time_range
+    return float(min(first + part * (last - first), last))
+
+
+def _fps(document: Mapping[str, Any]) -> float:
+    return float(_numbers([document.get("fps", DEFAULT_FPS)], 1, "fps")[0])
+
+
+def _whole(document: Mapping[str, Any], name: str) -> int:
+    value = document.get(name)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise InvalidInput(name, "a whole number of pixels", value)
+    return value
+
+
+def _numbers(value: Any, count: int, name: str) -> np.ndarray:
+    good = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
+    if not good or any(isinstance(each, bool) or not isinstance(each, int | float) for each in value):
+        raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", "something else")
+    array = np.array(value, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise InvalidInput(name, "finite", "NaN or infinity")
+    return array

@@ -1,0 +1,186 @@
+"""`msdgs-render`: a camera path through a scene, as images or as a film. Goes on where it was stopped."""
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import cast, get_args
+
+import numpy as np
+import OpenImageIO as oiio
+
+from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_path_file, turn_around
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import framing
+from msdgs_serve.imaging import FORMATS, ImageFormat, encode
+from msdgs_serve.imaging.encode import check_encodable
+from msdgs_serve.renderer import Renderer, RenderOptions
+from msdgs_serve.scene import InvalidInput, MsdgsError
+from msdgs_serve.video import VideoFormat, check_video, write_video
+
+PROGRAM = "msdgs-render"
+USAGE_ERROR = 2
+INTERRUPTED = 130
+RECORD = "msdgs-render.json"
+
+EXAMPLES = """\
+examples:
+  msdgs-render scene.onnx frames/                           one turn around the scene while its time runs, as PNG
+  msdgs-render scene.onnx turn.mp4 --frames 96 --fps 24     the same as a film
+  msdgs-render scene.onnx walk.webm --path camera_path.json a path drawn in nerfstudio's viewer
+  msdgs-render scene.onnx frames/ --format exr              colour, alpha and depth as numbers, for compositing
+
+Ctrl-C loses nothing: the same command goes on where it was stopped.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Returns the exit status: 2 where the command can't be carried out, 130 after Ctrl-C."""
+    options = _parser().parse_args(arguments)
+    try:
+        _run(options)
+    except KeyboardInterrupt:
+        print(f"\n{PROGRAM}: stopped; the same command goes on from here", file=sys.stderr)
+        return INTERRUPTED
+    except (MsdgsError, OSError) as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        PROGRAM, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scene", type=Path, help="a scene file (.onnx)")
+    parser.add_argument("out", type=Path, help="a folder for images, or a film: name.mp4 or name.webm")
+    parser.add_argument("--path", type=Path, help="a camera path, as nerfstudio writes it; default: one turn around")
+    parser.add_argument("--frames", type=int, default=60, help="of the turn (default 60)")
+    parser.add_argument("--elevation", type=float, default=20.0, help="of the turn, degrees (default 20)")
+    parser.add_argument("--fps", type=float, help=f"of a film; default: the path's, else {DEFAULT_FPS:g}")
+    parser.add_argument("--width", type=int, help="pixels; default: the path's, else the scene's first camera's")
+    parser.add_argument("--height", type=int, help="pixels; goes with --width")
+    parser.add_argument("--format", choices=get_args(ImageFormat), default="png", help="of images (default png)")
+    parser.add_argument("--quality", type=int, help="of jpeg and webp, 1 to 100")
+    parser.add_argument("--transparent", action="store_true", help="no background; for images")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> None:
+    video = options.out.suffix.lstrip(".")
+    is_film = bool(video)
+    if is_film:
+        check_video(video)
+    session = DeformationSession(options.scene)
+    path = _path(options, session)
+    image_format = cast(ImageFormat, "png" if is_film else options.format)
+    transparent = options.transparent or (FORMATS[image_format].holds_float and not is_film)
+    first = path.frames[0][0]
+    check_encodable(first.width, first.height, transparent, image_format, options.quality)
+    if is_film and transparent:
+        raise InvalidInput("--transparent", "left out for a film", "given")
+    folder = options.out.with_name(f"{options.out.name}.frames") if is_film else options.out
+    _claim(folder, _record(options, path, image_format, transparent))
+    files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(path.frames))]
+    background = "transparent" if transparent else "scene"
+    _draw(session, path, files, image_format, options.quality, RenderOptions(background))
+    if is_film:
+        unfinished = options.out.with_name(f".{options.out.name}.part")
+        with unfinished.open("wb") as file:
+            write_video(_pictures(files), options.fps or path.fps, cast(VideoFormat, video), file)
+        os.replace(unfinished, options.out)
+        shutil.rmtree(folder)
+    print(f"wrote {options.out}: {len(files)} frames of {first.width} × {first.height}")
+
+
+def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPath:
+    metadata = session.scene.metadata
+    if (options.width is None) != (options.height is None):
+        raise InvalidInput("--width", "given together with --height", "one of them")
+    size = None if options.width is None else (options.width, options.height)
+    if options.path is not None:
+        path = read_path_file(options.path, metadata.time_range, size)
+        return CameraPath(path.frames, options.fps or path.fps)
+    if options.frames < 1:
+        raise InvalidInput("--frames", "at least 1", options.frames)
+    view = framing(metadata)
+    size = size or (view.width, view.height)
+    frames = turn_around(
+        view.target, view.distance, options.elevation, view.up, view.fov_y, size, options.frames, metadata.time_range
+    )
+    return CameraPath(tuple(frames), options.fps or DEFAULT_FPS)
+
+
+def _draw(
+    session: DeformationSession,
+    path: CameraPath,
+    files: Sequence[Path],
+    image_format: ImageFormat,
+    quality: int | None,
+    options: RenderOptions,
+) -> None:
+    """The files that aren't there yet; each appears whole."""
+    missing = [number for number, file in enumerate(files) if not file.exists()]
+    if len(missing) < len(files):
+        print(f"{len(files) - len(missing)} of {len(files)} frames are there already")
+    renderer, started = Renderer(), time.monotonic()
+    for done, number in enumerate(missing, start=1):
+        camera, t = path.frames[number]
+        body = encode(renderer.render(session, camera, t, options), image_format, quality)
+        unfinished = files[number].with_name(f".{files[number].name}.part")
+        unfinished.write_bytes(body)
+        os.replace(unfinished, files[number])
+        _show_progress(done, len(missing), time.monotonic() - started)
+
+
+def _show_progress(done: int, count: int, seconds: float) -> None:
+    if sys.stderr.isatty() or done in (1, count):
+        left = seconds / done * (count - done)
+        end = "\n" if done == count or not sys.stderr.isatty() else ""
+        text = f"\rframe {done} of {count}, {done / max(seconds, 1e-9):.2f} a second, {left:.0f} s left   "
+        print(text, end=end, file=sys.stderr, flush=True)
+
+
+def _pictures(files: Sequence[Path]) -> Iterator[np.ndarray]:
+    """[H, W, 3] uint8 each."""
+    for file in files:
+        reader = oiio.ImageInput.open(str(file))
+        if not reader:
+            raise InvalidInput("frame", "an image that can be read; delete it to have it drawn anew", file)
+        yield np.asarray(reader.read_image(oiio.UINT8))[..., :3]
+        reader.close()
+
+
+def _record(options: argparse.Namespace, path: CameraPath, image_format: str, transparent: bool) -> str:
+    """What the frames depend on."""
+    digest = hashlib.sha256(options.scene.read_bytes())
+    for camera, t in path.frames:
+        digest.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, t)).encode())
+        digest.update(camera.camera_to_world.tobytes())
+    asked = {"format": image_format, "quality": options.quality, "transparent": transparent}
+    return json.dumps({**asked, "sha256": digest.hexdigest()})
+
+
+def _claim(folder: Path, record: str) -> None:
+    """Make the folder, or see that what is in it belongs to the same command."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / RECORD
+    if file.exists():
+        if file.read_text() != record:
+            expected = "an empty folder, or one with frames of the same scene, path and format"
+            raise InvalidInput("out", expected, f"{folder}, made by another command")
+        return
+    if any(not each.name.startswith(".") for each in folder.iterdir()):
+        raise InvalidInput("out", "an empty folder, or one that this command has begun", folder)
+    unfinished = folder / f".{RECORD}.part"
+    unfinished.write_text(record)
+    os.replace(unfinished, file)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
