@@ -91,7 +91,8 @@ class Renderer:
         gaussians = self.posed(session, moment, watch)
         with watch.stage("draw"):
             background = resolve_background(session, options.background)
-            rendering = rasterize(gaussians, camera, background=background, options=options.rasterizer)
+            constants = options.rasterizer._replace(mip=session.scene.metadata.antialiasing == "mip")
+            rendering = rasterize(gaussians, camera, background=background, options=constants)
             transparent = options.background == "transparent"
             return Image(rendering.rgb, rendering.alpha, rendering.depth, transparent, camera, t)
 
