@@ -95,8 +95,9 @@ class Renderer:
         later = None if options.motion_dt is None else self.posed(session, moment + options.motion_dt, watch)
         with watch.stage("draw"):
             background = resolve_background(session, options.background)
+            constants = options.rasterizer._replace(mip=session.scene.metadata.antialiasing == "mip")
             extra = None if later is None else displacements(gaussians, later, camera)
-            drawn = rasterize(gaussians, camera, background=background, extra=extra, options=options.rasterizer)
+            drawn = rasterize(gaussians, camera, background=background, extra=extra, options=constants)
             transparent = options.background == "transparent"
             motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]
             return Image(drawn.rgb, drawn.alpha, drawn.depth, transparent, camera, t, motion)
@@ -107,15 +108,9 @@ def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarra
 
     0 for those that are behind the camera at one of the times.
     """
-
-    def project(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        seen = means.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        front = seen[:, 2] > GSPLAT.near_plane
-        depth = np.where(front, seen[:, 2], 1)[:, None]
-        return seen[:, :2] / depth * (camera.fx, camera.fy), front
-
-    (start, start_seen), (end, end_seen) = project(now.means), project(later.means)
-    return np.where((start_seen & end_seen)[:, None], end - start, 0).astype(now.means.dtype)
+    (start, start_depths), (end, end_depths) = camera.project(now.means), camera.project(later.means)
+    seen = (start_depths > GSPLAT.near_plane) & (end_depths > GSPLAT.near_plane)
+    return np.where(seen[:, None], end - start, 0).astype(now.means.dtype)
 
 
 def check_times(

@@ -19,6 +19,7 @@ class Projection(NamedTuple):
     means2d: Tensor  # [N, 2] pixels
     depths: Tensor  # [N]
     conics: Tensor  # [N, 3] xx, xy, yy of the inverse covariance
+    compensations: Tensor  # [N] by which `mip` dims the opacities
     colors: Tensor  # [N, 3] harmonics plus 0.5, not below 0
 
 
@@ -31,13 +32,22 @@ def project(
     view = torch.from_numpy(camera.world_to_camera).to(means.dtype)[None]
     intrinsics = means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])[None]
     size = (camera.width, camera.height)
-    _, means2d, depths, conics, _ = _fully_fused_projection(
-        means, covars, view, intrinsics, *size, eps2d=options.eps2d, near_plane=options.near_plane
+    _, means2d, depths, conics, compensations = _fully_fused_projection(
+        means,
+        covars,
+        view,
+        intrinsics,
+        *size,
+        eps2d=options.eps2d,
+        near_plane=options.near_plane,
+        calc_compensations=True,
+        camera_model="ortho" if camera.model == "orthographic" else camera.model,  # pyright: ignore[reportArgumentType]
     )
+    assert compensations is not None
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
     directions = means - means.new_tensor(camera.position)
     colors = (_spherical_harmonics(degree, directions, sh) + 0.5).clamp(min=0)
-    return Projection(means2d[0], depths[0], conics[0], colors)
+    return Projection(means2d[0], depths[0], conics[0], compensations[0], colors)
 
 
 def render(

@@ -108,7 +108,7 @@ def test_a_missing_field_is_named(tmp_path: Path, field: str):
         ("sh_degree", "4"),
         ("sh_degree", "true"),
         ("background", "[0, 0, 2]"),
-        ("antialiasing", '"mip"'),
+        ("antialiasing", '"none"'),
         ("cameras", "[{}]"),
         ("cameras", "[1]"),
         ("checkpoint_sha256", '"abc"'),

@@ -11,6 +11,7 @@ from msdgs_serve.rasterizer.projection import (
     BLUE,
     DEPTH,
     GREEN,
+    LOG2_OPACITY,
     RED,
     ROOT_A,
     ROOT_B,
@@ -22,8 +23,9 @@ from msdgs_serve.rasterizer.projection import (
     project,
 )
 from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
 from tests import reference_torch
-from tests.scenes import ADVERSARIAL, as_dtype, random_scene
+from tests.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene
 from tests.tolerances import assert_close
 
 SCENES = ["random", *sorted(ADVERSARIAL)]
@@ -89,3 +91,88 @@ def test_pictures(name: str):
     got = rasterize(gaussians, camera, background=background)
     assert_close(got.rgb, rgb.numpy(), "rgb.float64")
     assert_close(got.alpha, alpha.numpy(), "alpha.float64")
+
+
+def of_model(model: str, camera: Camera) -> Camera:
+    """The same picture, more or less, by a camera of another model."""
+    scale = 0.25 if model == "orthographic" else 1.0
+    return replace(camera, model=model, fx=scale * camera.fx, fy=scale * camera.fy)
+
+
+@pytest.mark.parametrize("model", ["orthographic", "fisheye"])
+def test_other_cameras(model: str):
+    """Colours aside: gsplat takes an orthographic camera's lines of sight for those of a pinhole."""
+    gaussians, camera = scene("random", np.float64)
+    camera = of_model(model, camera)
+    got, want = project(gaussians, camera, GSPLAT), gsplat_projection(gaussians, camera)
+    drawn = got.extents[:, 0] > 0
+    assert drawn.mean() > 0.5
+    pixels, inverse = want.means2d.numpy()[drawn], want.conics.numpy()[drawn]
+    assert_close(got.records[drawn][:, [X, Y]], pixels, "projection.gsplat_fisheye")
+    size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])
+    assert_close((conics(got)[drawn] - inverse) / size, np.zeros_like(inverse), "projection.gsplat_fisheye")
+    assert_close(got.records[drawn, DEPTH], want.depths.numpy()[drawn], "projection.float64.relative")
+
+
+def test_mip_dims_what_it_spreads():
+    gaussians, camera = scene("random", np.float64)
+    gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
+    got = project(gaussians, camera, GSPLAT._replace(mip=True))
+    compensations = gsplat_projection(gaussians, camera).compensations.numpy()
+    drawn = got.extents[:, 0] > 0
+    assert 0.1 < np.median(compensations[drawn]) < 0.9
+    dimmed = gaussians.opacities * compensations
+    assert_close(2 ** got.records[drawn, LOG2_OPACITY], dimmed[drawn], "conic.float64.relative")
+    assert (dimmed[~drawn & (gsplat_projection(gaussians, camera).depths.numpy() > 1)] < GSPLAT.alpha_min).any()
+
+
+def test_distorted_fisheye_is_its_formula():
+    """Positions from the formula, footprints from its central differences."""
+    gaussians, camera = scene("random", np.float64)
+    k = (0.1, -0.05, 0.02, -0.01)
+    camera = replace(camera, model="fisheye", distortion=k)
+    world_to_camera = camera.world_to_camera
+    points = gaussians.means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        theta = np.arctan2(radius, points[:, 2])
+        rho = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
+        return points[:, :2] * (rho / radius)[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+    step = 1e-6
+    columns = [(pixels(points + step * axis) - pixels(points - step * axis)) / (2 * step) for axis in np.eye(3)]
+    axes = to_matrix(gaussians.quats) * gaussians.scales[:, None, :]
+    half_axes = np.stack(columns, axis=2) @ world_to_camera[:3, :3] @ axes
+    covariances = half_axes @ half_axes.swapaxes(1, 2) + GSPLAT.eps2d * np.eye(2)
+    inverse = np.linalg.inv(covariances)[:, [0, 0, 1], [0, 1, 1]]
+    got = project(gaussians, camera, GSPLAT)
+    drawn = got.extents[:, 0] > 0
+    assert drawn.mean() > 0.5
+    assert_close(got.records[drawn][:, [X, Y]], pixels(points)[drawn], "pixel")
+    size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])[drawn]
+    assert_close((conics(got)[drawn] - inverse[drawn]) / size, np.zeros_like(size), "conic.finite_differences")
+
+
+@pytest.mark.parametrize("model", ["orthographic", "fisheye"])
+def test_a_point_on_the_axis_is_drawn_in_the_centre(model: str):
+    gaussians = gaussians_of([[0, 0, 2.0]], scales=0.1, dtype=np.float64)
+    camera = replace(front_camera(), model=model)
+    got = project(gaussians, camera, GSPLAT)
+    np.testing.assert_allclose(got.records[0, [X, Y]], [camera.cx, camera.cy], atol=1e-6)
+    pixels = camera.fx * 0.1 / (2 if model == "fisheye" else 1)
+    expected = 1 / (pixels**2 + GSPLAT.eps2d)
+    np.testing.assert_allclose(conics(got)[0], [expected, 0, expected], rtol=1e-6, atol=1e-9)
+    axis = gaussians_of([[0, 0, 0.0]], dtype=np.float64)
+    assert project(axis, camera, GSPLAT).extents[0, 0] == 0
+
+
+def test_orthographic_pictures_do_not_depend_on_distance():
+    gaussians, camera = scene("random", np.float64)
+    gaussians = replace(gaussians, sh=gaussians.sh[:, :4])
+    camera = of_model("orthographic", camera)
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] -= 3 * pose[:3, 2]
+    near, far = rasterize(gaussians, camera), rasterize(gaussians, replace(camera, camera_to_world=pose))
+    assert near.alpha.max() > 0.5
+    assert_close(far.rgb, near.rgb, "rgb.float64")

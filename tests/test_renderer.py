@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer import INRIA, rasterize
+from msdgs_serve.rasterizer import GSPLAT, INRIA, rasterize
 from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_serve.scene.baked import BakedScene
@@ -74,6 +74,16 @@ def test_the_image_is_what_the_rasterizer_draws(session: DeformationSession):
     np.testing.assert_array_equal(image.alpha, drawn.alpha)
     np.testing.assert_array_equal(image.depth, drawn.depth)
     assert not image.transparent
+
+
+def test_a_scene_says_how_it_is_antialiased(tmp_path: Path):
+    session = DeformationSession(write_scene(tmp_path / "mip.onnx", antialiasing="mip"))
+    camera = level_camera(24, 24)
+    image = Renderer().render(session, camera, 0.5)
+    background, gaussians = metadata().background, session.gaussians(0.5)
+    want = rasterize(gaussians, camera, background=background, options=GSPLAT._replace(mip=True))
+    np.testing.assert_array_equal(image.rgb, want.rgb)
+    assert np.abs(image.rgb - rasterize(gaussians, camera, background=background).rgb).max() > 0.001
 
 
 def test_without_background_colours_are_premultiplied(session: DeformationSession):

@@ -156,3 +156,23 @@ def test_pose_can_not_be_changed_from_outside():
     assert camera.position[0] == 0
     with pytest.raises(ValueError, match="read-only"):
         camera.camera_to_world[0, 3] = 7
+
+
+@pytest.mark.parametrize(
+    ("field", "changes"),
+    [
+        ("camera.model", {"model": "panorama"}),
+        ("camera.distortion", {"model": "fisheye", "distortion": (0.1, 0.2)}),
+        ("camera.distortion", {"model": "fisheye", "distortion": (0.1, 0.2, 0, math.nan)}),
+        ("camera.distortion", {"distortion": (0.1, 0, 0, 0)}),
+    ],
+)
+def test_a_camera_model_that_cannot_be(field: str, changes: dict):
+    with pytest.raises(InvalidInput, match=field):
+        Camera(10.0, 10.0, 4.0, 4.0, 8, 8, np.eye(4), **changes)
+
+
+def test_a_resized_camera_keeps_its_model():
+    camera = Camera(10.0, 12.0, 4.0, 3.0, 8, 6, np.eye(4), "fisheye", (0.1, 0.0, 0.0, 0.0)).resized(16, 12)
+    assert (camera.model, camera.distortion) == ("fisheye", (0.1, 0.0, 0.0, 0.0))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 24, 8, 6)

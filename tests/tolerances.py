@@ -43,6 +43,8 @@ TABLE = (
     Row("projection.float64.relative", 1e-12, "the same formulas, a few dozen roundings"),
     Row("conic.float32.relative", 3e-6, "products of two entries of a root that is stored as float32"),
     Row("conic.float64.relative", 1e-10, "gsplat's determinant, a difference of products, loses digits for needles"),
+    Row("projection.gsplat_fisheye", 1e-5, "pixels; gsplat adds 1e-7 to the distance from the axis"),
+    Row("conic.finite_differences", 1e-7, "central differences with a step of 1e-6: 1e-13 / 1e-6"),
     Row("color.float32", 2e-6, "16 products of size 1, stored as float32"),
     Row("color.float64", 1e-12, "the same in float64"),
     # gradients, relative to the largest entry of their kind

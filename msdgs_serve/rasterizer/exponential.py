@@ -1,4 +1,4 @@
-"""2^x and log2 x of 16 numbers at once; NumPy's and the C library's are a call a number."""
+"""2^x, log2 x and atan x of 16 numbers at once; NumPy's and the C library's are a call a number."""
 
 import math
 
@@ -17,6 +17,10 @@ from msdgs_serve.rasterizer.lanes import (
 
 ATANH_SERIES = tuple(2 / math.log(2) / n for n in range(21, 0, -2))
 """Of 2 atanh(s) / ln 2 over s, highest power of s² first."""
+
+
+ATAN_SERIES = tuple((-1) ** (n // 2) / n for n in range(37, 0, -2))
+"""Of atan(s) / s, highest power of s² first; for |s| up to tan(pi / 8) the next term is 1e-16."""
 
 
 def exp2_polynomial(degree: int) -> tuple[float, ...]:
@@ -57,3 +61,18 @@ def log2(x: Lanes) -> Lanes:
     for coefficient in ATANH_SERIES:
         value = value * (s * s) + coefficient
     return exponent + s * value
+
+
+@kernel
+def arctangent(x: Lanes) -> Lanes:
+    """atan(x) of numbers that aren't negative, within some roundings."""
+    steep = x > 1
+    x = select(steep, 1 / x, x)
+    upper = x > math.tan(math.pi / 8)
+    s = select(upper, (x - 1) / (x + 1), x)
+    value = filled(0, s)
+    for coefficient in ATAN_SERIES:
+        value = value * (s * s) + coefficient
+    value = s * value
+    value = select(upper, value + math.pi / 4, value)
+    return select(steep, math.pi / 2 - value, value)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.exponential import log2
+from msdgs_serve.rasterizer.exponential import arctangent, log2
 from msdgs_serve.rasterizer.harmonics import harmonics_above_0
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.lanes import (
@@ -18,6 +18,7 @@ from msdgs_serve.rasterizer.lanes import (
     Mask,
     bits_of,
     converted,
+    filled,
     fma,
     load,
     load_columns,
@@ -32,7 +33,7 @@ from msdgs_serve.rasterizer.lanes import (
     store,
     store_rows,
 )
-from msdgs_serve.rasterizer.view import TILE, RasterizerOptions, View, view_of
+from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -132,21 +133,17 @@ def _project_range(
         if bits_of(drawn) == np.uint64(0):
             _store_nothing(records, first)
             continue
-        per_z = 1 / z
-        slope_x, slope_y = x * per_z, y * per_z
-        j00, j11 = view.fx * per_z, view.fy * per_z
-        j02 = -j00 * maximum(minimum(slope_x, spread(view.max_x)), spread(view.min_x))
-        j12 = -j11 * maximum(minimum(slope_y, spread(view.max_y)), spread(view.min_y))
+        u, v, jacobian = _seen_at(view, x, y, z)
         qw, qx = converted(qs[0], double), converted(qs[1], double)
         qy, qz = converted(qs[2], double), converted(qs[3], double)
         mx0, my0 = _half_axis(
-            r, j00, j02, j11, j12, 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
+            r, jacobian, 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
         )
         mx1, my1 = _half_axis(
-            r, j00, j02, j11, j12, 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
+            r, jacobian, 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
         )
         mx2, my2 = _half_axis(
-            r, j00, j02, j11, j12, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
+            r, jacobian, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
         )
         s0, s1, s2 = converted(ss[0], double), converted(ss[1], double), converted(ss[2], double)
         mx0, my0, mx1, my1, mx2, my2 = mx0 * s0, my0 * s0, mx1 * s1, my1 * s1, mx2 * s2, my2 * s2
@@ -154,10 +151,14 @@ def _project_range(
         xx, yy = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, my0 * my0 + my1 * my1 + my2 * my2
         xy = mx0 * my0 + mx1 * my1 + mx2 * my2
         d0, d1, d2 = mx1 * my2 - mx2 * my1, mx2 * my0 - mx0 * my2, mx0 * my1 - mx1 * my0
-        det = d0 * d0 + d1 * d1 + d2 * d2 + view.eps2d * (xx + yy) + view.eps2d * view.eps2d
+        sharp = d0 * d0 + d1 * d1 + d2 * d2
+        det = sharp + view.eps2d * (xx + yy) + view.eps2d * view.eps2d
+        if view.mip:
+            opacity = opacity * square_root(sharp / det)
+            drawn = drawn & (opacity >= view.alpha_min)
         xx, yy = xx + view.eps2d, yy + view.eps2d
         # from here on in the records' dtype: ratios, roots and sums of the above lose nothing in float32
-        u, v = converted(view.fx * slope_x + view.cx, records), converted(view.fy * slope_y + view.cy, records)
+        u, v = converted(u, records), converted(v, records)
         slope_h, slope_v = converted(xy / yy, records), converted(xy / xx, records)
         # alpha_min <= 2^(log2_opacity - |root @ d|²) bounds the distance; that ellipse has this bounding box
         log2_opacity = log2(maximum(converted(opacity, records), spread(real(view.alpha_min))))
@@ -175,11 +176,10 @@ def _project_range(
         root_a = square_root(converted(yy / det, records))
         root_b = -slope_h * root_a
         root_c = 1 / square_root(converted(yy, records))
-        dx = converted(wx - view.position[0], records)
-        dy = converted(wy - view.position[1], records)
-        dz = converted(wz - view.position[2], records)
-        per_distance = 1 / square_root(dx * dx + dy * dy + dz * dz)
-        red, green, blue = _raw_colors(sh, first, scratch, dx * per_distance, dy * per_distance, dz * per_distance)
+        dx, dy, dz = _direction(view, wx, wy, wz)
+        red, green, blue = _raw_colors(
+            sh, first, scratch, converted(dx, records), converted(dy, records), converted(dz, records)
+        )
         sound = sound and bits_of(drawn & (abs_sum(red, green, blue) < np.inf)) == bits
         store_rows(
             records,
@@ -254,14 +254,61 @@ def _store_nothing(records: np.ndarray, first: int) -> None:
 
 
 @kernel
-def _half_axis(
-    r: np.ndarray, j00: Lanes, j02: Lanes, j11: Lanes, j12: Lanes, a: Lanes, b: Lanes, c: Lanes
-) -> tuple[Lanes, Lanes]:
+def _half_axis(r: np.ndarray, jacobian: tuple, a: Lanes, b: Lanes, c: Lanes) -> tuple[Lanes, Lanes]:
     """J W of a world vector (a, b, c): x and y in the image."""
-    depth = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
-    x = j00 * (r[0, 0] * a + r[0, 1] * b + r[0, 2] * c) + j02 * depth
-    y = j11 * (r[1, 0] * a + r[1, 1] * b + r[1, 2] * c) + j12 * depth
-    return x, y
+    x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
+    y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
+    z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
+    (xx, xy, xz), (yx, yy, yz) = jacobian
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z
+
+
+@kernel
+def _seen_at(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple:
+    """Where points in camera axes are drawn, and the Jacobian of that, [2][3]."""
+    zero = filled(0, z)
+    if view.model == ORTHOGRAPHIC:
+        u, v = view.fx * x, view.fy * y
+        jacobian = ((filled(view.fx, z), zero, zero), (zero, filled(view.fy, z), zero))
+    elif view.model == FISHEYE:
+        # a speck away from the axis, so that nothing is divided by 0 on it
+        square = x * x + y * y + 1e-20 * z * z
+        radius = square_root(square)
+        theta = arctangent(radius / z)
+        tt = theta * theta
+        k = view.distortion
+        rho = theta * (1 + tt * (k[0] + tt * (k[1] + tt * (k[2] + tt * k[3]))))
+        growth = 1 + tt * (3 * k[0] + tt * (5 * k[1] + tt * (7 * k[2] + tt * (9 * k[3]))))
+        u, v = view.fx * rho * x / radius, view.fy * rho * y / radius
+        per_distance = growth / (square + z * z)
+        outwards, around = z * per_distance / square, rho / (radius * square)
+        mixed = x * y * (outwards - around)
+        xx = x * x * outwards + (square - x * x) * around
+        yy = y * y * outwards + (square - y * y) * around
+        jacobian = (
+            (view.fx * xx, view.fx * mixed, -view.fx * x * per_distance),
+            (view.fy * mixed, view.fy * yy, -view.fy * y * per_distance),
+        )
+    else:
+        per_z = 1 / z
+        ratio_x, ratio_y = x * per_z, y * per_z
+        u, v = view.fx * ratio_x, view.fy * ratio_y
+        xx, yy = view.fx * per_z, view.fy * per_z
+        xz = -xx * maximum(minimum(ratio_x, filled(view.max_x, z)), filled(view.min_x, z))
+        yz = -yy * maximum(minimum(ratio_y, filled(view.max_y, z)), filled(view.min_y, z))
+        jacobian = ((xx, zero, xz), (zero, yy, yz))
+    return u + view.cx, v + view.cy, jacobian
+
+
+@kernel
+def _direction(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Unit vectors of the lines of sight to points in the world."""
+    if view.model == ORTHOGRAPHIC:
+        r = view.rotation
+        return filled(r[2, 0], x), filled(r[2, 1], x), filled(r[2, 2], x)
+    dx, dy, dz = x - view.position[0], y - view.position[1], z - view.position[2]
+    per_distance = 1 / square_root(dx * dx + dy * dy + dz * dz)
+    return dx * per_distance, dy * per_distance, dz * per_distance
 
 
 @kernel

@@ -11,6 +11,7 @@ from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.projection import EXTENT_X, Splats
 from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
@@ -28,7 +29,14 @@ class GaussianGradients(NamedTuple):
 def project_backward(
     gaussians: Gaussians, splats: Splats, gradients: SplatGradients, camera: Camera, options: RasterizerOptions
 ) -> GaussianGradients:
-    """Gradients of the Gaussians from the gradients of their splats."""
+    """Gradients of the Gaussians from the gradients of their splats.
+
+    Raises `InvalidInput` for a camera that isn't pinhole and for `mip`: they are drawn, not trained with.
+    """
+    if camera.model != "pinhole":
+        raise InvalidInput("camera.model", "pinhole for gradients", camera.model)
+    if options.mip:
+        raise InvalidInput("options.mip", "False for gradients", options.mip)
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
     result = GaussianGradients(*(np.zeros_like(array) for array in arrays))
     view = view_of(camera, options)

@@ -1,11 +1,11 @@
 """What the kernels need to know of a camera, and the constants of a rasterizer."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.camera import Camera, CameraModel
 from msdgs_serve.scene.errors import InvalidInput
 
 TILE = 16
@@ -20,10 +20,14 @@ class RasterizerOptions(NamedTuple):
     alpha_min: float  # a Gaussian adds nothing to a pixel where its alpha is less
     alpha_max: float  # alpha is cut to this
     transmittance_min: float  # a pixel stops before the Gaussian that would take it to this or less
+    mip: bool = False  # dim what eps2d has spread, by √(det before / det after), as Mip-Splatting does
 
 
 GSPLAT = RasterizerOptions(near_plane=0.01, eps2d=0.3, alpha_min=1 / 255, alpha_max=0.999, transmittance_min=1e-4)
 INRIA = RasterizerOptions(near_plane=0.2, eps2d=0.3, alpha_min=1 / 255, alpha_max=0.99, transmittance_min=1e-4)
+
+
+PINHOLE, ORTHOGRAPHIC, FISHEYE = range(len(get_args(CameraModel)))
 
 
 class View(NamedTuple):
@@ -43,8 +47,11 @@ class View(NamedTuple):
     max_x: float
     min_y: float
     max_y: float
+    model: int  # `PINHOLE`, `ORTHOGRAPHIC` or `FISHEYE`
+    distortion: np.ndarray  # [4] k1 to k4 of a fisheye camera
     near_plane: float
     eps2d: float
+    mip: bool
     alpha_min: float
     log2_alpha_min: float
     tile_columns: int
@@ -70,8 +77,11 @@ def view_of(camera: Camera, options: RasterizerOptions) -> View:
         max_x=(camera.width - camera.cx) / camera.fx + margin_x,
         min_y=-camera.cy / camera.fy - margin_y,
         max_y=(camera.height - camera.cy) / camera.fy + margin_y,
+        model=get_args(CameraModel).index(camera.model),
+        distortion=np.array(camera.distortion),
         near_plane=float(options.near_plane),
         eps2d=float(options.eps2d),
+        mip=bool(options.mip),
         alpha_min=float(options.alpha_min),
         log2_alpha_min=math.log2(options.alpha_min),
         tile_columns=-(-int(camera.width) // TILE),

@@ -1,7 +1,8 @@
-"""A pinhole camera in OpenCV axes: x right, y down, z forward; pixel centres at half-integers."""
+"""Cameras in OpenCV axes: x right, y down, z forward; pixel centres at half-integers."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -11,6 +12,12 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Right-multiplied to a camera-to-world matrix: turns the camera's own y and z axes around."""
 
 MAX_PIXELS_PER_SIDE = 16384
+
+CameraModel = Literal["pinhole", "orthographic", "fisheye"]
+"""Where a point (x, y, z) in camera axes is drawn: at fx x / z + cx; at fx x + cx, fx in pixels a scene unit; at
+fx rho(theta) x / r + cx, with r the distance from the axis, theta the angle to it, and
+rho = theta (1 + k1 theta² + k2 theta⁴ + k3 theta⁶ + k4 theta⁸), as OpenCV's fisheye cameras. What is not in front of
+the camera is not drawn."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +31,8 @@ class Camera:
     width: int
     height: int
     camera_to_world: np.ndarray  # [4, 4] float64, rigid
+    model: CameraModel = "pinhole"
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # k1 to k4 of a fisheye camera
 
     def __post_init__(self) -> None:
         self._take_numbers()
@@ -38,6 +47,12 @@ class Camera:
             if not (type(value) is int and 1 <= value <= MAX_PIXELS_PER_SIDE):
                 raise InvalidInput(f"camera.{name}", f"an integer in [1, {MAX_PIXELS_PER_SIDE}]", value)
         object.__setattr__(self, "camera_to_world", _rigid(self.camera_to_world))
+        if self.model not in get_args(CameraModel):
+            raise InvalidInput("camera.model", f"one of {', '.join(get_args(CameraModel))}", self.model)
+        if len(self.distortion) != 4 or not all(math.isfinite(k) for k in self.distortion):
+            raise InvalidInput("camera.distortion", "4 finite numbers", self.distortion)
+        if any(self.distortion) and self.model != "fisheye":
+            raise InvalidInput("camera.distortion", "0 unless camera.model is fisheye", self.distortion)
 
     def _take_numbers(self) -> None:
         """Plain Python numbers, whatever array they came from: kernels are compiled for one type."""
@@ -61,13 +76,15 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """[3] the centre of projection in world space."""
+        """[3] the centre of projection in world space; of an orthographic camera, any point of its axis."""
         return self.camera_to_world[:3, 3]
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same view drawn with other numbers of pixels."""
         sx, sy = width / self.width, height / self.height
-        return Camera(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height, self.camera_to_world)
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
 
     @classmethod
     def from_fov(cls, camera_to_world: np.ndarray, width: int, height: int, fov_y: float) -> "Camera":

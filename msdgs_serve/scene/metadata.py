@@ -53,7 +53,7 @@ class SceneMetadata:
     sh_degree: int  # 0 to 3
     delta_space: str  # where deltas were added in training, e.g. "raw"
     background: tuple[float, float, float]  # sRGB in [0, 1], as trained
-    antialiasing: str  # "dilate": +0.3 px² on the projected covariance
+    antialiasing: str  # "dilate": +0.3 px² on the projected covariance; "mip": that, and dimmed by as much
     cameras: tuple[SceneCamera, ...]  # to start from
     left_out: tuple[Any, ...]  # what the export left out of the model
     measured_error: dict[str, Any]  # of the plan, against the model it was made from
@@ -175,7 +175,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "sh_degree": _sh_degree,
     "delta_space": _text,
     "background": _background,
-    "antialiasing": _one_of("dilate"),
+    "antialiasing": _one_of("dilate", "mip"),
     "cameras": _cameras,
     "left_out": _list,
     "measured_error": _mapping,
