@@ -27,6 +27,13 @@ UNSTABLE_ALLOWED = 0.01
 """Part of the Gaussians that may be unstable."""
 
 
+SMALLEST_PROMISE = 0.01
+"""Pixels: what float32 and 16-bit poses may add to any promise."""
+
+BROKEN_ALLOWED = 1e-3
+"""Part of the poses that may break their plan's promise; more only where Gaussians move too fast for any sampling."""
+
+
 class VerificationFailed(MsdgsError):
     """A written scene file doesn't compute what its model does."""
 
@@ -41,11 +48,17 @@ def verify(
 ) -> dict[str, Any]:
     """The largest errors against the model in float64 and float32, as `measured_error` stores them.
 
-    The file may hold more Gaussians than the model, static ones after all others; they aren't compared.
-    Errors of means are relative to the scene's half diagonal or, further out, to the largest coordinate; those
-    of scales to the Gaussian's largest scale; those of quaternions are absolute. Raises `VerificationFailed` where one
-    is above `tolerance` for a stable Gaussian, or too many Gaussians are unstable.
+    Only the plan `network` is held to `tolerance`. Others are measured, and those that were fitted to trajectories
+    must be as close between the times that they were fitted to as they promise. The file may hold more Gaussians than
+    the model, static ones after all others; they aren't compared. Errors of means are relative to the scene's half
+    diagonal or, further out, to the largest coordinate; those of scales to the Gaussian's largest scale; those of
+    quaternions are absolute. Raises `VerificationFailed` where one is above `tolerance` for a stable Gaussian, too many
+    Gaussians are unstable, or a promise is broken.
     """
+    stated = session.scene.metadata
+    if stated.plan != "network":
+        tolerance = math.inf
+    apart = _Apart(stated.measured_error.get("fitted"))
     double = copy.deepcopy(model).double()
     count = len(model.gaussians)
     stride = max(1, math.ceil(count / GAUSSIANS_A_TIME))
@@ -54,8 +67,10 @@ def verify(
     _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # stored as they are under every plan
     for i, t in enumerate(times_to_verify(*session.scene.metadata.time_range, times)):
         ids = np.arange(i % stride, count, stride)
-        got = _posed_by_file(session, t, ids)
         posed = {"float64": pose_arrays(double, t, ids), "float32": pose_arrays(model, t, ids)}
+        got = _posed_by_file(session, t, ids)
+        _give_sign_of(posed["float64"]["quats"], got["quats"])
+        apart.add(got, posed["float64"])
         size = half_diagonal(session.scene.metadata.bounds)
         own = largest_error(pose_errors(posed["float32"], posed["float64"], size))
         stable = own <= UNSTABLE * tolerance
@@ -75,12 +90,68 @@ def verify(
             f"by more than {UNSTABLE * tolerance:g}, a quarter of the tolerance"
         )
     return {
+        **apart.to_plain(),
         **worst["float64"],
         "against": "model in float64",
         "against_float32": worst["float32"],
         "unstable": {"count": int(unstable.sum()), "error": unstable_worst},
         "times": times,
     }
+
+
+class _Apart:
+    """The largest distances between two computations of poses, in units of the scene."""
+
+    def __init__(self, promise: dict[str, Any] | None) -> None:
+        self._promise = promise
+        self._position = self._displacement = self._degrees = 0.0
+        self._compared = self._broken = 0
+
+    def add(self, got: PosedArrays, expected: PosedArrays) -> None:
+        """Compare Gaussians at one time."""
+        positions, turns, displacements = _distances(got, expected)
+        self._position = max(self._position, float(positions.max(initial=0)))
+        self._displacement = max(self._displacement, float(displacements.max(initial=0)))
+        self._degrees = max(self._degrees, float(np.degrees(turns.max(initial=0))))
+        if self._promise is not None:
+            allowed = 2 * self._promise["error"] + SMALLEST_PROMISE * self._promise["pixel"]
+            self._compared += len(displacements)
+            self._broken += int(np.count_nonzero(~(displacements <= allowed)))
+
+    def _too_fast(self) -> float:
+        """Poses of Gaussians that the plan doesn't promise anything of."""
+        return 0.0 if self._promise is None else self._promise["too_fast_part"] * self._compared
+
+    def to_plain(self) -> dict[str, Any]:
+        """Entries of `measured_error`. Raises `VerificationFailed` where a promise is broken."""
+        fitted = {} if self._promise is None else {"fitted": self._promise}
+        if self._promise is not None and self._broken > BROKEN_ALLOWED * self._compared + self._too_fast():
+            raise VerificationFailed(
+                f"{self._broken:,} of {self._compared:,} poses are off by more than twice the "
+                f"{self._promise['error']:.3g} scene units that the plan promises"
+            )
+        return {
+            "position": self._position,
+            "displacement": self._displacement,
+            "rotation_degrees": self._degrees,
+            **fitted,
+        }
+
+
+def _distances(got: PosedArrays, expected: PosedArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[M] of means in scene units; angles in radians; and the largest of means, scales and ends of turned axes."""
+    scales = expected["scales"].astype(np.float64)
+    positions = np.linalg.norm(got["means"] - expected["means"], axis=1)
+    chords = np.linalg.norm(got["quats"] - expected["quats"], axis=1)
+    axes = 2 * (scales.max(axis=1) - scales.min(axis=1)) * chords
+    sizes = np.abs(got["scales"] - scales).max(axis=1)
+    turns = 4 * np.arcsin(np.clip(chords / 2, 0, 1))
+    return positions, turns, np.max([positions, axes, sizes], axis=0, initial=0)
+
+
+def _give_sign_of(quats: np.ndarray, changed: np.ndarray) -> None:
+    """A quaternion and its negative are one rotation: compare the nearer one."""
+    changed *= np.where((quats * changed).sum(axis=1, keepdims=True) < 0, -1, 1).astype(changed.dtype)
 
 
 def times_to_verify(t0: float, t1: float, count: int) -> list[float]:

@@ -24,14 +24,14 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 
-Channel = Literal["rgb", "alpha", "depth"]
+Channel = Literal["rgb", "alpha", "depth", "motion"]
 Format = Literal["png", "jpeg", "webp", "exr", "npy"]
 Color = tuple[float, float, float]
 Background = Color | Literal["auto", "scene", "transparent"]
 FloatArray = npt.NDArray[np.floating]
 
-CHANNELS: tuple[Channel, ...] = ("rgb", "alpha", "depth")
-WIDTHS: dict[str, int] = {"rgb": 3, "alpha": 1, "depth": 1}
+DEFAULT_CHANNELS: tuple[Channel, ...] = ("rgb", "alpha", "depth")
+WIDTHS: dict[str, int] = {"rgb": 3, "alpha": 1, "depth": 1, "motion": 2}
 DEFAULT_SECONDS = 60.0
 TRIES = 4
 OVERLOADED = 503
@@ -121,6 +121,7 @@ class Frame:
     rgb: FloatArray | None  # [H, W, 3] sRGB-encoded; premultiplied by alpha where the background is transparent
     alpha: FloatArray | None  # [H, W]
     depth: FloatArray | None  # [H, W] along the camera's axis, scene units, infinite where nothing is
+    motion: FloatArray | None  # [H, W, 2] pixels to the right and down, to where things are at t + dt
     plan: str  # how the scene's motion is computed
     milliseconds: dict[str, float]  # by stage: queue, pose, draw, encode
 
@@ -163,14 +164,15 @@ class Client:
         scene: str | None = None,
         width: int | None = None,
         height: int | None = None,
-        channels: Sequence[Channel] = CHANNELS,
+        channels: Sequence[Channel] = DEFAULT_CHANNELS,
         background: Background = "auto",
         shutter: Shutter | None = None,
+        dt: float | None = None,
     ) -> Frame:
-        """A frame as arrays. Raises `Problem` or `Unreachable`."""
+        """A frame as arrays. The channel `motion` needs `dt`, in scene time. Raises `Problem` or `Unreachable`."""
         body = request_body(
             camera, t, scene=scene, width=width, height=height, channels=channels, background=background,
-            shutter=shutter, format="npy",
+            shutter=shutter, dt=dt, format="npy",
         )  # fmt: skip
         response = self._call("POST", "/render", json=body)
         pixels = _array(response.content)
@@ -248,12 +250,13 @@ def request_body(
     channels: Sequence[Channel] | None = None,
     background: Background = "auto",
     shutter: Shutter | None = None,
+    dt: float | None = None,
 ) -> dict[str, Any]:
     """The JSON of `POST /render`; what is None is left out."""
     values = {
         "scene": scene, "camera": _plain(camera), "t": t, "width": width, "height": height, "format": format,
         "quality": quality, "channels": None if channels is None else list(channels), "background": background,
-        "shutter": None if shutter is None else _plain(shutter),
+        "dt": dt, "shutter": None if shutter is None else _plain(shutter),
     }  # fmt: skip
     return {name: value for name, value in values.items() if value is not None}
 
@@ -269,11 +272,11 @@ def _plain(value: Camera | Shutter) -> dict[str, Any]:
 def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Headers) -> Frame:
     edges = np.cumsum([WIDTHS[channel] for channel in channels])[:-1]
     parts = dict(zip(channels, np.split(pixels, edges, axis=2), strict=True))
-    found = {name: part if name == "rgb" else part[..., 0] for name, part in parts.items()}
+    found = {name: part if WIDTHS[name] > 1 else part[..., 0] for name, part in parts.items()}
     stages = [stage.split(";") for stage in headers.get("Server-Timing", "").split(", ") if stage]
     milliseconds = {name: float(duration.removeprefix("dur=")) for name, duration, *_ in stages}
-    rgb, alpha, depth = (found.get(name) for name in CHANNELS)
-    return Frame(rgb, alpha, depth, headers.get("Msdgs-Plan", ""), milliseconds)
+    rgb, alpha, depth, motion = (found.get(name) for name in WIDTHS)
+    return Frame(rgb, alpha, depth, motion, headers.get("Msdgs-Plan", ""), milliseconds)
 
 
 def _array(content: bytes) -> np.ndarray:

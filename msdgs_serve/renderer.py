@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import Image, average
 from msdgs_serve.pose_cache import PoseCache
@@ -43,6 +45,7 @@ class RenderOptions:
 
     background: Background = "scene"  # an sRGB-encoded colour, what the scene was trained on, or none
     shutter: Shutter | None = None  # motion blur; None: one moment
+    motion_dt: float | None = None  # draw motion vectors too, to this much later; not together with a shutter
     rasterizer: RasterizerOptions = GSPLAT
 
 
@@ -75,7 +78,7 @@ class Renderer:
             Interrupted: if the watch was stopped.
         """
         watch = watch or Watch()
-        check_times(session, t, options.shutter)
+        check_times(session, t, options.shutter, options.motion_dt)
         if options.shutter is None:
             return self._moment(session, camera, t, t, options, watch)
         moments = options.shutter.times(t)
@@ -89,25 +92,44 @@ class Renderer:
         self, session: DeformationSession, camera: Camera, t: float, moment: float, options: RenderOptions, watch: Watch
     ) -> Image:
         gaussians = self.posed(session, moment, watch)
+        later = None if options.motion_dt is None else self.posed(session, moment + options.motion_dt, watch)
         with watch.stage("draw"):
             background = resolve_background(session, options.background)
             constants = options.rasterizer._replace(mip=session.scene.metadata.antialiasing == "mip")
-            rendering = rasterize(gaussians, camera, background=background, options=constants)
+            extra = None if later is None else displacements(gaussians, later, camera)
+            drawn = rasterize(gaussians, camera, background=background, extra=extra, options=constants)
             transparent = options.background == "transparent"
-            return Image(rendering.rgb, rendering.alpha, rendering.depth, transparent, camera, t)
+            motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]
+            return Image(drawn.rgb, drawn.alpha, drawn.depth, transparent, camera, t, motion)
 
 
-def check_times(session: DeformationSession, t: float, shutter: Shutter | None = None) -> None:
+def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarray:
+    """[N, 2] how far each centre goes in the picture of `camera`, pixels to the right and down.
+
+    0 for those that are behind the camera at one of the times.
+    """
+    (start, start_depths), (end, end_depths) = camera.project(now.means), camera.project(later.means)
+    seen = (start_depths > GSPLAT.near_plane) & (end_depths > GSPLAT.near_plane)
+    return np.where(seen[:, None], end - start, 0).astype(now.means.dtype)
+
+
+def check_times(
+    session: DeformationSession, t: float, shutter: Shutter | None = None, motion_dt: float | None = None
+) -> None:
     """Raise `InvalidInput`, naming the field, for a time that the scene doesn't have."""
     first, last = session.scene.metadata.time_range
-    for field, time in _times(t, shutter):
+    if shutter is not None and motion_dt is not None:
+        raise InvalidInput("shutter", "left out where motion is drawn", "given")
+    for field, time in _times(t, shutter, motion_dt):
         if not first <= time <= last:
             expected = f"in the scene's range [{first}, {last}]"
             raise InvalidInput(field, expected if field == "t" else f"such that t + {field} is {expected}", time)
 
 
-def _times(t: float, shutter: Shutter | None) -> Iterator[tuple[str, float]]:
+def _times(t: float, shutter: Shutter | None, motion_dt: float | None) -> Iterator[tuple[str, float]]:
     yield "t", t
+    if motion_dt is not None:
+        yield "dt", t + motion_dt
     if shutter is not None:
         yield "shutter.open", t + shutter.open
         yield "shutter.close", t + shutter.close

@@ -268,24 +268,22 @@ def _evaluate(command: Evaluate) -> int:
 
 
 def _table(evaluation: "Evaluation") -> "Table":
-    from rich.table import Table
-
     from msdgs_train.evaluation_report import HEADINGS, cells
 
-    table = Table(title=f"{evaluation.split}, mean of {len(evaluation.frames)} images")
-    for heading in ("model", "step", *HEADINGS.values()):
-        table.add_column(heading, justify="left" if heading == "model" else "right")
-    for judged in evaluation.models:
-        table.add_row(judged.name, f"{judged.loaded.step:,}", *cells(evaluation, judged.mean))
-    return table
+    rows = [[j.name, f"{j.loaded.step:,}", *cells(evaluation, j.mean)] for j in evaluation.models]
+    title = f"{evaluation.split}, mean of {len(evaluation.frames)} images"
+    return _rich_table(["model", "step", *HEADINGS.values()], rows, names=1, title=title)
 
 
-def _rich_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> "Table":
+def _rich_table(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], *, names: int, title: str | None = None
+) -> "Table":
+    """Numbers are at the right of their columns, the first `names` columns at the left."""
     from rich.table import Table
 
-    shown = Table()
+    shown = Table(title=title)
     for i, heading in enumerate(headings):
-        shown.add_column(heading, justify="left" if i < 2 else "right")
+        shown.add_column(heading, justify="left" if i < names else "right")
     for row in rows:
         shown.add_row(*row)
     return shown
@@ -311,13 +309,15 @@ def _compare(command: Compare) -> int:
         command.steps, command.minutes, command.size, command.threads, command.init_count, command.max_gaussians
     )
     runs = make_runs(read_systems(command.systems, budget), command.data, command.seeds, command.out)
-    jobs = command.jobs or max(1, thread_count() // command.threads)
+    jobs = max(1, thread_count() // command.threads) if command.jobs is None else command.jobs
+    if jobs < 1:
+        raise InvalidInput("jobs", "1 or more", jobs)
     with ComparisonProgress(console, len(runs)) as progress:
         complete = train_all(runs, jobs, progress.ended)
     results = collect(runs)
     if results:
         paths = write_comparison(command.out, results, len(runs) - len(results))
-        console.print(_rich_table(HEADINGS, table(results)))
+        console.print(_rich_table(HEADINGS, table(results), names=2))
         console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
     if not complete:
         console.print("interrupted; the same command goes on", soft_wrap=True)

@@ -199,6 +199,13 @@ def test_from_nothing_to_the_table_and_not_again(
     assert "other settings: size" in capsys.readouterr().err
 
 
+def test_no_jobs_are_refused(
+    systems_file: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([*arguments(systems_file, data, tmp_path / "out"), "--jobs", "0"]) == cli.EXIT_INVALID
+    assert "`jobs` must be 1 or more" in capsys.readouterr().err
+
+
 def test_a_run_that_fails_is_said_and_the_others_go_on(systems_file: Path, tmp_path: Path) -> None:
     ended: list[tuple[str, Ended]] = []
     runs = make_runs(read_systems([str(systems_file)], BUDGET), [tmp_path / "nowhere"], [0], tmp_path / "out")

@@ -57,6 +57,7 @@ TABLE = (
     Row("gradient.float32", 1e-4, "sums over thousands of pixels of terms of both signs, each off by some 1e-6"),
     Row("gradient.second_order", 1e-5, "what a linear step of 2e-4 leaves out: its square times curvatures up to 100"),
     Row("oracle_db", 70.0, "whole picture, threshold pixels included: one step in 1 of 5,000 at every pixel"),
+    Row("motion_vector", 2e-3, "pixels; a displacement of 30, stored and blended in float32, over a sum of weights"),
     # losses
     Row("ssim.float32", 1e-5, "variances are differences of blurred squares; torch blurs in another order"),
     Row("ssim.float64", 1e-12, "as ssim.float32"),
@@ -71,6 +72,12 @@ TABLE = (
     Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
     Row("neighbour_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
+    Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
+    Row("between_samples.factor", 2.0, "times a promise made at samples: between them a cubic is off by as much again"),
+    Row("int8.relative", 0.2, "of the largest motion; 8 bits are 0.4 % of a range, and layers multiply it"),
+    Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),
+    Row("cubic_between", 1e-5, "fourth derivative 1,296 · h⁴ · 3/128 with h = 1/64, more at the ends"),
+    Row("spline_fit", 1e-9, "a pseudo-inverse of a well-conditioned band of up to 129 rows, float64"),
     Row("served_frame", 1e-3, "of a float pixel; onnxruntime's exponentials and products are not torch's to the bit"),
     # stability: made cases, docs/stability.md
     Row(
@@ -86,7 +93,7 @@ TABLE = (
     Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
     Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
     Row("export.float32_db", 90.0, "worst frame, float32 against float64: at a few pixels a splat is at its cut-off"),
-    Row("trim.elsewhere_db", 3.0, "half as much error again at times and places that trimming has not looked at"),
+    Row("trim.other_times_db", 2.0, "a quarter more error at times that trimming has not looked at"),
     # datasets
     Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
     Row("composite_of_8bit", 1.001 / 255, "half a step of colour and half a step of alpha, each rounded once"),

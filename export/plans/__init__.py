@@ -4,6 +4,7 @@ One file a plan. A graph deforms the ids that it is given in one go; the loop ov
 independent of the scene's size, is in the reader (`msdgs_serve.deformation`), where the chunks also run side by side.
 """
 
-from export.plans.registry import Plan, build, parse
+from export.plans.registry import POSSIBLE, Plan, build, parse
+from export.plans.trajectories import Trajectories
 
-__all__ = ["Plan", "build", "parse"]
+__all__ = ["POSSIBLE", "Plan", "Trajectories", "build", "parse"]

@@ -7,63 +7,101 @@ from dataclasses import dataclass
 import onnx
 
 from export.bake import Baked
+from export.plans.int8 import int8
+from export.plans.keyframes import keyframes
+from export.plans.lowrank import RANKS, lowrank
 from export.plans.network import network
+from export.plans.own_poses import COUNTS
 from export.plans.prefix import prefix
 from export.plans.scene_graph import still
+from export.plans.size import Size
+from export.plans.splines import FEWEST
+from export.plans.trajectories import Trajectories, trajectories_of
 from msdgs_serve.scene.errors import InvalidInput
 
-MOST = 9_999
-"""Of the number in a plan: more is a slip of the hand."""
+PIXELS = 0.1
+"""What a fitted plan without a size may be off."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A plan as its text names it: `prefix:2` is ("prefix", 2)."""
+    """A plan as its text names it: `prefix:2` is ("prefix", 2), `lowrank:0.05` ("lowrank", None, 0.05)."""
 
     name: str
-    number: int | None = None
+    count: int | None = None
+    pixels: float | None = None
 
     def __str__(self) -> str:
-        return self.name if self.number is None else f"{self.name}:{self.number}"
+        size = self.count if self.pixels is None else self.pixels
+        return self.name if size is None else f"{self.name}:{size}"
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it is fitted to trajectories."""
+        return self.name in _FITTED
 
 
 @dataclass(frozen=True)
-class _Kind:
-    least: int | None  # the smallest number that it takes; None: it takes none
-    build: Callable[[Baked, int], onnx.ModelProto]
+class _Range:
+    least: int
+    most: int
+    fit: Callable[[Baked, Trajectories, Size], onnx.ModelProto]
 
 
-_KINDS = {
-    "network": _Kind(None, lambda baked, _: network(baked)),
-    "prefix": _Kind(1, prefix),
+_FITTED = {
+    "lowrank": _Range(1, RANKS[-1], lowrank),
+    "keyframes": _Range(FEWEST, COUNTS[-1], keyframes),
 }
+_MOST_LAYERS = 1_000
+
+POSSIBLE = "; ".join(
+    [
+        "network",
+        "prefix:k, the first k layers",
+        "int8",
+        f"lowrank:r, r functions of time, {_FITTED['lowrank'].least} to {_FITTED['lowrank'].most}",
+        f"keyframes:n, n poses, {_FITTED['keyframes'].least} to {_FITTED['keyframes'].most}",
+        "lowrank:e or keyframes:e, as large as an error of e pixels needs, as in lowrank:0.05",
+        f"lowrank or keyframes, the same with e = {PIXELS}",
+    ]
+)
+"""All plans in words, for messages and help."""
 
 
-def parse(text: str) -> Plan:
+def parse(text: str | Plan) -> Plan:
     """The plan that a text names. Raises `InvalidInput` for any other text, saying which there are."""
-    match = re.fullmatch(r"([a-z0-9]+)(?::([0-9]{1,4}))?", text) if isinstance(text, str) else None
-    kind = _KINDS.get(match[1]) if match else None
-    if match and kind:
-        number = None if match[2] is None else int(match[2])
-        fits = number is None if kind.least is None else number is not None and number >= kind.least
-        if fits:
-            return Plan(match[1], number)
-    raise InvalidInput("plan", f"one of {possible()}", repr(text))
+    match = re.fullmatch(r"([a-z0-9]+)(?::(?:([0-9]{1,9})|([0-9]{1,9}\.[0-9]{1,9})))?", str(text), re.ASCII)
+    if match:
+        name = match[1]
+        plan = Plan(name, int(match[2]) if match[2] else None, float(match[3]) if match[3] else None)
+        if _exists(plan):
+            return plan
+    raise InvalidInput("plan", f"one of: {POSSIBLE}", repr(str(text)))
 
 
-def possible() -> str:
-    """All plans in words, for messages and help."""
-    return ", ".join(
-        name if kind.least is None else f"{name}:n with n from {kind.least} to {MOST}" for name, kind in _KINDS.items()
-    )
+def _exists(plan: Plan) -> bool:
+    if plan.name in _FITTED:
+        size = _FITTED[plan.name]
+        return plan.pixels != 0 and (plan.count is None or size.least <= plan.count <= size.most)
+    if plan.name == "prefix":
+        return plan.count is not None and 1 <= plan.count <= _MOST_LAYERS
+    return plan.name in ("network", "int8") and plan.count is None and plan.pixels is None
 
 
-def build(plan: str | Plan, baked: Baked) -> onnx.ModelProto:
-    """The scene file of a plan, without measured errors. A scene in which nothing moves has no nodes under any.
+def build(plan: str | Plan, baked: Baked, trajectories: Trajectories | None = None) -> onnx.ModelProto:
+    """The scene file of a plan. A scene in which nothing moves has no nodes under any.
 
+    Fitted plans take the scene's `trajectories`; left out, they are sampled, once for all plans of a scene.
+    What a fitted plan knows of its own errors is `measured_error` in the result, until the file itself is measured.
     Raises `InvalidInput` for a plan that doesn't exist or that this scene can't have.
     """
-    plan = parse(str(plan))
+    plan = parse(plan)
     if not len(baked.moving):
         return still(baked, str(plan))
-    return _KINDS[plan.name].build(baked, plan.number or 0)
+    if plan.name in _FITTED:
+        pixels = PIXELS if plan.count is None and plan.pixels is None else plan.pixels
+        size = Size(str(plan), plan.count, pixels)
+        return _FITTED[plan.name].fit(baked, trajectories or trajectories_of(baked), size)
+    if plan.name == "prefix":
+        return prefix(baked, plan.count or 0)
+    return int8(baked) if plan.name == "int8" else network(baked)

@@ -68,10 +68,13 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     shutter = None
     if request.shutter is not None:
         shutter = Shutter(request.shutter.open, request.shutter.close, request.shutter.samples)
-    for t in times:
-        check_times(scene.session, t, shutter)
     channels = request.channels or default_channels(request.format)
-    options = RenderOptions(background, shutter)
+    if ("motion" in channels) != (request.dt is not None):
+        expected = "given, as channels has motion" if request.dt is None else "left out, as channels has no motion"
+        raise InvalidInput("dt", expected, "nothing" if request.dt is None else request.dt)
+    for t in times:
+        check_times(scene.session, t, shutter, request.dt)
+    options = RenderOptions(background, shutter, request.dt)
     etag = _etag(scene, request)
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
 

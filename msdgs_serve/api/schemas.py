@@ -160,11 +160,15 @@ class RenderRequest(Strict):
     )
     channels: Channels | None = Field(
         default=None,
-        description="`rgb`, `alpha`, `depth`, in the order of the file. Default: all of them for `exr` and `npy`. The "
-        "others hold a single one as a picture; depth is lighter the nearer it is",
+        description="`rgb`, `alpha`, `depth`, `motion`, in the order of the file. Default for `exr` and `npy`: the "
+        "first three. The others hold a single one as a picture; depth is lighter the nearer it is, the hue of "
+        "motion is its direction. Motion is in pixels to the right and down, in `exr` as forward.u and forward.v",
     )
     depth_range: tuple[Number, Number] | None = Field(
         default=None, description="depths drawn white and darkest in a picture of depth; default: those of the frame"
+    )
+    dt: Number | None = Field(
+        default=None, description="`motion` leads to where things are at `t + dt`; needed for it, scene time"
     )
     shutter: ShutterSpec | None = Field(default=None, description="motion blur; default: a single moment")
     quality: Annotated[int, Field(strict=True, ge=1, le=100)] | None = Field(

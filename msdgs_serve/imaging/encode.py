@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 from msdgs_serve.imaging.exr_header import camera_attributes
 from msdgs_serve.imaging.formats import CHANNELS, DEFAULT_QUALITY, FORMATS, Channel, ImageFormat, default_channels
 from msdgs_serve.imaging.image import Image
-from msdgs_serve.imaging.pictures import DepthRange, picture
+from msdgs_serve.imaging.pictures import DepthRange, channel_of, picture
 from msdgs_serve.scene import InvalidInput, MsdgsError
 
 Attributes = dict[str, int | float | str]
@@ -34,7 +34,12 @@ EXR_ATTRIBUTES: Attributes = {
 }
 # CIE xy of red, green, blue and white
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-EXR_NAMES: dict[Channel, tuple[str, ...]] = {"rgb": ("R", "G", "B"), "alpha": ("A",), "depth": ("Z",)}
+EXR_NAMES: dict[Channel, tuple[str, ...]] = {
+    "rgb": ("R", "G", "B"),
+    "alpha": ("A",),
+    "depth": ("Z",),
+    "motion": ("forward.u", "forward.v"),
+}
 
 
 class EncodingFailed(MsdgsError):
@@ -52,7 +57,8 @@ def encode(
 
     PNG, JPEG and WebP hold an 8-bit picture: sRGB with straight alpha where the image is transparent (JPEG can't be),
     or a single channel. EXR holds any channels as 32-bit floats: scene-linear Rec.709 premultiplied R, G, B, A and
-    depth Z, with the camera and the time in its header. NPY holds float32 [H, W, C] as rendered: sRGB-encoded colour.
+    depth Z, motion as forward.u and forward.v, with the camera and the time in its header. NPY holds float32 [H, W, C]
+    as rendered: sRGB-encoded colour.
     `quality` in [1, 100] is for JPEG and WebP. Raises `InvalidInput` naming the parameter.
     """
     check_encodable(image.width, image.height, image.transparent, image_format, quality, channels)
@@ -102,7 +108,7 @@ def check_encodable(
 
 def numbers(image: Image, channels: Sequence[Channel]) -> np.ndarray:
     """[H, W, C] float32: the channels as rendered, in the order asked for; colour sRGB-encoded."""
-    parts = [getattr(image, channel) for channel in channels]
+    parts = [channel_of(image, channel) for channel in channels]
     return np.dstack(parts).astype(np.float32, copy=False)
 
 
@@ -125,9 +131,15 @@ def _check_channels(channels: Sequence[Channel], image_format: ImageFormat) -> N
 
 def _exr_pixels(image: Image, channels: Sequence[Channel]) -> np.ndarray:
     """[H, W, C] float32. Alpha is 1 everywhere unless the image is transparent."""
-    parts = {"rgb": image.linear_rgb, "depth": lambda: image.depth}
-    parts["alpha"] = lambda: image.alpha if image.transparent else np.ones_like(image.alpha)
-    return np.dstack([parts[channel]() for channel in channels]).astype(np.float32, copy=False)
+
+    def part(channel: Channel) -> np.ndarray:
+        if channel == "rgb":
+            return image.linear_rgb()
+        if channel == "alpha" and not image.transparent:
+            return np.ones_like(image.alpha)
+        return channel_of(image, channel)
+
+    return np.dstack([part(channel) for channel in channels]).astype(np.float32, copy=False)
 
 
 def _exr_spec(image: Image, channels: Sequence[Channel]) -> oiio.ImageSpec:

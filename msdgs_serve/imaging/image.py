@@ -23,6 +23,7 @@ class Image:
     transparent: bool = False
     camera: Camera | None = None  # that saw it, for formats that can say so
     t: float | None = None  # when, in the scene's time
+    motion: FloatArray | None = None  # [H, W, 2] pixels to the right and down, to where it is later; 0 for nothing
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3:
@@ -77,7 +78,7 @@ def average(images: Iterable[Image]) -> Image:
     mean_depth = np.full(alpha.shape, np.inf)
     np.divide(depth, coverage, out=mean_depth, where=coverage > 0)
     dtype = first.rgb.dtype
-    return replace(first, rgb=rgb.astype(dtype), alpha=alpha.astype(dtype), depth=mean_depth.astype(dtype))
+    return replace(first, motion=None, rgb=rgb.astype(dtype), alpha=alpha.astype(dtype), depth=mean_depth.astype(dtype))
 
 
 def srgb_to_linear(encoded: FloatArray) -> FloatArray:

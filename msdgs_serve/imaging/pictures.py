@@ -6,6 +6,7 @@ import numpy as np
 
 from msdgs_serve.imaging.formats import Channel
 from msdgs_serve.imaging.image import Image, to_8_bits
+from msdgs_serve.scene import InvalidInput
 
 FARTHEST_GREY = 0.15
 """Of the farthest depth, so that it differs from nothing at all, which is black."""
@@ -21,16 +22,35 @@ class DepthRange(NamedTuple):
 def picture(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
     """8 bits: [H, W, 3], [H, W, 4] with straight alpha for transparent colour, or [H, W, 1] for alpha and depth.
 
+    Motion is black where nothing moves; the hue is its direction, and the brightest is the fastest of this very image.
+
     Depth is lighter the nearer it is, over `depth_range` or, where None, over the depths of this very image.
     """
     if channel == "rgb":
         return image.display_pixels()
     if channel == "alpha":
         return to_8_bits(image.alpha)[..., None]
+    if channel == "motion":
+        return _motion_colors(channel_of(image, "motion"))
     near, far = depth_range or depths_of(image)
     seen = np.isfinite(image.depth)
     place = np.clip((np.where(seen, image.depth, far) - near) / max(far - near, 1e-12), 0, 1)
     return to_8_bits(np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0))[..., None]
+
+
+def channel_of(image: Image, channel: Channel) -> np.ndarray:
+    """The numbers of a channel. Raises `InvalidInput` for motion where the image was drawn without."""
+    values = getattr(image, channel)
+    if values is None:
+        raise InvalidInput("channels", "without motion, as it was not drawn", channel)
+    return values
+
+
+def _motion_colors(motion: np.ndarray) -> np.ndarray:
+    speed = np.hypot(motion[..., 0], motion[..., 1])
+    brightness = speed / max(float(speed.max(initial=0.0)), 1e-12)
+    angles = np.arctan2(motion[..., 1], motion[..., 0])[..., None] + np.radians([0, 240, 120])
+    return to_8_bits(brightness[..., None] * (0.5 + 0.5 * np.cos(angles)))
 
 
 def depths_of(image: Image) -> DepthRange:

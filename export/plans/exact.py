@@ -1,0 +1,75 @@
+"""The moving Gaussians of a baked scene at any time, in float64: what plans are fitted to and measured against."""
+
+import copy
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from export.bake import Baked
+from msdgs_train.deformation import MultiStepDeformation
+from msdgs_train.model import SMALLEST_SCALE, activated_scales, unit_quats
+
+CHUNK = 4096
+"""Gaussians at a time: an activation of 256 columns in float64 is 8 MiB."""
+
+POSE = 10
+"""Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""
+MEANS, SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
+
+Poses = npt.NDArray[np.float64]
+
+
+class ExactPoses:
+    """`at(t)`: the scene's layers run in float64 on the baked values, without any graph."""
+
+    def __init__(self, baked: Baked) -> None:
+        m = baked.moving
+        self.count = len(m)
+        self._raw = baked.scene.metadata.delta_space == "raw"
+        self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
+        factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
+        self._factors = [None if f is None else _double(f) for f in factors]
+        self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
+
+    def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
+        """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`, or of all."""
+        ids = np.arange(self.count) if ids is None else ids
+        posed = np.empty((len(ids), POSE))
+        for start in range(0, len(ids), CHUNK):
+            rows = slice(start, start + CHUNK)
+            posed[rows] = self._chunk(t, torch.from_numpy(ids[rows]))
+        return posed
+
+    @torch.no_grad()
+    def _chunk(self, t: float, ids: torch.Tensor) -> np.ndarray:
+        means, log_scales = self._means[ids], self._log_scales[ids]
+        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64))
+        of_means, of_scales, of_quats = (
+            delta if factors is None else factors[ids] * delta  # equation 12
+            for factors, delta in zip(self._factors, (deltas.means, deltas.scales, deltas.quats), strict=True)
+        )
+        if self._raw:
+            scales = activated_scales(log_scales + of_scales)
+        else:
+            scales = (activated_scales(log_scales) + of_scales).clamp_min(SMALLEST_SCALE)
+        return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).numpy()
+
+
+def pixel(baked: Baked) -> float:
+    """What one pixel of the scene's nearest camera spans in scene units at the middle of what moves.
+
+    Errors of plans are chosen in this unit. Without cameras: of a picture of 400 pixels across the scene's bounds.
+    """
+    low, high = np.array(baked.scene.metadata.bounds)
+    middle = np.median(baked.moving.means, axis=0) if len(baked.moving) else (low + high) / 2
+    spans = [
+        np.linalg.norm(view.camera.camera_to_world[:3, 3] - middle) / max(view.camera.fx, view.camera.fy)
+        for view in baked.scene.metadata.cameras
+    ]
+    size = max(float(np.linalg.norm(high - low)), 1e-30)
+    return float(min((s for s in spans if s > 0), default=size / 400))
+
+
+def _double(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(array.astype(np.float64))

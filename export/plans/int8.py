@@ -1,0 +1,76 @@
+"""Plan `int8`: the network with its widest matrix products in 8 bits, by onnxruntime's static quantiser.
+
+Weights have a scale for each output, activations one for each product, found on the scene's own Gaussians and times.
+Encodings, the first product, which reads them, the heads and all that depends on time alone stay float32.
+"""
+
+import logging
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
+
+from export.bake import Baked
+from export.plans.network import network
+from export.verify import times_to_verify
+from msdgs_serve.scene.errors import InvalidInput
+
+TIMES, GAUSSIANS = 16, 2048
+"""To calibrate with."""
+
+
+def int8(baked: Baked) -> onnx.ModelProto:
+    """The scene with all layers, products of width × width in 8 bits. Raises `InvalidInput` where there are none."""
+    exact = network(baked, "int8")
+    products = [node.name for node in exact.graph.node if node.op_type == "Gemm" and ".trunk" in node.name]
+    if not products:
+        raise InvalidInput("plan", "any but int8: no layer of this model has a product of width × width", "int8")
+    with tempfile.TemporaryDirectory() as folder, _quiet():
+        path = Path(folder) / "int8.onnx"
+        quantize_static(
+            exact,
+            path,
+            _Calibration(baked),
+            quant_format=QuantFormat.QDQ,
+            nodes_to_quantize=products,
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            calibrate_method=CalibrationMethod.MinMax,
+        )
+        quantised = onnx.load(path)
+    return quantised
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without recommendations: of a preparation that this graph doesn't need, and against a default of `ids`."""
+    logging.disable(logging.WARNING)
+    onnxruntime.set_default_logger_severity(3)
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)
+        onnxruntime.set_default_logger_severity(2)
+
+
+class _Calibration(CalibrationDataReader):
+    """Inputs of the network: Gaussians evenly spread over all, others at each time."""
+
+    def __init__(self, baked: Baked) -> None:
+        self._inputs = self._each(len(baked.moving), baked.scene.metadata.time_range)
+
+    def get_next(self) -> dict[str, Any] | None:  # type: ignore[override]
+        return next(self._inputs, None)
+
+    @staticmethod
+    def _each(count: int, time_range: tuple[float, float]) -> Iterator[dict[str, Any]]:
+        stride = max(1, count // GAUSSIANS)
+        for i, t in enumerate(times_to_verify(*time_range, TIMES)):
+            yield {"t": np.array([t], np.float32), "ids": np.arange(i % stride, count, stride, dtype=np.int64)}

@@ -1,0 +1,148 @@
+"""Plan `lowrank:r`: a pose is its mean over time plus r coefficients of the Gaussian times r functions of time.
+
+One function of time gives all ten numbers of a pose at once, so a frame is one product [M, r + 10] × [r + 10, 10].
+The functions come from the singular value decomposition of all trajectories, positions, scales and rotations weighted
+to be displacements in scene units: in squared error no other r functions are better. Scales are taken as they are and
+not as logarithms, which fall without end where a Gaussian vanishes: on *toybench* 99 % of the errors are a quarter
+smaller. Quaternions are multiplied by their weight, which making them unit takes out again.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import onnx
+from scipy.linalg import eigh
+
+from export.bake import Baked
+from export.graph import GraphBuilder
+from export.plans.exact import POSE, QUATS
+from export.plans.own_poses import CHUNK, own_poses, worst
+from export.plans.scene_graph import activated, finished, new_graph
+from export.plans.size import Size
+from export.plans.splines import design, fitting, samples_for, time_weights
+from export.plans.stored_poses import with_own_poses
+from export.plans.trajectories import Ids, Samples, Trajectories
+
+KNOTS = 131
+"""Control points of each function of time."""
+
+RANKS = (1, 2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+
+OWN_TERMS = 1_000
+"""A Gaussian with poses of its own takes as long, and as many bytes, as so many more terms for one Gaussian."""
+
+SAMPLED = 4_096
+"""Gaussians at which r is chosen."""
+
+
+def lowrank(baked: Baked, trajectories: Trajectories, size: Size) -> onnx.ModelProto:
+    """The scene with `size.count` terms, or with as many as make it cheapest within `size.pixels`."""
+    fit = _Fit(trajectories)
+    first_guess = fit.functions(np.arange(trajectories.count))
+    rank = size.count or RANKS[len(RANKS) // 2]
+    outliers = worst(trajectories, fit.errors(np.arange(trajectories.count), first_guess[:, :rank]), None)
+    functions = fit.functions(np.setdiff1d(np.arange(trajectories.count), outliers))
+    if size.pixels:
+        rank = _cheapest(trajectories, fit, functions, size.pixels)
+    functions = functions[:, :rank]
+    errors = fit.errors(np.arange(trajectories.count), functions)
+    chosen = worst(trajectories, errors, size.pixels)
+    most = size.pixels or np.delete(errors, chosen).max(initial=0) / trajectories.pixel
+    own, own_errors = own_poses(trajectories, chosen, most)
+    errors[chosen] = own_errors
+    graph, time_range = new_graph(baked), baked.scene.metadata.time_range
+    pose = _product(graph, fit.table(functions), fit.basis(functions), time_range)
+    activated(graph, with_own_poses(graph, pose, own, trajectories.count, time_range))
+    return finished(graph, baked, str(size), trajectories.promise(errors, len(own)))
+
+
+def _cheapest(trajectories: Trajectories, fit: "_Fit", functions: np.ndarray, pixels: float) -> int:
+    ids = np.arange(0, trajectories.count, -(-trajectories.count // SAMPLED))
+
+    def terms(rank: int) -> float:
+        return rank + OWN_TERMS * float((fit.errors(ids, functions[:, :rank]) > pixels * trajectories.pixel).mean())
+
+    return min((rank for rank in RANKS if rank <= functions.shape[1]), key=terms)
+
+
+def _product(graph: GraphBuilder, table: np.ndarray, basis: np.ndarray, time_range: tuple[float, float]) -> str:
+    """[M, 10] rows of a table of coefficients and mean poses, times the functions at `t` above an identity."""
+    rank = basis.shape[1]
+    cells, weights = time_weights(graph, "terms.clock", time_range, [KNOTS])
+    near = graph.node("Add", [cells, graph.constant("terms.neighbours", np.arange(4, dtype=np.int64))], "terms.near")
+    control = graph.node("Gather", [graph.constant("terms.control", basis.reshape(KNOTS, -1)), near], "terms.points")
+    shape = graph.constant("terms.shape", np.array([rank, POSE], np.int64))
+    functions = graph.node("Reshape", [graph.node("MatMul", [weights, control], "terms.flat"), shape], "terms.now")
+    identity = graph.constant("terms.mean", np.eye(POSE, dtype=np.float32))
+    factors = graph.node("Concat", [functions, identity], "terms.factors", axis=0)
+    rows = graph.node("Gather", [graph.constant("coefficients", table), "ids"], "ids.coefficients")
+    return graph.node("MatMul", [rows, factors], "terms.pose")
+
+
+class _Fit:
+    """Trajectories as rows of a matrix, [N, 131 · 10] control points in pixels, relative to the mean pose."""
+
+    def __init__(self, trajectories: Trajectories) -> None:
+        self._trajectories = trajectories
+        times = samples_for(KNOTS)
+        self._times = times
+        self._fitting = fitting(KNOTS, times).astype(np.float32)
+        self._design = design(KNOTS, times).astype(np.float32)
+
+    def functions(self, ids: Ids) -> np.ndarray:
+        """[131 · 10, R] right singular vectors, the most important first; no more than there are Gaussians."""
+        size = KNOTS * POSE
+        if len(ids) < size:
+            matrix = np.concatenate([np.zeros((1, size), np.float32), *(self._rows(rows)[0] for rows in _chunks(ids))])
+            return np.linalg.svd(matrix, full_matrices=False)[2][: RANKS[-1]].T
+        gram = np.zeros((size, size))
+        for rows in _chunks(ids):
+            matrix, _, _ = self._rows(rows)
+            gram += matrix.T @ matrix
+        return eigh(gram, subset_by_index=(size - RANKS[-1], size - 1))[1][:, ::-1].astype(np.float32)
+
+    def errors(self, ids: Ids, functions: np.ndarray) -> np.ndarray:
+        """[M] scene units."""
+        errors = np.empty(len(ids))
+        done = 0
+        for rows in _chunks(ids):
+            matrix, means, samples = self._rows(rows)
+            rebuilt = ((matrix @ functions) @ functions.T).reshape(len(rows), KNOTS, POSE) + means[:, None]
+            got = np.matmul(self._design, rebuilt) / self._units(rows)
+            got[..., QUATS] /= np.maximum(np.linalg.norm(got[..., QUATS], axis=-1, keepdims=True), 1e-8)
+            errors[done : done + len(rows)] = self._trajectories.distances(rows, got - samples)
+            done += len(rows)
+        return errors
+
+    def table(self, functions: np.ndarray) -> np.ndarray:
+        """[N, r + 10] coefficients and mean poses, the quaternions times their weights."""
+        table = np.empty((self._trajectories.count, functions.shape[1] + POSE), np.float32)
+        for rows in _chunks(np.arange(self._trajectories.count)):
+            matrix, means, _ = self._rows(rows)
+            table[rows] = np.concatenate([matrix @ functions, means * self._in_scene()], axis=1)
+        return table
+
+    def basis(self, functions: np.ndarray) -> np.ndarray:
+        """[131, r, 10] control points of the functions, means and scales in scene units."""
+        return (functions.T.reshape(-1, KNOTS, POSE) * self._in_scene()).transpose(1, 0, 2).astype(np.float32)
+
+    def _rows(self, ids: Ids) -> tuple[np.ndarray, np.ndarray, Samples]:
+        samples = self._trajectories.on_grid(self._times, ids)
+        control = np.matmul(self._fitting, samples) * self._units(ids)
+        means = control.mean(axis=1)
+        return (control - means[:, None]).reshape(len(ids), -1), means, samples
+
+    def _units(self, ids: Ids) -> np.ndarray:
+        """[M, 1, 10] what poses are multiplied by to be displacements in pixels."""
+        units = np.full((len(ids), 1, POSE), 1 / self._trajectories.pixel, np.float32)
+        units[..., QUATS] *= self._trajectories.rotation_weights[ids, None, None]
+        return units
+
+    def _in_scene(self) -> np.ndarray:
+        """[10] what the graph's values are multiplied by: quaternions stay in pixels."""
+        return np.array([self._trajectories.pixel] * 6 + [1.0] * 4, np.float32)
+
+
+def _chunks(ids: Ids) -> Iterator[Ids]:
+    for start in range(0, len(ids), CHUNK):
+        yield ids[start : start + CHUNK]
