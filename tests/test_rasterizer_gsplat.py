@@ -112,6 +112,9 @@ def test_other_cameras(model: str):
     size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])
     assert_close((conics(got)[drawn] - inverse) / size, np.zeros_like(inverse), "projection.gsplat_fisheye")
     assert_close(got.records[drawn, DEPTH], want.depths.numpy()[drawn], "projection.float64.relative")
+    exact, depths = camera.project(gaussians.means)
+    assert_close(got.records[drawn][:, [X, Y]], exact[drawn], "pixel")
+    assert_close(got.records[drawn, DEPTH], depths[drawn], "projection.float64.relative")
 
 
 def test_mip_dims_what_it_spreads():
@@ -150,6 +153,7 @@ def test_distorted_fisheye_is_its_formula():
     drawn = got.extents[:, 0] > 0
     assert drawn.mean() > 0.5
     assert_close(got.records[drawn][:, [X, Y]], pixels(points)[drawn], "pixel")
+    assert_close(camera.project(gaussians.means)[0], pixels(points), "pixel")
     size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])[drawn]
     assert_close((conics(got)[drawn] - inverse[drawn]) / size, np.zeros_like(size), "conic.finite_differences")
 

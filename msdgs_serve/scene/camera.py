@@ -74,6 +74,24 @@ class Camera:
         inverse[:3, 3] = -rotation.T @ position
         return inverse
 
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where world points [N, 3] are drawn, [N, 2] pixels, and how far along the axis they are, [N] scene units.
+
+        Pixels of points at depth 0 or less mean nothing.
+        """
+        world_to_camera = self.world_to_camera
+        seen = np.asarray(points, np.float64) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+        plane, depths = seen[:, :2], seen[:, 2]
+        if self.model == "pinhole":
+            plane = plane / np.where(depths > 0, depths, 1)[:, None]
+        elif self.model == "fisheye":
+            radii = np.hypot(plane[:, 0], plane[:, 1])
+            theta = np.arctan2(radii, depths)
+            powers = theta[:, None] ** (2, 4, 6, 8)
+            stretch = theta * (1 + powers @ np.array(self.distortion)) / np.where(radii > 0, radii, 1)
+            plane = plane * np.where(radii > 0, stretch, 1)[:, None]
+        return plane * (self.fx, self.fy) + (self.cx, self.cy), depths
+
     @property
     def position(self) -> np.ndarray:
         """[3] the centre of projection in world space; of an orthographic camera, any point of its axis."""
