@@ -317,7 +317,10 @@ def _compare(command: Compare) -> int:
     results = collect(runs)
     if results:
         paths = write_comparison(command.out, results, len(runs) - len(results))
-        console.print(_rich_table(HEADINGS, table(results), names=2))
+        if console.is_terminal:
+            console.print(_rich_table(HEADINGS, table(results), names=2))
+        else:  # 80 columns would cut it
+            console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, markup=False, highlight=False)
         console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
     if not complete:
         console.print("interrupted; the same command goes on", soft_wrap=True)

@@ -192,7 +192,7 @@ def test_from_nothing_to_the_table_and_not_again(
         assert (run["modulation_parameters"] == 0) == (run["system"] == "still")
     for name in ("comparison.md", "time.png", "layers.png"):
         assert (tmp_path / "out" / name).stat().st_size > 100
-    capsys.readouterr()
+    assert (tmp_path / "out" / "comparison.md").read_text() in capsys.readouterr().out
     assert cli.main(command) == 0
     assert capsys.readouterr().out.count("was finished") == 6
     assert cli.main([*command, "--size", "12"]) == cli.EXIT_INVALID
