@@ -21,8 +21,8 @@ from msdgs_serve.scene.metadata import SceneCamera
 if TYPE_CHECKING:
     from export.photographs import Photographs
 
-PLANS = ("int8", *(f"lowrank:{r}" for r in (4, 8, 16, 32)), *(f"keyframes:{n}" for n in (8, 16, 32, 64)))
-"""Besides `network` and every prefix of it."""
+PLANS = ("int8", "lowrank:0.5", "keyframes:2.0", "keyframes:0.5", "keyframes:0.1")
+"""Besides `network` and every prefix of it; fitted ones by the pixels that they may be off by."""
 
 TRIM_STEPS = (20.0, 10.0, 5.0, 1.0, -5.0, -10.0, -15.0)
 """dB above or below the error allowed, at which trimming is tried."""
@@ -131,6 +131,7 @@ class Sweep:
         """Lower SH degrees of what is on the front of the looks so far, the faster half of it."""
         ahead = sorted(self._undominated(0.0), key=lambda look: look.cpu)
         chosen = [look.candidate for look in ahead[: (len(ahead) + 1) // 2]]
+        chosen.sort(key=lambda c: c.trim_db or 0.0)  # plans share what they sample of one trimmed model
         return [(c.plan, c.trim_db, degree) for c in chosen for degree in range(c.sh_degree)]
 
     def _undominated(self, db_margin: float = DB_MARGIN) -> list[Look]:

@@ -83,6 +83,7 @@ def write_scene(
         _write(temporary, contents)
         session, allowed = DeformationSession(temporary), tolerance if exact else math.inf
         measured = verify(session, model, times=times, tolerance=allowed, on_time=on_time)
+        measured = properties(contents)["measured_error"] | measured  # what a fitted plan knows of itself stays
         if rendered is not None:
             measured |= {"rendered": rendered}
         helper.set_model_props(contents, _as_texts(properties(contents) | {"measured_error": measured}))
