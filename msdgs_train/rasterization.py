@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msdgs_serve.rasterizer.compositing import composite
+from msdgs_serve.rasterizer.compositing import Frame, composite
 from msdgs_serve.rasterizer.compositing_backward import composite_backward
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.projection_backward import project_backward
@@ -92,12 +92,12 @@ class _Rasterize(torch.autograd.Function):
         gaussians = Gaussians(*arrays)
         splats, tiles, alpha = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
-        behind = np.einsum("hwc,hwc->hw", rgb, grad_rgb) + alpha * grad_alpha
-        splat_grads = composite_backward(splats, tiles, ctx.view[1], behind, grad_rgb, grad_alpha)
-        grads = project_backward(gaussians, splats, splat_grads, *ctx.view)
-        ctx.info.means2d_grads = torch.from_numpy(splat_grads.means2d)
+        frame = Frame(rgb, alpha, np.empty((0, 0), rgb.dtype))
+        sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
+        grads = project_backward(gaussians, splats, sums, *ctx.view)
+        ctx.info.means2d_grads = torch.from_numpy(grads.means2d)
         grad_background = np.einsum("hw,hwc->c", 1 - alpha, grad_rgb)
-        arrays = (grads.means, grads.quats, grads.scales, splat_grads.opacities, grads.sh, grad_background)
+        arrays = (grads.means, grads.quats, grads.scales, grads.opacities, grads.sh, grad_background)
         return *(torch.from_numpy(array) for array in arrays), None, None, None
 
 

@@ -64,7 +64,7 @@ def rows_and_columns(
     matrix: np.ndarray, out: np.ndarray, squares: np.ndarray, triples: np.ndarray, columns: np.ndarray
 ) -> None:
     block = lanes.load_columns(matrix, 3, 2)
-    lanes.store_rows(out, 5, block)
+    lanes.store_columns(out, 5, 3, block)
     lanes.store_square(squares, 2, 7, block[0])
     lanes.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
     for k in range(16):
@@ -82,8 +82,9 @@ def test_memory(dtype: type):
     rows_and_columns.py_func(matrix, *want)
     for array, expected in zip(got, want, strict=True):
         np.testing.assert_array_equal(array, expected)
-    np.testing.assert_array_equal(got[0][5:, :5], matrix[3:7, 2:])
+    np.testing.assert_array_equal(got[0][5:, 3:8], matrix[3:7, 2:])
     np.testing.assert_array_equal(got[0][:5], -1)
+    np.testing.assert_array_equal(got[0][:, :3], -1)
 
 
 @kernel

@@ -5,8 +5,6 @@ For a pixel with gradient g, the splat's share of the loss is s = color · g_rgb
 d loss / d alpha_i = T_i s_i - (what all splats behind it and the background add) / (1 - alpha_i).
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from msdgs_serve.rasterizer.atomic import fetch_add
@@ -15,6 +13,7 @@ from msdgs_serve.rasterizer.compositing import (
     BLOCKS,
     PIXELS,
     TILES_A_TURN,
+    Frame,
     PixelLimits,
     grid_of_a_tile,
     log2_alpha,
@@ -32,6 +31,7 @@ from msdgs_serve.rasterizer.lanes import (
     lowest_bit,
     minimum,
     negative,
+    prefetch,
     select,
     spread,
     store,
@@ -40,13 +40,8 @@ from msdgs_serve.rasterizer.lanes import (
 from msdgs_serve.rasterizer.projection import (
     BLUE,
     GREEN,
-    LOG2_OPACITY,
     RECORD,
     RED,
-    ROOT_A,
-    ROOT_B,
-    ROOT_C,
-    ROOT_SCALE,
     Splats,
     X,
     Y,
@@ -62,42 +57,35 @@ SUMS = LANES
 """Numbers of a pair of splat and tile, nine in use: red, green, blue, then the moments of d loss / d sigma about the
 splat: 1, x, y, xx, xy, yy."""
 
-
-class SplatGradients(NamedTuple):
-    """d loss / d splat, zero where a splat is not drawn."""
-
-    means2d: np.ndarray  # [N, 2]
-    conics: np.ndarray  # [N, 3] of xx, xy (both off-diagonals together), yy
-    opacities: np.ndarray  # [N]
-    colors: np.ndarray  # [N, 3]
+AHEAD = np.uint64(16)
+"""Pairs between asking for a record and needing it."""
 
 
 def composite_backward(
     splats: Splats,
     tiles: TileLists,
     options: RasterizerOptions,
-    behind: np.ndarray,
+    frame: Frame,
     grad_rgb: np.ndarray,
     grad_alpha: np.ndarray,
-) -> SplatGradients:
-    """Gradients of the splats.
+) -> np.ndarray:
+    """The sums of each splat, [N, SUMS]: zero where it isn't drawn.
 
     Args:
-        behind: [H, W] the finished pixel times its gradient: rgb · grad_rgb + alpha grad_alpha, background included.
+        frame: what `composite` drew; its depth is not looked at.
         grad_rgb: [H, W, 3].
         grad_alpha: [H, W].
     """
     records = splats.records
-    count, dtype = len(records), records.dtype
-    pair_sums = np.zeros((len(tiles.splat_ids), SUMS), dtype)
+    pair_sums = np.empty((len(tiles.splat_ids), SUMS), records.dtype)
+    seen = np.empty(len(tiles.offsets) - 1, np.int64)
     turn = np.zeros(1, np.int64)
-    arguments = (turn, records, tiles, pixel_limits(options, dtype), behind, grad_rgb, grad_alpha, pair_sums)
+    limits = pixel_limits(options, records.dtype)
+    arguments = (turn, records, tiles, limits, frame.rgb, frame.alpha, grad_rgb, grad_alpha, pair_sums, seen)
     run_parallel(_tiles_backward, [arguments] * thread_count())
-    gradients = SplatGradients(
-        np.zeros((count, 2), dtype), np.zeros((count, 3), dtype), np.zeros(count, dtype), np.zeros((count, 3), dtype)
-    )
-    _gather(tiles.splat_ids, pair_sums, records, gradients)
-    return gradients
+    sums = np.zeros((len(records), SUMS), records.dtype)
+    _add_up(tiles, seen, pair_sums, sums)
+    return sums
 
 
 @kernel
@@ -106,17 +94,21 @@ def _tiles_backward(
     records: np.ndarray,
     tiles: TileLists,
     limits: PixelLimits,
-    behind: np.ndarray,
+    rgb: np.ndarray,
+    alpha: np.ndarray,
     grad_rgb: np.ndarray,
     grad_alpha: np.ndarray,
     pair_sums: np.ndarray,
+    seen: np.ndarray,
 ) -> None:
+    """Write the sums of each pair of tile and splat, and how many pairs of a tile have been: those behind what hides
+    them are left out."""
     count = len(tiles.offsets) - 1
     state = np.empty(6 * PIXELS, records.dtype)
     record = np.empty(RECORD, records.dtype)
     origin = np.zeros(RECORD, records.dtype)
     grid = grid_of_a_tile(records)
-    height, width = behind.shape
+    height, width = alpha.shape
     flat, flat_sums = records.reshape(-1), pair_sums.reshape(-1)
     while True:
         first = fetch_add(turn, TILES_A_TURN)
@@ -131,19 +123,25 @@ def _tiles_backward(
                 for column in range(min(TILE, width - x0)):
                     block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
                     pixel = np.uint64(block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE)
-                    state[GRAD_RED + pixel] = grad_rgb[y0 + row, x0 + column, 0]
-                    state[GRAD_GREEN + pixel] = grad_rgb[y0 + row, x0 + column, 1]
-                    state[GRAD_BLUE + pixel] = grad_rgb[y0 + row, x0 + column, 2]
-                    state[GRAD_ALPHA + pixel] = grad_alpha[y0 + row, x0 + column]
-                    state[BEHIND + pixel] = behind[y0 + row, x0 + column]
+                    y, x = y0 + row, x0 + column
+                    behind = alpha[y, x] * grad_alpha[y, x]
+                    for channel in range(3):
+                        grad = grad_rgb[y, x, channel]
+                        behind += rgb[y, x, channel] * grad
+                        state[GRAD_RED + np.uint64(PIXELS * channel) + pixel] = grad
+                    state[GRAD_ALPHA + pixel] = grad_alpha[y, x]
+                    state[BEHIND + pixel] = behind
             alive = np.uint64((1 << BLOCKS) - 1)
-            for pair in range(np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])):
+            first_pair, past = np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])
+            pair = first_pair
+            while pair < past and alive != np.uint64(0):
+                ahead = min(pair + AHEAD, past - np.uint64(1))
+                prefetch(flat, np.uint64(tiles.splat_ids[ahead]) * np.uint64(RECORD))
                 store(record, 0, load(flat, np.uint64(tiles.splat_ids[pair]) * np.uint64(RECORD)) - load(origin, 0))
                 bits = alive & bits_of(touched_blocks(record, np.uint64(0), grid, limits.log2_alpha_min))
-                if bits != np.uint64(0):
-                    alive &= ~_splat_backward(bits, record, grid, limits, state, flat_sums, pair * np.uint64(SUMS))
-                    if alive == np.uint64(0):
-                        break
+                alive &= ~_splat_backward(bits, record, grid, limits, state, flat_sums, pair * np.uint64(SUMS))
+                pair += np.uint64(1)
+            seen[tile] = pair - first_pair
 
 
 @kernel
@@ -231,20 +229,13 @@ def _splat_backward(
 
 
 @kernel
-def _gather(splat_ids: np.ndarray, pair_sums: np.ndarray, records: np.ndarray, gradients: SplatGradients) -> None:
-    """Add up each splat's tiles, always in the same order, and turn moments into gradients."""
-    real = records.dtype.type
-    unscaled = real(1 / ROOT_SCALE)
-    for pair in range(len(splat_ids)):
-        i = splat_ids[pair]
-        sums = pair_sums[pair]
-        a, b, c = records[i, ROOT_A] * unscaled, records[i, ROOT_B] * unscaled, records[i, ROOT_C] * unscaled
-        for channel in range(3):
-            gradients.colors[i, channel] += sums[channel]
-        # sigma = half of xx dx² + 2 xy dx dy + yy dy², with dx and dy growing as the mean falls
-        gradients.means2d[i, 0] -= a * a * sums[4] + a * b * sums[5]
-        gradients.means2d[i, 1] -= a * b * sums[4] + (b * b + c * c) * sums[5]
-        gradients.conics[i, 0] += sums[6] / 2
-        gradients.conics[i, 1] += sums[7]
-        gradients.conics[i, 2] += sums[8] / 2
-        gradients.opacities[i] -= sums[3] / 2 ** records[i, LOG2_OPACITY]
+def _add_up(tiles: TileLists, seen: np.ndarray, pair_sums: np.ndarray, sums: np.ndarray) -> None:
+    """Add up each splat's tiles, always in the same order."""
+    flat_pairs, flat = pair_sums.reshape(-1), sums.reshape(-1)
+    for tile in range(len(seen)):
+        first = np.uint64(tiles.offsets[tile])
+        for pair in range(first, first + np.uint64(seen[tile])):
+            ahead = min(pair + AHEAD, np.uint64(len(tiles.splat_ids) - 1))
+            prefetch(flat, np.uint64(tiles.splat_ids[ahead]) * np.uint64(SUMS))
+            place = np.uint64(tiles.splat_ids[pair]) * np.uint64(SUMS)
+            store(flat, place, load(flat, place) + load(flat_pairs, pair * np.uint64(SUMS)))

@@ -1,10 +1,11 @@
-"""Spherical harmonics of one direction for the kernels: values and derivatives, degree 0 to 3."""
+"""Spherical harmonics for the kernels: values and derivatives, degree 0 to 3."""
 
 from typing import Any
 
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.lanes import Lanes, load
 from msdgs_serve.scene.spherical_harmonics import SH_C1, SH_C2, SH_C3
 
 C20, C21, C22, C23, C24 = SH_C2
@@ -35,33 +36,22 @@ def harmonics_above_0(x: Any, y: Any, z: Any) -> tuple:
 
 
 @kernel
-def basis_gradient_into(gradient: np.ndarray, x: float, y: float, z: float) -> None:
-    """Write d basis / d (x, y, z) into `gradient` [coefficients, 3]."""
-    gradient[:] = 0
-    n = len(gradient)
-    if n > 1:
-        gradient[1, 1] = -SH_C1
-        gradient[2, 2] = SH_C1
-        gradient[3, 0] = -SH_C1
+def harmonics_slope(pulls: np.ndarray, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """The gradient in (x, y, z) of the sum of pull times basis function, 16 directions at a time.
+
+    `pulls` has 16 `Lanes` for each of the functions 0 to 15; the first is of no consequence.
+    """
     xx, yy, zz = x * x, y * y, z * z
-    if n > 4:
-        _set(gradient, 4, C20 * y, C20 * x, 0.0)
-        _set(gradient, 5, 0.0, C21 * z, C21 * y)
-        _set(gradient, 6, -2 * C22 * x, -2 * C22 * y, 4 * C22 * z)
-        _set(gradient, 7, C23 * z, 0.0, C23 * x)
-        _set(gradient, 8, 2 * C24 * x, -2 * C24 * y, 0.0)
-    if n > 9:
-        _set(gradient, 9, 6 * C30 * x * y, 3 * C30 * (xx - yy), 0.0)
-        _set(gradient, 10, C31 * y * z, C31 * x * z, C31 * x * y)
-        _set(gradient, 11, -2 * C32 * x * y, C32 * (4 * zz - xx - 3 * yy), 8 * C32 * y * z)
-        _set(gradient, 12, -6 * C33 * x * z, -6 * C33 * y * z, C33 * (6 * zz - 3 * xx - 3 * yy))
-        _set(gradient, 13, C34 * (4 * zz - 3 * xx - yy), -2 * C34 * x * y, 8 * C34 * x * z)
-        _set(gradient, 14, 2 * C35 * x * z, -2 * C35 * y * z, C35 * (xx - yy))
-        _set(gradient, 15, 3 * C36 * (xx - yy), -6 * C36 * x * y, 0.0)
-
-
-@kernel
-def _set(gradient: np.ndarray, k: int, dx: float, dy: float, dz: float) -> None:
-    gradient[k, 0] = dx
-    gradient[k, 1] = dy
-    gradient[k, 2] = dz
+    p1, p2, p3 = load(pulls, 16), load(pulls, 32), load(pulls, 48)
+    p4, p5, p6, p7, p8 = load(pulls, 64), load(pulls, 80), load(pulls, 96), load(pulls, 112), load(pulls, 128)
+    p9, p10, p11, p12 = C30 * load(pulls, 144), C31 * load(pulls, 160), C32 * load(pulls, 176), C33 * load(pulls, 192)
+    p13, p14, p15 = C34 * load(pulls, 208), C35 * load(pulls, 224), C36 * load(pulls, 240)
+    dx = -SH_C1 * p3 + C20 * y * p4 - 2 * C22 * x * p6 + C23 * z * p7 + 2 * C24 * x * p8
+    dx += 6 * x * y * p9 + y * z * p10 - 2 * x * y * p11 - 6 * x * z * p12
+    dx += (4 * zz - 3 * xx - yy) * p13 + 2 * x * z * p14 + 3 * (xx - yy) * p15
+    dy = -SH_C1 * p1 + C20 * x * p4 + C21 * z * p5 - 2 * C22 * y * p6 - 2 * C24 * y * p8
+    dy += 3 * (xx - yy) * p9 + x * z * p10 + (4 * zz - xx - 3 * yy) * p11 - 6 * y * z * p12
+    dy += -2 * x * y * p13 - 2 * y * z * p14 - 6 * x * y * p15
+    dz = SH_C1 * p2 + C21 * y * p5 + 4 * C22 * z * p6 + C23 * x * p7
+    dz += x * y * p10 + 8 * y * z * p11 + (6 * zz - 3 * xx - 3 * yy) * p12 + 8 * x * z * p13 + (xx - yy) * p14
+    return dx, dy, dz

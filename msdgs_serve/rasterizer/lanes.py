@@ -126,6 +126,7 @@ def _mask_for(kind: types.Type | None) -> types.Type | None:
 def _arithmetic() -> None:
     """+ - * / and < <= > >= between lanes, or lanes and a number, and & | ~ between masks: NumPy has them already."""
     binary = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+    binary |= {operator.iadd: "fadd", operator.isub: "fsub", operator.imul: "fmul"}  # which are the same for numbers
     comparisons = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}
     for function, name in binary.items():
         _typed(function, lambda a, b: _same_or_number(a, b))
@@ -409,10 +410,10 @@ def load_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tu
     return tuple(block.T.copy())
 
 
-def store_rows(array: np.ndarray, first_row: Index, columns: tuple[Lanes, ...]) -> None:
-    """Write 16 columns into the rows of an array [n, 16] from `first_row`; what is past its end is dropped."""
-    rows = array[int(first_row) : int(first_row) + LANES]
-    rows[:] = np.stack(columns, axis=1)[: len(rows)]
+def store_columns(array: np.ndarray, first_row: Index, first_column: Index, columns: tuple[Lanes, ...]) -> None:
+    """Write 16 columns into 16 rows of an array [n, m]; what is past its rows and columns is dropped."""
+    block = array[int(first_row) :, int(first_column) :][:LANES, :LANES]
+    block[:] = np.stack(columns, axis=1)[: block.shape[0], : block.shape[1]]
 
 
 def sums_of(columns: tuple[Lanes, ...]) -> Lanes:
@@ -458,9 +459,9 @@ def _type_load_columns(_context: Any) -> Callable:
     return lambda array, row, column: types.UniTuple(LanesType(array.dtype), LANES) if _is_array(array, 2) else None
 
 
-@type_callable(store_rows)
-def _type_store_rows(_context: Any) -> Callable:
-    return lambda array, row, columns: types.none if _is_array(array, 2) else None
+@type_callable(store_columns)
+def _type_store_columns(_context: Any) -> Callable:
+    return lambda array, row, column, columns: types.none if _is_array(array, 2) else None
 
 
 @lower_builtin(load, types.Array, types.Integer)
@@ -485,6 +486,11 @@ def _first(builder: Any, count: Any) -> Any:
 def _masked_load(builder: Any, place: Any, alignment: int, mask: Any, otherwise: Any) -> Any:
     name = f"llvm.masked.load.{_suffix(otherwise.type)}.p0"
     return _llvm(builder, name, otherwise.type, place, ir.Constant(ir.IntType(32), alignment), mask, otherwise)
+
+
+def _masked_store(builder: Any, place: Any, alignment: int, mask: Any, lanes: Any) -> None:
+    name = f"llvm.masked.store.{_suffix(lanes.type)}.p0"
+    _llvm(builder, name, ir.VoidType(), lanes, place, ir.Constant(ir.IntType(32), alignment), mask)
 
 
 @lower_builtin(load_or, types.Array, types.Integer, LanesType)
@@ -534,15 +540,18 @@ def _lower_load_columns(context: Any, builder: Any, signature: Any, values: Any)
     return context.make_tuple(builder, signature.return_type, _transposed(builder, rows))
 
 
-@lower_builtin(store_rows, types.Array, types.Integer, types.UniTuple)
-def _lower_store_rows(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+@lower_builtin(store_columns, types.Array, types.Integer, types.Integer, types.UniTuple)
+def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     kind = signature.args[0]
-    row = context.cast(builder, values[1], signature.args[1], types.intp)
-    places, count, _ = _rows(context, builder, kind, values[0], row, ir.Constant(ir.IntType(64), 0))
-    rows = _transposed(builder, [builder.extract_value(values[2], k) for k in range(LANES)])
+    row, column = (
+        context.cast(builder, v, t, types.intp) for v, t in zip(values[1:3], signature.args[1:3], strict=True)
+    )
+    places, count, width = _rows(context, builder, kind, values[0], row, column)
+    rows = _transposed(builder, [builder.extract_value(values[3], k) for k in range(LANES)])
+    some = _first(builder, width)
     for k, (place, lanes) in enumerate(zip(places, rows, strict=True)):
         with builder.if_then(builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)):
-            builder.store(lanes, place, align=kind.dtype.bitwidth // 8)
+            _masked_store(builder, place, kind.dtype.bitwidth // 8, some, lanes)
     return context.get_dummy_value()
 
 
@@ -620,7 +629,6 @@ def _lower_store_square(context: Any, builder: Any, signature: Any, values: Any)
 @lower_builtin(store_square_of_triples, types.Array, types.Integer, types.Integer, LanesType, LanesType, LanesType)
 def _lower_store_square_of_triples(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     kind = signature.args[0]
-    vector = values[3].type
     mask = _first(builder, ir.Constant(ir.IntType(64), 12))
     rows = []
     for row in range(4):
@@ -630,11 +638,9 @@ def _lower_store_square_of_triples(context: Any, builder: Any, signature: Any, v
         three = [place if channel < 2 else LANES + pixel for place, (pixel, channel) in enumerate(wanted)]
         some = _shuffled(builder, values[3], values[4], [*two, 0, 0, 0, 0])
         rows.append(_shuffled(builder, some, values[5], [*three, 0, 0, 0, 0]))
-    name = f"llvm.masked.store.{_suffix(vector)}.p0"
-    alignment = ir.Constant(ir.IntType(32), kind.dtype.bitwidth // 8)
 
     def write(place: Any, row: Any) -> None:
-        _llvm(builder, name, ir.VoidType(), row, place, alignment, mask)
+        _masked_store(builder, place, kind.dtype.bitwidth // 8, mask, row)
 
     return _store_pieces(context, builder, signature, values, rows, write)
 

@@ -31,7 +31,7 @@ from msdgs_serve.rasterizer.lanes import (
     spread,
     square_root,
     store,
-    store_rows,
+    store_columns,
 )
 from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
@@ -76,8 +76,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     records = np.empty((count, RECORD), dtype)
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
-    groups = split_evenly(-(-count // LANES), 2 * thread_count()) or [(0, 0)]
-    ranges = [(first * LANES, min(past * LANES, count)) for first, past in groups]
+    ranges = ranges_of_lanes(count)
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     sh = gaussians.sh.reshape(count, 3 * gaussians.sh.shape[1])
     visible = run_parallel(
@@ -86,6 +85,12 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     )
     parts = [keys[start : start + found] for (start, _), (found, _) in zip(ranges, visible, strict=True)]
     return Splats(records, rectangles, np.concatenate(parts), all(sound for _, sound in visible))
+
+
+def ranges_of_lanes(count: int) -> list[tuple[int, int]]:
+    """(start, stop) of parts of `range(count)` for the threads; each but the last has whole groups of 16."""
+    groups = split_evenly(-(-count // LANES), 2 * thread_count()) or [(0, 0)]
+    return [(first * LANES, min(past * LANES, count)) for first, past in groups]
 
 
 def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
@@ -133,18 +138,13 @@ def _project_range(
         if bits_of(drawn) == np.uint64(0):
             _store_nothing(records, first)
             continue
-        u, v, jacobian = _seen_at(view, x, y, z)
+        u, v, jacobian = seen_at(view, x, y, z)
         qw, qx = converted(qs[0], double), converted(qs[1], double)
         qy, qz = converted(qs[2], double), converted(qs[3], double)
-        mx0, my0 = _half_axis(
-            r, jacobian, 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
-        )
-        mx1, my1 = _half_axis(
-            r, jacobian, 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
-        )
-        mx2, my2 = _half_axis(
-            r, jacobian, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
-        )
+        axes = rotation_columns(qw, qx, qy, qz)
+        mx0, my0 = _half_axis(r, jacobian, axes[0])
+        mx1, my1 = _half_axis(r, jacobian, axes[1])
+        mx2, my2 = _half_axis(r, jacobian, axes[2])
         s0, s1, s2 = converted(ss[0], double), converted(ss[1], double), converted(ss[2], double)
         mx0, my0, mx1, my1, mx2, my2 = mx0 * s0, my0 * s0, mx1 * s1, my1 * s1, mx2 * s2, my2 * s2
         # the determinant is a sum of squares (Cauchy-Binet), so that a needle of 1e6 : 1 keeps its digits
@@ -176,14 +176,15 @@ def _project_range(
         root_a = square_root(converted(yy / det, records))
         root_b = -slope_h * root_a
         root_c = 1 / square_root(converted(yy, records))
-        dx, dy, dz = _direction(view, wx, wy, wz)
-        red, green, blue = _raw_colors(
+        dx, dy, dz = direction(view, wx, wy, wz)
+        red, green, blue = raw_colors(
             sh, first, scratch, converted(dx, records), converted(dy, records), converted(dz, records)
         )
         sound = sound and bits_of(drawn & (abs_sum(red, green, blue) < np.inf)) == bits
-        store_rows(
+        store_columns(
             records,
             first,
+            0,
             (
                 select(drawn, u, zero),
                 select(drawn, v, zero),
@@ -246,16 +247,28 @@ def depth_bits(depth: float) -> np.uint64:
 @kernel
 def _store_nothing(records: np.ndarray, first: int) -> None:
     zero = spread(records.dtype.type(0))
-    store_rows(
+    store_columns(
         records,
         first,
+        0,
         (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero),
     )
 
 
 @kernel
-def _half_axis(r: np.ndarray, jacobian: tuple, a: Lanes, b: Lanes, c: Lanes) -> tuple[Lanes, Lanes]:
-    """J W of a world vector (a, b, c): x and y in the image."""
+def rotation_columns(w: Lanes, x: Lanes, y: Lanes, z: Lanes) -> tuple:
+    """The rotation matrix of unit quaternions, by columns, [3][3]."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@kernel
+def _half_axis(r: np.ndarray, jacobian: tuple, axis: tuple) -> tuple[Lanes, Lanes]:
+    """J W of a vector in the world: x and y in the image."""
+    a, b, c = axis
     x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
     y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
     z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
@@ -264,7 +277,7 @@ def _half_axis(r: np.ndarray, jacobian: tuple, a: Lanes, b: Lanes, c: Lanes) -> 
 
 
 @kernel
-def _seen_at(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple:
+def seen_at(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple:
     """Where points in camera axes are drawn, and the Jacobian of that, [2][3]."""
     zero = filled(0, z)
     if view.model == ORTHOGRAPHIC:
@@ -301,7 +314,7 @@ def _seen_at(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple:
 
 
 @kernel
-def _direction(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+def direction(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """Unit vectors of the lines of sight to points in the world."""
     if view.model == ORTHOGRAPHIC:
         r = view.rotation
@@ -312,10 +325,13 @@ def _direction(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, 
 
 
 @kernel
-def _raw_colors(
+def raw_colors(
     sh: np.ndarray, first: int, scratch: np.ndarray, x: Lanes, y: Lanes, z: Lanes
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """SH + 0.5 towards the unit directions (x, y, z), before the cut at 0; `sh` is [N, 3 coefficients]."""
+    """SH + 0.5 towards the unit directions (x, y, z), before the cut at 0; `sh` is [N, 3 coefficients].
+
+    `scratch` then has the coefficients, 16 lanes each.
+    """
     width = sh.shape[1]
     for window in range(0, width, LANES):
         columns = load_columns(sh, first, window)

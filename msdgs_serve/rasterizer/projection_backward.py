@@ -1,35 +1,69 @@
-"""Gradient of the projection: from splats back to means, quaternions, scales and spherical harmonics."""
+"""Gradient of the projection: from splats back to means, quaternions, scales, opacities and spherical harmonics.
 
-import math
+16 Gaussians at a time in float64, like the projection. Written for pinhole cameras without `mip`.
+"""
+
 from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.compositing_backward import SplatGradients
-from msdgs_serve.rasterizer.harmonics import basis_gradient_into, harmonics_above_0
+from msdgs_serve.rasterizer.compositing import pixel_limits
+from msdgs_serve.rasterizer.exponential import exp2
+from msdgs_serve.rasterizer.harmonics import harmonics_above_0, harmonics_slope
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.projection import EXTENT_X, Splats
+from msdgs_serve.rasterizer.lanes import (
+    LANES,
+    Index,
+    Lanes,
+    Mask,
+    converted,
+    filled,
+    load,
+    load_columns,
+    select,
+    square_root,
+    store,
+    store_columns,
+)
+from msdgs_serve.rasterizer.projection import (
+    EXTENT_X,
+    LOG2_OPACITY,
+    ROOT_A,
+    ROOT_B,
+    ROOT_C,
+    ROOT_SCALE,
+    Splats,
+    ranges_of_lanes,
+    raw_colors,
+    rotation_columns,
+    seen_at,
+)
 from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_serve.threads import run_parallel, split_evenly, thread_count
+from msdgs_serve.threads import run_parallel
+
+# numbers of the columns of a record: a tuple is indexed by a plain int
+_A, _B, _C, _LOG2_OPACITY, _EXTENT = (int(place) for place in (ROOT_A, ROOT_B, ROOT_C, LOG2_OPACITY, EXTENT_X))
 
 
 class GaussianGradients(NamedTuple):
-    """d loss / d Gaussian; of the quaternion, as if its four numbers were free."""
+    """d loss / d Gaussian, 0 where it isn't drawn; of the quaternion, as if its four numbers were free."""
 
     means: np.ndarray  # [N, 3]
     quats: np.ndarray  # [N, 4] wxyz
     scales: np.ndarray  # [N, 3]
+    opacities: np.ndarray  # [N]
     sh: np.ndarray  # [N, (degree + 1)², 3]
+    means2d: np.ndarray  # [N, 2] of the projected means, a pixel
 
 
 def project_backward(
-    gaussians: Gaussians, splats: Splats, gradients: SplatGradients, camera: Camera, options: RasterizerOptions
+    gaussians: Gaussians, splats: Splats, sums: np.ndarray, camera: Camera, options: RasterizerOptions
 ) -> GaussianGradients:
-    """Gradients of the Gaussians from the gradients of their splats.
+    """Gradients of the Gaussians from the sums of their splats (`composite_backward`).
 
     Raises `InvalidInput` for a camera that isn't pinhole and for `mip`: they are drawn, not trained with.
     """
@@ -37,17 +71,16 @@ def project_backward(
         raise InvalidInput("camera.model", "pinhole for gradients", camera.model)
     if options.mip:
         raise InvalidInput("options.mip", "False for gradients", options.mip)
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
-    result = GaussianGradients(*(np.zeros_like(array) for array in arrays))
+    count = len(gaussians)
+    flat = np.empty((count, LANES), gaussians.means.dtype)
+    sh = gaussians.sh.reshape(count, 3 * gaussians.sh.shape[1])
+    grad_sh = np.empty_like(sh)
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, sh, splats.records, sums, flat, grad_sh)
+    polynomial = pixel_limits(options, flat.dtype).exp2
     view = view_of(camera, options)
-    run_parallel(
-        _backward_range,
-        [
-            (start, stop, view, *arrays, splats.records, gradients, result)
-            for start, stop in split_evenly(len(gaussians), 2 * thread_count())
-        ],
-    )
-    return result
+    run_parallel(_backward_range, [(start, stop, view, *arrays, polynomial) for start, stop in ranges_of_lanes(count)])
+    means, quats, scales, opacities, means2d, _ = np.split(flat, [3, 7, 10, 11, 13], axis=1)
+    return GaussianGradients(means, quats, scales, opacities[:, 0], grad_sh.reshape(gaussians.sh.shape), means2d)
 
 
 @kernel
@@ -60,230 +93,235 @@ def _backward_range(
     scales: np.ndarray,
     sh: np.ndarray,
     records: np.ndarray,
-    gradients: SplatGradients,
-    result: GaussianGradients,
+    sums: np.ndarray,
+    flat: np.ndarray,
+    grad_sh: np.ndarray,
+    polynomial: tuple,
 ) -> None:
-    rotation = np.empty((3, 3), np.float64)
-    grad_rotation = np.empty((3, 3), np.float64)
-    half_axes = np.empty((2, 3), np.float64)
-    grad_axes = np.empty((2, 3), np.float64)
-    grad_camera = np.empty(3, np.float64)
-    grad_world = np.empty(3, np.float64)
-    basis = np.empty(sh.shape[1], np.float64)
-    basis_gradient = np.empty((sh.shape[1], 3), np.float64)
-    for i in range(start, stop):
-        if records[i, EXTENT_X] == 0:
-            continue
-        x, y, z = _to_camera(view, means, i)
-        _project_axes(view, quats, scales, i, x, y, z, rotation, half_axes)
-        _axes_gradient(view, half_axes, gradients.conics, i, grad_axes)
-        grad_u, grad_v = float(gradients.means2d[i, 0]), float(gradients.means2d[i, 1])
-        grad_camera[0] = grad_u * view.fx / z
-        grad_camera[1] = grad_v * view.fy / z
-        grad_camera[2] = -(grad_u * view.fx * x + grad_v * view.fy * y) / (z * z)
-        _shape_gradient(view, scales, i, x, y, z, rotation, grad_axes, grad_rotation, grad_camera, result)
-        _quaternion_gradient(quats, i, grad_rotation, result.quats)
-        _color_gradient(view, means, sh, gradients.colors, i, basis, basis_gradient, grad_world, result.sh)
-        for k in range(3):
-            for j in range(3):
-                grad_world[k] += view.rotation[j, k] * grad_camera[j]
-            result.means[i, k] = grad_world[k]
+    double = np.empty(1, np.float64)
+    scratch, pulls = np.empty(48 * LANES, sh.dtype), np.zeros(LANES * LANES, sh.dtype)
+    w, t = view.rotation, view.translation
+    for first in range(start, stop, LANES):
+        record, moments = load_columns(records, first, 0), load_columns(sums, first, 0)
+        drawn = record[_EXTENT] > 0
+        mean = load_columns(means, first, 0)
+        wx, wy, wz = converted(mean[0], double), converted(mean[1], double), converted(mean[2], double)
+        x = w[0, 0] * wx + w[0, 1] * wy + w[0, 2] * wz + t[0]
+        y = w[1, 0] * wx + w[1, 1] * wy + w[1, 2] * wz + t[1]
+        z = w[2, 0] * wx + w[2, 1] * wy + w[2, 2] * wz + t[2]
+        _, _, jacobian = seen_at(view, x, y, z)
+        (j00, _, j02), (_, j11, j12) = jacobian
+        qs, ss = load_columns(quats, first, 0), load_columns(scales, first, 0)
+        qw, qx = converted(qs[0], double), converted(qs[1], double)
+        qy, qz = converted(qs[2], double), converted(qs[3], double)
+        axes = rotation_columns(qw, qx, qy, qz)
+        sizes = (converted(ss[0], double), converted(ss[1], double), converted(ss[2], double))
+        turned = (_turned(w, axes[0]), _turned(w, axes[1]), _turned(w, axes[2]))  # the axes as the camera has them
+        half = (
+            _half_axis(jacobian, turned[0], sizes[0]),
+            _half_axis(jacobian, turned[1], sizes[1]),
+            _half_axis(jacobian, turned[2], sizes[2]),
+        )
+        v_xx, v_xy, v_yy = _covariance_gradient(
+            half,
+            view.eps2d,
+            converted(moments[6], double),
+            converted(moments[7], double),
+            converted(moments[8], double),
+        )
+
+        grad_u, grad_v = _mean_gradient(record, moments)
+        per_z = 1 / z
+        grad_x, grad_y = converted(grad_u, double) * j00, converted(grad_v, double) * j11
+        grad_z = -(grad_x * x + grad_y * y) * per_z
+        zero = filled(0, z)
+        covariance = (v_xx, v_xy, v_yy)
+        size0, axis0, jacobian0 = _axis_gradient(w, jacobian, covariance, half[0], axes[0], turned[0], sizes[0])
+        size1, axis1, jacobian1 = _axis_gradient(w, jacobian, covariance, half[1], axes[1], turned[1], sizes[1])
+        size2, axis2, jacobian2 = _axis_gradient(w, jacobian, covariance, half[2], axes[2], turned[2], sizes[2])
+        grad_j00, grad_j02 = jacobian0[0] + jacobian1[0] + jacobian2[0], jacobian0[1] + jacobian1[1] + jacobian2[1]
+        grad_j11, grad_j12 = jacobian0[2] + jacobian1[2] + jacobian2[2], jacobian0[3] + jacobian1[3] + jacobian2[3]
+        # J has fx / z, -fx ratio / z and the same of y; the ratio moves only where it isn't clamped
+        ratio_x, ratio_y = -j02 / j00, -j12 / j11
+        grad_z += per_z * (grad_j02 * j00 * ratio_x + grad_j12 * j11 * ratio_y - grad_j00 * j00 - grad_j11 * j11)
+        free_x, free_y = x * per_z, y * per_z
+        grad_x_free = select((view.min_x < free_x) & (free_x < view.max_x), -grad_j02 * j00 * per_z, zero)
+        grad_y_free = select((view.min_y < free_y) & (free_y < view.max_y), -grad_j12 * j11 * per_z, zero)
+        grad_z += -grad_x_free * free_x - grad_y_free * free_y
+        gx, gy, gz = _turned_back(w, grad_x + grad_x_free, grad_y + grad_y_free, grad_z)
+        dx, dy, dz = _color_gradient(view, sh, first, scratch, pulls, drawn, wx, wy, wz, moments, grad_sh)
+        grad_quat = _quaternion_gradient(qw, qx, qy, qz, (axis0, axis1, axis2))
+        nothing = filled(0, record[0])
+        store_columns(
+            flat,
+            first,
+            0,
+            (
+                select(drawn, converted(gx + dx, flat), nothing),
+                select(drawn, converted(gy + dy, flat), nothing),
+                select(drawn, converted(gz + dz, flat), nothing),
+                select(drawn, converted(grad_quat[0], flat), nothing),
+                select(drawn, converted(grad_quat[1], flat), nothing),
+                select(drawn, converted(grad_quat[2], flat), nothing),
+                select(drawn, converted(grad_quat[3], flat), nothing),
+                select(drawn, converted(size0, flat), nothing),
+                select(drawn, converted(size1, flat), nothing),
+                select(drawn, converted(size2, flat), nothing),
+                select(drawn, -moments[3] * exp2(-record[_LOG2_OPACITY], polynomial), nothing),
+                select(drawn, grad_u, nothing),
+                select(drawn, grad_v, nothing),
+                nothing,
+                nothing,
+                nothing,
+            ),
+        )
 
 
 @kernel
-def _axes_gradient(view: View, half_axes: np.ndarray, grad_conics: np.ndarray, i: int, grad_axes: np.ndarray) -> None:
-    """Write d loss / d half-axes: the covariance is M Mᵀ + eps I and d conic = -conic d covariance conic."""
-    cov_xx, cov_xy, cov_yy, det = _covariance2d(half_axes, view.eps2d)
-    a, b, c = cov_yy / det, -cov_xy / det, cov_xx / det
-    g_xx, g_xy, g_yy = float(grad_conics[i, 0]), 0.5 * float(grad_conics[i, 1]), float(grad_conics[i, 2])
-    # G = -conic grad conic, symmetric
+def _turned(w: np.ndarray, axis: tuple) -> tuple[Lanes, Lanes, Lanes]:
+    """W times a vector."""
+    a, b, c = axis
+    return (
+        w[0, 0] * a + w[0, 1] * b + w[0, 2] * c,
+        w[1, 0] * a + w[1, 1] * b + w[1, 2] * c,
+        w[2, 0] * a + w[2, 1] * b + w[2, 2] * c,
+    )
+
+
+@kernel
+def _turned_back(w: np.ndarray, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """W transposed times a vector."""
+    return (
+        w[0, 0] * x + w[1, 0] * y + w[2, 0] * z,
+        w[0, 1] * x + w[1, 1] * y + w[2, 1] * z,
+        w[0, 2] * x + w[1, 2] * y + w[2, 2] * z,
+    )
+
+
+@kernel
+def _half_axis(jacobian: tuple, axis: tuple, size: Lanes) -> tuple[Lanes, Lanes]:
+    """J times a vector in camera axes, times its length: x and y in the image."""
+    (j00, _, j02), (_, j11, j12) = jacobian
+    return (j00 * axis[0] + j02 * axis[2]) * size, (j11 * axis[1] + j12 * axis[2]) * size
+
+
+@kernel
+def _axis_gradient(
+    w: np.ndarray, jacobian: tuple, covariance: tuple, half: tuple, axis: tuple, turned: tuple, size: Lanes
+) -> tuple:
+    """Of one axis: d loss / d scale, / d its vector in the world, [3], / d (j00, j02, j11, j12), [4]."""
+    v_xx, v_xy, v_yy = covariance
+    (j00, _, j02), (_, j11, j12) = jacobian
+    x, y = 2 * (v_xx * half[0] + v_xy * half[1]), 2 * (v_xy * half[0] + v_yy * half[1])
+    a, b, c = _turned_back(w, j00 * x, j11 * y, j02 * x + j12 * y)
+    grad_size = a * axis[0] + b * axis[1] + c * axis[2]
+    x, y = x * size, y * size
+    return grad_size, (a * size, b * size, c * size), (x * turned[0], x * turned[2], y * turned[1], y * turned[2])
+
+
+@kernel
+def _covariance_gradient(
+    half: tuple, eps2d: float, sum_xx: Lanes, sum_xy: Lanes, sum_yy: Lanes
+) -> tuple[Lanes, Lanes, Lanes]:
+    """d loss / d covariance, xx, xy, yy: it is M Mᵀ + eps I, and d conic = -conic d covariance conic."""
+    (mx0, my0), (mx1, my1), (mx2, my2) = half
+    xx, yy = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, my0 * my0 + my1 * my1 + my2 * my2
+    xy = mx0 * my0 + mx1 * my1 + mx2 * my2
+    d0, d1, d2 = mx1 * my2 - mx2 * my1, mx2 * my0 - mx0 * my2, mx0 * my1 - mx1 * my0
+    det = d0 * d0 + d1 * d1 + d2 * d2 + eps2d * (xx + yy) + eps2d * eps2d
+    a, b, c = (yy + eps2d) / det, -xy / det, (xx + eps2d) / det
+    g_xx, g_xy, g_yy = 0.5 * sum_xx, 0.5 * sum_xy, 0.5 * sum_yy
     p, q = a * g_xx + b * g_xy, a * g_xy + b * g_yy
     r, s = b * g_xx + c * g_xy, b * g_xy + c * g_yy
-    v_xx, v_xy, v_yy = -(p * a + q * b), -(p * b + q * c), -(r * b + s * c)
-    for k in range(3):
-        grad_axes[0, k] = 2 * (v_xx * half_axes[0, k] + v_xy * half_axes[1, k])
-        grad_axes[1, k] = 2 * (v_xy * half_axes[0, k] + v_yy * half_axes[1, k])
+    return -(p * a + q * b), -(p * b + q * c), -(r * b + s * c)
 
 
 @kernel
-def _shape_gradient(
-    view: View,
-    scales: np.ndarray,
-    i: int,
-    x: float,
-    y: float,
-    z: float,
-    rotation: np.ndarray,
-    grad_axes: np.ndarray,
-    grad_rotation: np.ndarray,
-    grad_camera: np.ndarray,
-    result: GaussianGradients,
-) -> None:
-    """Scales, rotation matrix (into `grad_rotation`) and, through the Jacobian, the mean in camera axes (added)."""
-    w = view.rotation
-    ratio_x, ratio_y = _clamped(x / z, view.min_x, view.max_x), _clamped(y / z, view.min_y, view.max_y)
-    j00, j02, j11, j12 = view.fx / z, -view.fx * ratio_x / z, view.fy / z, -view.fy * ratio_y / z
-    grad_j00, grad_j02, grad_j11, grad_j12 = 0.0, 0.0, 0.0, 0.0
-    for k in range(3):
-        scale = float(scales[i, k])
-        grad_scale = 0.0
-        g0, g1 = grad_axes[0, k], grad_axes[1, k]
-        for j in range(3):
-            to_image = g0 * (j00 * w[0, j] + j02 * w[2, j]) + g1 * (j11 * w[1, j] + j12 * w[2, j])
-            grad_scale += to_image * rotation[j, k]
-            grad_rotation[j, k] = to_image * scale
-        result.scales[i, k] = grad_scale
-        a, b, c = rotation[0, k] * scale, rotation[1, k] * scale, rotation[2, k] * scale
-        axis_x = w[0, 0] * a + w[0, 1] * b + w[0, 2] * c
-        axis_y = w[1, 0] * a + w[1, 1] * b + w[1, 2] * c
-        axis_z = w[2, 0] * a + w[2, 1] * b + w[2, 2] * c
-        grad_j00 += g0 * axis_x
-        grad_j02 += g0 * axis_z
-        grad_j11 += g1 * axis_y
-        grad_j12 += g1 * axis_z
-    zz = z * z
-    grad_camera[2] -= (grad_j00 * view.fx + grad_j11 * view.fy) / zz
-    grad_camera[2] += (grad_j02 * view.fx * ratio_x + grad_j12 * view.fy * ratio_y) / zz
-    if view.min_x < x / z < view.max_x:
-        grad_camera[0] -= grad_j02 * view.fx / zz
-        grad_camera[2] += grad_j02 * view.fx * x / (zz * z)
-    if view.min_y < y / z < view.max_y:
-        grad_camera[1] -= grad_j12 * view.fy / zz
-        grad_camera[2] += grad_j12 * view.fy * y / (zz * z)
+def _mean_gradient(record: tuple, moments: tuple) -> tuple[Lanes, Lanes]:
+    """d loss / d projected mean: sigma is half of |root @ d|², with d growing as the mean falls."""
+    a, b = record[_A] * (1 / ROOT_SCALE), record[_B] * (1 / ROOT_SCALE)
+    c = record[_C] * (1 / ROOT_SCALE)
+    along = a * moments[4] + b * moments[5]
+    return -a * along, -(b * along + c * c * moments[5])
 
 
 @kernel
-def _quaternion_gradient(quats: np.ndarray, i: int, g: np.ndarray, grad_quats: np.ndarray) -> None:
-    w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
-    grad_quats[i, 0] = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
-    grad_quats[i, 1] = 2 * (
-        w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - 2 * x * (g[1, 1] + g[2, 2])
-    )
-    grad_quats[i, 2] = 2 * (
-        w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - 2 * y * (g[0, 0] + g[2, 2])
-    )
-    grad_quats[i, 3] = 2 * (
-        w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - 2 * z * (g[0, 0] + g[1, 1])
+def _quaternion_gradient(w: Lanes, x: Lanes, y: Lanes, z: Lanes, columns: tuple) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """From the gradient of the rotation matrix, by columns."""
+    (g00, g10, g20), (g01, g11, g21), (g02, g12, g22) = columns
+    return (
+        2 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01)),
+        2 * (w * (g21 - g12) + y * (g01 + g10) + z * (g02 + g20) - 2 * x * (g11 + g22)),
+        2 * (w * (g02 - g20) + x * (g01 + g10) + z * (g12 + g21) - 2 * y * (g00 + g22)),
+        2 * (w * (g10 - g01) + x * (g02 + g20) + y * (g12 + g21) - 2 * z * (g00 + g11)),
     )
 
 
 @kernel
 def _color_gradient(
     view: View,
-    means: np.ndarray,
     sh: np.ndarray,
-    grad_colors: np.ndarray,
-    i: int,
-    basis: np.ndarray,
-    basis_gradient: np.ndarray,
-    grad_world: np.ndarray,
+    first: int,
+    scratch: np.ndarray,
+    pulls: np.ndarray,
+    drawn: Mask,
+    wx: Lanes,
+    wy: Lanes,
+    wz: Lanes,
+    moments: tuple,
     grad_sh: np.ndarray,
-) -> None:
-    """Coefficients, and the mean through the viewing direction (written to `grad_world`)."""
-    dx, dy, dz = means[i, 0] - view.position[0], means[i, 1] - view.position[1], means[i, 2] - view.position[2]
-    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-    dx, dy, dz = dx / distance, dy / distance, dz / distance
-    _basis_into(basis, dx, dy, dz)
-    basis_gradient_into(basis_gradient, dx, dy, dz)
-    red, green, blue = _raw_color(basis, sh, i)
-    grad_red = grad_colors[i, 0] if red > 0 else 0.0
-    grad_green = grad_colors[i, 1] if green > 0 else 0.0
-    grad_blue = grad_colors[i, 2] if blue > 0 else 0.0
-    gx, gy, gz = 0.0, 0.0, 0.0
-    for k in range(len(basis)):
-        grad_sh[i, k, 0] = basis[k] * grad_red
-        grad_sh[i, k, 1] = basis[k] * grad_green
-        grad_sh[i, k, 2] = basis[k] * grad_blue
-        pull = sh[i, k, 0] * grad_red + sh[i, k, 1] * grad_green + sh[i, k, 2] * grad_blue
-        gx += pull * basis_gradient[k, 0]
-        gy += pull * basis_gradient[k, 1]
-        gz += pull * basis_gradient[k, 2]
-    along = gx * dx + gy * dy + gz * dz
-    grad_world[0] = (gx - along * dx) / distance
-    grad_world[1] = (gy - along * dy) / distance
-    grad_world[2] = (gz - along * dz) / distance
+) -> tuple[Lanes, Lanes, Lanes]:
+    """Write the coefficients' gradients; returns that of the mean through the line of sight."""
+    double = np.empty(1, np.float64)
+    dx, dy, dz = wx - view.position[0], wy - view.position[1], wz - view.position[2]
+    per_distance = 1 / square_root(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx * per_distance, dy * per_distance, dz * per_distance
+    x, y, z = converted(dx, sh), converted(dy, sh), converted(dz, sh)
+    red, green, blue = raw_colors(sh, first, scratch, x, y, z)
+    zero = filled(0, red)
+    red = select(drawn & (red > 0), moments[0], zero)
+    green = select(drawn & (green > 0), moments[1], zero)
+    blue = select(drawn & (blue > 0), moments[2], zero)
+    width = sh.shape[1]
+    if width > 3:
+        basis = harmonics_above_0(x, y, z)
+        for k in range(1, width // 3):
+            place = np.uint64(48 * k)
+            pull = load(scratch, place) * red + load(scratch, place + np.uint64(16)) * green
+            pull += load(scratch, place + np.uint64(32)) * blue
+            store(scratch, place, basis[k - 1] * red)
+            store(scratch, place + np.uint64(16), basis[k - 1] * green)
+            store(scratch, place + np.uint64(32), basis[k - 1] * blue)
+            store(pulls, np.uint64(LANES * k), pull)
+    store(scratch, 0, SH_C0 * red)
+    store(scratch, 16, SH_C0 * green)
+    store(scratch, 32, SH_C0 * blue)
+    for window in range(0, width, LANES):
+        store_columns(grad_sh, first, window, _sixteen(scratch, np.uint64(LANES * window)))
+    gx, gy, gz = harmonics_slope(pulls, x, y, z)
+    px, py, pz = converted(gx, double), converted(gy, double), converted(gz, double)
+    along = px * dx + py * dy + pz * dz
+    return (px - along * dx) * per_distance, (py - along * dy) * per_distance, (pz - along * dz) * per_distance
 
 
 @kernel
-def _basis_into(basis: np.ndarray, x: float, y: float, z: float) -> None:
-    """Write as many basis functions as `basis` [1, 4, 9 or 16] has places, at the unit direction (x, y, z)."""
-    above = harmonics_above_0(x, y, z)
-    basis[0] = SH_C0
-    for k in range(1, len(basis)):
-        basis[k] = above[k - 1]
-
-
-@kernel
-def _raw_color(basis: np.ndarray, sh: np.ndarray, i: int) -> tuple[float, float, float]:
-    """SH + 0.5 of the i-th Gaussian, before the clamp at 0."""
-    red, green, blue = 0.5, 0.5, 0.5
-    for k in range(len(basis)):
-        red += basis[k] * sh[i, k, 0]
-        green += basis[k] * sh[i, k, 1]
-        blue += basis[k] * sh[i, k, 2]
-    return red, green, blue
-
-
-@kernel
-def _to_camera(view: View, means: np.ndarray, i: int) -> tuple[float, float, float]:
-    """The i-th mean in camera axes."""
-    r, t = view.rotation, view.translation
-    a, b, c = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
-    x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c + t[0]
-    y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c + t[1]
-    z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c + t[2]
-    return x, y, z
-
-
-@kernel
-def _clamped(value: float, low: float, high: float) -> float:
-    """`value`, cut to [low, high]."""
-    return min(max(value, low), high)
-
-
-@kernel
-def _rotation_into(rotation: np.ndarray, w: float, x: float, y: float, z: float) -> None:
-    """Write the rotation matrix [3, 3] of a unit quaternion."""
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-
-
-@kernel
-def _project_axes(
-    view: View,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    i: int,
-    x: float,
-    y: float,
-    z: float,
-    rotation: np.ndarray,
-    half_axes: np.ndarray,
-) -> None:
-    """Write R [3, 3] and J W R S [2, 3]: the three half-axes of Gaussian i as vectors in the image, pixels."""
-    w = view.rotation
-    j00, j02 = view.fx / z, -view.fx * _clamped(x / z, view.min_x, view.max_x) / z
-    j11, j12 = view.fy / z, -view.fy * _clamped(y / z, view.min_y, view.max_y) / z
-    _rotation_into(rotation, float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3]))
-    for k in range(3):
-        a, b, c = rotation[0, k], rotation[1, k], rotation[2, k]
-        depth = w[2, 0] * a + w[2, 1] * b + w[2, 2] * c
-        half_axes[0, k] = (j00 * (w[0, 0] * a + w[0, 1] * b + w[0, 2] * c) + j02 * depth) * scales[i, k]
-        half_axes[1, k] = (j11 * (w[1, 0] * a + w[1, 1] * b + w[1, 2] * c) + j12 * depth) * scales[i, k]
-
-
-@kernel
-def _covariance2d(half_axes: np.ndarray, eps2d: float) -> tuple[float, float, float, float]:
-    """xx, xy, yy and determinant of M Mᵀ + eps2d I for half-axes M [2, 3].
-
-    The determinant is a sum of squares (Cauchy-Binet), so that a needle of 1e6 : 1 keeps its digits.
-    """
-    m = half_axes
-    xx = m[0, 0] * m[0, 0] + m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2]
-    xy = m[0, 0] * m[1, 0] + m[0, 1] * m[1, 1] + m[0, 2] * m[1, 2]
-    yy = m[1, 0] * m[1, 0] + m[1, 1] * m[1, 1] + m[1, 2] * m[1, 2]
-    a = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-    b = m[0, 2] * m[1, 0] - m[0, 0] * m[1, 2]
-    c = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-    return xx + eps2d, xy, yy + eps2d, a * a + b * b + c * c + eps2d * (xx + yy) + eps2d * eps2d
+def _sixteen(scratch: np.ndarray, place: Index) -> tuple:
+    """16 `Lanes` that lie side by side."""
+    return (
+        load(scratch, place),
+        load(scratch, place + np.uint64(16)),
+        load(scratch, place + np.uint64(32)),
+        load(scratch, place + np.uint64(48)),
+        load(scratch, place + np.uint64(64)),
+        load(scratch, place + np.uint64(80)),
+        load(scratch, place + np.uint64(96)),
+        load(scratch, place + np.uint64(112)),
+        load(scratch, place + np.uint64(128)),
+        load(scratch, place + np.uint64(144)),
+        load(scratch, place + np.uint64(160)),
+        load(scratch, place + np.uint64(176)),
+        load(scratch, place + np.uint64(192)),
+        load(scratch, place + np.uint64(208)),
+        load(scratch, place + np.uint64(224)),
+        load(scratch, place + np.uint64(240)),
+    )
