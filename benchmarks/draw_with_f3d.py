@@ -1,8 +1,4 @@
-"""Draw a .splat file with F3D; run by other_renderers.py in an interpreter that has f3d and needs nothing of ours.
-
-The only argument is JSON: file, image, size [2], position [3], focal_point [3], view_up [3], view_angle (vertical, in
-degrees), repeats. Prints JSON: version, seconds [repeats].
-"""
+"""Draw a .splat file with F3D; drawers.py runs this in an interpreter that has f3d, and says what it asks for."""
 
 import json
 import sys
@@ -22,7 +18,7 @@ OPTIONS = {
 
 
 def main() -> None:
-    """One picture to the file `image`; one time a repeat, the first with all that F3D does once."""
+    """One answer a line; the first frame has in it all that F3D does once."""
     job = json.loads(sys.argv[1])
     engine = f3d.Engine.create_egl()
     engine.options.update(OPTIONS)
@@ -31,16 +27,20 @@ def main() -> None:
     window.size = tuple(job["size"])
     view = f3d.CameraState(**{name: tuple(job[name]) for name in ("position", "focal_point", "view_up")})
     view.view_angle = job["view_angle"]
-    seconds = []
-    for _ in range(job["repeats"]):
+    print(json.dumps({"version": engine.get_lib_info().version}), flush=True)
+    picture = None
+    for order in sys.stdin:
+        if order.strip() == "save":
+            picture.save(job["image"])  # pyright: ignore[reportOptionalMemberAccess]
+            print(json.dumps({"saved": True}), flush=True)
+            continue
         window.camera.state = view
         start = time.perf_counter()
         picture = window.render_to_image()
-        seconds.append(time.perf_counter() - start)
-        picture.save(job["image"])
+        seconds = time.perf_counter() - start
         window.camera.azimuth(20)  # F3D keeps its depth order until the view has turned by 3°
         window.render_to_image()
-    print(json.dumps({"version": engine.get_lib_info().version, "seconds": seconds}))
+        print(json.dumps({"seconds": seconds}), flush=True)
 
 
 if __name__ == "__main__":

@@ -43,3 +43,13 @@ def object_camera(width: int, height: int, turn: float = 0.6) -> Camera:
     focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)
     pose = Camera.from_look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), width, height, 40.0).camera_to_world
     return Camera(focal, focal, width / 2, height / 2, width, height, pose)
+
+
+def around(gaussians: Gaussians, width: int = 800, height: int = 800) -> Camera:
+    """Along +z, so far away that nine in ten Gaussians are in a picture `CAMERA_ANGLE_X` wide."""
+    target = np.median(gaussians.means, axis=0).astype(float)
+    radius = np.quantile(np.linalg.norm(gaussians.means - target, axis=1), 0.9)
+    focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)
+    pose = np.eye(4)
+    pose[:3, 3] = target - [0, 0, radius / np.sin(0.5 * CAMERA_ANGLE_X)]
+    return Camera(focal, focal, width / 2, height / 2, width, height, pose)

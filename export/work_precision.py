@@ -21,7 +21,7 @@ from msdgs_serve.scene.metadata import SceneCamera
 if TYPE_CHECKING:
     from export.photographs import Photographs
 
-PLANS = ("int8", "lowrank:0.5", "keyframes:2.0", "keyframes:0.5", "keyframes:0.1")
+PLANS = ("int8", "lowrank:0.5", "keyframes:2.0", "keyframes:0.5")
 """Besides `network` and every prefix of it; fitted ones by the pixels that they may be off by."""
 
 TRIM_STEPS = (20.0, 10.0, 5.0, 1.0, -5.0, -10.0, -15.0)
@@ -37,7 +37,10 @@ EVERY, LOOKS = 6, 3
 """A quick look compares every 6th frame and takes the least of 3 times."""
 
 TIME_MARGIN, DB_MARGIN = 1.15, 0.5
-MOST_POINTS = 28
+MOST_POINTS = 24
+LOWER_DEGREES = 3
+"""Candidates of which lower SH degrees are tried."""
+
 TIMED_VIEWS = 3
 
 RASTERIZERS: dict[str, RasterizerOptions] = {
@@ -77,10 +80,11 @@ class Sweep:
         self._tell("candidates: network", [(self._look, ("network", level)) for level in levels])
         texts = [f"prefix:{k}" for k in range(1, len(self.job.model.deformation))]
         texts += [text for text in PLANS if _known(text)]
-        untrimmed = levels[0] if levels else None
-        self._tell("candidates: other plans", [(self._look, (text, untrimmed)) for text in texts])
-        alone = [look for look in self.looks if look.candidate.trim_db == untrimmed]
-        pairs = [pair for level in levels[1:] for pair in self._pairs(alone, level)]
+        # the most careful trimming that leaves anything out: plans are fitted to what moves, not to still ground
+        careful = next((level for level in levels if self.job.trimmed(level).left_out), None)
+        self._tell("candidates: other plans", [(self._look, (text, careful)) for text in texts])
+        alone = [look for look in self.looks if look.candidate.trim_db == careful]
+        pairs = [pair for level in levels if level != careful for pair in self._pairs(alone, level)]
         self._tell("candidates: plans with trimming", [(self._look, pair) for pair in pairs])
         self._tell("candidates: SH degree", [(self._look, what) for what in self._degrees()])
         return self._measured()
@@ -128,9 +132,9 @@ class Sweep:
         return pairs
 
     def _degrees(self) -> list[tuple[str, float | None, int]]:
-        """Lower SH degrees of what is on the front of the looks so far, the faster half of it."""
+        """Lower SH degrees of the fastest on the front of the looks so far."""
         ahead = sorted(self._undominated(0.0), key=lambda look: look.cpu)
-        chosen = [look.candidate for look in ahead[: (len(ahead) + 1) // 2]]
+        chosen = [look.candidate for look in ahead[:LOWER_DEGREES]]
         chosen.sort(key=lambda c: c.trim_db or 0.0)  # plans share what they sample of one trimmed model
         return [(c.plan, c.trim_db, degree) for c in chosen for degree in range(c.sh_degree)]
 

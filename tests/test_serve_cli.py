@@ -97,6 +97,17 @@ def test_what_is_wrong_is_said_in_one_line(
     assert complaint.count("\n") == 1
 
 
+def test_a_start_that_fails_ends_the_program(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def fail(*_: object) -> bytes:
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr("msdgs_serve.api.service.encode", fail)
+    assert main([str(scene), "--port", "0"]) == 2
+    assert "could not start" in capsys.readouterr().err
+
+
 def test_a_port_in_use_is_said_before_anything_is_loaded(scene: Path, capsys: pytest.CaptureFixture[str]):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

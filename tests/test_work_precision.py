@@ -91,7 +91,7 @@ def few_candidates() -> Iterator[None]:
     """As many as the tests look at."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.work_precision.TRIM_STEPS", (5.0, 1.0, -5.0))
-        patch.setattr("export.timing.REPEATS", 2)
+        patch.setattr("export.work_precision.PLANS", ("int8", "keyframes:2.0"))
         yield
 
 

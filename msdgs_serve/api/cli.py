@@ -15,7 +15,7 @@ from msdgs_serve.api.openapi import render_examples
 from msdgs_serve.api.server import Server
 from msdgs_serve.api.settings import PROGRAM, Settings
 from msdgs_serve.renderer import Renderer
-from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.scene import MsdgsError
 from msdgs_serve.store import SceneStore
 from msdgs_serve.threads import THREADS_VARIABLE
 
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _serve(settings)
     except KeyboardInterrupt:
         pass
-    except (UsageError, InvalidInput, SceneFileInvalid) as error:
+    except (UsageError, MsdgsError) as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return USAGE_ERROR
     print("Stopped.", flush=True)

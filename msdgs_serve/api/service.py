@@ -90,6 +90,10 @@ class Service:
         except MsdgsError as error:
             self.failure, self.phase = error, Phase.FAILED
             return
+        except Exception:
+            logger.exception("the service could not start")
+            self.failure, self.phase = MsdgsError("could not start; the log says why"), Phase.FAILED
+            return
         self.start_seconds = time.perf_counter() - started
         if self.phase is Phase.STARTING:
             self.phase = Phase.READY
