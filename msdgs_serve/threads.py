@@ -7,12 +7,15 @@ kernels do neither.
 import itertools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 THREADS_VARIABLE = "MSDGS_THREADS"
 
+_check: ContextVar[Callable[[], object] | None] = ContextVar("check", default=None)
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 
@@ -27,14 +30,31 @@ def thread_count() -> int:
     return int(setting)
 
 
+@contextmanager
+def checking(check: Callable[[], object]) -> Iterator[None]:
+    """Within it, `run_parallel` calls `check` before every item: what that raises ends the work."""
+    token = _check.set(check)
+    try:
+        yield
+    finally:
+        _check.reset(token)
+
+
 def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
     """Call `function(*item)` for every item on the pool; results in the order of the items.
 
     The first exception is raised after all calls have ended. Must not be called from inside the pool.
     """
+    check = _check.get()
+
+    def call(*item: Any) -> Any:
+        if check is not None:
+            check()
+        return function(*item)
+
     if len(items) <= 1 or thread_count() == 1:
-        return [function(*item) for item in items]
-    futures = [_shared_pool().submit(function, *item) for item in items]
+        return [call(*item) for item in items]
+    futures = [_shared_pool().submit(call, *item) for item in items]
     errors = [error for future in futures if (error := future.exception()) is not None]
     if errors:
         raise errors[0]

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from msdgs_serve.scene import MsdgsError
+from msdgs_serve.threads import checking
 
 
 class Interrupted(MsdgsError):
@@ -12,7 +13,8 @@ class Interrupted(MsdgsError):
 
 
 class Watch:
-    """Times stages by name and ends the work between them once `stop` was called. One thread works, any may stop it."""
+    """Times stages by name; once `stop` was called, ends the work between them and inside. One thread works, any may
+    stop it."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}  # by stage; one that comes again adds to its time
@@ -30,11 +32,12 @@ class Watch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Check, and time what is done inside."""
+        """Check, also before each part that the work inside has on the pool, and time it."""
         self.check()
         started = time.perf_counter()
         try:
-            yield
+            with checking(self.check):
+                yield
         finally:
             self.add(name, time.perf_counter() - started)
 

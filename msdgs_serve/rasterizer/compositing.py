@@ -60,6 +60,8 @@ PIXELS = TILE * TILE
 BATCH = 63
 NOBODY = np.uint64(1 << BATCH)
 TILES_A_TURN = 16
+TILES_A_ROUND = 4096
+"""A megapixel: then the threads wait for each other, and who no longer wants the image may say so."""
 
 
 class PixelLimits(NamedTuple):
@@ -98,24 +100,26 @@ def composite(
     dtype = splats.records.dtype
     frame = Frame(*(np.empty((height, width, *more), dtype) for more in ((3,), (), ())))
     limits = pixel_limits(options, dtype)
-    turn = np.zeros(1, np.int64)
-    run_parallel(
-        _composite_tiles, [(turn, splats.records, tiles, limits, background, frame) for _ in range(thread_count())]
-    )
+    count = len(tiles.offsets) - 1
+    for first in range(0, count, TILES_A_ROUND):
+        turn = np.array([first])
+        past = min(first + TILES_A_ROUND, count)
+        arguments = (turn, past, splats.records, tiles, limits, background, frame)
+        run_parallel(_composite_tiles, [arguments] * thread_count())
     return frame
 
 
 @kernel
 def _composite_tiles(
     turn: np.ndarray,
+    past: int,
     records: np.ndarray,
     tiles: TileLists,
     limits: PixelLimits,
     background: np.ndarray,
     frame: Frame,
 ) -> None:
-    """Draw tiles, `TILES_A_TURN` of them at each turn, until all have been."""
-    count = len(tiles.offsets) - 1
+    """Draw tiles, `TILES_A_TURN` of them at each turn, up to the tile `past`."""
     state = np.empty(5 * PIXELS, records.dtype)
     batch = np.zeros((BATCH + 1) * RECORD, records.dtype)
     batch[np.uint64(BATCH * RECORD) + LOG2_OPACITY] = -np.inf
@@ -127,9 +131,9 @@ def _composite_tiles(
     flat = records.reshape(-1)
     while True:
         first = fetch_add(turn, TILES_A_TURN)
-        if first >= count:
+        if first >= past:
             return
-        for tile in range(first, min(first + TILES_A_TURN, count)):
+        for tile in range(first, min(first + TILES_A_TURN, past)):
             x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
             origin[0], origin[1] = x0, y0
             _prefetch_tile(x0, y0, min(TILE, height - y0), frame)
