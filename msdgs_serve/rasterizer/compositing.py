@@ -60,6 +60,8 @@ PIXELS = TILE * TILE
 BATCH = 63
 NOBODY = np.uint64(1 << BATCH)
 TILES_A_TURN = 16
+AHEAD = np.uint64(64)
+"""Pairs between asking for a record and needing it; without it a frame of 100,000 splats takes 1.15x the time."""
 TILES_A_ROUND = 4096
 """A megapixel: then the threads wait for each other, and who no longer wants the image may say so."""
 
@@ -128,7 +130,7 @@ def _composite_tiles(
     alive = np.empty(BLOCKS, np.bool_)
     touching = np.empty(BLOCKS, np.uint64)
     height, width = frame.alpha.shape
-    flat = records.reshape(-1)
+    flat, last = records.reshape(-1), np.uint64(max(len(tiles.splat_ids), 1) - 1)
     while True:
         first = fetch_add(turn, TILES_A_TURN)
         if first >= past:
@@ -142,12 +144,11 @@ def _composite_tiles(
             alive[:] = True
             for begin in range(tiles.offsets[tile], tiles.offsets[tile + 1], BATCH):
                 many = min(BATCH, tiles.offsets[tile + 1] - begin)
-                ahead = min(BATCH, tiles.offsets[tile + 1] - begin - many)
-                for k in range(np.uint64(begin + many), np.uint64(begin + many + ahead)):
-                    prefetch(flat, np.uint64(tiles.splat_ids[k]) * np.uint64(RECORD))
                 touching[:] = np.uint64(0)
                 for k in range(np.uint64(many)):
-                    source = np.uint64(tiles.splat_ids[np.uint64(begin) + k]) * np.uint64(RECORD)
+                    entry = np.uint64(begin) + k
+                    prefetch(flat, np.uint64(tiles.splat_ids[min(entry + AHEAD, last)]) * np.uint64(RECORD))
+                    source = np.uint64(tiles.splat_ids[entry]) * np.uint64(RECORD)
                     place = k * np.uint64(RECORD)
                     store(batch, place, load(flat, source) - load(origin, 0))
                     mark(touching, k, touched_blocks(batch, place, grid, limits.log2_alpha_min))
