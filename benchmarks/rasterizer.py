@@ -15,6 +15,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import Progress
+from scipy.optimize import nnls
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -102,6 +103,7 @@ class Run:
         if options.splats:
             real = [Subject(path.name, gaussians := read_gaussians(path), around(gaussians)) for path in options.splats]
             self._time_stages("real", real)
+            predict(self.result["real"], self.result["frames"])
             self._save_pictures(real)
         if options.knobs:
             self._time_knobs()
@@ -200,8 +202,23 @@ class Run:
                 pictures = [drawer.picture() for drawer in drawers]
             milliseconds = times.milliseconds()
             ratio = milliseconds["the other"]["min"] / milliseconds["this one"]["min"]
-            row = {"count": count, "milliseconds": milliseconds, "ratio": ratio, "psnr": psnr(*pictures)}
+            error = psnr(*pictures)
+            row = {"count": count, "milliseconds": milliseconds, "ratio": ratio}
+            row["psnr"] = error if np.isfinite(error) else None
             self.result["checkouts"].append(row)
+
+
+def predict(rows: list[dict[str, Any]], seeded: list[dict[str, Any]]) -> None:
+    """Add to real scenes the milliseconds that seeded ones would take with as much work: a fit to these with costs of
+    0 or more for a Gaussian, a tile entry, a lane and a pixel."""
+
+    def work(row: dict[str, Any]) -> list[float]:
+        return [row["count"], row["tile_entries"], row["lanes"], row["size"][0] * row["size"][1]]
+
+    took = np.array([row["milliseconds"]["total"]["min"] for row in seeded])
+    costs, _ = nnls(np.array([work(row) for row in seeded]) / took[:, None], np.ones(len(took)))
+    for row in rows:
+        row["predicted_milliseconds"] = float(np.dot(costs, work(row)))
 
 
 def square_camera() -> Camera:

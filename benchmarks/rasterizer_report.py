@@ -39,6 +39,10 @@ def summary(result: Row) -> list[str]:
         if (100_000, size) in rows and (1_000_000, size) in rows:
             growth = _total(rows[1_000_000, size]) / _total(rows[100_000, size])
             lines.append(f"100k to 1M Gaussians at {_size(size)}: {growth:.2f} times the time")
+    for row in result.get("real", []):
+        if "predicted_milliseconds" in row:
+            share = _total(row) / row["predicted_milliseconds"]
+            lines.append(f"{row['scene']}: {share:.2f} times what the seeded scenes foretell for its work")
     return lines
 
 
@@ -124,7 +128,9 @@ def _checkouts(rows: list[Row]) -> Table:
     table = _table("Checkouts, 800×800, in turns", "Gaussians", "this one", "the other", "other / this", "PSNR")
     for row in rows:
         times = (_minimum_and_median(row["milliseconds"][name]) for name in ("this one", "the other"))
-        table.add_row(f"{row['count']:,}", *times, f"{row['ratio']:.2f}", f"{row['psnr']:.1f} dB")
+        table.add_row(
+            f"{row['count']:,}", *times, f"{row['ratio']:.2f}", f"{row['psnr']:.1f} dB" if row["psnr"] else "same"
+        )
     return table
 
 

@@ -174,6 +174,47 @@ def crowd() -> Scene:
     return gaussians_of(means, scales=0.02, opacities=opacities), front_camera(19, 17)
 
 
+def needles_of_a_million() -> Scene:
+    """Aspect 1e6 : 1, in all directions; some far longer than the picture, some thinner than float32 sees."""
+    rng = np.random.default_rng(8)
+    count = 33
+    means = np.column_stack([rng.uniform(-1, 1, size=(count, 2)), rng.uniform(2, 4, count)])
+    lengths = np.exp(rng.uniform(np.log(0.1), np.log(100), count))
+    scales = lengths[:, None] * [1, 1e-6, 1e-6]
+    return gaussians_of(means, scales=scales, quats=unit_quats(rng, count)), front_camera()
+
+
+def giants_without_end() -> Scene:
+    """Over the whole frame, round and flat, up to e²⁰ scene units, with small ones before and behind them."""
+    rng = np.random.default_rng(9)
+    log_scales = np.linspace(0, 20, 21)
+    scales = np.exp(np.column_stack([log_scales, log_scales, np.where(np.arange(21) % 2, log_scales, -3)]))
+    means = np.column_stack([rng.uniform(-1, 1, size=(21, 2)), np.linspace(2, 8, 21)])
+    giants = gaussians_of(means, scales=scales, opacities=0.15, quats=unit_quats(rng, 21))
+    return joined(giants, gaussians_of(means[::2] * [0.5, 0.5, 1] - [0, 0, 0.1], scales=0.1)), front_camera()
+
+
+def ten_thousand_on_a_pixel() -> Scene:
+    """One pixel's list is as long as the scene, most of it behind where the light has run out."""
+    depths = np.linspace(2, 6, 10_000)
+    means = np.column_stack([0.01 * depths, 0.01 * depths, depths])
+    opacities = np.random.default_rng(10).uniform(0.004, 0.02, 10_000)
+    return gaussians_of(means, scales=0.005 * depths, opacities=opacities), front_camera(17, 9)
+
+
+def at_the_camera() -> Scene:
+    """Centres exactly at the eye, beside it in its plane, and a step before it; one splat beyond."""
+    means = [[0, 0, 0], [0, 0, 0], [0.3, 0, 0], [0, -0.3, 0], [0, 0, 1e-30], [0, 0, 0.02], [0.2, 0.1, 2]]
+    return gaussians_of(means, scales=[0.5, 1e-6, 0.5, 0.5, 0.5, 0.01, 0.1], opacities=0.6), front_camera()
+
+
+def through_the_near_plane() -> Scene:
+    """Discs and needles that lie along the axis: their bodies reach from behind the eye to far before it."""
+    rng = np.random.default_rng(11)
+    means = np.column_stack([rng.uniform(-0.3, 0.3, size=(17, 2)), np.geomspace(0.0101, 1.0, 17)])
+    return gaussians_of(means, scales=[[0.02, 0.05, 2.0]] * 17, opacities=0.4), front_camera()
+
+
 def principal_point_outside() -> Scene:
     """The optical axis leaves the picture: only a side view of the scene is seen."""
     gaussians, camera = random_scene(6, 150)
@@ -199,6 +240,11 @@ ADVERSARIAL: dict[str, Callable[[], Scene]] = {
         subpixel,
         opacity_extremes,
         crowd,
+        needles_of_a_million,
+        giants_without_end,
+        ten_thousand_on_a_pixel,
+        at_the_camera,
+        through_the_near_plane,
         principal_point_outside,
         oblong_pixels,
     )

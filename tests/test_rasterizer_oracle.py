@@ -1,11 +1,13 @@
 """The kernels against the float64 loop renderer, on random and on adversarial scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering, rasterize
 from tests.reference import DEPTH_BAND, Reference, render
-from tests.scenes import ADVERSARIAL, as_dtype, random_scene
+from tests.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene
 from tests.tolerances import tolerance
 
 BACKGROUND = (0.2, 0.6, 0.9)
@@ -49,6 +51,9 @@ def assert_same_depth(got: Rendering, want: Reference, row: str):
         (5, 300, 33, 1, 3),
         (6, 1, 53, 37, 3),
         (7, 0, 53, 37, 3),
+        (12, 15, 53, 37, 3),
+        (13, 17, 37, 53, 2),
+        (14, 47, 16, 17, 1),
     ],
 )
 def test_random_scenes(seed: int, count: int, width: int, height: int, degree: int):
@@ -65,6 +70,24 @@ def test_adversarial_scenes(name: str):
     gaussians, camera = ADVERSARIAL[name]()
     want = render(gaussians, camera, BACKGROUND, depth_band=0.0 if name in EXACT_DEPTHS else DEPTH_BAND)
     assert_same_picture(rasterize(gaussians, camera, background=BACKGROUND), want, "float32")
+
+
+def test_largest_picture():
+    """8192 × 8192, in which a few splats are found where they belong, small, large and at the far corner."""
+    side = 8192
+    camera = front_camera(side, side, focal=6000.0)
+    means = np.array([[0, 0, 3], [-1.2, 1.3, 2], [0.5, -1.0, 2.2], [1.36, 1.36, 2]])
+    gaussians = gaussians_of(means, scales=[0.3, 0.002, 1e-5, 0.01], opacities=0.8)
+    got = rasterize(gaussians, camera, background=BACKGROUND)
+    assert got.rgb.shape == (side, side, 3)
+    centers = means[:, :2] / means[:, 2:] * 6000 + side / 2
+    for x, y in np.clip(centers.astype(int) - 30, 0, side - 60):
+        part = np.s_[y : y + 60, x : x + 60]
+        crop = replace(camera, cx=camera.cx - x, cy=camera.cy - y, width=60, height=60)
+        want = render(gaussians, crop, BACKGROUND)
+        assert want.alpha.any()
+        assert_same_picture(Rendering(*(channel[part] for channel in got)), want, "float32_8192")
+    assert not got.alpha[:1000, :1000].any()
 
 
 @pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])

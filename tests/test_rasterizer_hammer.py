@@ -1,0 +1,61 @@
+"""Sixteen threads that draw frames of different sizes at once, for some seconds or for `MSDGS_HAMMER_SECONDS`."""
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msdgs_serve.rasterizer import rasterize
+from tests.scenes import Scene, as_dtype, random_scene
+from tests.tolerances import tolerance
+
+THREADS = 16
+SECONDS = float(os.environ.get("MSDGS_HAMMER_SECONDS", "3"))
+SIZES = ((1, 1), (16, 16), (53, 37), (300, 200), (17, 400), (640, 480), (128, 129), (1000, 40))
+MEMORY = Path("/proc/self/statm")
+
+
+def scenes() -> list[Scene]:
+    """From none to thousands of splats, both dtypes."""
+    made = [random_scene(80 + k, count, *SIZES[k]) for k, count in enumerate((10, 0, 500, 3000, 33, 1000, 1, 800))]
+    return [(as_dtype(scene, np.float64) if k % 3 == 2 else scene, camera) for k, (scene, camera) in enumerate(made)]
+
+
+def bytes_of(scene: Scene) -> list[bytes]:
+    return [channel.tobytes() for channel in rasterize(*scene)]
+
+
+def resident_bytes() -> int:
+    return int(MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(not MEMORY.exists(), reason="no /proc/self/statm to read this process's memory from")
+def test_many_threads_at_once():
+    """Same bytes as serial frames, and memory that doesn't grow once all threads have drawn all scenes."""
+    drawn = scenes()
+    expected = [bytes_of(scene) for scene in drawn]
+    start, frames = threading.Barrier(THREADS), [0] * THREADS
+    deadline = time.monotonic() + SECONDS
+
+    def hammer(thread: int) -> list[tuple[float, int]]:
+        """When a round was done, and how much memory the process had then."""
+        start.wait(timeout=60)
+        order, samples = np.random.default_rng(thread), []
+        while not samples or time.monotonic() < deadline:
+            for k in order.permutation(len(drawn)):
+                assert bytes_of(drawn[k]) == expected[k], f"scene {k} in thread {thread}"
+                frames[thread] += 1
+            samples.append((time.monotonic(), resident_bytes()))
+        return samples
+
+    with ThreadPoolExecutor(THREADS) as threads:
+        rounds = list(threads.map(hammer, range(THREADS)))
+    assert min(frames) >= len(drawn)
+    warm = max(samples[0][0] for samples in rounds)
+    before = max(memory for samples in rounds for moment, memory in samples if moment <= warm)
+    after = max((memory for samples in rounds for moment, memory in samples if moment > warm), default=before)
+    assert after - before <= tolerance("hammer.growth"), f"{sum(frames)} frames"
