@@ -23,6 +23,7 @@ Off = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 def main(
     model: Annotated[Path, tyro.conf.Positional],
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
+    kind: Annotated[str | None, tyro.conf.arg(name="from", metavar="KIND")] = None,
     max_error: float = 50.0,
     plan: str | None = None,
     quick: Off = False,
@@ -48,13 +49,20 @@ def main(
 
     msdgs-serve scenes/ball.onnx
 
+    Scenes of others are recognised by what is in them: INRIA's and SuperSplat's .ply, .spz, SOG and .splat files,
+    numbered sequences of them, and runs of Deformable-3D-Gaussians and 4DGaussians (docs/formats.md):
+
+    python export/to_onnx.py garden.ply -o scenes/garden.onnx
+
     In seconds instead of minutes, all layers as trained, without what isn't seen:
 
     python export/to_onnx.py runs/ball/model.pt --quick
 
     Args:
-        model: The `model.pt` of a training run.
+        model: The `model.pt` of a training run, or a file or folder of another program.
         output: The scene file to write; by default beside the model, ending in .onnx.
+        kind: What the input is, where it isn't recognised: model, ply, spz, sog, splat, sequence, sequence:blend,
+            sequence:switch, deformgs, 4dgs.
         max_error: PSNR in dB that the worst frame must have against the exact network; differences are invisible from
             about 50. Lower is faster and less exact.
         plan: Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all.
@@ -83,9 +91,12 @@ def main(
     try:
         with console.status("loading torch and onnxruntime"):
             from export.command import Settings, export  # heavy: a second or more, so not before --help
+            from export.importers.command import model_or_import
         off = frozenset(rule for rule, is_off in switched_off.items() if is_off)
         plan = "network" if quick and plan is None else plan
-        export(Settings(model, output, max_error, plan, data, off, tolerance, times), console)
+        with model_or_import(model, kind, output, console) as source:
+            if source is not None:
+                export(Settings(source, output, max_error, plan, data, off, tolerance, times), console)
     except KeyboardInterrupt:
         console.print(f"stopped; {output} is as it was", markup=False)
         return 130

@@ -1,0 +1,18 @@
+"""What can be wrong with a file that comes from elsewhere."""
+
+from pathlib import Path
+
+from msdgs_serve.scene.errors import MsdgsError
+
+
+class ImportFailed(MsdgsError):
+    """A file or folder can't be read as the format that it is, or is taken for."""
+
+    def __init__(self, file: str | Path, problem: str) -> None:
+        super().__init__(f"{file}: {problem}")
+        self.file = Path(file)
+
+
+def cut_off(file: str | Path, what: str, needed: int, found: int) -> ImportFailed:
+    """A file that ends before what its header promises."""
+    return ImportFailed(file, f"is cut off: {what} needs {needed:,} bytes, there are {found:,}")

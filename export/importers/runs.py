@@ -1,0 +1,102 @@
+"""Folders of other trainers' runs to a model.pt, which then goes the way of our own."""
+
+import ast
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from export.importers.deformgs import read_deformgs
+from export.importers.errors import ImportFailed
+from export.importers.ply import read_ply
+from export.importers.scene import metadata_of
+from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.checkpoint import SceneInfo, save_model
+from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.model import DynamicGaussians
+
+RUNS: dict[str, Callable[[Path, CanonicalGaussians, int], tuple[DynamicGaussians, list[str]]]] = {
+    "deformgs": read_deformgs,
+}
+"""Reads the network of an iteration's folder: the model, and what is to be said of it."""
+
+MOST_CAMERAS = 1_000
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+
+
+def write_model(run: Path, kind: str, output: Path, console: Console) -> Path:
+    """Write the last iteration of a run of Deformable-3D-Gaussians (`deformgs`) as a model.pt; returns its path.
+
+    Raises `ImportFailed` naming what is missing or differs.
+    """
+    if kind not in RUNS:
+        raise ImportFailed(run, f"is a run of {kind}, which can't be read yet")
+    clouds = {int(p.parent.name.rpartition("_")[2]): p for p in run.glob("point_cloud/iteration_*/point_cloud.ply")}
+    if not clouds:
+        raise ImportFailed(run, "has no point_cloud/iteration_*/point_cloud.ply")
+    iteration = max(clouds)
+    source = read_ply(clouds[iteration])
+    if source.dropped:
+        raise ImportFailed(clouds[iteration], f"{source.dropped:,} Gaussians hold NaN, infinity or no direction")
+    settings = _settings(run / "cfg_args")
+    model, notes = RUNS[kind](run, canonical(source.gaussians), iteration)
+    metadata = metadata_of(source.gaussians.means, source.gaussians.sh_degree, "0" * 64)
+    cameras = _cameras(run / "cameras.json") or [camera.to_plain() for camera in metadata.cameras]
+    info = SceneInfo(
+        background=WHITE if settings.get("white_background") else BLACK,
+        bounds=[list(b) for b in metadata.bounds],
+        cameras=cameras,
+    )
+    save_model(output, model, info, iteration)
+    console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
+    for note in notes:
+        console.print(note, markup=False)
+    return output
+
+
+def canonical(g: Gaussians) -> CanonicalGaussians:
+    """Activated Gaussians back in storage space."""
+    opacities = g.opacities.astype(np.float64).clip(1e-7, 1 - 1e-7)
+    arrays = (g.means, np.log(g.scales), g.quats, np.log(opacities / (1 - opacities)), g.sh[:, :1], g.sh[:, 1:])
+    return CanonicalGaussians(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
+
+
+def _settings(file: Path) -> dict[str, Any]:
+    """The plain values of cfg_args, which is the text of a Namespace; nothing of it is run."""
+    try:
+        call = ast.parse(file.read_text(), mode="eval").body
+    except FileNotFoundError:
+        return {}
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise ImportFailed(file, f"can't be read: {error}") from error
+    values = {}
+    for keyword in call.keywords if isinstance(call, ast.Call) else ():
+        if isinstance(keyword.value, ast.Constant):
+            values[keyword.arg] = keyword.value.value
+    return values
+
+
+def _cameras(file: Path) -> list[dict[str, Any]]:
+    """Of INRIA's cameras.json, where there is one; position and rotation are camera to world in OpenCV axes."""
+    if not file.is_file():
+        return []
+    try:
+        cameras = []
+        for stored in json.loads(file.read_text())[:MOST_CAMERAS]:
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = stored["rotation"], stored["position"]
+            size = int(stored["width"]), int(stored["height"])
+            camera = Camera(stored["fx"], stored["fy"], size[0] / 2, size[1] / 2, *size, pose)
+            intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+            name = re.sub(r"\s+", " ", str(stored["img_name"])) or "camera"
+            cameras.append({"name": name, "t": 0.0, **intrinsics, "camera_to_world": pose.tolist()})
+        return cameras
+    except (OSError, ValueError, KeyError, TypeError, InvalidInput) as error:
+        raise ImportFailed(file, f"isn't a list of cameras as INRIA's trainer writes it: {error!r}") from error

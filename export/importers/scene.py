@@ -1,0 +1,135 @@
+"""A scene file of Gaussians that no model of ours made: its metadata, and its proof before it replaces anything."""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import helper
+
+from export.bake import Baked, Moving
+from export.importers.splats import Splats
+from export.plans import build
+from export.write import properties
+from msdgs_serve import __version__
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
+from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
+from msdgs_train.files import replacing
+
+WITHIN = (0.01, 0.99)
+"""Parts of the Gaussians below and above which, along each axis, their centres may lie outside of the bounds: strays of
+a trained scene are often far away."""
+
+UP = np.array([0.0, -1.0, 0.0])
+"""Of files that don't say: COLMAP's axes, in which INRIA's trainer and most others work."""
+
+CAMERAS, SIZE, FOV_Y, ELEVATION = 6, 800, 50.0, 15.0
+"""A circle of cameras to start from, in degrees and pixels; the files hold none."""
+
+NEAR = 2.2
+"""Distance of these cameras from the middle, in half diagonals of the bounds."""
+
+
+def static_scene(source: Splats, sha256: str) -> onnx.ModelProto:
+    """The scene file of one set of Gaussians, in which nothing moves."""
+    g = source.gaussians
+    metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped)
+    scene = BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
+    three = np.empty((0, 3), np.float32)
+    return build("network", Baked(scene, Moving(three, three, np.empty((0, 4), np.float32), None), ()))
+
+
+def metadata_of(
+    means: np.ndarray, sh_degree: int, sha256: str, antialiasing: str = "dilate", dropped: int = 0
+) -> SceneMetadata:
+    """What a scene says of itself where its file says nothing: bounds and cameras from the centres, black behind."""
+    low, high = (tuple(float(v) for v in np.quantile(means, part, axis=0)) for part in WITHIN)
+    left_out = ()
+    if dropped:
+        what = "Gaussians with NaN, infinity or a quaternion without direction"
+        left_out = ({"rule": "unusable", "what": what, "count": dropped, "of": dropped + len(means)},)
+    return SceneMetadata(
+        contract=CONTRACT,
+        layers=(),
+        plan="network",
+        time_range=(0.0, 1.0),
+        bounds=(low, high),
+        sh_degree=sh_degree,
+        delta_space="raw",
+        background=(0.0, 0.0, 0.0),
+        antialiasing=antialiasing,
+        cameras=cameras_around(np.array(low), np.array(high)),
+        left_out=left_out,
+        measured_error={},
+        package_version=__version__,
+        checkpoint_sha256=sha256,
+    )
+
+
+def cameras_around(low: np.ndarray, high: np.ndarray) -> tuple[SceneCamera, ...]:
+    """On a circle about the middle of a box, `UP` upwards."""
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    poses = [orbit(middle, NEAR * reach, 360 * i / CAMERAS, ELEVATION, UP) for i in range(CAMERAS)]
+    return tuple(
+        SceneCamera(f"around {i}", 0.0, Camera.from_fov(pose, SIZE, SIZE, FOV_Y)) for i, pose in enumerate(poses)
+    )
+
+
+def write_imported(
+    output: Path,
+    contents: onnx.ModelProto,
+    expected: Callable[[float], Gaussians],
+    times: Sequence[float],
+    on_time: Callable[[], object] = lambda: None,
+    rows: Callable[[float], slice] = lambda t: slice(None),
+) -> BakedScene:
+    """Write a scene file beside `output`, compare it with what was read at some times, and only then move it there.
+
+    `rows` are those of the scene that `expected` has. The largest differences go into the metadata: of means relative
+    to the half diagonal of the bounds or, further out, to the largest coordinate; of entries of rotation matrices; of
+    scales relative to a Gaussian's largest. Raises `SceneFileInvalid`.
+    """
+    with replacing(output) as temporary:
+        temporary.write_bytes(contents.SerializeToString())
+        session = DeformationSession(temporary)
+        worst = {"means": 0.0, "quats": 0.0, "scales": 0.0}
+        for t in times:
+            for name, error in _differences(session, expected(t), t, rows(t)).items():
+                worst[name] = max(worst[name], error)
+            on_time()
+        measured = properties(contents)["measured_error"] | worst
+        measured |= {"against": "the files that were imported", "times": len(times)}
+        values = {**properties(contents), "measured_error": measured}
+        helper.set_model_props(contents, {name: json.dumps(value, allow_nan=False) for name, value in values.items()})
+        temporary.write_bytes(contents.SerializeToString())
+        return DeformationSession(temporary).scene
+
+
+def _differences(session: DeformationSession, expected: Gaussians, t: float, rows: slice) -> dict[str, float]:
+    means, quats, scales = (getattr(session.gaussians(t), name)[rows] for name in ("means", "quats", "scales"))
+    low, high = np.array(session.scene.metadata.bounds)
+    size = max(float(np.linalg.norm(high - low)) / 2, 1e-30)
+    far = np.maximum(np.abs(expected.means.astype(np.float64)).max(axis=1, initial=0), size)
+    turned = np.abs(to_matrix(quats.astype(np.float64)) - to_matrix(expected.quats.astype(np.float64)))
+    largest = expected.scales.max(axis=1, initial=0).astype(np.float64)
+    return {
+        "means": float((np.abs(means - expected.means).max(axis=1) / far).max(initial=0)),
+        "quats": float(turned.max(initial=0)),
+        "scales": float((np.abs(scales - expected.scales).max(axis=1) / largest).max(initial=0)),
+    }
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder by name."""
+    if path.is_file():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    total = hashlib.sha256()
+    for file in sorted(each for each in path.iterdir() if each.is_file()):
+        total.update(file.name.encode() + b"\0" + bytes.fromhex(digest(file)))
+    return total.hexdigest()

@@ -1,0 +1,218 @@
+"""A folder of numbered splat files, one a frame, to a scene that moves.
+
+Where the n-th Gaussian of a frame is the n-th of the next, and only poses differ, frames are the points of a cubic
+spline: plan `keyframes`. Elsewhere frames are switched: the scene holds the Gaussians of all of them, and a graph
+shows those of the frame that is nearest in time. Opacities are constants of a scene file, so what isn't shown is
+parked far below the scene, as small as a Gaussian can be: plan `frames`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto
+from scipy.spatial import KDTree
+
+from export.bake import Baked, Moving
+from export.importers.errors import ImportFailed
+from export.importers.recognise import frame_files, read_splats
+from export.importers.scene import UP, metadata_of
+from export.importers.splats import Splats
+from export.plans.exact import POSE, QUATS
+from export.plans.scene_graph import activated, finished, new_graph
+from export.plans.splines import design
+from export.plans.stored_poses import StoredPoses, shared_grid
+from msdgs_serve.scene.baked import BakedScene
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.model import SMALLEST_SCALE
+
+CONSTANT = 0.02
+"""Opacities and SH coefficients may differ by this between frames that are blended: two steps of 8 bits."""
+
+APART = 3.0
+"""How many times as far from its nearest neighbour a Gaussian may be in the next frame, at nine in ten."""
+
+SAMPLED = 5_000
+PARKED_AT = 1e6
+"""Half diagonals of the scene's bounds below its middle."""
+
+MOST = 1 << 26
+"""Gaussians of all frames together."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames in the order of time, which runs evenly from 0 to 1."""
+
+    gaussians: tuple[Gaussians, ...]
+    dropped: int
+    antialiasing: str
+    blended: bool
+
+    def times(self) -> list[float]:
+        """Of the frames."""
+        return np.linspace(0, 1, len(self.gaussians)).tolist()
+
+
+def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], object] = lambda: None) -> Frames:
+    """All numbered files of a folder. `how`: `blend`, `switch`, or None to decide by what is in them.
+
+    Raises `ImportFailed` where a file can't be read, there is only one, or frames that don't correspond are to be
+    blended.
+    """
+    files = frame_files(folder)
+    if len(files) < 2:
+        raise ImportFailed(folder, "holds no sequence: two numbered .ply, .sog, .spz or .splat files at least")
+    read: list[Splats] = []
+    for file in files:
+        read.append(read_splats(file))
+        if sum(map(len, read)) > MOST:
+            raise ImportFailed(folder, f"has more than {MOST:,} Gaussians in {len(read)} of {len(files)} frames")
+        on_frame()
+    modes, degrees = {each.antialiasing for each in read}, {each.gaussians.sh_degree for each in read}
+    if len(modes) > 1 or len(degrees) > 1:
+        found = f"anti-aliasing {sorted(modes)} and SH of degrees {sorted(degrees)}"
+        raise ImportFailed(folder, f"its frames differ in what a scene has once: {found}")
+    frames, dropped = tuple(each.gaussians for each in read), sum(each.dropped for each in read)
+    problem = None if how == "switch" else _why_not_blended(frames, any(each.dropped for each in read))
+    if how == "blend" and problem:
+        raise ImportFailed(folder, f"can't be blended: {problem}")
+    return Frames(frames, dropped, read[0].antialiasing, problem is None and how != "switch")
+
+
+def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:
+    """The scene file of a sequence."""
+    return _blended(sequence, sha256) if sequence.blended else _switched(sequence, sha256)
+
+
+def posed(sequence: Frames, number: int) -> Gaussians:
+    """What the scene shows of one frame, in the order of the scene: without those of other frames if they switch."""
+    g = sequence.gaussians[number]
+    if not sequence.blended:
+        return g
+    order = np.concatenate(_parts(sequence))
+    return Gaussians(g.means[order], g.quats[order], g.scales[order], g.opacities[order], g.sh[order])
+
+
+def shown_rows(sequence: Frames, number: int) -> slice:
+    """The rows of the scene that belong to one frame."""
+    if sequence.blended:
+        return slice(None)
+    start = sum(map(len, sequence.gaussians[:number]))
+    return slice(start, start + len(sequence.gaussians[number]))
+
+
+def _why_not_blended(frames: tuple[Gaussians, ...], dropped: bool) -> str | None:
+    first = frames[0]
+    if dropped:
+        return "some of its Gaussians can't be drawn, so the n-th of two frames may be different ones"
+    for number, frame in enumerate(frames[1:], start=1):
+        if len(frame) != len(first):
+            return f"frame 0 has {len(first):,} Gaussians, frame {number} {len(frame):,}"
+        for name in ("opacities", "sh"):
+            if np.abs(getattr(frame, name) - getattr(first, name)).max() > CONSTANT:
+                return f"{name} change, by frame {number}, and a scene file holds them as constants"
+    for number in range(len(frames) - 1):
+        if not _neighbours_stay(frames[number].means, frames[number + 1].means):
+            return f"the n-th Gaussian of frame {number} isn't the n-th of the next"
+    return None
+
+
+def _neighbours_stay(now: np.ndarray, later: np.ndarray) -> bool:
+    """Whether what is near in one frame is near in the next: shuffled or newly sorted Gaussians lose each other."""
+    if len(now) < 2:
+        return True
+    chosen = np.unique(np.linspace(0, len(now) - 1, min(len(now), SAMPLED)).astype(int))
+    distances, found = (np.asarray(each) for each in KDTree(now).query(now[chosen], k=2))
+    nearest, own = found[:, 1], distances[:, 1]
+    size = float(np.linalg.norm(now.max(axis=0) - now.min(axis=0)))
+    then = np.linalg.norm(later[chosen] - later[nearest], axis=1)
+    return float(np.quantile(then / np.maximum(own, 1e-3 * size), 0.9)) <= APART
+
+
+def _parts(sequence: Frames) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the Gaussians that move, and of those that are the same in all frames."""
+    first = sequence.gaussians[0]
+    moves = np.zeros(len(first), bool)
+    for frame in sequence.gaussians[1:]:
+        for name in ("means", "quats", "scales"):
+            moves |= (getattr(frame, name) != getattr(first, name)).any(axis=1)
+    return np.flatnonzero(moves), np.flatnonzero(~moves)
+
+
+def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
+    frames = sequence.gaussians
+    moving, still = _parts(sequence)
+    first, count = frames[0], len(frames)
+    metadata = metadata_of(np.concatenate([f.means for f in frames]), first.sh_degree, sha256, sequence.antialiasing)
+    order = np.concatenate([moving, still])
+    scene = BakedScene(
+        replace(metadata, plan=f"keyframes:{count + 2}"),
+        len(moving),
+        first.means[still],
+        first.quats[still],
+        first.scales[still],
+        first.opacities[order],
+        first.sh[order],
+    ).validate("the imported sequence")
+    poses = np.stack([np.concatenate([f.means, f.scales, f.quats], axis=1)[moving] for f in frames], axis=1)
+    _give_one_sign(poses)
+    control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
+    baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving], None), ())
+    graph = new_graph(baked)
+    activated(graph, shared_grid(graph, StoredPoses.of(control), metadata.time_range))
+    return finished(graph, baked, f"keyframes:{count + 2}")
+
+
+def _through(count: int) -> np.ndarray:
+    """[n + 2, n] control points of the natural cubic spline through n evenly spread points, a knot at each of them."""
+    rows = design(count + 2, count)
+    ends = np.zeros((2, count + 2))
+    # second derivatives at the ends of a clamped spline with equal intervals, times a constant
+    ends[0, :3] = (2, -3, 1) if count > 2 else (1, -2, 1)
+    ends[1, -3:] = (1, -3, 2) if count > 2 else (1, -2, 1)
+    return np.linalg.inv(np.concatenate([rows, ends]))[:, :count]
+
+
+def _give_one_sign(poses: np.ndarray) -> None:
+    quats = poses[..., QUATS]
+    turned = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
+    quats[:, 1:] *= np.cumprod(turned, axis=1)[..., None].astype(poses.dtype)
+    assert poses.shape[2] == POSE
+
+
+def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
+    frames = sequence.gaussians
+    means, quats, scales, opacities, sh = (
+        np.concatenate([getattr(frame, name) for frame in frames])
+        for name in ("means", "quats", "scales", "opacities", "sh")
+    )
+    metadata = metadata_of(means, frames[0].sh_degree, sha256, sequence.antialiasing, sequence.dropped)
+    plan = f"frames:{len(frames)}"
+    empty = np.empty((0, 3), np.float32)
+    scene = BakedScene(
+        replace(metadata, plan=plan), len(means), empty, np.empty((0, 4), np.float32), empty, opacities, sh
+    ).validate("the imported sequence")
+    baked = Baked(scene, Moving(means, scales, quats, None), ())
+    graph = new_graph(baked)
+    low, high = np.array(metadata.bounds)
+    parked = (low + high) / 2 - PARKED_AT * max(float(np.linalg.norm(high - low)) / 2, 1e-3) * UP
+
+    half = graph.constant("frames.half", np.array([0.5], np.float32))
+    last = graph.constant("frames.last", np.array([len(frames) - 1], np.float32))
+    place = graph.node("Add", [graph.node("Mul", ["t", last], "frames.place"), half], "frames.rounded")
+    number = graph.node("Cast", [graph.node("Floor", [place], "frames.floor")], "frames.now", to=TensorProto.INT64)
+    of = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
+    own = graph.node("Gather", [graph.constant("frames.of", of), "ids"], "ids.frame")
+    column = graph.constant("frames.column", np.array([1], np.int64))
+    shown = graph.node("Unsqueeze", [graph.node("Equal", [own, number], "ids.is_now"), column], "ids.shown")
+    away = graph.constant("frames.away", parked.astype(np.float32)[None])
+    least = graph.constant("frames.least", np.array([[SMALLEST_SCALE]], np.float32))
+    stored = {"means": means, "scales": scales, "quats": quats}
+    of_ids = {n: graph.node("Gather", [graph.constant(f"frames.{n}", a), "ids"], f"ids.{n}") for n, a in stored.items()}
+    graph.node("Where", [shown, of_ids["means"], away], "means")
+    graph.node("Where", [shown, of_ids["scales"], least], "scales")
+    graph.node("Identity", [of_ids["quats"]], "quats")
+    return finished(graph, baked, plan)

@@ -1,0 +1,97 @@
+"""What every reader of a splat file returns: activated Gaussians without the ones that nothing can draw."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from export.importers.errors import ImportFailed
+from msdgs_serve.scene.gaussians import FloatArray, Gaussians
+from msdgs_serve.scene.quaternion import MIN_NORM
+
+LOG_SCALE_LIMIT = 20.0
+"""Scales stay within e^-20 and e^20, as those of trained models do."""
+
+FURTHEST = 1e12
+"""Scene units from the origin; beyond it differences of float32 positions mean nothing."""
+
+BRIGHTEST = 1e4
+"""Of an SH coefficient; real ones are below 10."""
+
+
+@dataclass(frozen=True)
+class Splats:
+    """The Gaussians of one file, float32, in its own order and axes."""
+
+    gaussians: Gaussians
+    dropped: int = 0  # had NaN, infinity or a quaternion without direction, and are not in `gaussians`
+    antialiasing: str = "dilate"  # or "mip", where the file says that it was trained so
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+
+def splats(
+    file: Path,
+    means: np.ndarray,
+    log_scales: np.ndarray,
+    raw_quats: np.ndarray,
+    opacities: np.ndarray,
+    sh: np.ndarray,
+    antialiasing: str = "dilate",
+) -> Splats:
+    """Activated Gaussians from stored ones: means [N, 3], log_scales [N, 3], raw_quats [N, 4] wxyz of any length,
+    opacities [N] in [0, 1] and sh [N, C, 3].
+
+    Rows that hold NaN, infinity, what is out of all proportion or a quaternion of norm under 1e-8 are dropped and
+    counted; log-scales are cut to ±20. Raises `ImportFailed` where no row is left.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        norms = np.linalg.norm(raw_quats.astype(np.float64), axis=1)
+        good = (
+            (np.abs(means) <= FURTHEST).all(axis=1)
+            & ~np.isnan(log_scales).any(axis=1)
+            & (norms >= MIN_NORM)
+            & np.isfinite(norms)
+            & ~np.isnan(opacities)
+            & (np.abs(sh) <= BRIGHTEST).all(axis=(1, 2))
+        )
+    count = int(good.sum())
+    if not count:
+        problem = "holds no Gaussians" if not len(good) else f"none of its {len(good):,} Gaussians can be drawn"
+        raise ImportFailed(file, problem)
+    rows = slice(None) if count == len(good) else good
+    scales = np.exp(log_scales[rows].astype(np.float64).clip(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
+    gaussians = Gaussians(
+        _float32(means[rows]),
+        _float32(raw_quats[rows] / norms[rows, None]),
+        _float32(scales),
+        _float32(opacities[rows].clip(0, 1)),
+        _float32(sh[rows]),
+    )
+    return Splats(gaussians.validate(), len(good) - count, antialiasing)
+
+
+def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:
+    """Opacities of logits, in float64; infinite logits, as some converters write them, are 0 and 1."""
+    x = raw_opacities.astype(np.float64)
+    small = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1 / (1 + small), small / (1 + small))
+
+
+def smallest_three(values: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """[N, 4] quaternions from all components but the largest, [N, 3] in order, and its place, [N] in 0 to 3.
+
+    The largest is positive and makes the length 1.
+    """
+    quats = np.zeros((len(values), 4))
+    left = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
+    for place in range(4):
+        rows = largest == place
+        quats[np.ix_(rows, [i for i in range(4) if i != place])] = values[rows]
+        quats[rows, place] = left[rows]
+    return quats
+
+
+def _float32(array: np.ndarray) -> FloatArray:
+    return np.ascontiguousarray(array, dtype=np.float32)
