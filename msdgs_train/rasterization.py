@@ -92,7 +92,8 @@ class _Rasterize(torch.autograd.Function):
         gaussians = Gaussians(*arrays)
         splats, tiles, alpha = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
-        frame = Frame(rgb, alpha, np.empty((0, 0), rgb.dtype))
+        unused = np.empty((0, 0), rgb.dtype)
+        frame = Frame(rgb, alpha, unused, unused)
         sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
         grads = project_backward(gaussians, splats, sums, *ctx.view)
         ctx.info.means2d_grads = torch.from_numpy(grads.means2d)

@@ -235,3 +235,28 @@ def test_extra_channels_that_cannot_be(bad: np.ndarray):
     gaussians, camera = scene(20, np.float32)
     with pytest.raises(InvalidInput, match="extra"):
         rasterize(gaussians, camera, extra=bad)
+
+
+@DTYPES
+def test_median_depth_is_where_half_of_the_light_is_gone(dtype: type):
+    """Against a loop over the Gaussians, front to back, at pixels where no rounding decides."""
+    gaussians, camera = scene(20, dtype)
+    got = rasterize(gaussians, camera, background=BACKGROUND, median_depth=True)
+    plain = rasterize(gaussians, camera, background=BACKGROUND)
+    np.testing.assert_array_equal(got.rgb, plain.rgb)
+    assert plain.median_depth.size == 0
+    want, margin = np.full(got.alpha.shape, np.inf), np.full(got.alpha.shape, np.inf)
+    axis = camera.world_to_camera[2]
+    depths = (gaussians.means.astype(float) @ axis[:3] + axis[3]).astype(dtype)
+    before = np.ones_like(got.alpha)
+    order = np.argsort(depths, kind="stable")
+    for count, i in enumerate(order, start=1):
+        after = 1 - rasterize(select(gaussians, order[:count]), camera).alpha
+        margin = np.minimum(margin, np.abs(after - 0.5))
+        want[(before > 0.5) & (after <= 0.5)] = depths[i]
+        before = after
+    clear = margin > 1e-4
+    assert np.isfinite(want[clear]).any()
+    np.testing.assert_array_equal(np.isfinite(got.median_depth[clear]), np.isfinite(want[clear]))
+    seen = clear & np.isfinite(want)
+    assert_close(got.median_depth[seen], want[seen], "projection.float32.relative")

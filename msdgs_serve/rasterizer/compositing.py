@@ -93,14 +93,23 @@ class Frame(NamedTuple):
     rgb: np.ndarray  # [H, W, 3] the background included
     alpha: np.ndarray  # [H, W] 1 - transmittance
     depth: np.ndarray  # [H, W] mean distance along the camera axis, infinite where alpha is 0
+    median_depth: np.ndarray  # [H, W] of the splat that takes half of the light, else infinite; or [0, 0]: not drawn
 
 
 def composite(
-    splats: Splats, tiles: TileLists, width: int, height: int, background: np.ndarray, options: RasterizerOptions
+    splats: Splats,
+    tiles: TileLists,
+    width: int,
+    height: int,
+    background: np.ndarray,
+    options: RasterizerOptions,
+    *,
+    median_depth: bool = False,
 ) -> Frame:
     """Blend the splats into an image."""
     dtype = splats.records.dtype
-    frame = Frame(*(np.empty((height, width, *more), dtype) for more in ((3,), (), ())))
+    rgb, alpha, depth = (np.empty((height, width, *more), dtype) for more in ((3,), (), ()))
+    frame = Frame(rgb, alpha, depth, np.empty((height, width) if median_depth else (0, 0), dtype))
     limits = pixel_limits(options, dtype)
     count = len(tiles.offsets) - 1
     for first in range(0, count, TILES_A_ROUND):
@@ -122,7 +131,8 @@ def _composite_tiles(
     frame: Frame,
 ) -> None:
     """Draw tiles, `TILES_A_TURN` of them at each turn, up to the tile `past`."""
-    state = np.empty(5 * PIXELS, records.dtype)
+    state = np.empty(6 * PIXELS, records.dtype)
+    median = frame.median_depth.size > 0
     batch = np.zeros((BATCH + 1) * RECORD, records.dtype)
     batch[np.uint64(BATCH * RECORD) + LOG2_OPACITY] = -np.inf
     origin = np.zeros(RECORD, records.dtype)
@@ -140,7 +150,8 @@ def _composite_tiles(
             origin[0], origin[1] = x0, y0
             _prefetch_tile(x0, y0, min(TILE, height - y0), frame)
             state[:PIXELS] = 1
-            state[PIXELS:] = 0
+            state[PIXELS : 5 * PIXELS] = 0
+            state[5 * PIXELS :] = np.inf
             alive[:] = True
             for begin in range(tiles.offsets[tile], tiles.offsets[tile + 1], BATCH):
                 many = min(BATCH, tiles.offsets[tile + 1] - begin)
@@ -157,7 +168,7 @@ def _composite_tiles(
                     if alive[block]:
                         bits = touching[block]
                         if bits != np.uint64(0):
-                            alive[block] = _blend_block(block, bits, batch, grid, limits, state)
+                            alive[block] = _blend_block(block, bits, batch, grid, limits, median, state)
                         some |= alive[block]
                 if not some:
                     break
@@ -215,7 +226,13 @@ def touched_blocks(batch: np.ndarray, place: np.uint64, grid: np.ndarray, log2_a
 
 @kernel
 def _blend_block(
-    block: np.uint64, bits: np.uint64, batch: np.ndarray, grid: np.ndarray, limits: PixelLimits, state: np.ndarray
+    block: np.uint64,
+    bits: np.uint64,
+    batch: np.ndarray,
+    grid: np.ndarray,
+    limits: PixelLimits,
+    median: bool,
+    state: np.ndarray,
 ) -> bool:
     """Blend the splats of the batch that `bits` names into a block; whether any of its pixels is still open.
 
@@ -240,13 +257,25 @@ def _blend_block(
         alpha = minimum(alpha, filled(limits.alpha_max, alpha))
         alpha = select(exponent >= limits.log2_alpha_min, alpha, filled(0, alpha))
         one, two = first_of(alpha), second_of(alpha)
-        weight, left = _seen(first_of(one), left, limits.transmittance_min)
+        weight, after = _seen(first_of(one), left, limits.transmittance_min)
+        if median:
+            _keep_median(left, after, batch[first + DEPTH], state, lane)
+        left = after
         red, green, blue, depth = _added(weight, batch, first, red, green, blue, depth)
-        weight, left = _seen(second_of(one), left, limits.transmittance_min)
+        weight, after = _seen(second_of(one), left, limits.transmittance_min)
+        if median:
+            _keep_median(left, after, batch[second + DEPTH], state, lane)
+        left = after
         red, green, blue, depth = _added(weight, batch, second, red, green, blue, depth)
-        weight, left = _seen(first_of(two), left, limits.transmittance_min)
+        weight, after = _seen(first_of(two), left, limits.transmittance_min)
+        if median:
+            _keep_median(left, after, batch[third + DEPTH], state, lane)
+        left = after
         red, green, blue, depth = _added(weight, batch, third, red, green, blue, depth)
-        weight, left = _seen(second_of(two), left, limits.transmittance_min)
+        weight, after = _seen(second_of(two), left, limits.transmittance_min)
+        if median:
+            _keep_median(left, after, batch[fourth + DEPTH], state, lane)
+        left = after
         red, green, blue, depth = _added(weight, batch, fourth, red, green, blue, depth)
     store(state, lane, left)
     store(state, lane + np.uint64(PIXELS), red)
@@ -254,6 +283,15 @@ def _blend_block(
     store(state, lane + np.uint64(3 * PIXELS), blue)
     store(state, lane + np.uint64(4 * PIXELS), depth)
     return bits_of(left > real(0)) != np.uint64(0)
+
+
+@kernel
+def _keep_median(before: Lanes, after: Lanes, depth: float, state: np.ndarray, lane: np.uint64) -> None:
+    """Where the light falls to a half or less between two transmittances, keep the depth."""
+    place = lane + np.uint64(5 * PIXELS)
+    crossed = (before > 0.5) & (negative(after) >= -0.5)
+    kept = load(state, place)
+    store(state, place, select(crossed, filled(depth, kept), kept))
 
 
 @kernel
@@ -295,6 +333,7 @@ def _write_tile(
     whole = rows == TILE and columns == TILE
     width = frame.alpha.shape[1]
     rgb, alphas, depths = frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1)
+    median, medians = frame.median_depth.size > 0, frame.median_depth.reshape(-1)
     infinite = spread(state.dtype.type(np.inf))
     for block in range(np.uint64(BLOCKS)):
         lane = block * np.uint64(LANES)
@@ -310,6 +349,8 @@ def _write_tile(
             store_square_of_triples(rgb, 3 * start, 3 * width, red, green, blue)
             store_square(alphas, start, width, alpha)
             store_square(depths, start, width, depth)
+            if median:
+                store_square(medians, start, width, load(state, lane + np.uint64(5 * PIXELS)))
         else:
             store(state, lane, alpha)
             store(state, lane + np.uint64(PIXELS), red)
@@ -325,3 +366,5 @@ def _write_tile(
                 for channel in range(3):
                     frame.rgb[y0 + row, x0 + column, channel] = state[place + PIXELS * (channel + 1)]
                 frame.depth[y0 + row, x0 + column] = state[place + 4 * PIXELS]
+                if median:
+                    frame.median_depth[y0 + row, x0 + column] = state[place + 5 * PIXELS]

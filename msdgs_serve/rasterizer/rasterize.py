@@ -20,6 +20,7 @@ class Rendering(NamedTuple):
     rgb: np.ndarray  # [H, W, 3] display-referred, the background included
     alpha: np.ndarray  # [H, W] 1 - transmittance
     depth: np.ndarray  # [H, W] expected distance along the camera axis, scene units, infinite where alpha is 0
+    median_depth: np.ndarray  # [H, W] distance of the splat that takes half of the light, else infinite; [0, 0] unasked
     extra: np.ndarray  # [H, W, C] what was asked for besides, weighted as colours are; divide by alpha for a mean
 
 
@@ -28,6 +29,7 @@ def rasterize(
     camera: Camera,
     *,
     background: npt.ArrayLike = (0.0, 0.0, 0.0),
+    median_depth: bool = False,
     extra: np.ndarray | None = None,
     options: RasterizerOptions = GSPLAT,
 ) -> Rendering:
@@ -50,7 +52,8 @@ def rasterize(
         gaussians.validate()
     extra = _checked_extra(extra, gaussians)
     tiles = bin_into_tiles(splats, camera.width, camera.height)
-    frame = composite(splats, tiles, camera.width, camera.height, background, options)
+    size = (camera.width, camera.height)
+    frame = composite(splats, tiles, *size, background, options, median_depth=median_depth)
     return Rendering(*frame, _drawn_extra(extra, splats, tiles, camera, options))
 
 
