@@ -151,7 +151,7 @@ class Run:
     def _time_knobs(self) -> None:
         runs = KnobRuns(object_scene(KNOB_COUNT, self.options.seed), square_camera())
         self.result["oracle_agreement"] = oracle_agreement(self.options.seed)
-        for _ in self._turns("knobs", self.options.repeats):
+        for _ in self._turns("knobs", 3 * self.options.repeats):
             runs.draw_all()
             self.result["knobs"] = runs.rows()
 
