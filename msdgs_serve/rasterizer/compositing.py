@@ -110,12 +110,13 @@ def composite(
     dtype = splats.records.dtype
     rgb, alpha, depth = (np.empty((height, width, *more), dtype) for more in ((3,), (), ()))
     frame = Frame(rgb, alpha, depth, np.empty((height, width) if median_depth else (0, 0), dtype))
+    wanted = (True,) if median_depth else ()
     limits = pixel_limits(options, dtype)
     count = len(tiles.offsets) - 1
     for first in range(0, count, TILES_A_ROUND):
         turn = np.array([first])
         past = min(first + TILES_A_ROUND, count)
-        arguments = (turn, past, splats.records, tiles, limits, background, frame)
+        arguments = (turn, past, splats.records, tiles, limits, background, wanted, frame)
         run_parallel(_composite_tiles, [arguments] * thread_count())
     return frame
 
@@ -128,11 +129,14 @@ def _composite_tiles(
     tiles: TileLists,
     limits: PixelLimits,
     background: np.ndarray,
+    median: tuple,
     frame: Frame,
 ) -> None:
-    """Draw tiles, `TILES_A_TURN` of them at each turn, up to the tile `past`."""
+    """Draw tiles, `TILES_A_TURN` of them at each turn, up to the tile `past`.
+
+    `median` is (True,) or (): whether there is a median depth is known when this is compiled, and costs nothing if not.
+    """
     state = np.empty(6 * PIXELS, records.dtype)
-    median = frame.median_depth.size > 0
     batch = np.zeros((BATCH + 1) * RECORD, records.dtype)
     batch[np.uint64(BATCH * RECORD) + LOG2_OPACITY] = -np.inf
     origin = np.zeros(RECORD, records.dtype)
@@ -172,7 +176,7 @@ def _composite_tiles(
                         some |= alive[block]
                 if not some:
                     break
-            _write_tile(x0, y0, min(TILE, width - x0), min(TILE, height - y0), state, background, frame)
+            _write_tile(x0, y0, min(TILE, width - x0), min(TILE, height - y0), state, background, median, frame)
 
 
 @kernel
@@ -231,7 +235,7 @@ def _blend_block(
     batch: np.ndarray,
     grid: np.ndarray,
     limits: PixelLimits,
-    median: bool,
+    median: tuple,
     state: np.ndarray,
 ) -> bool:
     """Blend the splats of the batch that `bits` names into a block; whether any of its pixels is still open.
@@ -258,22 +262,22 @@ def _blend_block(
         alpha = select(exponent >= limits.log2_alpha_min, alpha, filled(0, alpha))
         one, two = first_of(alpha), second_of(alpha)
         weight, after = _seen(first_of(one), left, limits.transmittance_min)
-        if median:
+        if len(median) > 0:
             _keep_median(left, after, batch[first + DEPTH], state, lane)
         left = after
         red, green, blue, depth = _added(weight, batch, first, red, green, blue, depth)
         weight, after = _seen(second_of(one), left, limits.transmittance_min)
-        if median:
+        if len(median) > 0:
             _keep_median(left, after, batch[second + DEPTH], state, lane)
         left = after
         red, green, blue, depth = _added(weight, batch, second, red, green, blue, depth)
         weight, after = _seen(first_of(two), left, limits.transmittance_min)
-        if median:
+        if len(median) > 0:
             _keep_median(left, after, batch[third + DEPTH], state, lane)
         left = after
         red, green, blue, depth = _added(weight, batch, third, red, green, blue, depth)
         weight, after = _seen(second_of(two), left, limits.transmittance_min)
-        if median:
+        if len(median) > 0:
             _keep_median(left, after, batch[fourth + DEPTH], state, lane)
         left = after
         red, green, blue, depth = _added(weight, batch, fourth, red, green, blue, depth)
@@ -328,12 +332,19 @@ def _seen(alpha: Lanes, left: Lanes, transmittance_min: float) -> tuple[Lanes, L
 
 @kernel
 def _write_tile(
-    x0: int, y0: int, columns: int, rows: int, state: np.ndarray, background: np.ndarray, frame: Frame
+    x0: int,
+    y0: int,
+    columns: int,
+    rows: int,
+    state: np.ndarray,
+    background: np.ndarray,
+    median: tuple,
+    frame: Frame,
 ) -> None:
     whole = rows == TILE and columns == TILE
     width = frame.alpha.shape[1]
     rgb, alphas, depths = frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1)
-    median, medians = frame.median_depth.size > 0, frame.median_depth.reshape(-1)
+    medians = frame.median_depth.reshape(-1)
     infinite = spread(state.dtype.type(np.inf))
     for block in range(np.uint64(BLOCKS)):
         lane = block * np.uint64(LANES)
@@ -349,7 +360,7 @@ def _write_tile(
             store_square_of_triples(rgb, 3 * start, 3 * width, red, green, blue)
             store_square(alphas, start, width, alpha)
             store_square(depths, start, width, depth)
-            if median:
+            if len(median) > 0:
                 store_square(medians, start, width, load(state, lane + np.uint64(5 * PIXELS)))
         else:
             store(state, lane, alpha)
@@ -366,5 +377,5 @@ def _write_tile(
                 for channel in range(3):
                     frame.rgb[y0 + row, x0 + column, channel] = state[place + PIXELS * (channel + 1)]
                 frame.depth[y0 + row, x0 + column] = state[place + 4 * PIXELS]
-                if median:
+                if len(median) > 0:
                     frame.median_depth[y0 + row, x0 + column] = state[place + 5 * PIXELS]
