@@ -78,6 +78,10 @@ class SceneStore:
         """Of all scenes, sorted; whether they can be opened is not known yet."""
         return sorted(self._files())
 
+    def file(self, name: str) -> Path:
+        """Where a scene lies, for what may lie beside it. Raises `SceneNotFound`."""
+        return self._file(name)
+
     def status(self, name: str) -> SceneStatus:
         """Raises `SceneNotFound`."""
         self._file(name)

@@ -245,7 +245,7 @@ def test_the_documentation_is_whole(client: httpx.Client):
     for reference in {part.split('"')[0] for part in text.split('"#/components/schemas/')[1:]}:
         assert reference in schemas
     assert set(document["paths"]) == {
-        *("/render", "/render/batch", "/render/video", "/scenes", "/scenes/{name}"),
+        *("/render", "/render/batch", "/render/video", "/scenes", "/scenes/{name}", "/scenes/{name}/report"),
         *("/live", "/ready", "/metrics"),
     }
     expected = {"200", "304", "400", "404", "408", "413", "422", "503", "504"}

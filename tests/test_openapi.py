@@ -40,7 +40,7 @@ def operations(client: httpx.Client) -> list[Any]:
 
 def test_every_call_answers_as_the_document_says(client: httpx.Client):
     every = operations(client)
-    assert len(every) == 10
+    assert len(every) == 11
     for operation in every:
 
         @hypothesis.settings(

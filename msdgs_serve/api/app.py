@@ -9,7 +9,7 @@ from msdgs_serve.api.errors import install_error_handlers
 from msdgs_serve.api.keys import KeyCheck, read_keys
 from msdgs_serve.api.observe import REQUEST_ID, Observe
 from msdgs_serve.api.openapi import install_openapi
-from msdgs_serve.api.routes import batch, health, render, scenes, video
+from msdgs_serve.api.routes import batch, health, render, scenes, video, viewer
 from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
@@ -34,7 +34,7 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
     service = Service(store, renderer, settings)
     app = FastAPI(title="msdgs", version=__version__, description=DESCRIPTION, lifespan=service.lifespan)
     app.state.service = service
-    for calls in (render, batch, video, scenes, health):
+    for calls in (render, batch, video, scenes, health, viewer):
         app.include_router(calls.router)
     install_error_handlers(app)
     install_openapi(app, store, keys=keys is not None)

@@ -1,4 +1,4 @@
-"""Keys: who has none of them is answered 401, on every route but the health checks."""
+"""Keys: who has none is answered 401, on every route but the health checks and the page, which asks for one."""
 
 import hashlib
 import hmac
@@ -11,7 +11,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from msdgs_serve.api.errors import KIND, problem_response
 from msdgs_serve.scene import InvalidInput
 
-OPEN_PATHS = ("/live", "/ready")
+OPEN_PATHS = ("/live", "/ready", "/")
+OPEN_FOLDER = "/viewer/"
 SHORTEST_KEY = 16
 
 
@@ -26,7 +27,7 @@ class KeyCheck:
         self._digests = [_digest(key.encode()) for key in keys]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in OPEN_PATHS or self._fits(scope):
+        if scope["type"] != "http" or _is_open(scope["path"]) or self._fits(scope):
             await self._app(scope, receive, send)
             return
         scope[KIND] = "unauthorized"
@@ -40,6 +41,10 @@ class KeyCheck:
         given = bearer.strip() if kind.lower() == b"bearer" else headers.get(b"x-api-key", b"")
         digest = _digest(given)
         return sum([hmac.compare_digest(digest, known) for known in self._digests]) > 0
+
+
+def _is_open(path: str) -> bool:
+    return path in OPEN_PATHS or path.startswith(OPEN_FOLDER)
 
 
 def read_keys(path: Path) -> list[str]:

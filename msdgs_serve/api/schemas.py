@@ -284,6 +284,17 @@ class GaussianCounts(BaseModel):
     total: int
 
 
+class SceneView(BaseModel):
+    """How the scene is seen where a request says nothing else; OpenCV axes."""
+
+    target: tuple[float, float, float] = Field(description="the middle of the scene, world")
+    distance: float = Field(description="from there, in scene units")
+    up: tuple[float, float, float] = Field(description="world, of length 1")
+    fov_y: float = Field(description="vertical field of view, degrees")
+    width: int = Field(description="pixels")
+    height: int = Field(description="pixels")
+
+
 class SceneDetail(SceneEntry):
     """A scene, from what its file says of itself."""
 
@@ -297,8 +308,10 @@ class SceneDetail(SceneEntry):
     background: tuple[float, float, float] = Field(description="sRGB-encoded")
     antialiasing: str
     delta_space: str
+    view: SceneView
     cameras: list[dict[str, Any]] = Field(description="fx, fy, cx, cy, width, height in pixels; OpenCV axes")
     measured_error: dict[str, Any] = Field(description="of the plan, against the exact network")
+    report: bool = Field(description="whether `GET /scenes/{name}/report` has something to say")
     left_out: list[Any] = Field(description="what the exporter took out of the trained model")
     package_version: str
     checkpoint_sha256: str

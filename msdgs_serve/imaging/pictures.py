@@ -25,17 +25,19 @@ def picture(image: Image, channel: Channel, depth_range: DepthRange | None = Non
     Motion is black where nothing moves; the hue is its direction, and the brightest is the fastest of this very image.
 
     Depth is lighter the nearer it is, over `depth_range` or, where None, over the depths of this very image.
+
+    Both are darker where the image is thin (alpha below 1), so that what is hardly seen in colour is hardly seen here.
     """
     if channel == "rgb":
         return image.display_pixels()
     if channel == "alpha":
         return to_8_bits(image.alpha)[..., None]
     if channel == "motion":
-        return _motion_colors(channel_of(image, "motion"))
+        return _motion_colors(channel_of(image, "motion") * image.alpha[..., None])
     near, far = depth_range or depths_of(image)
     seen = np.isfinite(image.depth)
     place = np.clip((np.where(seen, image.depth, far) - near) / max(far - near, 1e-12), 0, 1)
-    return to_8_bits(np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0))[..., None]
+    return to_8_bits(np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0) * image.alpha)[..., None]
 
 
 def channel_of(image: Image, channel: Channel) -> np.ndarray:

@@ -7,7 +7,7 @@ import uuid
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 from pathlib import Path as FilePath
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import anyio
@@ -17,9 +17,12 @@ from starlette.requests import ClientDisconnect
 
 from msdgs_serve.api.errors import ClientGone, Refused
 from msdgs_serve.api.openapi import SCENE_BODY, problems
-from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList
+from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList, SceneView
 from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.framing import framing
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.scene.baked import SceneMetadata
+from msdgs_serve.scene_report import read_report, report_path
 from msdgs_serve.store import MAX_NAME_LENGTH, SceneStore
 
 SceneName = Annotated[str, Path(max_length=MAX_NAME_LENGTH, description="as in `GET /scenes`", examples=["toybench"])]
@@ -48,6 +51,21 @@ def list_scenes(service: SharedService) -> SceneList:
 def describe_scene(name: SceneName, service: SharedService) -> SceneDetail:
     """Time range, cameras to start from, plan, counts and measured error. Loads the scene if it isn't yet."""
     return _describe(service.store, name)
+
+
+@router.get(
+    "/scenes/{name}/report",
+    summary="Error against run time",
+    responses=problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
+)
+def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
+    """What the exporter measured of the ways to store this scene: the `.report.json` beside its file, format
+    `msdgs-report/1`. 404 where there is none, or where it is of another model."""
+    served = service.store.get(name)
+    report = read_report(service.store.file(name), served.session.scene.metadata.checkpoint_sha256)
+    if report is None:
+        raise Refused(HTTPStatus.NOT_FOUND, "not_found", "There is no report of this scene.")
+    return report
 
 
 @router.post(
@@ -155,10 +173,18 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         background=metadata.background,
         antialiasing=metadata.antialiasing,
         delta_space=metadata.delta_space,
+        view=_view(metadata),
         cameras=[camera.to_plain() for camera in metadata.cameras],
         measured_error=metadata.measured_error,
+        report=report_path(store.file(name)).is_file(),
         left_out=list(metadata.left_out),
         package_version=metadata.package_version,
         checkpoint_sha256=metadata.checkpoint_sha256,
         sha256=served.sha256,
     )
+
+
+def _view(metadata: SceneMetadata) -> SceneView:
+    seen = framing(metadata)
+    vectors = {"target": seen.target.tolist(), "up": seen.up.tolist()}
+    return SceneView(**vectors, distance=seen.distance, fov_y=seen.fov_y, width=seen.width, height=seen.height)

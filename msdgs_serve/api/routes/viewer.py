@@ -1,0 +1,71 @@
+"""The page at `/`: a scene in a browser. Its files are those of `msdgs_serve/viewer`, as they are."""
+
+import hashlib
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, Header
+from fastapi.responses import Response
+
+from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.frames import is_unchanged
+
+FOLDER = Path(__file__).parents[2] / "viewer"
+PAGE = "index.html"
+MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",
+}
+IfNoneMatch = Annotated[str | None, Header(max_length=8192)]
+
+
+@dataclass(frozen=True)
+class PageFile:
+    """A file of the page, in memory."""
+
+    content: bytes
+    media_type: str
+    etag: str
+
+
+def _read(folder: Path) -> dict[str, PageFile]:
+    """By name; nothing else is ever opened, so that no path of a request can lead elsewhere."""
+    files: dict[str, PageFile] = {}
+    for path in folder.iterdir():
+        if path.suffix in MEDIA_TYPES:
+            content = path.read_bytes()
+            etag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+            files[path.name] = PageFile(content, MEDIA_TYPES[path.suffix], etag)
+    return files
+
+
+FILES = _read(FOLDER)
+
+router = APIRouter(include_in_schema=False)
+
+
+@router.get("/")
+async def page(if_none_match: IfNoneMatch = None) -> Response:
+    """The page itself."""
+    return _answer(FILES[PAGE], if_none_match)
+
+
+@router.get("/viewer/{name}")
+async def page_file(name: str, if_none_match: IfNoneMatch = None) -> Response:
+    """What the page is made of."""
+    if name not in FILES:
+        raise Refused(HTTPStatus.NOT_FOUND, "not_found", "The page has no such file.")
+    return _answer(FILES[name], if_none_match)
+
+
+def _answer(file: PageFile, if_none_match: str | None) -> Response:
+    headers = {**HEADERS, "ETag": file.etag}
+    if is_unchanged(if_none_match, file.etag):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    return Response(file.content, media_type=file.media_type, headers=headers)

@@ -1,0 +1,42 @@
+"""The report that the exporter leaves beside a scene file: error against run time of the ways to store the scene."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from msdgs_serve.scene import SceneFileInvalid
+
+SUFFIX = ".report.json"
+FORMAT = "msdgs-report/1"
+MAX_BYTES = 4 << 20
+
+
+def report_path(scene_file: Path) -> Path:
+    """Where the report of a scene lies, if there is one."""
+    return scene_file.with_suffix(SUFFIX)
+
+
+def read_report(scene_file: Path, checkpoint_sha256: str) -> dict[str, Any] | None:
+    """The report beside `scene_file`; None where there is none, or where it is of another model.
+
+    Raises `SceneFileInvalid` for a file that is no report.
+    """
+    path = report_path(scene_file)
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise SceneFileInvalid(path.name, "report", f"can't be read: {error.strerror}") from None
+    try:
+        report = json.loads(text, parse_constant=_refuse) if len(text) <= MAX_BYTES else None
+    except (ValueError, RecursionError):
+        report = None
+    if not isinstance(report, dict) or report.get("format") != FORMAT:
+        raise SceneFileInvalid(path.name, "report", f"must be a report, {FORMAT}, of at most {MAX_BYTES} bytes")
+    return report if report.get("checkpoint_sha256") == checkpoint_sha256 else None
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")

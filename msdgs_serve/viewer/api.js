@@ -1,0 +1,49 @@
+// Calls of the service. Addresses are relative, so that the page works behind a proxy's prefix.
+
+const KEY = "msdgs-key";
+
+export class Unreachable extends Error {}
+
+/** An answer that is an error; `detail` is for people, `fields` are those of the request that are wrong. */
+export class Refusal extends Error {
+  constructor(status, problem, retryAfter) {
+    super(problem.detail ?? `The service answered ${status}.`);
+    this.status = status;
+    this.fields = (problem.errors ?? []).map((error) => error.field);
+    this.retryAfter = retryAfter;
+  }
+}
+
+export const readKey = () => sessionStorage.getItem(KEY) ?? "";
+
+export function keepKey(key) {
+  if (key) sessionStorage.setItem(KEY, key);
+  else sessionStorage.removeItem(KEY);
+}
+
+/** The answer, if it is a good one or "not modified". Throws `Unreachable`, `Refusal`, or an AbortError. */
+export async function call(path, { headers = {}, ...options } = {}) {
+  const key = readKey();
+  const authorization = key ? { Authorization: `Bearer ${key}` } : {};
+  let response;
+  try {
+    response = await fetch(path, { ...options, headers: { ...headers, ...authorization }, credentials: "omit" });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Unreachable();
+  }
+  if (response.ok || response.status === 304) return response;
+  if (response.status === 502) throw new Unreachable(); // a proxy whose service is away
+  const problem = await response.json().catch(() => ({}));
+  throw new Refusal(response.status, problem, Number(response.headers.get("Retry-After")) || 1);
+}
+
+export const scenePath = (name) => `scenes/${encodeURIComponent(name)}`;
+
+export const getJson = async (path) => (await call(path)).json();
+
+/** POST /render. */
+export function render(body, { signal, etag } = {}) {
+  const headers = { "Content-Type": "application/json", ...(etag ? { "If-None-Match": etag } : {}) };
+  return call("render", { method: "POST", headers, body: JSON.stringify(body), signal });
+}

@@ -1,0 +1,58 @@
+// Whether the service answers: a line that says when it doesn't, and the way back.
+
+import { Refusal, Unreachable, call } from "./api.js";
+
+const SHORTEST_WAIT = 1000;
+const LONGEST_WAIT = 5000;
+const GROWTH = 1.5;
+
+export class Connection {
+  /** `banner` is the line's element; `recovered` is called when the service is back, `keyNeeded` when it asks for one. */
+  constructor(banner, { recovered, keyNeeded }) {
+    this.banner = banner;
+    this.recovered = recovered;
+    this.keyNeeded = keyNeeded;
+    this.isLost = false;
+    this.timer = 0;
+  }
+
+  /** Say what is wrong, and come back where waiting helps. */
+  failed(error) {
+    if (error instanceof Unreachable) this.#lose("The service doesn’t answer. Trying again…");
+    else if (error instanceof Refusal && error.status === 503) this.#lose(error.message, error.retryAfter * 1000);
+    else if (error instanceof Refusal && error.status === 401) {
+      this.say("The service asks for a key.");
+      this.keyNeeded();
+    } else this.say(error.message);
+  }
+
+  say(text) {
+    this.banner.textContent = text;
+    this.banner.hidden = !text;
+  }
+
+  #lose(text, wait = SHORTEST_WAIT) {
+    this.say(text);
+    if (this.isLost) return;
+    this.isLost = true;
+    this.#tryAfter(Math.max(wait, SHORTEST_WAIT));
+  }
+
+  #tryAfter(wait) {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.#try(wait), wait);
+  }
+
+  async #try(wait) {
+    try {
+      await call("ready");
+    } catch (error) {
+      if (error instanceof Refusal) this.say(error.message);
+      this.#tryAfter(Math.min(wait * GROWTH, LONGEST_WAIT));
+      return;
+    }
+    this.isLost = false;
+    this.say("");
+    this.recovered();
+  }
+}

@@ -1,0 +1,117 @@
+// The work-precision diagram of a report: milliseconds across, error of the worst frame upwards.
+
+const SVG = "http://www.w3.org/2000/svg";
+const WIDTH = 320;
+const HEIGHT = 230;
+const LEFT = 44;
+const RIGHT = 12;
+const TOP = 10;
+const BOTTOM = 36;
+const DB_STEP = 10;
+const HIGHEST = 110; // dB; what is exact is drawn here
+const PLACES = [[1, 1.5, 2, 3, 4, 5, 6, 7, 8], [1, 2, 5], [1]]; // of a decade, as many as there is room for
+const MOST_TICKS = 6;
+const KINDS = ["network", "prefix", "int8", "lowrank", "keyframes"];
+
+/** Draw into an <svg>; `tell(text)` gets a sentence about the point that is looked at. */
+export function drawDiagram(svg, report, tell) {
+  const points = report.points.map(pointOf).sort((a, b) => a.milliseconds - b.milliseconds);
+  const across = scale(points.map((point) => Math.log(point.milliseconds)), [LEFT + 8, WIDTH - RIGHT - 8]);
+  const upwards = scale([...points.map((point) => point.psnr), report.max_error], [TOP + 8, HEIGHT - BOTTOM - 8]);
+  const x = (milliseconds) => across(Math.log(milliseconds));
+  svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
+  svg.replaceChildren(
+    ...timeAxis(points, x),
+    ...errorAxis(points, upwards),
+    ...allowed(report.max_error, upwards(report.max_error)),
+    frontLine(points, x, upwards),
+    ...points.map((point) => dot(point, x(point.milliseconds), upwards(point.psnr), tell)),
+  );
+  tell(sentence(points.find((point) => point.chosen) ?? points[0]));
+}
+
+function pointOf(point) {
+  return {
+    plan: point.plan,
+    kind: point.plan.split(":")[0],
+    front: point.front,
+    chosen: point.chosen,
+    trimmed: point.trim_db,
+    milliseconds: point.milliseconds.total.min,
+    psnr: Math.min(point.error.psnr_worst ?? HIGHEST, HIGHEST),
+    bytes: point.bytes,
+  };
+}
+
+/** From values to places between the two ends. */
+function scale(values, [first, last]) {
+  const [low, high] = [Math.min(...values), Math.max(...values)];
+  return (value) => (high > low ? first + ((value - low) / (high - low)) * (last - first) : (first + last) / 2);
+}
+
+function timeAxis(points, x) {
+  const [fastest, slowest] = [points[0].milliseconds, points.at(-1).milliseconds];
+  const inside = PLACES.map((decade) => ticksOf(decade, fastest, slowest)).find((ticks) => ticks.length <= MOST_TICKS);
+  const marked = inside?.length > 1 ? inside : [fastest, slowest].map((place) => Number(place.toPrecision(2)));
+  const ticks = marked.flatMap((place) => [
+    make("line", { class: "grid", x1: x(place), x2: x(place), y1: TOP, y2: HEIGHT - BOTTOM }),
+    make("text", { class: "tick", x: x(place), y: HEIGHT - BOTTOM + 14, "text-anchor": "middle" }, `${place}`),
+  ]);
+  const name = make("text", { class: "axis", x: (LEFT + WIDTH - RIGHT) / 2, y: HEIGHT - 4, "text-anchor": "middle" });
+  name.textContent = "milliseconds a frame";
+  return [...ticks, name];
+}
+
+function ticksOf(decade, low, high) {
+  const powers = [-1, 0, 1, 2, 3, 4];
+  const all = powers.flatMap((power) => decade.map((place) => Number((place * 10 ** power).toPrecision(2))));
+  return all.filter((place) => place >= low && place <= high);
+}
+
+function errorAxis(points, y) {
+  const values = points.map((point) => point.psnr);
+  const ticks = [];
+  for (let db = DB_STEP * Math.ceil(Math.min(...values) / DB_STEP); db <= Math.max(...values); db += DB_STEP) {
+    ticks.push(make("line", { class: "grid", x1: LEFT, x2: WIDTH - RIGHT, y1: y(db), y2: y(db) }));
+    ticks.push(make("text", { class: "tick", x: LEFT - 6, y: y(db) + 4, "text-anchor": "end" }, `${db} dB`));
+  }
+  return ticks;
+}
+
+function allowed(db, y) {
+  return [
+    make("line", { class: "allowed", x1: LEFT, x2: WIDTH - RIGHT, y1: y, y2: y }),
+    make("text", { class: "tick", x: WIDTH - RIGHT, y: y - 4, "text-anchor": "end" }, `allowed: ${db} dB`),
+  ];
+}
+
+function frontLine(points, x, y) {
+  const front = points.filter((point) => point.front);
+  const steps = front.map((point, i) => `${i ? `H${x(point.milliseconds)}V` : `M${x(point.milliseconds)} `}${y(point.psnr)}`);
+  return make("path", { class: "front", d: steps.join("") });
+}
+
+function dot(point, x, y, tell) {
+  const kind = KINDS.includes(point.kind) ? point.kind : "other";
+  const drawn = make("circle", {
+    class: `dot ${kind}${point.chosen ? " chosen" : ""}${point.front ? "" : " behind"}`,
+    cx: x, cy: y, r: point.chosen ? 6 : 4.5,
+    tabindex: 0, role: "img", "aria-label": sentence(point),
+  }); // prettier-ignore
+  for (const event of ["pointerenter", "focus", "click"]) drawn.addEventListener(event, () => tell(sentence(point)));
+  return drawn;
+}
+
+function sentence(point) {
+  const trimmed = point.trimmed === null ? "all of it" : `trimmed to ${point.trimmed} dB`;
+  const error = point.psnr >= HIGHEST ? "exact" : `${point.psnr.toFixed(1)} dB in the worst frame`;
+  const served = point.chosen ? "Chosen: " : "";
+  return `${served}${point.plan}, ${trimmed}. ${point.milliseconds.toFixed(1)} ms, ${error}, ${(point.bytes / 1e6).toFixed(2)} MB.`;
+}
+
+function make(kind, attributes, text = "") {
+  const made = document.createElementNS(SVG, kind);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.textContent = text;
+  return made;
+}

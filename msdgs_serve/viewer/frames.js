@@ -1,0 +1,145 @@
+// Frames, one request at a time: small ones while something moves, a full one once all is still.
+// What is newest wins: a full frame in work is given up when something moves, and the service stops drawing it.
+
+import { Refusal, Unreachable, render } from "./api.js";
+
+const STILL_AFTER = 150; // milliseconds
+const IMPATIENCE = 500; // milliseconds after which a moving frame that is out of date is given up
+const SHRINK = 0.5; // of the pixels, where the service says that they are too many
+const FEWEST_PIXELS = 64 * 64;
+
+export class Frames {
+  /**
+   * `host` has: size() of a full frame in pixels; body(); isMoving(); show(bitmap, facts); failed(error).
+   */
+  constructor(host, pace) {
+    this.host = host;
+    this.pace = pace;
+    this.mostPixels = 2.5e6;
+    this.inFlight = null;
+    this.wanted = false;
+    this.changedAt = 0;
+    this.timer = 0;
+    this.paused = true;
+  }
+
+  /** Something to be seen has changed. `cut`: so much that the frame in work is of no use. */
+  change({ cut = false } = {}) {
+    this.changedAt = performance.now();
+    this.wanted = true;
+    this.shown = null;
+    const flight = this.inFlight;
+    if (flight && (cut || flight.full || performance.now() - flight.asked > IMPATIENCE)) flight.abort.abort();
+    this.#next();
+  }
+
+  pause() {
+    this.paused = true;
+    this.inFlight?.abort.abort();
+    clearTimeout(this.timer);
+  }
+
+  resume() {
+    this.paused = false;
+    this.change();
+  }
+
+  /** Ask again for what is shown; costs nothing while it is the same. */
+  async check() {
+    if (this.paused || this.inFlight || !this.shown || this.#isMoving()) return;
+    await this.#fetch({ full: true, etag: this.shown.etag });
+  }
+
+  /** Width and height of a frame in full quality. */
+  fullSize() {
+    const { width, height } = this.host.size();
+    const scale = Math.min(1, Math.sqrt(this.mostPixels / (width * height)));
+    return { width: Math.max(1, Math.floor(width * scale)), height: Math.max(1, Math.floor(height * scale)) };
+  }
+
+  #isMoving() {
+    return this.host.isMoving() || performance.now() - this.changedAt < STILL_AFTER;
+  }
+
+  #next() {
+    clearTimeout(this.timer);
+    if (this.paused || this.inFlight) return;
+    if (this.wanted && this.#isMoving()) {
+      this.wanted = false;
+      this.#fetch({ full: false });
+    } else if (this.wanted || !this.shown) {
+      const wait = this.host.isMoving() ? STILL_AFTER : STILL_AFTER - (performance.now() - this.changedAt);
+      if (wait > 0) {
+        this.timer = setTimeout(() => this.#next(), wait + 1);
+        return;
+      }
+      this.wanted = false;
+      this.#fetch({ full: true });
+    }
+  }
+
+  async #fetch({ full, etag }) {
+    const size = full ? this.fullSize() : this.pace.size(this.fullSize());
+    const body = { ...this.host.body(), ...size, ...(full ? { format: "png" } : { format: "jpeg", quality: 85 }) };
+    const abort = new AbortController();
+    this.inFlight = { abort, full, asked: performance.now() };
+    try {
+      const response = await render(body, { signal: abort.signal, etag });
+      if (response.status !== 304) await this.#show(response, size, full, etag !== undefined);
+    } catch (error) {
+      this.#failed(error);
+    } finally {
+      this.inFlight = null;
+    }
+    this.#next();
+  }
+
+  async #show(response, size, full, isNews) {
+    const { asked, abort } = this.inFlight;
+    const bitmap = await createImageBitmap(await response.blob());
+    if (abort.signal.aborted) return;
+    await new Promise(requestAnimationFrame);
+    const seconds = (performance.now() - asked) / 1000;
+    const stages = timings(response.headers.get("Server-Timing"));
+    if (!full) this.pace.measured(size.width * size.height, seconds, (stages.draw ?? 0) + (stages.encode ?? 0));
+    this.host.show(bitmap, { ...size, full, seconds, stages, isNews });
+    bitmap.close();
+    if (full && !this.wanted) this.shown = { etag: response.headers.get("ETag") };
+  }
+
+  #failed(error) {
+    if (error.name === "AbortError") {
+      this.wanted = true;
+      return;
+    }
+    if (error instanceof Unreachable) {
+      this.wanted = true;
+      this.paused = true;
+    } else if (error instanceof Refusal && this.#isTooLarge(error)) {
+      this.mostPixels *= SHRINK;
+      this.wanted = true;
+      return;
+    } else if (error instanceof Refusal && error.status === 503) {
+      this.wanted = true;
+      this.paused = true;
+    } else {
+      this.paused = true;
+    }
+    this.host.failed(error);
+  }
+
+  #isTooLarge(error) {
+    const aboutSize = error.fields.some((field) => field === "width" || field === "height");
+    return error.status === 422 && aboutSize && this.mostPixels > FEWEST_PIXELS;
+  }
+}
+
+/** Seconds by stage, from a Server-Timing header. */
+export function timings(header) {
+  const stages = {};
+  for (const part of (header ?? "").split(",")) {
+    const found = /^\s*([\w-]+);dur=([\d.]+)/.exec(part);
+    if (found) stages[found[1]] = Number(found[2]) / 1000;
+  }
+  return stages;
+}

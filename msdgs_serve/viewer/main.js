@@ -1,0 +1,247 @@
+// The page: what is shown, and what its parts say to each other.
+
+import { getJson, keepKey, readKey, scenePath } from "./api.js";
+import { Camera } from "./camera.js";
+import { Connection } from "./connection.js";
+import { Controls } from "./controls.js";
+import { drawDiagram } from "./diagram.js";
+import { showFacts } from "./facts.js";
+import { Frames } from "./frames.js";
+import { Pace } from "./pace.js";
+import { Player } from "./player.js";
+import { frameBody, numbersBody } from "./request.js";
+import { SceneList } from "./scenes.js";
+import { copy, curlCommand, download, fromHash, toHash } from "./share.js";
+import { Stage } from "./stage.js";
+import { Timeline } from "./timeline.js";
+
+const LOOK_EVERY = 3000; // milliseconds, for changed scenes
+const NOTICE_FOR = 2500;
+const VIEWS = ["rgb", "depth", "motion"];
+
+const find = (id) => document.getElementById(id);
+const state = { scene: null, camera: null, player: new Player(), view: "rgb" };
+const pace = new Pace();
+const stage = new Stage(find("picture"), find("status"));
+const timeline = new Timeline(state.player, { changed: () => changed(), started: run });
+const connection = new Connection(find("banner"), { recovered, keyNeeded: () => find("key-dialog").showModal() });
+const scenes = new SceneList(find("scenes"), { open: (name) => guarded(() => open(name)), isIdle });
+const controls = new Controls(find("picture"), { camera: () => state.camera, moved: () => moved(), command });
+const frames = new Frames(
+  {
+    size: () => stage.size(state),
+    body: () => frameBody(state),
+    isMoving: () => state.player.playing || controls.flying.size > 0,
+    show,
+    failed: (error) => connection.failed(error),
+  },
+  pace,
+);
+let isFast = false;
+let running = 0;
+
+async function open(name, look = {}) {
+  const scene = await getJson(scenePath(name));
+  const isAnother = state.scene?.name !== name;
+  state.scene = scene;
+  state.player.range = scene.time_range;
+  if (isAnother) {
+    state.camera = new Camera(scene.view);
+    state.camera.aspect = stage.aspect();
+    state.player.seek(0);
+  }
+  applyLook(look);
+  describe();
+  connection.say("");
+  frames.paused = false;
+  frames.change({ cut: true });
+  await showReport(scene);
+}
+
+function applyLook({ t = null, at = null, sceneCamera = null, view = null }) {
+  if (t !== null) state.player.seekTime(t);
+  if (at) [state.camera.azimuth, state.camera.elevation, state.camera.distance] = at;
+  if (at) state.camera.target = at.slice(3);
+  if (sceneCamera in state.scene.cameras) state.camera.take(state.scene.cameras[sceneCamera], sceneCamera);
+  if (VIEWS.includes(view)) state.view = view;
+}
+
+function describe() {
+  const { scene } = state;
+  document.title = `${scene.name} · msdgs`;
+  find("title").textContent = scene.name;
+  scenes.mark(scene.name);
+  stage.background(scene.background);
+  showFacts(find("facts"), scene);
+  const options = scene.cameras.map((camera, i) => new Option(camera.name, i));
+  find("camera").replaceChildren(new Option("Free view", ""), ...options);
+  find("camera").hidden = scene.cameras.length === 0;
+  find("view").elements.view.value = state.view;
+  timeline.show();
+}
+
+async function showReport({ name, report: isThere }) {
+  const section = find("report");
+  const report = isThere ? await getJson(`${scenePath(name)}/report`).catch(() => null) : null;
+  if (state.scene.name !== name) return;
+  section.hidden = !report?.points?.length;
+  if (section.hidden) return;
+  const { processor, threads } = report.machine;
+  find("report-machine").textContent = `Measured on ${processor}, ${threads} threads.`;
+  drawDiagram(find("diagram"), report, (text) => (find("report-point").textContent = text));
+}
+
+/** Something to be seen is different. */
+function changed() {
+  if (state.camera) frames.change();
+}
+
+function moved() {
+  const { sceneCamera } = state.camera;
+  find("camera").value = sceneCamera === null ? "" : String(sceneCamera);
+  changed();
+  if (controls.flying.size > 0) run();
+}
+
+function show(bitmap, facts) {
+  stage.show(bitmap, facts);
+  if (!facts.full) return;
+  history.replaceState(null, "", toHash(state));
+  if (facts.isNews) guarded(() => open(state.scene.name));
+  if (facts.isNews) scenes.renew(state.scene.name);
+}
+
+/** Whether there is nothing better to do than small pictures. */
+function isIdle() {
+  return !connection.isLost && (frames.shown || frames.paused) && !frames.inFlight;
+}
+
+/** Time and flight go on with the screen's frames, as long as there are any. */
+function run() {
+  if (running) return;
+  let before = performance.now();
+  const tick = (now) => {
+    const seconds = Math.min(Math.max(now - before, 0) / 1000, 0.5);
+    before = now;
+    if (state.player.playing && !connection.isLost) {
+      state.player.advance(seconds);
+      timeline.show();
+      changed();
+    }
+    const isFlying = controls.advance(seconds, isFast);
+    running = state.player.playing || isFlying ? requestAnimationFrame(tick) : 0;
+  };
+  running = requestAnimationFrame(tick);
+}
+
+function command(key) {
+  const place = VIEWS[Number(key) - 1];
+  if (place) setView(place);
+  else if (key === " ") timeline.toggle();
+  else if (key === ",") timeline.step(-1);
+  else if (key === ".") timeline.step(1);
+  else if (key === "r") resetCamera();
+  else if (key === "?") find("help").showModal();
+  else return false;
+  return true;
+}
+
+function setView(view) {
+  state.view = view;
+  find("view").elements.view.value = view;
+  frames.change({ cut: true });
+}
+
+function resetCamera() {
+  state.camera.reset();
+  moved();
+}
+
+async function recovered() {
+  await guarded(async () => {
+    await scenes.refresh();
+    if (state.scene) await open(state.scene.name);
+    else await start();
+  });
+}
+
+/** Look whether scenes have come, changed or gone. */
+async function lookAgain() {
+  if (document.hidden || connection.isLost || find("key-dialog").open) return;
+  await guarded(async () => {
+    await scenes.refresh();
+    if (state.scene && !scenes.names.includes(state.scene.name)) connection.say(`${state.scene.name} is gone.`);
+    else if (!state.scene && scenes.names.length) await start();
+    else if (state.scene) await frames.check();
+    scenes.mark(state.scene?.name);
+  });
+}
+
+async function start() {
+  await scenes.refresh();
+  const look = fromHash(location.hash);
+  const name = scenes.names.includes(look.scene) ? look.scene : scenes.names[0];
+  if (name === undefined) connection.say("No scene yet. A file that is put into the service’s folder appears here.");
+  else await open(name, look);
+}
+
+async function guarded(action) {
+  try {
+    await action();
+  } catch (error) {
+    connection.failed(error);
+  }
+}
+
+function notice(text) {
+  find("notice").textContent = text;
+  setTimeout(() => find("notice").textContent === text && (find("notice").textContent = ""), NOTICE_FOR);
+}
+
+async function takeAlong(kind) {
+  const size = frames.fullSize();
+  if (kind === "curl") {
+    const text = curlCommand({ ...frameBody(state), ...size, format: "png" });
+    if (await copy(text)) return notice("Copied.");
+    find("command").value = text;
+    find("command-dialog").showModal();
+    find("command").select();
+    return undefined;
+  }
+  const body = kind === "exr" ? numbersBody(state) : { ...frameBody(state), format: kind };
+  await download({ ...body, ...size }, `${state.scene.name}-${state.player.t}.${kind}`);
+  return undefined;
+}
+
+function listen() {
+  find("view").addEventListener("change", (event) => setView(event.target.value));
+  find("reset").addEventListener("click", resetCamera);
+  find("camera").addEventListener("change", ({ target }) => {
+    if (target.value === "") return;
+    const index = Number(target.value);
+    state.camera.take(state.scene.cameras[index], index);
+    moved();
+  });
+  for (const button of document.querySelectorAll("[data-take]")) {
+    button.addEventListener("click", () => state.scene && guarded(() => takeAlong(button.dataset.take)));
+  }
+  for (const button of document.querySelectorAll("[data-opens]")) {
+    button.addEventListener("click", () => find(button.dataset.opens).showModal());
+  }
+  find("key-form").addEventListener("submit", () => {
+    keepKey(find("key").value.trim());
+    connection.say("");
+    guarded(start);
+  });
+  for (const event of ["keydown", "keyup"]) document.addEventListener(event, ({ shiftKey }) => (isFast = shiftKey));
+  window.addEventListener("hashchange", () => guarded(start));
+  stage.onResize(() => {
+    if (state.camera) state.camera.aspect = stage.aspect();
+    changed();
+  });
+  setInterval(lookAgain, LOOK_EVERY);
+}
+
+find("key").value = readKey();
+listen();
+guarded(start);

@@ -1,0 +1,93 @@
+// The list of scenes, with a small picture of each.
+
+import { call, getJson } from "./api.js";
+
+const THUMBNAIL = { width: 96, height: 72 };
+
+export class SceneList {
+  /** `host` has: open(name); isIdle(), whether a picture may be asked for now. */
+  constructor(list, host) {
+    this.list = list;
+    this.host = host;
+    this.items = new Map();
+    this.waiting = new Set();
+    this.isDrawing = false;
+    this.observer = new IntersectionObserver((entries) => {
+      for (const { target, isIntersecting } of entries) {
+        if (isIntersecting) this.waiting.add(target.dataset.scene);
+        else this.waiting.delete(target.dataset.scene);
+      }
+    });
+    setInterval(() => this.#drawOne(), 200);
+  }
+
+  get names() {
+    return [...this.items.keys()];
+  }
+
+  /** Ask which there are. Throws what `call` throws. */
+  async refresh() {
+    const { scenes } = await getJson("scenes");
+    const names = new Set(scenes.map((scene) => scene.name));
+    for (const [name, item] of this.items) {
+      if (!names.has(name)) this.#remove(name, item);
+    }
+    for (const scene of scenes) {
+      const item = this.items.get(scene.name) ?? this.#add(scene.name);
+      this.list.append(item);
+      item.classList.toggle("broken", scene.problem);
+      item.querySelector(".note").textContent = scene.problem ? "file is broken" : "";
+    }
+  }
+
+  /** Mark the one that is shown. */
+  mark(name) {
+    for (const [each, item] of this.items) {
+      const button = item.querySelector("button");
+      if (each === name) button.setAttribute("aria-current", "true");
+      else button.removeAttribute("aria-current");
+    }
+  }
+
+  /** Draw a scene's small picture again. */
+  renew(name) {
+    if (this.items.has(name)) this.waiting.add(name);
+  }
+
+  #add(name) {
+    const item = document.getElementById("scene-item").content.firstElementChild.cloneNode(true);
+    item.dataset.scene = name;
+    item.querySelector(".name").textContent = name;
+    item.querySelector("button").addEventListener("click", () => this.host.open(name));
+    const picture = item.querySelector("canvas");
+    [picture.width, picture.height] = [2 * THUMBNAIL.width, 2 * THUMBNAIL.height];
+    this.items.set(name, item);
+    this.observer.observe(item);
+    return item;
+  }
+
+  #remove(name, item) {
+    this.observer.unobserve(item);
+    this.waiting.delete(name);
+    this.items.delete(name);
+    item.remove();
+  }
+
+  async #drawOne() {
+    const [name] = this.waiting;
+    if (name === undefined || this.isDrawing || document.hidden || !this.host.isIdle()) return;
+    this.isDrawing = true;
+    this.waiting.delete(name);
+    try {
+      const picture = this.items.get(name).querySelector("canvas");
+      const query = new URLSearchParams({ scene: name, width: picture.width, height: picture.height, format: "jpeg" });
+      const bitmap = await createImageBitmap(await (await call(`render?${query}`)).blob());
+      picture.getContext("2d").drawImage(bitmap, 0, 0);
+      this.observer.unobserve(this.items.get(name) ?? picture);
+    } catch {
+      // the frame itself tells what is wrong
+    } finally {
+      this.isDrawing = false;
+    }
+  }
+}

@@ -1,0 +1,58 @@
+// Taking a frame along: as a command, as a file, as an address.
+
+import { readKey, render } from "./api.js";
+import { short } from "./camera.js";
+
+/** The command that asks for the same frame. A key is not written into it. */
+export function curlCommand(body) {
+  const key = readKey() ? " -H \"Authorization: Bearer $MSDGS_KEY\"" : "";
+  const address = quoted(new URL("render", document.baseURI).href);
+  const output = `-o frame.${body.format}`;
+  return `curl ${address}${key} -H 'Content-Type: application/json' ${output} -d ${quoted(JSON.stringify(body))}`;
+}
+
+/** For a shell. */
+const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
+
+/** Whether the clipboard took it; it doesn't on pages that came without encryption from other machines. */
+export async function copy(text) {
+  try {
+    await navigator.clipboard.writeText(text);
+    return true;
+  } catch {
+    return false;
+  }
+}
+
+/** Ask for the frame and hand it to the browser as a file. */
+export async function download(body, name) {
+  const blob = await (await render(body)).blob();
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}
+
+/** What is shown, as the part of the address after #. */
+export function toHash({ scene, camera, player, view }) {
+  const { azimuth, elevation, distance, target, sceneCamera } = camera;
+  const lengths = [distance, ...target].map((x) => short(x, distance));
+  const free = [short(azimuth), short(elevation), ...lengths].join(",");
+  const at = sceneCamera === null ? { at: free } : { camera: sceneCamera };
+  return `#${new URLSearchParams({ scene: scene.name, t: player.t, view, ...at })}`.replaceAll("%2C", ",");
+}
+
+/** The reverse; what is missing or makes no sense is left out. */
+export function fromHash(hash) {
+  const given = new URLSearchParams(hash.slice(1));
+  const at = (given.get("at") ?? "").split(",").map(Number);
+  const [t, sceneCamera] = ["t", "camera"].map((name) => (given.has(name) ? Number(given.get(name)) : NaN));
+  return {
+    scene: given.get("scene"),
+    view: given.get("view"),
+    t: Number.isFinite(t) ? t : null,
+    sceneCamera: Number.isInteger(sceneCamera) ? sceneCamera : null,
+    at: at.length === 6 && at.every(Number.isFinite) && at[2] > 0 ? at : null,
+  };
+}

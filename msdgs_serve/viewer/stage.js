@@ -1,0 +1,62 @@
+// The picture, and the line below that says what it took.
+
+const SHARPEST = 2; // device pixels to one of the page, more than that nobody sees
+
+export class Stage {
+  constructor(canvas, status) {
+    this.canvas = canvas;
+    this.status = status;
+    this.context = canvas.getContext("2d", { alpha: false });
+    this.rate = 0;
+    this.shownAt = 0;
+  }
+
+  aspect() {
+    const { clientWidth, clientHeight } = this.canvas;
+    return Math.max(clientWidth, 1) / Math.max(clientHeight, 1);
+  }
+
+  /** Of a full frame, in pixels; one of the scene's own cameras keeps its proportions. */
+  size({ scene, camera }) {
+    const sharpness = Math.min(window.devicePixelRatio || 1, SHARPEST);
+    let [width, height] = [this.canvas.clientWidth * sharpness, this.canvas.clientHeight * sharpness];
+    if (camera.sceneCamera !== null) {
+      const stored = scene.cameras[camera.sceneCamera];
+      const scale = Math.min(width / stored.width, height / stored.height);
+      [width, height] = [stored.width * scale, stored.height * scale];
+    }
+    return { width: Math.max(1, Math.round(width)), height: Math.max(1, Math.round(height)) };
+  }
+
+  /** Around the picture: the scene's own, sRGB from 0 to 1. */
+  background(color) {
+    this.canvas.style.background = `rgb(${color.map((x) => Math.round(255 * x)).join(" ")})`;
+  }
+
+  show(bitmap, { width, height, full, seconds, stages }) {
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      [this.canvas.width, this.canvas.height] = [width, height];
+    }
+    this.context.drawImage(bitmap, 0, 0);
+    this.canvas.dataset.shown = full ? "full" : "moving";
+    this.#tell(width, height, full, seconds, stages);
+  }
+
+  onResize(action) {
+    new ResizeObserver(action).observe(this.canvas);
+  }
+
+  #tell(width, height, full, seconds, stages) {
+    const now = performance.now();
+    const between = (now - this.shownAt) / 1000;
+    this.shownAt = now;
+    if (between < 1) this.rate = this.rate ? this.rate + 0.2 * (1 / between - this.rate) : 1 / between;
+    else this.rate = 0;
+    const parts = [`${width} × ${height}`, `${milliseconds(seconds)} ms`];
+    if (!full && this.rate) parts.push(`${Math.round(this.rate)} frames/s`);
+    if (full) for (const name of ["pose", "draw", "encode"]) parts.push(`${name} ${milliseconds(stages[name] ?? 0)}`);
+    this.status.textContent = parts.join(" · ");
+  }
+}
+
+const milliseconds = (seconds) => Math.round(1000 * seconds);
