@@ -5,6 +5,7 @@ import logging
 import os
 import socket
 import sys
+import time
 from collections.abc import Sequence
 
 from pydantic import ValidationError
@@ -14,6 +15,7 @@ from msdgs_serve.api.observe import JsonLines
 from msdgs_serve.api.openapi import render_examples
 from msdgs_serve.api.server import Server
 from msdgs_serve.api.settings import PROGRAM, Settings
+from msdgs_serve.rasterizer.ahead import compile_kernels
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import MsdgsError
 from msdgs_serve.store import SceneStore
@@ -33,6 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _configure_logging(settings)
         if settings.threads is not None:
             os.environ[THREADS_VARIABLE] = str(settings.threads)
+        if settings.compile:
+            return _compile()
         _serve(settings)
     except KeyboardInterrupt:
         pass
@@ -49,7 +53,7 @@ def _settings(arguments: Sequence[str]) -> Settings:
     except ValidationError as error:
         wrong = [f"--{item['loc'][0]}: {item['msg']}".replace("_", "-") for item in error.errors()]
         raise UsageError("; ".join(wrong)) from None
-    if not settings.scenes:
+    if not (settings.scenes or settings.compile):
         raise UsageError(f"which scene? `{PROGRAM} scene.onnx` serves one; `{PROGRAM} --help` tells more")
     return settings
 
@@ -61,6 +65,14 @@ def _configure_logging(settings: Settings) -> None:
     )
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
+
+
+def _compile() -> int:
+    print("Compiling, which takes up to a minute …", flush=True)
+    started = time.perf_counter()
+    folder = compile_kernels()
+    print(f"Kernels are ready after {time.perf_counter() - started:.1f} s, in {folder}", flush=True)
+    return 0
 
 
 def _serve(settings: Settings) -> None:

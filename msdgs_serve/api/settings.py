@@ -8,6 +8,7 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 from pydantic_settings import (
     BaseSettings,
+    CliImplicitFlag,
     CliPositionalArg,
     EnvSettingsSource,
     PydanticBaseSettingsSource,
@@ -23,6 +24,7 @@ class Settings(BaseSettings):
 
       msdgs-serve scene.onnx                  one scene
       msdgs-serve scenes/ --port 9000         every .onnx file of a folder; files may come, change and go
+      msdgs-serve --compile                   compile now, so that the next start needn't, and stop
       MSDGS_SCENES=scenes/ msdgs-serve        every flag can be given as an environment variable, MSDGS_ before its name
 
     A scene file comes from `python export/to_onnx.py model.pt`. Once it listens, /docs explains each call.
@@ -59,6 +61,9 @@ class Settings(BaseSettings):
     frame_max_age: int = Field(default=0, ge=0, description="seconds that caches may keep a frame without asking")
     api_keys_file: Path | None = Field(default=None, description="keys, one a line; without one no request is answered")
     cors_origins: list[str] = Field(default=[], description="web pages that may call, as https://example.org; or *")
+    compile: CliImplicitFlag[bool] = Field(
+        default=False, description="store compiled kernels for this kind of processor and stop; needs no scene"
+    )
     threads: int | None = Field(
         default=None, ge=1, le=256, description="threads that compute; default: one for each core"
     )
