@@ -1,0 +1,107 @@
+"""What `convert.py` does."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from export.exporters.ply import write_ply
+from export.exporters.proof import Proof, require, splats_of, visionary_of
+from export.exporters.spz import write_spz
+from export.exporters.visionary import visionary_model
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.files import replacing
+
+LOSSLESS, LOSSY = 60.0, 45.0
+"""dB that what was written must have by default."""
+
+VISIONARY = ".visionary.onnx"
+FILMS = (".mp4", ".webm")
+COMPARED = 5
+"""Times at which a model that moves is compared."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line says."""
+
+    scene: Path
+    out: Path
+    t: float | None
+    frames: int
+    min_psnr: float | None  # dB
+
+
+def convert(settings: Settings, console: Console) -> None:
+    """Write, read back, compare. Raises `InvalidInput`, `SceneFileInvalid` and `ConversionFailed`; a file that isn't
+    close enough doesn't take the place of an old one."""
+    out = settings.out
+    if out.suffix in FILMS:
+        raise InvalidInput("out", f"other than a film: msdgs-render {settings.scene} {out} writes one", out.name)
+    session = DeformationSession(settings.scene)
+    if out.name.endswith(VISIONARY):
+        _visionary(session, settings, console)
+    elif out.suffix in (".ply", ".spz"):
+        t0, _ = session.scene.metadata.time_range
+        psnr = _one(session, out, t0 if settings.t is None else settings.t, settings.min_psnr)
+        console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {psnr:.1f} dB from the scene", markup=False)
+    elif not out.suffix:
+        _sequence(session, settings, console)
+    else:
+        raise InvalidInput("out", f"a folder, or named .ply, .spz or {VISIONARY}", out.name)
+
+
+def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | None) -> float:
+    gaussians, metadata = session.gaussians(t), session.scene.metadata
+    mip = metadata.antialiasing == "mip"
+    with replacing(file) as temporary:
+        if file.suffix == ".ply":
+            write_ply(temporary, gaussians)
+        else:
+            write_spz(temporary, gaussians, metadata.antialiasing)
+        default = LOSSLESS if file.suffix == ".ply" else LOSSY
+        psnr = Proof(session, mip=mip).psnr(splats_of(temporary)(t), t)
+        require(psnr, default if min_psnr is None else min_psnr, file.name)
+    return psnr
+
+
+def _sequence(session: DeformationSession, settings: Settings, console: Console) -> None:
+    if settings.t is not None:
+        raise InvalidInput("t", "left out for a folder; --frames says how many", settings.t)
+    if settings.frames < 2:
+        raise InvalidInput("frames", "2 or more", settings.frames)
+    times = np.linspace(*session.scene.metadata.time_range, settings.frames).tolist()
+    out, digits = settings.out, len(str(settings.frames - 1))
+    out.mkdir(parents=True, exist_ok=True)
+    if any(each.suffix == ".ply" for each in out.iterdir()):
+        raise InvalidInput("out", "a folder without PLY files", str(out))
+    worst = min(
+        _one(session, out / f"{settings.scene.stem}_{number:0{digits}}.ply", t, settings.min_psnr)
+        for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
+    )
+    console.print(f"{out}: {len(times)} files, the worst {worst:.1f} dB from the scene", markup=False)
+
+
+def _visionary(session: DeformationSession, settings: Settings, console: Console) -> None:
+    out, metadata = settings.out, session.scene.metadata
+    model = visionary_model(settings.scene)
+    with replacing(out) as temporary:
+        temporary.write_bytes(model.SerializeToString())
+        worst = _worst(session, visionary_of(temporary))
+        require(worst, LOSSY if settings.min_psnr is None else settings.min_psnr, out.name)
+    console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {worst:.1f} dB from the scene", markup=False)
+    if metadata.antialiasing == "mip":
+        console.print("its anti-aliasing isn't in this format: thin parts come out brighter")
+    if session.scene.moving_count and metadata.plan.partition(":")[0] in ("network", "prefix"):
+        console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a scene that is cheaper")
+
+
+def _worst(session: DeformationSession, shown: Callable[[float], Gaussians]) -> float:
+    proof = Proof(session, mip=False)
+    times = np.linspace(*session.scene.metadata.time_range, COMPARED if session.scene.moving_count else 1)
+    return min(proof.psnr(shown(float(np.float32(t))), float(np.float32(t))) for t in times)

@@ -1,0 +1,34 @@
+"""PLY in the layout of INRIA's trainer: binary, float32, 17 properties and those of the SH bands."""
+
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from msdgs_serve.scene.gaussians import Gaussians
+
+NEAREST_TO_END = 1e-7
+"""Opacities 0 and 1 have no finite logit; this far from them no pixel of 8 bits differs."""
+
+
+def write_ply(file: Path, gaussians: Gaussians) -> None:
+    """All Gaussians in storage space: logits of opacities, logarithms of scales, wxyz quaternions; normals are 0."""
+    rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)  # a channel's coefficients together
+    opacities = gaussians.opacities.astype(np.float64).clip(NEAREST_TO_END, 1 - NEAREST_TO_END)
+    columns = {
+        **_columns("xyz", gaussians.means),
+        **{f"n{axis}": np.zeros(len(gaussians), np.float32) for axis in "xyz"},
+        **_columns([f"f_dc_{i}" for i in range(3)], gaussians.sh[:, 0]),
+        **_columns([f"f_rest_{i}" for i in range(rest.shape[1])], rest),
+        "opacity": np.log(opacities / (1 - opacities)),
+        **_columns([f"scale_{i}" for i in range(3)], np.log(gaussians.scales.astype(np.float64))),
+        **_columns([f"rot_{i}" for i in range(4)], gaussians.quats),
+    }
+    rows = np.empty(len(gaussians), [(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        rows[name] = values
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(file))
+
+
+def _columns(names: str | list[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(zip(names, values.T, strict=True))

@@ -1,0 +1,76 @@
+"""Is what was written the scene? It is read back, drawn, and compared with the scene's own pictures."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+
+from export.exporters.visionary import COLORS, COUNT, GAUSSIANS, unpacked
+from export.importers.recognise import read_splats
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import framing
+from msdgs_serve.rasterizer import GSPLAT, rasterize
+from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.metrics import psnr_from_mse
+
+VIEWS, SIZE, ELEVATION = 3, 256, 20.0
+"""Cameras about the scene, the pixels of their shorter side, and degrees."""
+
+
+class ConversionFailed(MsdgsError):
+    """What was written doesn't look like the scene."""
+
+
+class Proof:
+    """Pictures of a scene, to compare others with."""
+
+    def __init__(self, session: DeformationSession, *, mip: bool) -> None:
+        """`mip`: with the anti-aliasing of Mip-Splatting, as far as the other format knows it."""
+        self._session, self._options = session, GSPLAT._replace(mip=mip)
+        metadata = session.scene.metadata
+        view = framing(metadata)
+        shown = SIZE / min(view.width, view.height)
+        size = max(1, round(view.width * shown)), max(1, round(view.height * shown))
+        poses = [orbit(view.target, view.distance, 360 * i / VIEWS, ELEVATION, view.up) for i in range(VIEWS)]
+        self._cameras = [Camera.from_fov(pose, *size, view.fov_y) for pose in poses]
+        self._background = metadata.background
+
+    def psnr(self, got: Gaussians, t: float) -> float:
+        """dB of the worst view; pictures are compared as they are shown, cut to [0, 1]."""
+        expected = self._session.gaussians(t)
+        return min(self._psnr(got, expected, camera) for camera in self._cameras)
+
+    def _psnr(self, got: Gaussians, expected: Gaussians, camera: Camera) -> float:
+        frames = (
+            rasterize(each, camera, background=self._background, options=self._options).rgb.clip(0, 1)
+            for each in (got, expected)
+        )
+        first, second = (frame.astype(np.float64) for frame in frames)
+        return psnr_from_mse(float(np.square(first - second).mean()))
+
+
+def splats_of(file: Path) -> Callable[[float], Gaussians]:
+    """What a splat file shows, at any time."""
+    gaussians = read_splats(file).gaussians
+    return lambda t: gaussians
+
+
+def visionary_of(file: Path) -> Callable[[float], Gaussians]:
+    """What a Visionary model shows."""
+    session = ort.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+
+    def shown(t: float) -> Gaussians:
+        names = [GAUSSIANS, COLORS, COUNT]
+        gaussians, colors, count = (np.asarray(a) for a in session.run(names, {"time": np.array([t], np.float32)}))
+        return unpacked(gaussians, colors.astype(np.float32), int(count[0]))
+
+    return shown
+
+
+def require(psnr: float, least: float, what: str) -> None:
+    """Raise `ConversionFailed` under `least` dB."""
+    if not psnr >= least:
+        raise ConversionFailed(f"{what} is {psnr:.1f} dB from the scene, and {least:g} dB were asked for")

@@ -1,0 +1,220 @@
+"""ONNX as Visionary plays it in a browser: a time in, packed Gaussians and colours out.
+
+The graph is the scene's own with its ids fixed to all of them. What doesn't depend on time is computed here, and
+covariances take the place of rotations and scales.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+from onnx import NodeProto, TensorProto, helper, numpy_helper
+
+from export.graph import GraphBuilder
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.baked import BakedScene
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.quaternion import from_matrix, to_matrix
+
+OPSET, IR_VERSION = 17, 8
+MULTIPLE = 256
+"""Rows are padded to a whole number of these, by Gaussians of opacity 0."""
+
+COLUMNS, COLOR_COLUMNS = 10, 48
+GAUSSIANS, COLORS, COUNT = "gaussian_f32", "color_f16", "num_points"
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Rows and columns of the covariance that are kept: xx xy xz yy yz zz."""
+
+CONTROL_FLOW = {"If", "Loop", "Scan", "SequenceMap"}
+QUANTISED = {"QuantizeLinear", "DequantizeLinear"}
+RESERVED = ("sh", "color", "rgb")
+
+
+class VisionaryInvalid(MsdgsError):
+    """A model breaks a rule of Visionary's."""
+
+
+def visionary_model(scene_file: Path) -> onnx.ModelProto:
+    """The model of a scene file. Raises `InvalidInput` for the plan `int8`, whose graph no browser runs on its GPU."""
+    scene = DeformationSession(scene_file).scene
+    source = onnx.load(scene_file)
+    if any(node.op_type in QUANTISED for node in source.graph.node):
+        raise InvalidInput("scene", "of another plan than int8, as lowrank: to_onnx.py --plan lowrank", "int8")
+    graph = GraphBuilder()
+    rows = []
+    if scene.moving_count:
+        _moving(graph, source.graph)
+        rows.append(_packed(graph, scene.opacities[: scene.moving_count]))
+    count = len(scene)
+    padding = -count % MULTIPLE
+    rest = np.concatenate([_packed_static(scene), np.zeros((padding, COLUMNS), np.float32)])
+    rows.append(graph.constant("static_rows", rest))
+    graph.node("Concat", rows, GAUSSIANS, axis=0)
+    colors = np.zeros((count + padding, COLOR_COLUMNS), np.float16)
+    colors[:count, : 3 * scene.sh.shape[1]] = scene.sh.reshape(count, -1)
+    graph.node("Identity", [graph.constant("harmonics", colors)], COLORS)
+    graph.node("Identity", [graph.constant("count", np.array([count], np.int32))], COUNT)
+    model = _model(graph, count + padding)
+    check_visionary(model)
+    return model
+
+
+def _moving(graph: GraphBuilder, source: onnx.GraphProto) -> None:
+    """The nodes of a scene's graph that depend on time, which then is `time`; all others become constants."""
+    known = {each.name: numpy_helper.to_array(each) for each in source.initializer}
+    changing, nodes = {"t"}, list[NodeProto]()
+    for node in source.node:
+        if changing & set(node.input):
+            changing |= set(node.output)
+            nodes.append(node)
+    still = [node for node in source.node if node not in nodes]
+    needed = {name for node in nodes for name in node.input} | {"means", "quats", "scales"}
+    known |= _computed(still, source, sorted(needed & {name for node in still for name in node.output}))
+    for name in sorted(needed & set(known)):
+        values = known[name]
+        graph.constant(name, values.astype(np.float32) if values.dtype in (np.int16, np.float16) else values)
+    for node in nodes:
+        copied = NodeProto.FromString(node.SerializeToString())
+        copied.input[:] = ["time" if name == "t" else name for name in node.input]
+        graph.nodes.append(copied)
+
+
+def _computed(nodes: list[NodeProto], source: onnx.GraphProto, names: list[str]) -> dict[str, np.ndarray]:
+    """Values that don't depend on time."""
+    if not names:
+        return {}
+    outputs = [onnx.ValueInfoProto(name=name) for name in names]
+    graph = helper.make_graph(nodes, "still", [], outputs, list(source.initializer))
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    return dict(zip(names, session.run(names, {}), strict=True))  # type: ignore[arg-type]
+
+
+def _packed(graph: GraphBuilder, opacities: np.ndarray) -> str:
+    """[M, 10] of `means`, `quats` and `scales`: position, opacity, covariance R S Sᵀ Rᵀ."""
+    first, second, matrix_of = _quadratic()
+    monomials = graph.node("Mul", [_take(graph, "quats", first), _take(graph, "quats", second)], "quats.monomials")
+    matrix = graph.node("MatMul", [monomials, graph.constant("quats.to_matrix", matrix_of)], "rotation")
+    axes = graph.node("Mul", [matrix, _take(graph, "scales", [0, 1, 2] * 3)], "axes")  # rows of R S
+    left = _take(graph, axes, [3 * i + k for i, _ in PAIRS for k in range(3)])
+    right = _take(graph, axes, [3 * j + k for _, j in PAIRS for k in range(3)])
+    sums = graph.constant("covariance.sums", np.kron(np.eye(6), np.ones((3, 1))).astype(np.float32))
+    covariances = graph.node("MatMul", [graph.node("Mul", [left, right], "covariance.terms"), sums], "covariance")
+    column = graph.constant("opacity", np.ascontiguousarray(opacities[:, None], np.float32))
+    return graph.node("Concat", ["means", column, covariances], "moving_rows", axis=1)
+
+
+def _take(graph: GraphBuilder, value: str, columns: list[int]) -> str:
+    name = f"{value}.take{len(graph.nodes)}"
+    indices = graph.constant(f"{name}.columns", np.array(columns, np.int64))
+    return graph.node("Gather", [value, indices], name, axis=1)
+
+
+def _quadratic() -> tuple[list[int], list[int], np.ndarray]:
+    """The ten products of two components of a quaternion, and the [10, 9] matrix from them to a rotation matrix."""
+    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+    w, x, y, z = range(4)
+    entries = [
+        {(w, w): 1, (x, x): 1, (y, y): -1, (z, z): -1},
+        {(x, y): 2, (w, z): -2},
+        {(x, z): 2, (w, y): 2},
+        {(x, y): 2, (w, z): 2},
+        {(w, w): 1, (x, x): -1, (y, y): 1, (z, z): -1},
+        {(y, z): 2, (w, x): -2},
+        {(x, z): 2, (w, y): -2},
+        {(y, z): 2, (w, x): 2},
+        {(w, w): 1, (x, x): -1, (y, y): -1, (z, z): 1},
+    ]
+    matrix = np.array([[entry.get(pair, 0) for entry in entries] for pair in pairs], np.float32)
+    return [i for i, _ in pairs], [j for _, j in pairs], matrix
+
+
+def _packed_static(scene: BakedScene) -> np.ndarray:
+    axes = to_matrix(scene.static_quats.astype(np.float64)) * scene.static_scales[:, None, :]
+    covariances = axes @ axes.transpose(0, 2, 1)
+    kept = np.stack([covariances[:, i, j] for i, j in PAIRS], axis=1)
+    opacities = scene.opacities[scene.moving_count :, None]
+    return np.concatenate([scene.static_means, opacities, kept], axis=1).astype(np.float32)
+
+
+def _model(graph: GraphBuilder, rows: int) -> onnx.ModelProto:
+    outputs = {
+        GAUSSIANS: (TensorProto.FLOAT, [rows, COLUMNS]),
+        COLORS: (TensorProto.FLOAT16, [rows, COLOR_COLUMNS]),
+        COUNT: (TensorProto.INT32, [1]),
+    }
+    contents = helper.make_graph(
+        graph.nodes,
+        "msdgs_visionary",
+        [helper.make_tensor_value_info("time", TensorProto.FLOAT, [1])],
+        [helper.make_tensor_value_info(name, *kind) for name, kind in outputs.items()],
+        list(graph.constants.values()),
+    )
+    imports = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(contents, opset_imports=imports, ir_version=IR_VERSION, producer_name="msdgs")
+    onnx.checker.check_model(model)
+    return model
+
+
+def check_visionary(model: onnx.ModelProto) -> None:
+    """Raise `VisionaryInvalid` listing every rule of Visionary's that a model breaks."""
+    problems = [*_interface_problems(model), *_graph_problems(model)]
+    if problems:
+        raise VisionaryInvalid("; ".join(problems))
+
+
+def _interface_problems(model: onnx.ModelProto) -> list[str]:
+    problems = []
+    opsets = {each.domain: each.version for each in model.opset_import}
+    if opsets != {"": OPSET}:
+        problems.append(f"operator sets {opsets} instead of {OPSET} alone")
+    if [_kind(each) for each in model.graph.input] != [("time", TensorProto.FLOAT, [1])]:
+        problems.append("its input must be `time`, float32 [1], alone")
+    outputs = {name: (kind, shape) for name, kind, shape in map(_kind, model.graph.output)}
+    rows = outputs.get(GAUSSIANS, (0, [0]))[1][0]
+    expected = {
+        GAUSSIANS: (TensorProto.FLOAT, [rows, COLUMNS]),
+        COLORS: (TensorProto.FLOAT16, [rows, COLOR_COLUMNS]),
+        COUNT: (TensorProto.INT32, [1]),
+    }
+    problems += [f"output `{name}` must be {kind}" for name, kind in expected.items() if outputs.get(name) != kind]
+    if not rows or rows % MULTIPLE:
+        problems.append(f"{rows} rows are no multiple of {MULTIPLE}")
+    others = [name for name in outputs if name not in expected and any(word in name for word in RESERVED)]
+    return problems + [f"output `{name}` would be taken for colours" for name in others]
+
+
+def _graph_problems(model: onnx.ModelProto) -> list[str]:
+    graph = model.graph
+    problems = [f"{node.op_type} is control flow" for node in graph.node if node.op_type in CONTROL_FLOW]
+    problems += [f"{node.op_type} isn't float32" for node in graph.node if node.op_type in QUANTISED]
+    to_outputs = {name for node in graph.node if COLORS in node.output for name in node.input}
+    allowed = {TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL}
+    for each in graph.initializer:
+        if each.data_type not in allowed and not (each.name in to_outputs and each.data_type == TensorProto.FLOAT16):
+            problems.append(f"constant `{each.name}` is {TensorProto.DataType.Name(each.data_type)}, not float32")
+        elif each.data_location == TensorProto.EXTERNAL:
+            problems.append(f"constant `{each.name}` lies in another file")
+        elif not np.isfinite(numpy_helper.to_array(each)).all():
+            problems.append(f"constant `{each.name}` holds NaN or infinity")
+    return problems
+
+
+def _kind(value: onnx.ValueInfoProto) -> tuple[str, int, list[int]]:
+    tensor = value.type.tensor_type
+    return value.name, tensor.elem_type, [each.dim_value for each in tensor.shape.dim]
+
+
+def unpacked(gaussians: np.ndarray, colors: np.ndarray, count: int) -> Gaussians:
+    """What a viewer draws of the outputs: rotations and scales are the axes of the covariances."""
+    rows = gaussians[:count].astype(np.float64)
+    covariances = np.empty((count, 3, 3))
+    for column, (i, j) in enumerate(PAIRS):
+        covariances[:, i, j] = covariances[:, j, i] = rows[:, 4 + column]
+    squares, axes = np.linalg.eigh(covariances)
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
+    scales = np.sqrt(np.maximum(squares, 0)).clip(1e-9)
+    arrays = (rows[:, :3], from_matrix(axes), scales, rows[:, 3], colors[:count].reshape(count, -1, 3))
+    return Gaussians(*(np.ascontiguousarray(a, np.float32) for a in arrays))
