@@ -94,6 +94,22 @@ def test_one_view_said_in_four_ways(client: httpx.Client):
         assert np.abs(render(client, camera=camera) - expected).max() <= 1
 
 
+def test_cameras_of_other_models(client: httpx.Client):
+    """At five units, the middle of the picture is where a pinhole has it; away from it they differ."""
+    pose = level_pose()
+    matrix = {"type": "matrix", "camera_to_world": pose.tolist(), "fx": 100.0}
+    pinhole = render(client, camera=matrix).astype(int)
+    for changes in ({"model": "fisheye"}, {"model": "fisheye", "distortion": [0.5, 0, 0, 0]}):
+        other = render(client, camera={**matrix, **changes}).astype(int)
+        assert np.abs(other[SIZE // 2, SIZE // 2] - pinhole[SIZE // 2, SIZE // 2]).max() <= 2
+        assert np.abs(other - pinhole).max() > 5
+    flat = render(client, camera={**matrix, "model": "orthographic", "fx": 20.0}).astype(int)
+    nearer = pose.copy()
+    nearer[:3, 3] += pose[:3, 2]
+    moved = {**matrix, "camera_to_world": nearer.tolist(), "model": "orthographic", "fx": 20.0}
+    np.testing.assert_allclose(render(client, camera=moved), flat, atol=1)
+
+
 def test_a_camera_of_the_scene_by_index_or_name(client: httpx.Client):
     by_index = render(client, camera={"type": "scene", "index": 1}, width=None, height=None)
     assert by_index.shape == (48, 64, 3)

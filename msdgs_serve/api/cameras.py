@@ -10,7 +10,7 @@ from msdgs_serve.framing import Framing, framing
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.baked import SceneCamera as StoredCamera
 from msdgs_serve.scene.baked import SceneMetadata
-from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
+from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, OPENGL_TO_OPENCV, orbit
 
 
 def resolve_camera(request: RenderRequest, metadata: SceneMetadata) -> Camera:
@@ -48,8 +48,10 @@ def _matrix_camera(spec: MatrixCamera, request: RenderRequest, scene: Framing) -
     cy = height / 2 if spec.cy is None else spec.cy
     pose = np.array(spec.camera_to_world, dtype=np.float64)
     if spec.axes == "opengl":
-        return Camera.from_opengl(pose, width, height, fx=fx, fy=fy, cx=cx, cy=cy)
-    return Camera(fx, fy, cx, cy, width, height, pose)
+        pose = pose @ OPENGL_TO_OPENCV
+    if spec.model != "pinhole" and spec.fx is None:
+        raise InvalidInput("camera.fov_y", "camera.fx, unless camera.model is pinhole", spec.fov_y)
+    return Camera(fx, fy, cx, cy, width, height, pose, spec.model, spec.distortion)
 
 
 def _size(request: RenderRequest, width: int, height: int) -> tuple[int, int]:

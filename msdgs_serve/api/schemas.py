@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag
 
 from msdgs_serve.imaging import Channel, ImageFormat
-from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
+from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, CameraModel
 from msdgs_serve.store import MAX_NAME_LENGTH
 from msdgs_serve.video import VideoFormat
 
@@ -59,6 +59,13 @@ class MatrixCamera(Strict):
     )
     cy: Number | None = Field(
         default=None, description="principal point, pixels from the top edge; default: the middle"
+    )
+    model: CameraModel = Field(
+        default="pinhole",
+        description="`orthographic`: `fx` is in pixels a scene unit; `fisheye`: as OpenCV has it",
+    )
+    distortion: tuple[Number, Number, Number, Number] = Field(
+        default=(0.0, 0.0, 0.0, 0.0), description="k1 to k4 of a `fisheye` camera"
     )
 
 
