@@ -99,6 +99,15 @@ TABLE = (
     Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
     Row("export.float32_db", 90.0, "worst frame, float32 against float64: at a few pixels a splat is at its cut-off"),
     Row("trim.other_times_db", 2.0, "a quarter more error at times that trimming has not looked at"),
+    # files of other programs
+    Row("splat_values", 3e-6, "float32 logarithms and logits of size 10, back through exp"),
+    Row("splat_file_db", 60.0, "stored as float32: what is called lossless"),
+    Row("quantised_splat_file_db", 45.0, "bytes of colour and opacity, 8 to 16 bits of everything else: lossy"),
+    Row("stored_frame", 1e-4, "16 bits over a motion of half the scene, relative to the scene"),
+    Row("spz_position", 3e-4, "scene units; 12 fractional bits"),
+    Row("spz_rotation", 2e-2, "entries of a matrix; 10 bits a component of one file, 10 of the other"),
+    Row("import.network", 1e-5, "a network of 8 layers in float32, its sums in another order"),
+    Row("visionary.relative", 2e-5, "products of float32 rotations and scales, relative to the largest covariance"),
     # datasets
     Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
     Row("composite_of_8bit", 1.001 / 255, "half a step of colour and half a step of alpha, each rounded once"),

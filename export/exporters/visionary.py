@@ -77,8 +77,13 @@ def _moving(graph: GraphBuilder, source: onnx.GraphProto) -> None:
         graph.constant(name, values.astype(np.float32) if values.dtype in (np.int16, np.float16) else values)
     for node in nodes:
         copied = NodeProto.FromString(node.SerializeToString())
-        copied.input[:] = ["time" if name == "t" else name for name in node.input]
+        copied.input[:] = [_RENAMED.get(name, name) for name in node.input]
+        copied.output[:] = [_RENAMED.get(name, name) for name in node.output]
         graph.nodes.append(copied)
+
+
+_RENAMED = {"t": "time", "time": "scene.time"}
+"""Values of a scene's graph that are called otherwise here."""
 
 
 def _computed(nodes: list[NodeProto], source: onnx.GraphProto, names: list[str]) -> dict[str, np.ndarray]:
@@ -86,7 +91,9 @@ def _computed(nodes: list[NodeProto], source: onnx.GraphProto, names: list[str])
     if not names:
         return {}
     outputs = [onnx.ValueInfoProto(name=name) for name in names]
-    graph = helper.make_graph(nodes, "still", [], outputs, list(source.initializer))
+    read = {name for node in nodes for name in node.input}
+    constants = [each for each in source.initializer if each.name in read]
+    graph = helper.make_graph(nodes, "still", [], outputs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     return dict(zip(names, session.run(names, {}), strict=True))  # type: ignore[arg-type]

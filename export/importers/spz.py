@@ -75,6 +75,9 @@ class _Plain:
             raise cut_off(self._file, what, count, len(found))
         return found
 
+    def finish(self) -> None:
+        """Nothing comes after the data."""
+
 
 class _Gzip:
     """The same from a gzip stream, of which no more is unpacked than is asked for."""
@@ -100,6 +103,15 @@ class _Gzip:
             raise cut_off(self._file, what, count, len(found))
         return bytes(found)
 
+    def finish(self) -> None:
+        """See that the stream's end, which has its checksum, is there; more data than was asked for may come first."""
+        try:
+            more = self._unpacker.decompress(self._packed, 1)
+        except zlib.error as error:
+            raise ImportFailed(self._file, f"has a damaged gzip stream: {error}") from error
+        if not more and not self._unpacker.eof:
+            raise ImportFailed(self._file, "is cut off: its gzip stream has no end")
+
 
 def _header(file: Path, start: bytes) -> Header:
     if len(start) < HEADER.size:
@@ -122,7 +134,9 @@ def _one_stream(file: Path, stream: _Plain | _Gzip) -> tuple[Header, list[bytes]
         raise ImportFailed(file, "is SPZ version 4 inside gzip, which has streams of its own")
     if sum(header.sizes) > stream.possible():
         raise cut_off(file, f"{header.count:,} Gaussians", sum(header.sizes), stream.possible())
-    return header, [stream.take(size, f"{header.count:,} Gaussians") for size in header.sizes]
+    parts = [stream.take(size, f"{header.count:,} Gaussians") for size in header.sizes]
+    stream.finish()
+    return header, parts
 
 
 def _streams(file: Path, header: Header, contents: bytes) -> list[bytes]:

@@ -1,0 +1,149 @@
+"""What is written for other viewers is the scene: read back, and held to the rules of each format."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+from rich.console import Console
+
+from export.bake import bake
+from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
+from export.exporters.proof import ConversionFailed, visionary_of
+from export.exporters.visionary import VisionaryInvalid, check_visionary, visionary_model
+from export.importers import read_splats
+from export.plans import build
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
+from tests.models import SCENE, random_model
+from tests.tolerances import tolerance
+
+QUIET = Console(quiet=True)
+
+
+def scene_file(folder: Path, plan: str = "network", **config: int) -> Path:
+    """A moving scene of 300 Gaussians."""
+    model = random_model(300, noise=0.02, time_frequencies=2, **config)
+    file = folder / "scene.onnx"
+    file.write_bytes(build(plan, bake(model, SCENE, "0" * 64)).SerializeToString())
+    return file
+
+
+def run(scene: Path, out: Path, t: float | None = None, frames: int = 30, min_psnr: float | None = None) -> None:
+    convert(Settings(scene, out, t, frames, min_psnr), QUIET)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_ply_of_one_moment_is_that_moment(tmp_path: Path, degree: int):
+    scene = scene_file(tmp_path, sh_degree=degree)
+    run(scene, tmp_path / "a.ply", t=0.4)
+    expected, got = DeformationSession(scene).gaussians(0.4), read_splats(tmp_path / "a.ply").gaussians
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        scale = max(1.0, float(np.abs(getattr(expected, name)).max()))
+        assert np.abs(getattr(got, name) - getattr(expected, name)).max() <= tolerance("splat_values") * scale
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode().split("property float ")
+    names = [line.split()[0] for line in header[1:]]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert len(names) == 14 + 3 * (degree + 1) ** 2
+
+
+def test_a_sequence_covers_the_scenes_time(tmp_path: Path):
+    scene = scene_file(tmp_path)
+    run(scene, tmp_path / "frames", frames=11)
+    files = sorted((tmp_path / "frames").iterdir())
+    assert [file.name for file in files] == [f"scene_{i:02}.ply" for i in range(11)]
+    last = DeformationSession(scene).gaussians(1.0)
+    assert np.abs(read_splats(files[-1]).gaussians.means - last.means).max() < tolerance("splat_values")
+    with pytest.raises(InvalidInput, match=r"a folder without PLY files"):
+        run(scene, tmp_path / "frames", frames=3)
+
+
+@pytest.mark.parametrize("antialiasing", ["dilate", "mip"])
+def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
+    scene = scene_file(tmp_path, sh_degree=2)
+    contents = onnx.load(scene)
+    for entry in contents.metadata_props:
+        if entry.key == "antialiasing":
+            entry.value = f'"{antialiasing}"'
+    onnx.save(contents, scene)
+    run(scene, tmp_path / "a.spz")  # which compares pictures, and refuses under 45 dB
+    read = read_splats(tmp_path / "a.spz")
+    assert read.antialiasing == antialiasing
+    expected = DeformationSession(scene).gaussians(0.0)
+    assert np.abs(read.gaussians.means - expected.means).max() < tolerance("splat_values")
+    turned = np.abs(to_matrix(read.gaussians.quats) - to_matrix(expected.quats))
+    assert turned.max() < tolerance("spz_rotation")
+
+
+def test_what_is_not_close_enough_does_not_replace_a_file(tmp_path: Path):
+    scene, out = scene_file(tmp_path), tmp_path / "a.spz"
+    out.write_text("old")
+    with pytest.raises(ConversionFailed, match=r"99.5 dB were asked for"):
+        run(scene, out, min_psnr=99.5)
+    assert out.read_text() == "old"
+    assert LOSSLESS > LOSSY >= 45
+
+
+@pytest.mark.parametrize("plan", ["network", "lowrank:8", "lowrank:1", "keyframes:7", "keyframes"])
+def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str):
+    scene = scene_file(tmp_path, plan)
+    run(scene, tmp_path / "a.visionary.onnx")
+    shown, session = visionary_of(tmp_path / "a.visionary.onnx"), DeformationSession(scene)
+    for t in (0.0, 0.3, 0.77, 1.0):
+        got, expected = shown(t), session.gaussians(t)
+        assert np.abs(got.means - expected.means).max() <= tolerance("export.relative")
+        ours, theirs = covariances(expected), covariances(got)
+        assert np.abs(ours - theirs).max() <= tolerance("visionary.relative") * np.abs(ours).max()
+
+
+def covariances(g: Gaussians) -> np.ndarray:
+    axes = to_matrix(g.quats.astype(np.float64)) * g.scales[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def test_visionary_pads_with_nothing(tmp_path: Path):
+    model = visionary_model(scene_file(tmp_path))
+    session = onnx.shape_inference.infer_shapes(model)
+    assert session.graph.output[0].type.tensor_type.shape.dim[0].dim_value == 512
+    (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+    assert len(visionary_of(tmp_path / "a.onnx")(0.5)) == 300
+
+
+def test_rules_of_visionary_are_checked(tmp_path: Path):
+    def changed() -> onnx.ModelProto:
+        return visionary_model(scene_file(tmp_path))
+
+    model = changed()
+    model.graph.output.append(helper.make_tensor_value_info("means_rgb", TensorProto.FLOAT, [1]))
+    with pytest.raises(VisionaryInvalid, match=r"`means_rgb` would be taken for colours"):
+        check_visionary(model)
+    model = changed()
+    model.opset_import[0].version = 18
+    model.graph.input.append(helper.make_tensor_value_info("camera", TensorProto.FLOAT, [4, 4]))
+    with pytest.raises(VisionaryInvalid, match=r"instead of 17 alone; its input must be `time`"):
+        check_visionary(model)
+    model = changed()
+    model.graph.output[0].type.tensor_type.shape.dim[0].dim_value = 300
+    with pytest.raises(VisionaryInvalid, match=r"300 rows are no multiple of 256"):
+        check_visionary(model)
+    model = changed()
+    model.graph.node[0].op_type = "Loop"
+    with pytest.raises(VisionaryInvalid, match=r"Loop is control flow"):
+        check_visionary(model)
+
+
+def test_a_quantised_plan_is_refused_with_what_to_do(tmp_path: Path):
+    with pytest.raises(InvalidInput, match=r"--plan lowrank"):
+        run(scene_file(tmp_path, "int8"), tmp_path / "a.visionary.onnx")
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [("a.mp4", r"msdgs-render"), ("a.obj", r"a folder, or named .ply, .spz or .visionary.onnx")],
+)
+def test_other_endings_say_what_there_is(tmp_path: Path, out: str, message: str):
+    with pytest.raises(InvalidInput, match=message):
+        run(scene_file(tmp_path), tmp_path / out)
