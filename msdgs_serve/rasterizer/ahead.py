@@ -50,7 +50,7 @@ def _gaussians(coefficients: int) -> Gaussians:
     random = np.random.default_rng(0)
     return Gaussians(
         means=random.uniform(-1, 1, (COUNT, 3)).astype(np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (COUNT, 1)),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (COUNT, 1)),
         scales=np.full((COUNT, 3), 0.1, np.float32),
         opacities=np.full(COUNT, 0.5, np.float32),
         sh=np.zeros((COUNT, coefficients, 3), np.float32),

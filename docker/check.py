@@ -1,0 +1,315 @@
+"""Build the image, run it as a careful operator would, and lose a replica under load.
+
+    python docker/check.py                                    with images from the usual registry
+    BASE_IMAGE=… PROXY_IMAGE=… python docker/check.py         with images that are there already
+
+Read from the environment: BASE_IMAGE, PIP_INDEX_URL, MSDGS_IMAGE, PROXY_IMAGE, as compose.yaml does; CA_FILE,
+certificates for the build; BUILD_NETWORK, `host` where containers have no other; DOCKER, the command.
+Exit status 77 and the reason where there is no daemon; all containers, the network and the volumes are removed again.
+"""
+
+import itertools
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+SKIPPED = 77
+DOCKER = os.environ.get("DOCKER", "docker")
+IMAGE = os.environ.get("MSDGS_IMAGE", "msdgs:check")
+BASE_IMAGE = os.environ.get("BASE_IMAGE", "python:3.11-slim-bookworm")
+PROXY_IMAGE = os.environ.get("PROXY_IMAGE", "nginx:1.28-alpine")
+PROJECT = "msdgs-check"
+REPLICAS = 3
+LOAD = 120
+"""Frames asked for while a replica is killed."""
+CLIENTS = 4
+MAX_MEGABYTES = 600
+PATIENCE = 120.0
+"""Seconds until a service must be ready, on a machine that is busy with other things."""
+HARDENED = ["--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--security-opt", "no-new-privileges"]
+
+
+class Skipped(Exception):
+    """Nothing can be checked here."""
+
+
+class Answer:
+    """Of an HTTP request."""
+
+    def __init__(self, status: int, headers: Mapping[str, str], body: bytes) -> None:
+        self.status = status
+        self.headers = {name.lower(): value for name, value in headers.items()}
+        self.body = body
+
+
+def main() -> int:
+    """All checks in a row; the first that fails ends it."""
+    try:
+        compose = available()
+    except Skipped as reason:
+        print(f"skipped: {reason}")
+        return SKIPPED
+    build()
+    check_contents()
+    check_cold_start()
+    with composition(compose) as url:
+        check_cache(url)
+        check_affinity(url)
+        check_kill(url)
+    print("The image and the composition do what docs/docker.md says.")
+    return 0
+
+
+def available() -> list[str]:
+    """The compose command. Raises `Skipped` without a daemon, without compose, or without images to build from."""
+    if shutil.which(DOCKER) is None:
+        raise Skipped(f"there is no {DOCKER} command")
+    if output(DOCKER, "info", check=False).returncode != 0:
+        raise Skipped("no Docker daemon answers")
+    compose = [DOCKER, "compose"]
+    if output(*compose, "version", check=False).returncode != 0:
+        compose = ["docker-compose"]
+        if shutil.which("docker-compose") is None:
+            raise Skipped("there is no docker compose")
+    for image in (BASE_IMAGE, PROXY_IMAGE):
+        known = output(DOCKER, "image", "inspect", image, check=False).returncode == 0
+        if not known and output(DOCKER, "pull", "--quiet", image, check=False).returncode != 0:
+            raise Skipped(f"image {image} can't be had")
+    return compose
+
+
+def build() -> None:
+    """The serve target."""
+    command = [DOCKER, "build", "-f", "docker/Dockerfile", "--target", "serve", "-t", IMAGE]
+    command += ["--build-arg", f"BASE_IMAGE={BASE_IMAGE}"]
+    if "PIP_INDEX_URL" in os.environ:
+        command += ["--build-arg", f"PIP_INDEX_URL={os.environ['PIP_INDEX_URL']}"]
+    if "CA_FILE" in os.environ:
+        command += ["--secret", f"id=ca,src={os.environ['CA_FILE']}"]
+    if "BUILD_NETWORK" in os.environ:
+        command += ["--network", os.environ["BUILD_NETWORK"]]
+    started = time.perf_counter()
+    subprocess.run([*command, "."], cwd=ROOT, env={**os.environ, "DOCKER_BUILDKIT": "1"}, check=True)
+    print(f"Built in {time.perf_counter() - started:.0f} s")
+
+
+def check_contents() -> None:
+    """Small, not root, no torch."""
+    facts = json.loads(output(DOCKER, "image", "inspect", IMAGE).stdout)[0]
+    megabytes = facts["Size"] / 1e6
+    print(f"Image: {megabytes:.0f} MB")
+    expect(megabytes < MAX_MEGABYTES, f"the image has at most {MAX_MEGABYTES} MB")
+    expect(facts["Config"]["User"].split(":")[0] not in ("", "0", "root"), "it doesn't run as root")
+    code = "import importlib.util; print(importlib.util.find_spec('torch'))"
+    without_torch = output(DOCKER, "run", "--rm", "--network", "none", "--entrypoint", "python", IMAGE, "-c", code)
+    expect(without_torch.stdout.strip() == "None", "there is no torch in it")
+
+
+def check_cold_start() -> None:
+    """From `docker run` to the bytes of a frame, with a read-only root and no capabilities; nothing is compiled."""
+    port = free_port()
+    where = ["--network", "host", "-e", "MSDGS_HOST=127.0.0.1", "-e", f"MSDGS_PORT={port}"]
+    started = time.perf_counter()
+    container = output(DOCKER, "run", "--detach", *HARDENED, *where, IMAGE).stdout.strip()
+    try:
+        running = time.perf_counter()
+        answer = wait_for(lambda: frame(f"http://127.0.0.1:{port}", 0.5, size=400))
+        ended = time.perf_counter()
+        print(
+            f"First frame {ended - running:.1f} s after the container ran ({ended - started:.1f} s with its creation)"
+        )
+        expect(answer.body[:8] == b"\x89PNG\r\n\x1a\n", "a frame is a PNG")
+        count = "find {} -name '*.nbc' | wc -l"
+        stored = sh(container, count.format("/opt/msdgs/lib/python3*/site-packages/msdgs_serve"))
+        copied = sh(container, count.format("/tmp"))
+        expect(
+            int(stored) > 0 and stored == copied, f"no kernel is compiled at the start ({stored} stored, {copied} then)"
+        )
+        expect(
+            output(DOCKER, "exec", container, "touch", "/opt/x", check=False).returncode != 0, "the root is read-only"
+        )
+        expect(sh(container, "id -u") != "0", "its user isn't root")
+        expect(sh(container, "grep CapEff /proc/1/status").endswith("0" * 16), "it has no capabilities")
+        ready = output(DOCKER, "exec", container, "python", "/opt/msdgs/ready.py", check=False)
+        expect(ready.returncode == 0, "its health check passes")
+        stopping = time.perf_counter()
+        output(DOCKER, "stop", container)
+        code = output(DOCKER, "inspect", "--format", "{{.State.ExitCode}}", container).stdout.strip()
+        expect(code == "0", f"it stops by itself when asked to, after {time.perf_counter() - stopping:.1f} s")
+    finally:
+        output(DOCKER, "rm", "--force", container, check=False)
+
+
+@contextmanager
+def composition(compose: list[str]) -> Iterator[str]:
+    """`up` with replicas, then `down`; the address of the proxy."""
+    port = free_port()
+    environment = {**os.environ, "MSDGS_IMAGE": IMAGE, "PROXY_IMAGE": PROXY_IMAGE, "PORT": f"127.0.0.1:{port}"}
+    command = [*compose, "-p", PROJECT, "-f", "docker/compose.yaml"]
+    try:
+        up = ["up", "--detach", "--no-build", "--scale", f"render={REPLICAS}"]
+        subprocess.run([*command, *up], cwd=ROOT, env=environment, check=True)
+        url = f"http://127.0.0.1:{port}"
+        wait_for(lambda: get(f"{url}/ready"))
+        for name in containers("render"):
+            wait_for(
+                lambda name=name: Answer(
+                    503 if sh(name, "python /opt/msdgs/ready.py; echo $?") != "0" else 200, {}, b""
+                )
+            )
+        yield url
+    finally:
+        subprocess.run([*command, "down", "--volumes"], cwd=ROOT, env=environment, check=False, capture_output=True)
+
+
+def check_cache(url: str) -> None:
+    """A frame is drawn once, kept a second, then held against the scene by its ETag."""
+    first = frame(url, 0.25)
+    second = frame(url, 0.25)
+    expect((first.headers["x-cache"], second.headers["x-cache"]) == ("MISS", "HIT"), "a frame is taken from the cache")
+    expect(first.body == second.body and first.headers["etag"] == second.headers["etag"], "it is the same")
+    expect("server-timing" in first.headers and "server-timing" not in second.headers, "only drawn frames have times")
+    known = frame(url, 0.25, **{"If-None-Match": first.headers["etag"]})
+    expect((known.status, known.body) == (304, b""), "who has it gets a 304")
+    time.sleep(1.5)
+    expect(frame(url, 0.25).headers["x-cache"] == "REVALIDATED", "an older one is held against the scene, not redrawn")
+    keyed = frame(url, 0.25, **{"X-API-Key": "some"})
+    expect(keyed.headers["x-cache"] == "BYPASS", "frames for a key are not taken from the cache")
+    expect(get(f"{url}/metrics").status == 404, "metrics are not for everybody")
+    expect(get(f"{url}/").status == 200, "the page is there")
+
+
+def check_affinity(url: str) -> None:
+    """Frames of one time go to one replica, by link and by call; all replicas have work."""
+    marked = "affinity"
+    times = [number / 32 for number in range(32)]
+    for t in times:
+        frame(url, t, azimuth=1, **{"X-Request-ID": f"{marked}.{t}.link"})
+        for azimuth in (2, 3):
+            post(url, t, azimuth, f"{marked}.{t}.call{azimuth}")
+    served: dict[str, set[str]] = {}
+    for entry in log():
+        if entry["id"].startswith(marked):
+            served.setdefault(entry["id"].split(".call")[0].split(".link")[0], set()).add(entry["replica"])
+    by_call_and_link = [len(replicas) for replicas in served.values()]
+    expect(len(by_call_and_link) == len(times), "every frame is in the log")
+    expect(max(by_call_and_link) <= 2 and sum(by_call_and_link) <= 2 * len(times), "a time has its replica")
+    used = set[str]().union(*served.values())
+    expect(len(used) == REPLICAS, f"{REPLICAS} replicas share the work")
+
+
+def check_kill(url: str) -> None:
+    """A replica is killed while clients ask for new frames: nobody notices."""
+    numbers, statuses, slowest = itertools.count(), list[int](), 0.0
+    lock, victim = threading.Lock(), containers("render")[0]
+
+    def ask(_: int) -> None:
+        nonlocal slowest
+        number = next(numbers)
+        if number == LOAD // 3:
+            output(DOCKER, "kill", victim)
+        started = time.perf_counter()
+        status = post(url, (number % 97) / 97, 10 + number, f"kill.{number}").status
+        with lock:
+            statuses.append(status)
+            slowest = max(slowest, time.perf_counter() - started)
+
+    with ThreadPoolExecutor(CLIENTS) as pool:
+        list(pool.map(ask, range(LOAD)))
+    good = statuses.count(200)
+    expect(good == LOAD, f"{good} of {LOAD} frames came while a replica was killed, the slowest after {slowest:.1f} s")
+
+
+def frame(url: str, t: float, *, size: int = 64, azimuth: int = 30, **headers: str) -> Answer:
+    """A frame by link."""
+    link = f"{url}/render?scene=toybench&azimuth={azimuth}&elevation=20&t={t}&width={size}&height={size}"
+    return get(link, **headers)
+
+
+def post(url: str, t: float, azimuth: int, request_id: str) -> Answer:
+    """A frame by call."""
+    camera = {"type": "orbit", "azimuth": azimuth, "elevation": 20}
+    body = {"scene": "toybench", "camera": camera, "t": t, "width": 64, "height": 64}
+    headers = {"Content-Type": "application/json", "X-Request-ID": request_id}
+    return ask(urllib.request.Request(f"{url}/render", json.dumps(body).encode(), headers))
+
+
+def get(url: str, **headers: str) -> Answer:
+    """What a GET answers; status 0 where nobody does."""
+    return ask(urllib.request.Request(url, headers=headers))
+
+
+def ask(request: urllib.request.Request) -> Answer:
+    """What a request answers; status 0 where nobody does."""
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    try:
+        with direct.open(request, timeout=60) as response:
+            return Answer(response.status, response.headers, response.read())
+    except urllib.error.HTTPError as error:
+        return Answer(error.code, error.headers, error.read())
+    except OSError:
+        return Answer(0, {}, b"")
+
+
+def wait_for(attempt: Callable[[], Answer]) -> Answer:
+    """The first answer of status 200."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        answer = attempt()
+        if answer.status == 200:
+            return answer
+        time.sleep(0.05)
+    sys.exit(f"FAILED: not ready after {PATIENCE:.0f} s")
+
+
+def containers(service: str) -> list[str]:
+    """Ids of a service's containers."""
+    labels = {"com.docker.compose.project": PROJECT, "com.docker.compose.service": service}
+    filters = [part for name, value in labels.items() for part in ("--filter", f"label={name}={value}")]
+    return output(DOCKER, "ps", "--quiet", *filters).stdout.split()
+
+
+def log() -> list[dict[str, str]]:
+    """The proxy's log of requests."""
+    lines = output(DOCKER, "logs", containers("proxy")[0]).stdout.splitlines()
+    return [json.loads(line) for line in lines if line.startswith("{")]
+
+
+def sh(container: str, script: str) -> str:
+    """What a shell in a container prints."""
+    return output(DOCKER, "exec", container, "sh", "-c", script, check=False).stdout.strip()
+
+
+def output(*command: str, check: bool = True) -> "subprocess.CompletedProcess[str]":
+    """Run a command quietly."""
+    return subprocess.run(command, check=check, capture_output=True, text=True)
+
+
+def free_port() -> int:
+    """A port of this machine that nobody has."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def expect(holds: bool, what: str) -> None:
+    """Say it, or end with it."""
+    if not holds:
+        sys.exit(f"FAILED: {what}")
+    print(f"ok: {what}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
