@@ -25,9 +25,9 @@ def serving(
     *scenes: Path, renderer: Renderer | None = None, server: list[Server] | None = None, **settings: Any
 ) -> Iterator[httpx.Client]:
     """A client of a service over these scenes, which ends on leaving. The server is added to `server`."""
-    chosen = Settings(scenes=list(scenes), **{"watch_seconds": WATCH_SECONDS, **settings})
+    chosen = Settings(scenes=list(scenes), **{"watch_seconds": WATCH_SECONDS, "port": 0, **settings})
     app = create_app(SceneStore(scenes), renderer or Renderer(), chosen)
-    listener = bind("127.0.0.1", 0)
+    listener = bind("127.0.0.1", chosen.port)
     running = Server(app, chosen)
     if server is not None:
         server.append(running)
