@@ -7,7 +7,7 @@ import pytest
 
 from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering, rasterize
 from tests.reference import DEPTH_BAND, Reference, render
-from tests.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene
+from tests.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene, select
 from tests.tolerances import tolerance
 
 BACKGROUND = (0.2, 0.6, 0.9)
@@ -98,3 +98,15 @@ def test_float64_agrees_to_rounding(name: str, options: RasterizerOptions):
     got = rasterize(gaussians, camera, background=BACKGROUND, options=options)
     assert got.rgb.dtype == np.float64
     assert_same_picture(got, render(gaussians, camera, BACKGROUND, options, depth_band=0.0), "float64")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_median_depth_lies_behind_half_of_the_light(dtype: type):
+    """Three sheets of opacity 0.4: the light falls to 0.6, then to 0.36; where there is one sheet, never to a half."""
+    sheets = gaussians_of([[0, 0, 2], [0, 0, 3], [0, 0, 4]], scales=1e4, opacities=0.4, dtype=dtype)
+    camera = front_camera(20, 20)
+    picture = rasterize(sheets, camera, median_depth=True)
+    np.testing.assert_array_equal(picture.median_depth, np.full((20, 20), 3, dtype))
+    alone = rasterize(select(sheets, slice(1)), camera, median_depth=True)
+    assert np.isinf(alone.median_depth).all()
+    assert rasterize(sheets, camera).median_depth.shape == (0, 0)
