@@ -205,7 +205,8 @@ def check_affinity(url: str) -> None:
             served.setdefault(entry["id"].split(".call")[0].split(".link")[0], set()).add(entry["replica"])
     by_call_and_link = [len(replicas) for replicas in served.values()]
     expect(len(by_call_and_link) == len(times), "every frame is in the log")
-    expect(max(by_call_and_link) <= 2 and sum(by_call_and_link) <= 2 * len(times), "a time has its replica")
+    alone = by_call_and_link.count(1)
+    expect(alone >= 0.9 * len(times), f"{alone} of {len(times)} times have one replica; others were asked again")
     used = set[str]().union(*served.values())
     expect(len(used) == REPLICAS, f"{REPLICAS} replicas share the work")
 

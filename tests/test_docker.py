@@ -1,0 +1,97 @@
+"""Images and composition: what can be seen without a daemon, and with one the whole check of docker/check.py."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from msdgs_serve.api.metrics import Metrics
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.api.work import WorkQueue
+from msdgs_serve.pose_cache import PoseCache
+from msdgs_serve.store import SceneStore
+from tests.processes import ROOT
+
+DOCKER = ROOT / "docker"
+SKIPPED = 77
+PIN = re.compile(r"^([\w.-]+)==([^\s;\\]+)", re.MULTILINE)
+
+
+def pins(path: Path) -> dict[str, str]:
+    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in PIN.findall(path.read_text())}
+
+
+@pytest.mark.parametrize("name", ["build", "serve", "train"])
+def test_every_requirement_is_a_tested_version_with_hashes(name: str):
+    path = DOCKER / "requirements" / f"{name}.txt"
+    tested, locked = pins(ROOT / "constraints.txt"), pins(path)
+    assert locked
+    differing = {name: version for name, version in locked.items() if tested.get(name, version) != version}
+    assert not differing, "docker/lock.sh makes them anew"
+    blocks = re.split(r"\n(?=\S)", path.read_text().strip())
+    assert len(blocks) == len(locked)
+    assert all("--hash=sha256:" in block for block in blocks)
+
+
+def test_what_serves_has_no_torch():
+    assert not {"torch", "onnx", "scipy", "matplotlib"} & pins(DOCKER / "requirements" / "serve.txt").keys()
+    assert "torch" not in pins(DOCKER / "requirements" / "train.txt"), "it comes from an index of its own"
+
+
+def test_what_images_copy_is_sent_to_the_build():
+    sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    copied = re.findall(
+        r"^COPY (?!--from)(?:--chown=\S+ )?(.+) \S+$", (DOCKER / "Dockerfile").read_text(), re.MULTILINE
+    )
+    files = [file for line in copied for file in line.split()]
+    assert files
+    for file in files:
+        assert (ROOT / file).exists()
+        assert any(Path(file).match(pattern) for pattern in sent), file
+
+
+def composition() -> dict[str, Any]:
+    return yaml.safe_load((DOCKER / "compose.yaml").read_text())["services"]
+
+
+def test_services_have_no_rights_they_don_t_need():
+    for name, service in composition().items():
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+    assert all(composition()[name]["read_only"] for name in ("render", "proxy", "prometheus"))
+
+
+def test_the_service_is_told_nothing_that_it_doesn_t_know():
+    known = {f"MSDGS_{name.upper()}" for name in Settings.model_fields}
+    assert composition()["render"]["environment"].keys() <= known
+    in_image = re.findall(r"MSDGS_\w+", (DOCKER / "Dockerfile").read_text())
+    assert in_image
+    assert set(in_image) <= known
+
+
+def test_the_dashboard_asks_for_metrics_that_there_are():
+    metrics = Metrics(SceneStore([]), PoseCache(0), WorkQueue(1, 1, 1.0))
+    metrics.count_request("POST", "/render", 200, 0.1, 100)
+    metrics.count_problem("invalid")
+    metrics.count_stages({"draw": 0.1})
+    exposed = set(re.findall(r"^(\w+)[{ ]", metrics.page().decode(), re.MULTILINE))
+    dashboard = json.loads((DOCKER / "grafana" / "dashboards" / "msdgs.json").read_text())
+    asked = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    named = set(re.findall(r"\b(?:msdgs|process)_\w+", " ".join(asked)))
+    assert named
+    assert named <= exposed
+
+
+@pytest.mark.slow
+def test_the_image_and_the_composition_with_a_daemon():
+    done = subprocess.run(
+        [sys.executable, DOCKER / "check.py"], cwd=ROOT, capture_output=True, text=True, timeout=1800, check=False
+    )
+    if done.returncode == SKIPPED:
+        pytest.skip(done.stdout.strip())
+    assert done.returncode == 0, done.stdout + done.stderr
