@@ -139,10 +139,10 @@ def test_flat_grids_and_straight_lines_in_time_are_smooth() -> None:
         assert float(planes.time_offsets()) == pytest.approx(2)
         planes.time[:, 4] += 1
         planes.space[:, 3] += 1
-    assert float(planes.time_bends()) == pytest.approx((1 + 4 + 1) / 7)
-    assert float(planes.time_offsets()) == pytest.approx(2 + 1 / 9)
-    assert float(planes.space_slopes()) == pytest.approx(2 / 31)
-    assert float(planes.space_bends()) == pytest.approx((1 + 4 + 1) / 30)
+        assert float(planes.time_bends()) == pytest.approx((1 + 4 + 1) / 7)
+        assert float(planes.time_offsets()) == pytest.approx(2 + 1 / 9)
+        assert float(planes.space_slopes()) == pytest.approx(2 / 31)
+        assert float(planes.space_bends()) == pytest.approx((1 + 4 + 1) / 30)
 
 
 def test_grids_of_before_there_were_several_are_read() -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from msdgs_serve.api.observe import JsonLines, request_id
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
+from msdgs_serve.imaging.pictures import FARTHEST_GREY
 from tests.images import decode
 from tests.scene_files import metadata, write_scene
 from tests.service import serving
@@ -137,15 +138,15 @@ def test_channels_come_in_the_order_asked_for(client: httpx.Client):
 
 
 def test_depth_as_a_picture_is_lighter_the_nearer(client: httpx.Client):
-    depth = array(client, channels=["depth"])[..., 0]
-    grey, _ = decode(post(client, channels=["depth"]).content, "png")
+    """White where nearest, `FARTHEST_GREY` where farthest, darker where it is thin, black where nothing is."""
+    depth, alpha = (array(client, channels=[name])[..., 0] for name in ("depth", "alpha"))
     seen = np.isfinite(depth)
-    assert (grey[~seen] == 0).all()
-    assert grey[depth == depth[seen].min()].max() == 255
-    order = np.argsort(depth[seen])
-    assert (np.diff(grey[seen].ravel()[order].astype(int)) <= 0).all()
-    fixed, _ = decode(post(client, channels=["depth"], depth_range=[0, 10]).content, "png")
-    assert 0 < fixed[seen].min() <= fixed[seen].max() < 255
+    assert 0 < seen.mean() < 1
+    for asked, (near, far) in (({}, (depth[seen].min(), depth[seen].max())), ({"depth_range": [0, 10]}, (0, 10))):
+        grey = decode(post(client, channels=["depth"], **asked).content, "png")[0][..., 0].astype(int)
+        place = (np.where(seen, depth, far) - near) / (far - near)
+        want = 255 * alpha * np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0)
+        assert np.abs(grey - want).max() <= 1
 
 
 def test_motion_blur_is_the_mean_of_moments_in_linear_light(client: httpx.Client):
