@@ -164,6 +164,7 @@ def _write_webp(file: Path, values: np.ndarray) -> None:
     spec.attribute("compression", "lossless:100")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     writer = oiio.ImageOutput.create(str(file))
+    assert writer is not None
     assert writer.open(str(file), spec), writer.geterror()
     assert writer.write_image(pixels.reshape(width, width, 4))
     writer.close()

@@ -213,7 +213,7 @@ def moving_frames(count: int) -> list[Gaussians]:
     first, frames = some_gaussians(200, 0), []
     for i in range(count):
         means = first.means.copy()
-        means[:-10] += np.float32([0.05 * i, 0.02 * i * i, 0])
+        means[:-10] += np.array([0.05 * i, 0.02 * i * i, 0], np.float32)
         frames.append(Gaussians(means, first.quats, first.scales, first.opacities, first.sh))
     return frames
 
