@@ -37,7 +37,7 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> Path:
     Raises `ImportFailed` naming what is missing or differs.
     """
     if kind not in RUNS:
-        raise ImportFailed(run, f"is a run of {kind}, which isn't read; its planes need not be a cube about the origin, as ours are")
+        raise ImportFailed(run, f"is a run of {kind}, which isn't read: its planes needn't span a cube")
     clouds = {int(p.parent.name.rpartition("_")[2]): p for p in run.glob("point_cloud/iteration_*/point_cloud.ply")}
     if not clouds:
         raise ImportFailed(run, "has no point_cloud/iteration_*/point_cloud.ply")
