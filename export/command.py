@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import onnx
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
+from rich.table import Column, Table
 
 from export.job import Candidate, Job, Unreachable
 from export.plans import parse
@@ -30,6 +30,12 @@ if TYPE_CHECKING:
 
 LEAST_ERROR = 10.0
 """dB. Under it a frame isn't one of the scene any more."""
+
+WIDE = 180
+"""Characters that all columns of the table take."""
+
+TELLING = ("", "plan", "trimmed to", "SH", "moving", "ms", "MB", "worst frame")
+"""Columns for narrower terminals."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +137,13 @@ def _planned(job: Job, settings: Settings) -> tuple[Candidate, RenderedError]:
 
 
 def _print_table(contents: dict, console: Console) -> None:
-    table = Table(*COLUMNS, box=None)
-    for row in rows(contents):
-        table.add_row(*row, style="bold" if row[0] == "★" else None)
+    """All columns where they fit, else those that say most; the report has them all."""
+    names = list(COLUMNS) if console.width >= WIDE else [name for name in COLUMNS if name in TELLING]
+    table = Table(*(Column(name, no_wrap=True) for name in names), box=None)
+    usual = [row for row in rows(contents) if names == list(COLUMNS) or not row[COLUMNS.index("rasterizer")]]
+    for row in usual:
+        cells = [cell for name, cell in zip(COLUMNS, row, strict=True) if name in names]
+        table.add_row(*cells, style="bold" if row[0] == "★" else None)
     console.print(table)
 
 

@@ -15,6 +15,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Request
 
 from msdgs_serve.api.routes.viewer import FILES, FOLDER
+from msdgs_serve.imaging import ImageFormat
 from msdgs_serve.scene.camera import orbit
 from tests.browser import chromium, forget, wait_until_still
 from tests.images import decode
@@ -292,12 +293,13 @@ def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Cli
         assert words[:2] == ["curl", str(client.base_url.join("render"))]
         answer = client.post("/render", content=words[-1], headers={"Content-Type": "application/json"})
         np.testing.assert_array_equal(decode(answer.content, "png")[0], picture(page))
-        for label, channels in (("PNG", 3), ("EXR", 5)):
+        files: list[tuple[str, ImageFormat, int]] = [("PNG", "png", 3), ("EXR", "exr", 5)]
+        for label, image_format, channels in files:
             with page.expect_download() as download:
                 page.get_by_role("button", name=label, exact=True).click()
-            assert download.value.suggested_filename == f"it's-0.5.{label.lower()}"
+            assert download.value.suggested_filename == f"it's-0.5.{image_format}"
             content = Path(download.value.path()).read_bytes()
-            assert decode(content, label.lower())[0].shape == (*picture(page).shape[:2], channels)
+            assert decode(content, image_format)[0].shape == (*picture(page).shape[:2], channels)
 
 
 def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Path):

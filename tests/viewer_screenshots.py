@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from tests.browser import chromium, wait_until_still
 from tests.service import serving
@@ -23,7 +24,8 @@ def main(folder: Path) -> None:
     """Write one JPEG for each of `SHOTS`."""
     with serving(SCENE) as client, chromium() as browser:
         for name, device, scheme, view in SHOTS:
-            with browser.new_context(**device, color_scheme=scheme) as context:
+            options: Any = {**device, "color_scheme": scheme}
+            with browser.new_context(**options) as context:
                 page = context.new_page()
                 page.goto(f"{client.base_url}/#scene={SCENE.stem}&view={view}&{AT}")
                 wait_until_still(page)

@@ -52,7 +52,9 @@ class Settings(BaseSettings):
     max_video_frames: int = Field(default=300, ge=1, le=1000, description="most frames of a film")
     max_video_pixels: int = Field(default=1 << 28, ge=1, description="largest width × height × frames of a film")
     max_scene_megabytes: int = Field(default=1024, ge=1, description="largest scene file that is taken in")
-    uploads: bool = Field(default=False, description="let clients add and delete scenes, in the first folder given")
+    uploads: CliImplicitFlag[bool] = Field(
+        default=False, description="let clients add and delete scenes, in the first folder given"
+    )
     header_seconds: float = Field(default=10.0, gt=0, description="time limit for a request's headers")
     body_seconds: float = Field(default=10.0, gt=0, description="time limit for a request's body; for uploads, idle")
     read_seconds: float = Field(default=10.0, gt=0, description="how long a client may take no bytes of its answer")
