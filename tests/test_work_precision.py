@@ -105,8 +105,9 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
     swept: tuple[Job, SweepResult],
 ):
     _, result = swept
-    usual = [p for p in result.points if p.rasterizer == DEFAULT_RASTERIZER]
-    assert sum(p.candidate.plan == "network" and p.candidate.trim_db is None for p in usual) == 1
+    whole = [p for p in result.points if p.candidate.plan == "network" and p.candidate.trim_db is None]
+    most = max(p.candidate.sh_degree for p in whole)
+    assert sum(p.rasterizer == DEFAULT_RASTERIZER and p.candidate.sh_degree == most for p in whole) == 1
     within = [p for p in result.points if p.error.psnr_worst >= 45]
     chosen = result.points[result.chosen]
     assert chosen.milliseconds == min(p.milliseconds for p in within)
@@ -139,7 +140,8 @@ def test_the_report_holds_what_it_promises(swept: tuple[Job, SweepResult], tmp_p
         assert p["moving"] + p["static"] <= GROUND + OBJECT
     page = paths[1].read_text()
     assert page.count("★ |") == 1
-    assert "motion of Gaussians that never move visibly" in page
+    chosen = next(p for p in read["points"] if p["chosen"])  # times decide: all of such small files are fast
+    assert ("motion of Gaussians that never move visibly" in page) == (chosen["static"] > 0)
     assert all(len(row) == len(COLUMNS) for row in rows(contents))
     with Image.open(paths[2]) as picture:
         assert picture.format == "PNG"
@@ -194,9 +196,11 @@ def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.Capt
     save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
     assert main(tmp_path / "model.pt", max_error=45.0, no_bands=True) == 0
     shown = capsys.readouterr().err
-    assert "left out: motion of Gaussians that never move visibly" in shown
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene
+    # which of such small files is the fastest is a matter of chance
+    still = scene.moving_count < len(moving_object().gaussians)
+    assert ("left out: motion of Gaussians that never move visibly" in shown) == still
     assert scene.metadata.sh_degree == 1 or scene.metadata.left_out[-1]["rule"] == "sh_degree"
     assert scene.metadata.measured_error["rendered"]["psnr_worst"] >= 45
     contents = json.loads((tmp_path / "model.report.json").read_text())
