@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from numba.core import config
@@ -10,11 +9,9 @@ from numba.core import config
 from msdgs_serve.rasterizer.jit import RASTERIZER
 from msdgs_serve.rasterizer.kernel_files import is_writable
 from msdgs_serve.rasterizer.rasterize import rasterize
-from msdgs_serve.rasterizer.view import GSPLAT
-from msdgs_serve.scene.camera import Camera, CameraModel, look_at
+from msdgs_serve.scene.camera import Camera, look_at
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
 
 SIZE = 32
 """Pixels along a side: several tiles."""
@@ -27,7 +24,7 @@ class KernelsNotStored(MsdgsError):
 
 
 def compile_kernels() -> Path:
-    """Draw a tiny float32 frame of each kind, so that every kernel of `rasterize` is on disk.
+    """Draw a tiny float32 frame, so that every kernel of `rasterize` is on disk: one serves all cameras and scenes.
 
     They are good for processors of the kind of this one. Returns the folder that has them. Raises `KernelsNotStored`.
     """
@@ -37,21 +34,13 @@ def compile_kernels() -> Path:
     if not is_writable(folder):
         raise KernelsNotStored(f"kernels are kept in {folder}, which can't be written; NUMBA_CACHE_DIR names another")
     pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
-    for model in get_args(CameraModel):
-        camera = Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose, model)
-        for coefficients in SH_DEGREES:
-            for mip in (False, True):
-                gaussians, motion = _gaussians(coefficients), np.ones((COUNT, 2), np.float32)
-                rasterize(gaussians, camera, extra=motion, options=GSPLAT._replace(mip=mip))
-    return folder
-
-
-def _gaussians(coefficients: int) -> Gaussians:
     random = np.random.default_rng(0)
-    return Gaussians(
+    gaussians = Gaussians(
         means=random.uniform(-1, 1, (COUNT, 3)).astype(np.float32),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (COUNT, 1)),
         scales=np.full((COUNT, 3), 0.1, np.float32),
         opacities=np.full(COUNT, 0.5, np.float32),
-        sh=np.zeros((COUNT, coefficients, 3), np.float32),
+        sh=np.zeros((COUNT, 1, 3), np.float32),
     )
+    rasterize(gaussians, Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose))
+    return folder

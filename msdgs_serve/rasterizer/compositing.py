@@ -245,9 +245,13 @@ def _blend_block(
     real = batch.dtype.type
     lane = block * np.uint64(LANES)
     pixel_x, pixel_y = load(grid, 32) + grid[block], load(grid, 48) + grid[np.uint64(16) + block]
-    left = load(state, lane)
-    red, green = load(state, lane + np.uint64(PIXELS)), load(state, lane + np.uint64(2 * PIXELS))
-    blue, depth = load(state, lane + np.uint64(3 * PIXELS)), load(state, lane + np.uint64(4 * PIXELS))
+    sums = (
+        load(state, lane),
+        load(state, lane + np.uint64(PIXELS)),
+        load(state, lane + np.uint64(2 * PIXELS)),
+        load(state, lane + np.uint64(3 * PIXELS)),
+        load(state, lane + np.uint64(4 * PIXELS)),
+    )
     while bits != np.uint64(0):
         first, bits = _next(bits)
         second, bits = _next(bits)
@@ -261,26 +265,11 @@ def _blend_block(
         alpha = minimum(alpha, filled(limits.alpha_max, alpha))
         alpha = select(exponent >= limits.log2_alpha_min, alpha, filled(0, alpha))
         one, two = first_of(alpha), second_of(alpha)
-        weight, after = _seen(first_of(one), left, limits.transmittance_min)
-        if len(median) > 0:
-            _keep_median(left, after, batch[first + DEPTH], state, lane)
-        left = after
-        red, green, blue, depth = _added(weight, batch, first, red, green, blue, depth)
-        weight, after = _seen(second_of(one), left, limits.transmittance_min)
-        if len(median) > 0:
-            _keep_median(left, after, batch[second + DEPTH], state, lane)
-        left = after
-        red, green, blue, depth = _added(weight, batch, second, red, green, blue, depth)
-        weight, after = _seen(first_of(two), left, limits.transmittance_min)
-        if len(median) > 0:
-            _keep_median(left, after, batch[third + DEPTH], state, lane)
-        left = after
-        red, green, blue, depth = _added(weight, batch, third, red, green, blue, depth)
-        weight, after = _seen(second_of(two), left, limits.transmittance_min)
-        if len(median) > 0:
-            _keep_median(left, after, batch[fourth + DEPTH], state, lane)
-        left = after
-        red, green, blue, depth = _added(weight, batch, fourth, red, green, blue, depth)
+        sums = _blended(first_of(one), batch, first, limits, median, state, lane, sums)
+        sums = _blended(second_of(one), batch, second, limits, median, state, lane, sums)
+        sums = _blended(first_of(two), batch, third, limits, median, state, lane, sums)
+        sums = _blended(second_of(two), batch, fourth, limits, median, state, lane, sums)
+    left, red, green, blue, depth = sums
     store(state, lane, left)
     store(state, lane + np.uint64(PIXELS), red)
     store(state, lane + np.uint64(2 * PIXELS), green)
@@ -313,21 +302,28 @@ def _next(bits: np.uint64) -> tuple[np.uint64, np.uint64]:
 
 
 @kernel
-def _added(
-    weight: Lanes, batch: np.ndarray, place: np.uint64, red: Lanes, green: Lanes, blue: Lanes, depth: Lanes
-) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+def _blended(
+    alpha: Lanes,
+    batch: np.ndarray,
+    place: np.uint64,
+    limits: PixelLimits,
+    median: tuple,
+    state: np.ndarray,
+    lane: np.uint64,
+    sums: tuple,
+) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
+    """What is left of the light, red, green, blue and depth behind one more splat."""
+    left, red, green, blue, depth = sums
+    after = fma(-alpha, left, left)
+    goes_on = after > limits.transmittance_min
+    weight = select(goes_on, alpha * left, filled(0, left))
+    after = select(goes_on, after, negative(left))
+    if len(median) > 0:
+        _keep_median(left, after, batch[place + DEPTH], state, lane)
     red = fma(weight, spread(batch[place + RED]), red)
     green = fma(weight, spread(batch[place + GREEN]), green)
     blue = fma(weight, spread(batch[place + BLUE]), blue)
-    return red, green, blue, fma(weight, spread(batch[place + DEPTH]), depth)
-
-
-@kernel
-def _seen(alpha: Lanes, left: Lanes, transmittance_min: float) -> tuple[Lanes, Lanes]:
-    """With which weight a splat is seen, and the transmittance that it leaves."""
-    after = fma(-alpha, left, left)
-    goes_on = after > transmittance_min
-    return select(goes_on, alpha * left, filled(0, left)), select(goes_on, after, negative(left))
+    return after, red, green, blue, fma(weight, spread(batch[place + DEPTH]), depth)
 
 
 @kernel

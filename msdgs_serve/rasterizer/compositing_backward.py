@@ -156,17 +156,8 @@ def _splat_backward(
 ) -> np.uint64:
     """Write the sums of a splat over the blocks that `bits` names; returns those of them that are done now."""
     zero = spread(record.dtype.type(0))
-    sum_red, sum_green, sum_blue, sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = (
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-    )
+    sum_red, sum_green, sum_blue = zero, zero, zero
+    sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
     done = np.uint64(0)
     while bits != np.uint64(0):
         block = lowest_bit(bits)
@@ -201,30 +192,8 @@ def _splat_backward(
         sum_xx, sum_xy, sum_yy = fma(along_x, dx, sum_xx), fma(along_x, dy, sum_xy), fma(along_y, dy, sum_yy)
         if bits_of(goes_on) == np.uint64(0):
             done |= np.uint64(1) << block
-    store(
-        sums,
-        place,
-        sums_of(
-            (
-                sum_red,
-                sum_green,
-                sum_blue,
-                sum_1,
-                sum_x,
-                sum_y,
-                sum_xx,
-                sum_xy,
-                sum_yy,
-                zero,
-                zero,
-                zero,
-                zero,
-                zero,
-                zero,
-                zero,
-            )
-        ),
-    )
+    moments = (sum_red, sum_green, sum_blue, sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy)
+    store(sums, place, sums_of(moments))
     return done
 
 

@@ -16,6 +16,8 @@ from numba.core import cgutils, types
 from numba.core.datamodel import models
 from numba.extending import lower_builtin, register_model, type_callable
 
+from msdgs_serve.rasterizer.jit import FAST_MATH
+
 LANES = 16
 
 Lanes = Any
@@ -57,8 +59,7 @@ class _MaskModel(models.PrimitiveModel):
 
 MASK = MaskType()
 REALS = (types.float32, types.float64)
-FREEDOMS = ("contract", "nsz", "arcp")
-"""Floating-point freedoms: those of `jit.FAST_MATH`."""
+FREEDOMS = tuple(sorted(FAST_MATH))
 
 
 def _typed(function: Callable, result: Callable[..., types.Type | None]) -> None:
@@ -411,14 +412,26 @@ def load_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tu
 
 
 def store_columns(array: np.ndarray, first_row: Index, first_column: Index, columns: tuple[Lanes, ...]) -> None:
-    """Write 16 columns into 16 rows of an array [n, m]; what is past its rows and columns is dropped."""
+    """Write up to 16 columns, and 0 for those that lack, into 16 rows of an array [n, m]; what is past its rows and
+    columns is dropped."""
     block = array[int(first_row) :, int(first_column) :][:LANES, :LANES]
-    block[:] = np.stack(columns, axis=1)[: block.shape[0], : block.shape[1]]
+    block[:] = _sixteen(columns).T[: block.shape[0], : block.shape[1]]
 
 
 def sums_of(columns: tuple[Lanes, ...]) -> Lanes:
-    """The sum of each of 16 `Lanes`, in the lane of its number."""
-    return np.stack(columns).sum(axis=1)
+    """The sum of each of up to 16 `Lanes`, in the lane of its number; 0 in the others."""
+    return _sixteen(columns).sum(axis=1)
+
+
+def _sixteen(columns: tuple[Lanes, ...]) -> np.ndarray:
+    """[16, 16] columns as rows, filled up with zeros."""
+    return np.stack([*columns, *[np.zeros_like(columns[0])] * (LANES - len(columns))])
+
+
+def _filled_up(builder: Any, columns: Any) -> list[Any]:
+    """The vectors of a tuple, and vectors of zeros up to 16."""
+    vectors = [builder.extract_value(columns, k) for k in range(len(columns.type))]
+    return vectors + [ir.Constant(vectors[0].type, [0.0] * LANES)] * (LANES - len(vectors))
 
 
 @type_callable(sums_of)
@@ -428,7 +441,7 @@ def _type_sums_of(_context: Any) -> Callable:
 
 @lower_builtin(sums_of, types.UniTuple)
 def _lower_sums_of(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    vectors = [builder.extract_value(values[0], k) for k in range(LANES)]
+    vectors = _filled_up(builder, values[0])
     lower, upper = ([lane for k in range(start, start + 8) for lane in (k, LANES + k)] for start in (0, 8))
     while len(vectors) > 1:  # two vectors of partial sums become one, whose neighbours belong to one and the other
         pairs = [(vectors[k], vectors[k + len(vectors) // 2]) for k in range(len(vectors) // 2)]
@@ -547,7 +560,7 @@ def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any
         context.cast(builder, v, t, types.intp) for v, t in zip(values[1:3], signature.args[1:3], strict=True)
     )
     places, count, width = _rows(context, builder, kind, values[0], row, column)
-    rows = _transposed(builder, [builder.extract_value(values[3], k) for k in range(LANES)])
+    rows = _transposed(builder, _filled_up(builder, values[3]))
     some = _first(builder, width)
     for k, (place, lanes) in enumerate(zip(places, rows, strict=True)):
         with builder.if_then(builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)):

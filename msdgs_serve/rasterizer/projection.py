@@ -142,21 +142,15 @@ def _project_range(
         qw, qx = converted(qs[0], double), converted(qs[1], double)
         qy, qz = converted(qs[2], double), converted(qs[3], double)
         axes = rotation_columns(qw, qx, qy, qz)
-        mx0, my0 = _half_axis(r, jacobian, axes[0])
-        mx1, my1 = _half_axis(r, jacobian, axes[1])
-        mx2, my2 = _half_axis(r, jacobian, axes[2])
-        s0, s1, s2 = converted(ss[0], double), converted(ss[1], double), converted(ss[2], double)
-        mx0, my0, mx1, my1, mx2, my2 = mx0 * s0, my0 * s0, mx1 * s1, my1 * s1, mx2 * s2, my2 * s2
-        # the determinant is a sum of squares (Cauchy-Binet), so that a needle of 1e6 : 1 keeps its digits
-        xx, yy = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, my0 * my0 + my1 * my1 + my2 * my2
-        xy = mx0 * my0 + mx1 * my1 + mx2 * my2
-        d0, d1, d2 = mx1 * my2 - mx2 * my1, mx2 * my0 - mx0 * my2, mx0 * my1 - mx1 * my0
-        sharp = d0 * d0 + d1 * d1 + d2 * d2
-        det = sharp + view.eps2d * (xx + yy) + view.eps2d * view.eps2d
+        half = (
+            half_axis(jacobian, turned(r, axes[0]), converted(ss[0], double)),
+            half_axis(jacobian, turned(r, axes[1]), converted(ss[1], double)),
+            half_axis(jacobian, turned(r, axes[2]), converted(ss[2], double)),
+        )
+        xx, xy, yy, sharp, det = covariance2d(half, view.eps2d)
         if view.mip:
             opacity = opacity * square_root(sharp / det)
             drawn = drawn & (opacity >= view.alpha_min)
-        xx, yy = xx + view.eps2d, yy + view.eps2d
         # from here on in the records' dtype: ratios, roots and sums of the above lose nothing in float32
         u, v = converted(u, records), converted(v, records)
         slope_h, slope_v = converted(xy / yy, records), converted(xy / xx, records)
@@ -200,8 +194,6 @@ def _project_range(
                 select(drawn, slope_v, zero),
                 select(drawn, extent_x, zero),
                 select(drawn, extent_y, zero),
-                zero,
-                zero,
             ),
         )
         scale, past_column, past_row = 1 / TILE, spread(real(view.tile_columns)), spread(real(view.tile_rows))
@@ -247,12 +239,7 @@ def depth_bits(depth: float) -> np.uint64:
 @kernel
 def _store_nothing(records: np.ndarray, first: int) -> None:
     zero = spread(records.dtype.type(0))
-    store_columns(
-        records,
-        first,
-        0,
-        (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero),
-    )
+    store_columns(records, first, 0, (zero,))
 
 
 @kernel
@@ -266,14 +253,36 @@ def rotation_columns(w: Lanes, x: Lanes, y: Lanes, z: Lanes) -> tuple:
 
 
 @kernel
-def _half_axis(r: np.ndarray, jacobian: tuple, axis: tuple) -> tuple[Lanes, Lanes]:
-    """J W of a vector in the world: x and y in the image."""
-    a, b, c = axis
-    x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
-    y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
-    z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
+def turned(rotation: np.ndarray, vector: tuple) -> tuple[Lanes, Lanes, Lanes]:
+    """A matrix [3, 3] times a vector."""
+    a, b, c = vector
+    return (
+        rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c,
+        rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c,
+        rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c,
+    )
+
+
+@kernel
+def half_axis(jacobian: tuple, axis: tuple, size: Lanes) -> tuple[Lanes, Lanes]:
+    """J times a vector in camera axes, times its length: x and y in the image."""
+    x, y, z = axis
     (xx, xy, xz), (yx, yy, yz) = jacobian
-    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z
+    return (xx * x + xy * y + xz * z) * size, (yx * x + yy * y + yz * z) * size
+
+
+@kernel
+def covariance2d(half: tuple, eps2d: float) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
+    """xx, xy, yy of M Mᵀ + eps I for half-axes M, [3][2], and the determinants before eps I and with it.
+
+    These are sums of squares (Cauchy-Binet), so that a needle of 1e6 : 1 keeps its digits.
+    """
+    (mx0, my0), (mx1, my1), (mx2, my2) = half
+    xx, yy = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, my0 * my0 + my1 * my1 + my2 * my2
+    xy = mx0 * my0 + mx1 * my1 + mx2 * my2
+    d0, d1, d2 = mx1 * my2 - mx2 * my1, mx2 * my0 - mx0 * my2, mx0 * my1 - mx1 * my0
+    sharp = d0 * d0 + d1 * d1 + d2 * d2
+    return xx + eps2d, xy, yy + eps2d, sharp, sharp + eps2d * (xx + yy) + eps2d * eps2d
 
 
 @kernel

@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.compositing import pixel_limits
-from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.harmonics import harmonics_above_0, harmonics_slope
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.lanes import (
@@ -20,6 +18,7 @@ from msdgs_serve.rasterizer.lanes import (
     filled,
     load,
     load_columns,
+    load_or,
     select,
     square_root,
     store,
@@ -27,16 +26,18 @@ from msdgs_serve.rasterizer.lanes import (
 )
 from msdgs_serve.rasterizer.projection import (
     EXTENT_X,
-    LOG2_OPACITY,
     ROOT_A,
     ROOT_B,
     ROOT_C,
     ROOT_SCALE,
     Splats,
+    covariance2d,
+    half_axis,
     ranges_of_lanes,
     raw_colors,
     rotation_columns,
     seen_at,
+    turned,
 )
 from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
@@ -46,7 +47,7 @@ from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_serve.threads import run_parallel
 
 # numbers of the columns of a record: a tuple is indexed by a plain int
-_A, _B, _C, _LOG2_OPACITY, _EXTENT = (int(place) for place in (ROOT_A, ROOT_B, ROOT_C, LOG2_OPACITY, EXTENT_X))
+_A, _B, _C, _EXTENT = (int(place) for place in (ROOT_A, ROOT_B, ROOT_C, EXTENT_X))
 
 
 class GaussianGradients(NamedTuple):
@@ -75,10 +76,10 @@ def project_backward(
     flat = np.empty((count, LANES), gaussians.means.dtype)
     sh = gaussians.sh.reshape(count, 3 * gaussians.sh.shape[1])
     grad_sh = np.empty_like(sh)
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, sh, splats.records, sums, flat, grad_sh)
-    polynomial = pixel_limits(options, flat.dtype).exp2
+    g = gaussians
+    arrays = (g.means, g.quats, g.scales, g.opacities, sh, splats.records, sums, flat, grad_sh)
     view = view_of(camera, options)
-    run_parallel(_backward_range, [(start, stop, view, *arrays, polynomial) for start, stop in ranges_of_lanes(count)])
+    run_parallel(_backward_range, [(start, stop, view, *arrays) for start, stop in ranges_of_lanes(count)])
     means, quats, scales, opacities, means2d, _ = np.split(flat, [3, 7, 10, 11, 13], axis=1)
     return GaussianGradients(means, quats, scales, opacities[:, 0], grad_sh.reshape(gaussians.sh.shape), means2d)
 
@@ -91,12 +92,12 @@ def _backward_range(
     means: np.ndarray,
     quats: np.ndarray,
     scales: np.ndarray,
+    opacities: np.ndarray,
     sh: np.ndarray,
     records: np.ndarray,
     sums: np.ndarray,
     flat: np.ndarray,
     grad_sh: np.ndarray,
-    polynomial: tuple,
 ) -> None:
     double = np.empty(1, np.float64)
     scratch, pulls = np.empty(48 * LANES, sh.dtype), np.zeros(LANES * LANES, sh.dtype)
@@ -116,11 +117,11 @@ def _backward_range(
         qy, qz = converted(qs[2], double), converted(qs[3], double)
         axes = rotation_columns(qw, qx, qy, qz)
         sizes = (converted(ss[0], double), converted(ss[1], double), converted(ss[2], double))
-        turned = (_turned(w, axes[0]), _turned(w, axes[1]), _turned(w, axes[2]))  # the axes as the camera has them
+        seen = (turned(w, axes[0]), turned(w, axes[1]), turned(w, axes[2]))  # the axes as the camera has them
         half = (
-            _half_axis(jacobian, turned[0], sizes[0]),
-            _half_axis(jacobian, turned[1], sizes[1]),
-            _half_axis(jacobian, turned[2], sizes[2]),
+            half_axis(jacobian, seen[0], sizes[0]),
+            half_axis(jacobian, seen[1], sizes[1]),
+            half_axis(jacobian, seen[2], sizes[2]),
         )
         v_xx, v_xy, v_yy = _covariance_gradient(
             half,
@@ -136,9 +137,9 @@ def _backward_range(
         grad_z = -(grad_x * x + grad_y * y) * per_z
         zero = filled(0, z)
         covariance = (v_xx, v_xy, v_yy)
-        size0, axis0, jacobian0 = _axis_gradient(w, jacobian, covariance, half[0], axes[0], turned[0], sizes[0])
-        size1, axis1, jacobian1 = _axis_gradient(w, jacobian, covariance, half[1], axes[1], turned[1], sizes[1])
-        size2, axis2, jacobian2 = _axis_gradient(w, jacobian, covariance, half[2], axes[2], turned[2], sizes[2])
+        size0, axis0, jacobian0 = _axis_gradient(w, jacobian, covariance, half[0], axes[0], seen[0], sizes[0])
+        size1, axis1, jacobian1 = _axis_gradient(w, jacobian, covariance, half[1], axes[1], seen[1], sizes[1])
+        size2, axis2, jacobian2 = _axis_gradient(w, jacobian, covariance, half[2], axes[2], seen[2], sizes[2])
         grad_j00, grad_j02 = jacobian0[0] + jacobian1[0] + jacobian2[0], jacobian0[1] + jacobian1[1] + jacobian2[1]
         grad_j11, grad_j12 = jacobian0[2] + jacobian1[2] + jacobian2[2], jacobian0[3] + jacobian1[3] + jacobian2[3]
         # J has fx / z, -fx ratio / z and the same of y; the ratio moves only where it isn't clamped
@@ -152,6 +153,7 @@ def _backward_range(
         dx, dy, dz = _color_gradient(view, sh, first, scratch, pulls, drawn, wx, wy, wz, moments, grad_sh)
         grad_quat = _quaternion_gradient(qw, qx, qy, qz, (axis0, axis1, axis2))
         nothing = filled(0, record[0])
+        opacity = load_or(opacities, first, filled(1, nothing))
         store_columns(
             flat,
             first,
@@ -167,25 +169,11 @@ def _backward_range(
                 select(drawn, converted(size0, flat), nothing),
                 select(drawn, converted(size1, flat), nothing),
                 select(drawn, converted(size2, flat), nothing),
-                select(drawn, -moments[3] * exp2(-record[_LOG2_OPACITY], polynomial), nothing),
+                select(drawn, -moments[3] / opacity, nothing),
                 select(drawn, grad_u, nothing),
                 select(drawn, grad_v, nothing),
-                nothing,
-                nothing,
-                nothing,
             ),
         )
-
-
-@kernel
-def _turned(w: np.ndarray, axis: tuple) -> tuple[Lanes, Lanes, Lanes]:
-    """W times a vector."""
-    a, b, c = axis
-    return (
-        w[0, 0] * a + w[0, 1] * b + w[0, 2] * c,
-        w[1, 0] * a + w[1, 1] * b + w[1, 2] * c,
-        w[2, 0] * a + w[2, 1] * b + w[2, 2] * c,
-    )
 
 
 @kernel
@@ -199,15 +187,8 @@ def _turned_back(w: np.ndarray, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, La
 
 
 @kernel
-def _half_axis(jacobian: tuple, axis: tuple, size: Lanes) -> tuple[Lanes, Lanes]:
-    """J times a vector in camera axes, times its length: x and y in the image."""
-    (j00, _, j02), (_, j11, j12) = jacobian
-    return (j00 * axis[0] + j02 * axis[2]) * size, (j11 * axis[1] + j12 * axis[2]) * size
-
-
-@kernel
 def _axis_gradient(
-    w: np.ndarray, jacobian: tuple, covariance: tuple, half: tuple, axis: tuple, turned: tuple, size: Lanes
+    w: np.ndarray, jacobian: tuple, covariance: tuple, half: tuple, axis: tuple, seen: tuple, size: Lanes
 ) -> tuple:
     """Of one axis: d loss / d scale, / d its vector in the world, [3], / d (j00, j02, j11, j12), [4]."""
     v_xx, v_xy, v_yy = covariance
@@ -216,7 +197,7 @@ def _axis_gradient(
     a, b, c = _turned_back(w, j00 * x, j11 * y, j02 * x + j12 * y)
     grad_size = a * axis[0] + b * axis[1] + c * axis[2]
     x, y = x * size, y * size
-    return grad_size, (a * size, b * size, c * size), (x * turned[0], x * turned[2], y * turned[1], y * turned[2])
+    return grad_size, (a * size, b * size, c * size), (x * seen[0], x * seen[2], y * seen[1], y * seen[2])
 
 
 @kernel
@@ -224,12 +205,8 @@ def _covariance_gradient(
     half: tuple, eps2d: float, sum_xx: Lanes, sum_xy: Lanes, sum_yy: Lanes
 ) -> tuple[Lanes, Lanes, Lanes]:
     """d loss / d covariance, xx, xy, yy: it is M Mᵀ + eps I, and d conic = -conic d covariance conic."""
-    (mx0, my0), (mx1, my1), (mx2, my2) = half
-    xx, yy = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, my0 * my0 + my1 * my1 + my2 * my2
-    xy = mx0 * my0 + mx1 * my1 + mx2 * my2
-    d0, d1, d2 = mx1 * my2 - mx2 * my1, mx2 * my0 - mx0 * my2, mx0 * my1 - mx1 * my0
-    det = d0 * d0 + d1 * d1 + d2 * d2 + eps2d * (xx + yy) + eps2d * eps2d
-    a, b, c = (yy + eps2d) / det, -xy / det, (xx + eps2d) / det
+    xx, xy, yy, _, det = covariance2d(half, eps2d)
+    a, b, c = yy / det, -xy / det, xx / det
     g_xx, g_xy, g_yy = 0.5 * sum_xx, 0.5 * sum_xy, 0.5 * sum_yy
     p, q = a * g_xx + b * g_xy, a * g_xy + b * g_yy
     r, s = b * g_xx + c * g_xy, b * g_xy + c * g_yy

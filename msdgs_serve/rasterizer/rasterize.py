@@ -64,10 +64,9 @@ def _checked_extra(extra: np.ndarray | None, gaussians: Gaussians) -> np.ndarray
     extra = np.asarray(extra)
     if extra.ndim != 2 or len(extra) != count:
         raise InvalidInput("extra", f"of shape ({count}, channels)", extra.shape)
-    if not np.isfinite(extra).all():
-        raise InvalidInput(
-            "extra", "finite", f"{np.count_nonzero(~np.isfinite(extra))} values that are NaN or infinite"
-        )
+    bad = int(np.count_nonzero(~np.isfinite(extra)))
+    if bad:
+        raise InvalidInput("extra", "finite", f"{bad} values that are NaN or infinite")
     return extra
 
 
