@@ -37,9 +37,12 @@ class DeformationSession:
         contents = self._read()
         default_ids = self._check_constants(contents)
         self._session = self._open(contents)
-        properties = self._session.get_modelmeta().custom_metadata_map
-        metadata = SceneMetadata.from_properties(properties, self._file)
-        self._check_interface()
+        try:
+            properties = self._session.get_modelmeta().custom_metadata_map
+            metadata = SceneMetadata.from_properties(properties, self._file)
+            self._check_interface()
+        except UnicodeDecodeError as error:
+            raise SceneFileInvalid(self._file, "file", f"has text that isn't UTF-8: {error}") from error
         self.scene = self._read_scene(metadata, default_ids)
         for t in metadata.time_range:
             self._check_sample(t)

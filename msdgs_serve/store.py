@@ -208,18 +208,10 @@ class SceneStore:
             before = _signature(file)
             with file.open("rb") as stream:
                 sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-            session = self._session(file)
+            session = self._open_scene(file)
             if _signature(file) == before:
                 return session, sha256
         raise SceneFileInvalid(file.name, "file", "changes while it is read")
-
-    def _session(self, file: Path) -> DeformationSession:
-        try:
-            return self._open_scene(file)
-        except (MsdgsError, OSError):
-            raise
-        except Exception as error:  # damaged files find errors in libraries that nobody has listed
-            raise SceneFileInvalid(file.name, "file", f"can't be opened: {error}") from error
 
     def _entry(self, name: str) -> _Entry:
         with self._lock:

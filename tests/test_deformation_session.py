@@ -13,7 +13,7 @@ import torch
 from export.bake import bake
 from export.plans import build
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.model import DynamicGaussians
 from tests.models import random_model
@@ -130,3 +130,12 @@ def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
     activation_mb = count * width * 4 / 2**20
     outputs_mb = count * 10 * 4 / 2**20
     assert float(done.stdout) < outputs_mb + 0.25 * activation_mb
+
+
+@pytest.mark.parametrize("text", [b"package_version", b"static_means"])
+def test_text_that_is_not_utf_8_is_refused(path: Path, tmp_path: Path, text: bytes):
+    """In the metadata, in names of outputs."""
+    damaged = tmp_path / "damaged.onnx"
+    damaged.write_bytes(path.read_bytes().replace(text, b"\xff" + text[1:]))
+    with pytest.raises(SceneFileInvalid, match=r"damaged.onnx"):
+        DeformationSession(damaged)
