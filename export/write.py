@@ -1,12 +1,8 @@
-"""A checkpoint in, a proven scene file out."""
+"""A graph in, a proven scene file out."""
 
-import hashlib
 import json
 import math
-import os
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,17 +10,13 @@ from typing import Any
 import onnx
 from onnx import helper
 
-from export.bake import bake
-from export.plans import build
-from export.precision.assess import assess
 from export.verify import TIMES, TOLERANCE, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
-from msdgs_train.checkpoint import load_model
+from msdgs_train.files import replacing
 from msdgs_train.model import DynamicGaussians
 
 PLAN = "network"
-STABILITY_TIMES = 8
 
 
 @dataclass(frozen=True)
@@ -40,27 +32,6 @@ class Exported:
     @property
     def measured_error(self) -> dict[str, Any]:
         return self.metadata.measured_error
-
-
-def export_scene(
-    checkpoint: Path,
-    output: Path,
-    *,
-    tolerance: float = TOLERANCE,
-    times: int = TIMES,
-    on_time: Callable[[], object] = lambda: None,
-) -> Exported:
-    """Bake `checkpoint`, write it beside `output`, compare that file with the model, and only then move it there.
-
-    Whatever goes wrong before, `output` stays as it was. Raises `CheckpointInvalid`, `ModelNotExportable`,
-    `PlanUnsafe`, `VerificationFailed`, or `SceneFileInvalid` where the written file breaks its contract.
-    """
-    loaded = load_model(checkpoint)
-    with checkpoint.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    baked = bake(loaded.model, loaded.scene, sha256)
-    assess(loaded.model, loaded.scene, times=STABILITY_TIMES).require(PLAN)
-    return write_scene(output, build(PLAN, baked), loaded.model, tolerance=tolerance, times=times, on_time=on_time)
 
 
 def write_scene(
@@ -79,17 +50,16 @@ def write_scene(
     else than the model's own layers isn't held to `tolerance`: its frames have been judged.
     """
     exact = rendered is None or properties(contents)["plan"] == PLAN
-    with _beside(output) as temporary:
-        _write(temporary, contents)
+    with replacing(output) as temporary:
+        temporary.write_bytes(contents.SerializeToString())
         session, allowed = DeformationSession(temporary), tolerance if exact else math.inf
         measured = verify(session, model, times=times, tolerance=allowed, on_time=on_time)
         measured = properties(contents)["measured_error"] | measured  # what a fitted plan knows of itself stays
         if rendered is not None:
             measured |= {"rendered": rendered}
         helper.set_model_props(contents, _as_texts(properties(contents) | {"measured_error": measured}))
-        _write(temporary, contents)
+        temporary.write_bytes(contents.SerializeToString())
         scene = DeformationSession(temporary).scene  # only its metadata is new, and it must be whole like the first
-        os.replace(temporary, output)
     return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
 
 
@@ -100,22 +70,3 @@ def properties(contents: onnx.ModelProto) -> dict[str, Any]:
 
 def _as_texts(values: dict[str, Any]) -> dict[str, str]:
     return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}
-
-
-@contextmanager
-def _beside(output: Path) -> Iterator[Path]:
-    """A new file in the same folder; gone at the end unless it was moved away."""
-    handle, name = tempfile.mkstemp(dir=output.parent, prefix=f".{output.stem}.", suffix=".onnx.tmp")
-    os.fchmod(handle, 0o644) if hasattr(os, "fchmod") else None
-    os.close(handle)
-    try:
-        yield Path(name)
-    finally:
-        Path(name).unlink(missing_ok=True)
-
-
-def _write(path: Path, contents: onnx.ModelProto) -> None:
-    with path.open("wb") as file:
-        file.write(contents.SerializeToString())
-        file.flush()
-        os.fsync(file.fileno())

@@ -18,7 +18,6 @@ from export.plans import build
 from export.precision.formats import FLOAT32, in_format
 from export.precision.frames import image_gap
 from export.precision.gap import half_diagonal, largest_error, pose_arrays, pose_errors
-from export.write import export_scene
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
@@ -27,6 +26,7 @@ from msdgs_train.checkpoint import SceneInfo, load_model, save_model
 from msdgs_train.layers import PositionalEncoding, octaves
 from msdgs_train.model import Domain, DynamicGaussians
 from msdgs_train.rasterization import rasterize as rasterize_for_training
+from tests.exports import export_scene
 from tests.models import CAMERA, SCENE, random_model
 from tests.scene_files import write_scene
 from tests.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of

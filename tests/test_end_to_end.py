@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from export.write import export_scene
 from msdgs_serve.scene import Camera
 from msdgs_train.checkpoint import save_model
 from msdgs_train.rasterization import rasterize
+from tests.exports import export_scene
 from tests.images import decode, linear_to_srgb
 from tests.models import CAMERA, SCENE, random_model
 from tests.service import serving

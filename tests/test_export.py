@@ -17,12 +17,12 @@ from export.bake import ModelNotExportable, bake, starting_cameras
 from export.plans import build
 from export.to_onnx import main
 from export.verify import VerificationFailed, times_to_verify, verify
-from export.write import export_scene
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.checkpoint import SceneInfo, save_model
 from msdgs_train.model import LOG_SCALE_LIMIT, DynamicGaussians
+from tests.exports import export_scene
 from tests.models import SCENE, random_model
 from tests.tolerances import tolerance
 

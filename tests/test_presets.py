@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from export.write import export_scene
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli import PresetName
@@ -18,6 +17,7 @@ from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians, ModelConfig
 from msdgs_train.presets import DEFAULT, PRESETS, preset
 from msdgs_train.trainer import Trainer
+from tests.exports import export_scene
 from tests.tolerances import tolerance
 from tests.training_scene import write_scene
 

@@ -16,12 +16,12 @@ from export.precision.frames import View, image_gap
 from export.precision.gap import pose_arrays
 from export.precision.stability_report import PlanUnsafe
 from export.stability import UNSTEADY, main
-from export.write import export_scene
 from msdgs_train.checkpoint import save_model
 from msdgs_train.deformation import MultiStepDeformation
 from msdgs_train.layers import LayerStep
 from msdgs_train.model import DynamicGaussians
 from tests import stability_extreme, stability_stiff
+from tests.exports import export_scene
 from tests.models import SCENE, random_model
 from tests.stability_rows import FAILS, Row
 from tests.stability_suite import PAGE
