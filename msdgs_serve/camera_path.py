@@ -81,13 +81,32 @@ def read_nerfstudio(
 
 def read_path_file(path: Path, time_range: tuple[float, float], size: tuple[int, int] | None = None) -> CameraPath:
     """The path in a JSON file in nerfstudio's layout. Raises `InvalidInput`."""
+    return read_nerfstudio(_document(path), time_range, size)
+
+
+def read_scene_names(path: Path) -> list[str]:
+    """The `scene` that each camera of a path in a JSON file names. Raises `InvalidInput` naming the key."""
+    cameras = _document(path).get("camera_path")
+    if not isinstance(cameras, list) or not cameras:
+        raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
+    return [_scene_name(each, f"camera_path.{number}") for number, each in enumerate(cameras)]
+
+
+def _scene_name(camera: Any, at: str) -> str:
+    name = camera.get("scene") if isinstance(camera, dict) else None
+    if not isinstance(name, str) or not name.endswith(".onnx"):
+        raise InvalidInput(f"{at}.scene", "a scene file (.onnx), from the path's folder", name)
+    return name
+
+
+def _document(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise InvalidInput("path", "a JSON file that can be read", f"{path}: {error}") from None
     if not isinstance(document, dict):
         raise InvalidInput("path", "a JSON object, as nerfstudio writes it", f"{path}: {type(document).__name__}")
-    return read_nerfstudio(document, time_range, size)
+    return document
 
 
 def _time(camera: Mapping[str, Any], evenly: float, time_range: tuple[float, float], name: str) -> float:

@@ -27,14 +27,17 @@ class DeformationSession:
     number of threads, so neither do the results.
     """
 
-    def __init__(self, path: str | Path, *, chunk: int = CHUNK) -> None:
-        """Raises `SceneFileInvalid` naming the field where the file isn't a whole, finite `msdgs/1` scene."""
+    def __init__(self, path: str | Path, *, chunk: int = CHUNK, contents: bytes | None = None) -> None:
+        """`contents` are the file's, where they came by another way and `path` is but its name.
+
+        Raises `SceneFileInvalid` naming the field where the file isn't a whole, finite `msdgs/1` scene.
+        """
         if chunk < 1:
             raise InvalidInput("chunk", "1 or more", chunk)
         self.path = Path(path)
         self._chunk = chunk
         self._file = self.path.name
-        contents = self._read()
+        contents = self._read() if contents is None else contents
         default_ids = self._check_constants(contents)
         self._session = self._open(contents)
         try:

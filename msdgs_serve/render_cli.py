@@ -1,24 +1,32 @@
-"""`msdgs-render`: a camera path through a scene, as images or as a film. Goes on where it was stopped."""
+"""`msdgs-render`: a camera path through scenes, as images or as a film, drawn here or by a Ray cluster.
+
+Goes on where it was stopped.
+"""
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import cast, get_args
 
 import numpy as np
 import OpenImageIO as oiio
 
-from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_path_file, turn_around
+from msdgs_serve.blocks import Block, Look, View, draw_block, plan_blocks
+from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_path_file, read_scene_names, turn_around
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
-from msdgs_serve.imaging import FORMATS, ImageFormat, encode
+from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
+from msdgs_serve.ray_blocks import draw_on_ray
+from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import InvalidInput, MsdgsError
 from msdgs_serve.video import VideoFormat, check_video, write_video
@@ -34,6 +42,8 @@ examples:
   msdgs-render scene.onnx turn.mp4 --frames 96 --fps 24     the same as a film
   msdgs-render scene.onnx walk.webm --path camera_path.json a path drawn in nerfstudio's viewer
   msdgs-render scene.onnx frames/ --format exr              colour, alpha and depth as numbers, for compositing
+  msdgs-render views.json frames/                           a path whose cameras each name their "scene"
+  msdgs-render scene.onnx frames/ --ray auto                drawn by the Ray cluster of this machine; else ADDRESS
 
 Ctrl-C loses nothing: the same command goes on where it was stopped.
 """
@@ -57,7 +67,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         PROGRAM, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scene", type=Path, help="a scene file (.onnx)")
+    scene = 'a scene file (.onnx), or a camera path (.json) whose cameras name one each, as "scene"'
+    parser.add_argument("scene", type=Path, help=scene)
     parser.add_argument("out", type=Path, help="a folder for images, or a film: name.mp4 or name.webm")
     parser.add_argument("--path", type=Path, help="a camera path, as nerfstudio writes it; default: one turn around")
     parser.add_argument("--frames", type=int, default=60, help="of the turn (default 60)")
@@ -68,6 +79,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--format", choices=get_args(ImageFormat), default="png", help="of images (default png)")
     parser.add_argument("--quality", type=int, help="of jpeg and webp, 1 to 100")
     parser.add_argument("--transparent", action="store_true", help="no background; for images")
+    ray = "draw on a Ray cluster: `auto`, that of this machine (one is started where there is none), or its address"
+    parser.add_argument("--ray", metavar="ADDRESS", help=ray)
     return parser
 
 
@@ -76,33 +89,49 @@ def _run(options: argparse.Namespace) -> None:
     is_film = bool(video)
     if is_film:
         check_video(video)
-    session = DeformationSession(options.scene)
-    path = _path(options, session)
+    views, fps = _views(options)
     image_format = cast(ImageFormat, "png" if is_film else options.format)
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_film)
-    first = path.frames[0][0]
+    first = views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
     if is_film and transparent:
         raise InvalidInput("--transparent", "left out for a film", "given")
     folder = options.out.with_name(f"{options.out.name}.frames") if is_film else options.out
-    _claim(folder, _record(options, path, image_format, transparent))
-    files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(path.frames))]
+    _claim(folder, _record(options, views, image_format, transparent))
+    files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(views))]
     background = "transparent" if transparent else "scene"
-    _draw(session, path, files, image_format, options.quality, RenderOptions(background))
+    _draw(views, files, Look(image_format, options.quality, RenderOptions(background)), options.ray)
     if is_film:
         unfinished = options.out.with_name(f".{options.out.name}.part")
         with unfinished.open("wb") as file:
-            write_video(_pictures(files), options.fps or path.fps, cast(VideoFormat, video), file)
+            write_video(_pictures(files), fps, cast(VideoFormat, video), file)
         os.replace(unfinished, options.out)
         shutil.rmtree(folder)
     print(f"wrote {options.out}: {len(files)} frames of {first.width} × {first.height}")
 
 
-def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPath:
-    metadata = session.scene.metadata
+def _views(options: argparse.Namespace) -> tuple[list[View], float]:
+    """All frames, and how many of them are a second of a film."""
     if (options.width is None) != (options.height is None):
         raise InvalidInput("--width", "given together with --height", "one of them")
-    size = None if options.width is None else (options.width, options.height)
+    if options.scene.suffix == ".json":
+        return _views_of_scenes(options)
+    path = _path(options, DeformationSession(options.scene))
+    return [View(options.scene, camera, t) for camera, t in path.frames], path.fps
+
+
+def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
+    if options.path is not None:
+        raise InvalidInput("--path", "left out where the first argument is a path", options.path)
+    scenes = [options.scene.parent / name for name in read_scene_names(options.scene)]
+    ranges = {scene: DeformationSession(scene).scene.metadata.time_range for scene in dict.fromkeys(scenes)}
+    paths = {scene: read_path_file(options.scene, time_range, _size(options)) for scene, time_range in ranges.items()}
+    views = [View(scene, *paths[scene].frames[number]) for number, scene in enumerate(scenes)]
+    return views, options.fps or paths[scenes[0]].fps
+
+
+def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPath:
+    metadata, size = session.scene.metadata, _size(options)
     if options.path is not None:
         path = read_path_file(options.path, metadata.time_range, size)
         return CameraPath(path.frames, options.fps or path.fps)
@@ -116,26 +145,38 @@ def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPat
     return CameraPath(tuple(frames), options.fps or DEFAULT_FPS)
 
 
-def _draw(
-    session: DeformationSession,
-    path: CameraPath,
-    files: Sequence[Path],
-    image_format: ImageFormat,
-    quality: int | None,
-    options: RenderOptions,
-) -> None:
+def _size(options: argparse.Namespace) -> tuple[int, int] | None:
+    return None if options.width is None else (options.width, options.height)
+
+
+def _draw(views: Sequence[View], files: Sequence[Path], look: Look, ray: str | None) -> None:
     """The files that aren't there yet; each appears whole."""
     missing = [number for number, file in enumerate(files) if not file.exists()]
     if len(missing) < len(files):
         print(f"{len(files) - len(missing)} of {len(files)} frames are there already")
-    renderer, started = Renderer(), time.monotonic()
-    for done, number in enumerate(missing, start=1):
-        camera, t = path.frames[number]
-        body = encode(renderer.render(session, camera, t, options), image_format, quality)
-        unfinished = files[number].with_name(f".{files[number].name}.part")
-        unfinished.write_bytes(body)
-        os.replace(unfinished, files[number])
-        _show_progress(done, len(missing), time.monotonic() - started)
+    if not missing:
+        return
+    with ExitStack() as stack:
+        if ray is None:
+            frames = _draw_here(plan_blocks(views, missing), look)
+        else:
+            cores = stack.enter_context(ray_cluster(ray))
+            print(f"Ray has {cores} cores", file=sys.stderr)
+            frames = draw_on_ray(plan_blocks(views, missing, cores), look, cores)
+        started = time.monotonic()
+        for done, (number, body) in enumerate(frames, start=1):
+            unfinished = files[number].with_name(f".{files[number].name}.part")
+            unfinished.write_bytes(body)
+            os.replace(unfinished, files[number])
+            _show_progress(done, len(missing), time.monotonic() - started)
+
+
+def _draw_here(blocks: Sequence[Block], look: Look) -> Iterator[tuple[int, bytes]]:
+    renderer = Renderer()
+    for scene, of_one_scene in itertools.groupby(blocks, lambda block: block.scene):
+        session = DeformationSession(scene)
+        for block in of_one_scene:
+            yield from draw_block(block, session, renderer, look)
 
 
 def _show_progress(done: int, count: int, seconds: float) -> None:
@@ -156,10 +197,12 @@ def _pictures(files: Sequence[Path]) -> Iterator[np.ndarray]:
         reader.close()
 
 
-def _record(options: argparse.Namespace, path: CameraPath, image_format: str, transparent: bool) -> str:
+def _record(options: argparse.Namespace, views: Sequence[View], image_format: str, transparent: bool) -> str:
     """What the frames depend on."""
-    digest = hashlib.sha256(options.scene.read_bytes())
-    for camera, t in path.frames:
+    digest = hashlib.sha256()
+    contents = {scene: hashlib.sha256(scene.read_bytes()).digest() for scene in {view.scene for view in views}}
+    for scene, camera, t in views:
+        digest.update(contents[scene])
         digest.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, t)).encode())
         digest.update(camera.camera_to_world.tobytes())
     asked = {"format": image_format, "quality": options.quality, "transparent": transparent}

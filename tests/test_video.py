@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from msdgs_serve import render_cli
+from msdgs_serve import blocks
 from msdgs_serve.camera_path import read_nerfstudio
 from msdgs_serve.imaging import Image, encode
 from msdgs_serve.render_cli import INTERRUPTED, main
@@ -164,10 +164,10 @@ def test_what_was_stopped_goes_on(scene: Path, tmp_path: Path, monkeypatch: pyte
         return encode(image, *arguments)
 
     command = (scene, film, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
-    monkeypatch.setattr(render_cli, "encode", encode_two)
+    monkeypatch.setattr(blocks, "encode", encode_two)
     assert run(*command) == INTERRUPTED
     assert not film.exists()
-    monkeypatch.setattr(render_cli, "encode", lambda image, *more: drawn.append(image.t) or encode(image, *more))
+    monkeypatch.setattr(blocks, "encode", lambda image, *more: drawn.append(image.t) or encode(image, *more))
     assert run(*command) == 0
     assert drawn == [0.0, 0.25, 0.5, 0.75, 1.0]
     frames, rate = frames_of(film.read_bytes())

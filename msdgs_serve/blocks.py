@@ -1,0 +1,88 @@
+"""Frames, cut into blocks by scene and time. This code draws them, here and elsewhere."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.imaging import ImageFormat, encode
+from msdgs_serve.renderer import Renderer, RenderOptions
+from msdgs_serve.scene import Camera
+
+LARGEST = 16
+"""Frames of a block: what a worker that dies takes with it, and what Ctrl-C throws away."""
+
+
+class View(NamedTuple):
+    """What one frame shows."""
+
+    scene: Path
+    camera: Camera
+    t: float
+
+
+class Frame(NamedTuple):
+    """One frame of a block; `number` is its place among all."""
+
+    number: int
+    camera: Camera
+    t: float
+
+
+@dataclass(frozen=True)
+class Block:
+    """Frames of one scene in the order of their times, so that each time is posed once."""
+
+    scene: Path
+    frames: tuple[Frame, ...]
+
+
+@dataclass(frozen=True)
+class Look:
+    """How frames are drawn and written."""
+
+    image_format: ImageFormat
+    quality: int | None
+    options: RenderOptions
+
+
+def plan_blocks(views: Sequence[View], numbers: Sequence[int], workers: int = 1) -> list[Block]:
+    """The frames `numbers` of `views` in blocks: all of one scene after each other, by time.
+
+    Blocks have `LARGEST` frames, or fewer where `workers` would have less than four each. A time that has more frames
+    than fit into what is left of a block begins a new one.
+    """
+    size = max(1, min(LARGEST, len(numbers) // (4 * workers)))
+    scenes = list(dict.fromkeys(view.scene for view in views))
+    blocks = []
+    for scene in scenes:
+        frames = [Frame(number, views[number].camera, views[number].t) for number in numbers]
+        frames = [frame for frame in frames if views[frame.number].scene == scene]
+        blocks += [Block(scene, tuple(part)) for part in _cut(sorted(frames, key=_by_time), size)]
+    return blocks
+
+
+def draw_block(
+    block: Block, session: DeformationSession, renderer: Renderer, look: Look
+) -> Iterator[tuple[int, bytes]]:
+    """Number and file contents of each frame, one after the other."""
+    for number, camera, t in block.frames:
+        yield number, encode(renderer.render(session, camera, t, look.options), look.image_format, look.quality)
+
+
+def _by_time(frame: Frame) -> tuple[float, int]:
+    return frame.t, frame.number
+
+
+def _cut(frames: Sequence[Frame], size: int) -> Iterator[list[Frame]]:
+    block: list[Frame] = []
+    for index, frame in enumerate(frames):
+        begins_time = index == 0 or frames[index - 1].t != frame.t
+        together = sum(other.t == frame.t for other in frames[index : index + size]) if begins_time else 1
+        if block and len(block) + together > size:
+            yield block
+            block = []
+        block.append(frame)
+    if block:
+        yield block
