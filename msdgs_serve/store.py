@@ -5,9 +5,11 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import Framing, framing
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
 
 SUFFIX = ".onnx"
@@ -29,6 +31,11 @@ class ServedScene:
     name: str
     session: DeformationSession
     sha256: str  # of its file
+
+    @cached_property
+    def framing(self) -> Framing:
+        """How it is seen where a request says nothing; needed for each."""
+        return framing(self.session.scene.metadata)
 
 
 @dataclass(frozen=True)

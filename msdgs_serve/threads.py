@@ -4,8 +4,10 @@ numba's own parallel layers abort when two threads enter them or when the proces
 kernels do neither.
 """
 
+import contextlib
 import itertools
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +16,9 @@ from contextvars import ContextVar
 from typing import Any
 
 THREADS_VARIABLE = "MSDGS_THREADS"
+GIVING_WAY = 10
+"""Niceness of threads that compute for requests: under too much load /live is answered in a quarter of the time that it
+takes without, or less; with 5 the gain is smaller."""
 
 _check: ContextVar[Callable[[], object] | None] = ContextVar("check", default=None)
 _lock = threading.Lock()
@@ -38,6 +43,16 @@ def checking(check: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         _check.reset(token)
+
+
+def give_way() -> None:
+    """This thread, and those that it starts from now on, let other threads go first (Linux).
+
+    Without it a thread that is woken up to answer something short waits while all cores compute.
+    """
+    if sys.platform == "linux":  # elsewhere priorities are the process's
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), GIVING_WAY)
 
 
 def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:

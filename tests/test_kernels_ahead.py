@@ -32,15 +32,15 @@ import dataclasses
 from pathlib import Path
 from msdgs_serve.api.cameras import resolve_camera
 from msdgs_serve.api.schemas import RenderRequest
-from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
 from msdgs_serve.store import SceneStore
 
-session = SceneStore([Path(sys.argv[1])]).get("toybench").session
+served = SceneStore([Path(sys.argv[1])]).get("toybench")
+session = served.session
 request = RenderRequest.model_validate(
     {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 40, "height": 30}
 )
-camera = resolve_camera(request, session.scene.metadata)
+camera = resolve_camera(request, served)
 renderer = Renderer()
 for model in ("pinhole", "orthographic", "fisheye"):
     view = dataclasses.replace(camera, model=model)

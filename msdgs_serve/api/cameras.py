@@ -6,20 +6,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from msdgs_serve.api.schemas import LookAtCamera, MatrixCamera, OrbitCamera, RenderRequest, SceneCamera
-from msdgs_serve.framing import Framing, framing
+from msdgs_serve.framing import Framing
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.baked import SceneCamera as StoredCamera
-from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, OPENGL_TO_OPENCV, orbit
+from msdgs_serve.store import ServedScene
 
 
-def resolve_camera(request: RenderRequest, metadata: SceneMetadata) -> Camera:
+def resolve_camera(request: RenderRequest, served: ServedScene) -> Camera:
     """The camera to draw with, of the size to draw. Raises `InvalidInput` naming the request's field."""
     spec = request.camera
     if isinstance(spec, SceneCamera):
-        camera = _pick(spec, metadata.cameras).camera
+        camera = _pick(spec, served.session.scene.metadata.cameras).camera
         return camera.resized(*_size(request, camera.width, camera.height))
-    scene = framing(metadata)
+    scene = served.framing
     if isinstance(spec, MatrixCamera):
         return _matrix_camera(spec, request, scene)
     width, height = _size(request, scene.width, scene.height)

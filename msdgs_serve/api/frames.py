@@ -59,7 +59,7 @@ class FramePlan:
 def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     """Check everything that can be wrong with a request; may load its scene. Raises the domain's errors."""
     scene = service.scene(request.scene)
-    camera = resolve_camera(request, scene.session.scene.metadata)
+    camera = resolve_camera(request, scene)
     times = request.t if isinstance(request.t, list) else [request.t]
     _check_amounts(service, request, camera, len(times))
     background = _background(request)

@@ -10,11 +10,9 @@ from fastapi.openapi.utils import get_openapi
 from msdgs_serve.api.errors import MEDIA_TYPE, FieldError, Problem
 from msdgs_serve.api.keys import OPEN_PATHS
 from msdgs_serve.api.schemas import BatchItem
-from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS
-from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_serve.scene.camera import orbit
-from msdgs_serve.store import SceneStore
+from msdgs_serve.store import SceneStore, ServedScene
 from msdgs_serve.video import VIDEO_FORMATS
 
 Responses = dict[int | str, dict[str, Any]]
@@ -100,7 +98,7 @@ def render_examples(store: SceneStore) -> Examples:
     loaded = next((status.name for status in statuses if status.loaded), None)
     if loaded is None:
         return {}
-    return _examples(store.get(loaded).session.scene.metadata, {"scene": loaded} if len(statuses) > 1 else {})
+    return _examples(store.get(loaded), {"scene": loaded} if len(statuses) > 1 else {})
 
 
 def _add_keys(document: dict[str, Any]) -> None:
@@ -118,8 +116,8 @@ def _add_keys(document: dict[str, Any]) -> None:
                 call["responses"][str(HTTPStatus.UNAUTHORIZED.value)] = refusal
 
 
-def _examples(metadata: SceneMetadata, scene: dict[str, str]) -> Examples:
-    frame = framing(metadata)
+def _examples(served: ServedScene, scene: dict[str, str]) -> Examples:
+    frame, metadata = served.framing, served.session.scene.metadata
     pose = orbit(frame.target, frame.distance, azimuth=60, elevation=25, up=frame.up)
     t = float(np.clip(round(np.mean(metadata.time_range), 4), *metadata.time_range))
     size = {"width": 400, "height": 400}

@@ -21,6 +21,7 @@ from msdgs_serve.imaging import encode
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.store import SceneStore, ServedScene
+from msdgs_serve.threads import give_way
 
 logger = logging.getLogger("msdgs_serve")
 
@@ -84,6 +85,7 @@ class Service:
         logger.error("%s", error)
 
     def _live(self) -> None:
+        give_way()  # loading a scene disturbs nobody
         started = time.perf_counter()
         try:
             self._warm_up()
@@ -116,9 +118,7 @@ class Service:
             metadata = scene.session.scene.metadata
             camera = {"type": "orbit", "azimuth": 0, "elevation": 0}
             request = RenderRequest.model_validate({"camera": camera, "t": 0, "width": 32, "height": 32})
-            encode(
-                self.renderer.render(scene.session, resolve_camera(request, metadata), metadata.time_range[0]), "png"
-            )
+            encode(self.renderer.render(scene.session, resolve_camera(request, scene), metadata.time_range[0]), "png")
             return
 
     def _refresh(self) -> None:
@@ -133,7 +133,8 @@ class Service:
             logger.exception("looking at the scenes' files failed")
 
 
-def _service(request: Request) -> Service:
+async def _service(request: Request) -> Service:
+    """Not a plain function: those FastAPI calls on a thread, and a health check would wait for one."""
     return request.app.state.service
 
 

@@ -12,6 +12,7 @@ from typing import TypeVar
 from starlette.requests import Request
 
 from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.threads import give_way
 from msdgs_serve.watch import Watch
 
 Result = TypeVar("Result")
@@ -28,7 +29,7 @@ class WorkQueue:
         self._workers = workers
         self._places = workers + waiting
         self._seconds = seconds
-        self._executor = ThreadPoolExecutor(workers, thread_name_prefix="render")
+        self._executor = ThreadPoolExecutor(workers, "render", initializer=give_way)
         self._lock = threading.Lock()
         self._taken = 0
         self._running = 0

@@ -19,9 +19,8 @@ from msdgs_serve.api.errors import ClientGone, Refused
 from msdgs_serve.api.openapi import SCENE_BODY, problems
 from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList, SceneView
 from msdgs_serve.api.service import Service, SharedService
-from msdgs_serve.framing import framing
+from msdgs_serve.framing import Framing
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
-from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_serve.scene_report import read_report, report_path
 from msdgs_serve.store import MAX_NAME_LENGTH, SceneStore
 
@@ -173,7 +172,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         background=metadata.background,
         antialiasing=metadata.antialiasing,
         delta_space=metadata.delta_space,
-        view=_view(metadata),
+        view=_view(served.framing),
         cameras=[camera.to_plain() for camera in metadata.cameras],
         measured_error=metadata.measured_error,
         report=report_path(store.file(name)).is_file(),
@@ -184,7 +183,6 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
     )
 
 
-def _view(metadata: SceneMetadata) -> SceneView:
-    seen = framing(metadata)
+def _view(seen: Framing) -> SceneView:
     vectors = {"target": seen.target.tolist(), "up": seen.up.tolist()}
     return SceneView(**vectors, distance=seen.distance, fov_y=seen.fov_y, width=seen.width, height=seen.height)

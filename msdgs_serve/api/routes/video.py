@@ -84,9 +84,9 @@ def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath
     else:
         width, height, given = body.width, body.height, body.frames or ()
         requests = [RenderRequest(camera=each.camera, t=each.t, width=width, height=height) for each in given]
-        first = resolve_camera(requests[0], metadata)
+        first = resolve_camera(requests[0], scene)
         asked = {"width": first.width, "height": first.height}
-        cameras = [resolve_camera(each.model_copy(update=asked), metadata) for each in requests]
+        cameras = [resolve_camera(each.model_copy(update=asked), scene) for each in requests]
         path = CameraPath(tuple(zip(cameras, [each.t for each in given], strict=True)), DEFAULT_FPS)
     if len(path.frames) > service.settings.max_video_frames:
         raise InvalidInput("frames", f"at most {service.settings.max_video_frames}", len(path.frames))

@@ -1,0 +1,135 @@
+"""Many clients at once, and what they saw."""
+
+import multiprocessing
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.service_process import Connection, Running
+from benchmarks.service_requests import Wanted, digest
+
+HEALTH_PAUSE = 0.05
+MEMORY_PAUSE = 0.5
+
+
+@dataclass
+class Tally:
+    """What clients saw."""
+
+    seconds: list[float] = field(default_factory=list)  # of accepted requests
+    statuses: Counter[int] = field(default_factory=Counter)
+    bodies: Counter[tuple[Wanted, str]] = field(default_factory=Counter)  # what was asked for, and the answer's digest
+    resident: list[tuple[float, int]] = field(default_factory=list)  # seconds from the start, bytes of the service
+    lasted: float = 0.0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def frames_a_second(self) -> float:
+        return self.statuses[200] / self.lasted
+
+    def milliseconds(self, part: float) -> float:
+        """A quantile of the time of accepted requests."""
+        return 1000 * float(np.quantile(self.seconds, part)) if self.seconds else float("nan")
+
+    def add(self, wanted: Wanted, status: int, body: bytes, seconds: float) -> None:
+        """One answer."""
+        found = digest(body) if status == 200 else ""
+        with self.lock:
+            self.statuses[status] += 1
+            if status == 200:
+                self.seconds.append(seconds)
+                self.bodies[wanted, found] += 1
+
+
+class Health(NamedTuple):
+    """Of /live and /ready, asked for in turns on new connections by a process of its own."""
+
+    p99: float  # milliseconds
+    statuses: dict[int, int]
+
+
+def saturate(running: Running, requests: Sequence[Wanted], clients: int, seconds: float) -> Tally:
+    """Clients that ask again as soon as they are answered; those refused wait as long as they are told."""
+    tally, stop = Tally(), time.monotonic() + seconds
+
+    def ask(seed: int) -> None:
+        chance, connection = random.Random(seed), Connection(running.port)
+        while time.monotonic() < stop:
+            wanted = chance.choice(requests)
+            started = time.perf_counter()
+            answer = connection.ask("POST", "/render", wanted.body())
+            tally.add(wanted, answer.status, answer.body, time.perf_counter() - started)
+            if answer.status == 503:
+                time.sleep(float(answer.headers["retry-after"]))
+        connection.close()
+
+    _together(running, tally, [threading.Thread(target=ask, args=(seed,)) for seed in range(clients)])
+    return tally
+
+
+def at_rate(running: Running, requests: Sequence[Wanted], clients: int, seconds: float, rate: float) -> Tally:
+    """Requests at evenly spread moments, whatever becomes of those before, as long as one of `clients` is free."""
+    tally, lock = Tally(), threading.Lock()
+    moments = iter(enumerate(np.arange(0, seconds, 1 / rate)))
+    begun = time.monotonic()
+
+    def ask() -> None:
+        connection = Connection(running.port)
+        while True:
+            with lock:
+                number, moment = next(moments, (0, None))
+            if moment is None:
+                break
+            time.sleep(max(0.0, begun + moment - time.monotonic()))
+            wanted = requests[number % len(requests)]
+            started = time.perf_counter()
+            answer = connection.ask("POST", "/render", wanted.body())
+            tally.add(wanted, answer.status, answer.body, time.perf_counter() - started)
+        connection.close()
+
+    _together(running, tally, [threading.Thread(target=ask) for _ in range(clients)])
+    return tally
+
+
+def overload(
+    running: Running, requests: Sequence[Wanted], clients: int, seconds: float, rate: float
+) -> tuple[Tally, Health]:
+    """`at_rate` while somebody looks after the service's health."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        pool.submit(int).result()  # started before the load is
+        health = pool.submit(watch_health, running.port, seconds)
+        return at_rate(running, requests, clients, seconds, rate), health.result()
+
+
+def watch_health(port: int, seconds: float) -> Health:
+    """In turns, for so long."""
+    took: list[float] = []
+    statuses: Counter[int] = Counter()
+    stop = time.monotonic() + seconds
+    while time.monotonic() < stop:
+        for path in ("/live", "/ready"):
+            started = time.perf_counter()
+            connection = Connection(port)
+            statuses[connection.ask("GET", path).status] += 1
+            connection.close()
+            took.append(time.perf_counter() - started)
+        time.sleep(HEALTH_PAUSE)
+    return Health(1000 * float(np.quantile(took, 0.99)), dict(statuses))
+
+
+def _together(running: Running, tally: Tally, threads: Sequence[threading.Thread]) -> None:
+    """Start all, note the service's memory until they end."""
+    begun = time.monotonic()
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        tally.resident.append((time.monotonic() - begun, running.resident_bytes()))
+        time.sleep(MEMORY_PAUSE)
+    tally.lasted = time.monotonic() - begun
