@@ -32,8 +32,8 @@ def _features(graph: GraphBuilder, name: str, grid: PlaneGrid, means: str, time:
     """[M, C] the features of one grid at the means [M, 3]."""
     size, channels = grid.space.shape[1], grid.space.shape[3]
     scaled = graph.node("Mul", [means, graph.constant(f"{name}.cells", to_numpy(grid.cells))], f"{name}.scaled")
-    middle = graph.constant(f"{name}.middle", np.array((size - 1) / 2, np.float32))
-    positions = graph.node("Add", [scaled, middle], f"{name}.positions")
+    origin = graph.constant(f"{name}.origin", to_numpy(grid.origin))
+    positions = graph.node("Add", [scaled, origin], f"{name}.positions")
     cells, parts = _cells(graph, f"{name}.xyz", positions, size)
     lines = _lines(graph, name, grid, time)
     over_time = _interpolated_lines(graph, name, lines, cells, parts, size)

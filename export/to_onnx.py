@@ -50,7 +50,7 @@ def main(
     msdgs-serve scenes/ball.onnx
 
     Scenes of others are recognised by what is in them: INRIA's and SuperSplat's .ply, .spz, SOG and .splat files,
-    numbered sequences of them, and runs of Deformable-3D-Gaussians (docs/formats.md):
+    numbered sequences of them, and runs of Deformable-3D-Gaussians and 4DGaussians (docs/formats.md):
 
     python export/to_onnx.py garden.ply -o scenes/garden.onnx
 
@@ -62,7 +62,7 @@ def main(
         model: The `model.pt` of a training run, or a file or folder of another program.
         output: The scene file to write; by default beside the model, ending in .onnx.
         kind: What the input is, where it isn't recognised: model, ply, spz, sog, splat, sequence, sequence:blend,
-            sequence:switch, deformgs.
+            sequence:switch, deformgs, 4dgs.
         max_error: PSNR in dB that the worst frame must have against the exact network; differences are invisible from
             about 50. Lower is faster and less exact.
         plan: Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all.

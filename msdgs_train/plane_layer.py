@@ -20,10 +20,11 @@ class PlaneGrid(nn.Module):
     """xy, xz, yz, xt, yt, zt planes of features, interpolated and multiplied.
 
     Planes over time begin as ones, so that a new grid knows space only. It spans the whole of the time range and a cube
-    of space; beyond its border a Gaussian reads the border's features.
+    of space (one that is imported, any box); beyond its border a Gaussian reads the border's features.
     """
 
     cells: Tensor
+    origin: Tensor
     first_time: Tensor
     time_cells: Tensor
 
@@ -33,14 +34,15 @@ class PlaneGrid(nn.Module):
         super().__init__()
         self.space = nn.Parameter(torch.empty(3, space_nodes, space_nodes, channels).uniform_(*SPACE_INIT))
         self.time = nn.Parameter(torch.ones(3, time_nodes, space_nodes, channels))
-        self.register_buffer("cells", torch.tensor((space_nodes - 1) / (2 * half_extent)))  # a scene unit
+        self.register_buffer("cells", torch.full((3,), (space_nodes - 1) / (2 * half_extent)))  # a scene unit, by axis
+        self.register_buffer("origin", torch.full((3,), (space_nodes - 1) / 2))  # where (0, 0, 0) is, in cells
         first, last = time_range
         self.register_buffer("first_time", torch.tensor(first))
         self.register_buffer("time_cells", torch.tensor((time_nodes - 1) / ((last - first) or 1.0)))  # a unit of time
 
     def forward(self, means: Tensor, t: Tensor) -> Tensor:
         """Features [N, C] of means, [N, 3], at time `t`, a scalar tensor."""
-        positions = means * self.cells + (self.space.shape[1] - 1) / 2
+        positions = means * self.cells + self.origin
         return _PlaneFeatures.apply(self.space, self.lines(t), positions)
 
     def lines(self, t: Tensor) -> Tensor:
@@ -140,10 +142,15 @@ class PlaneLayer(nn.Module):
 
 
 def _name_the_grid(layer: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Models of before there were several grids hold the only one's tensors under the layer's own name."""
+    """Older models hold the only grid's tensors under the layer's own name, and one size of cells for all axes."""
     for name in ("space", "time", "cells", "first_time", "time_cells"):
         if prefix + name in state:
             state[f"{prefix}grids.0.{name}"] = state.pop(prefix + name)
+    for name in [name for name in state if name.startswith(f"{prefix}grids.") and name.endswith(".cells")]:
+        grid = name.removesuffix("cells")
+        if state[name].ndim == 0 and f"{grid}space" in state:
+            state[name] = state[name].expand(3).clone()
+            state[f"{grid}origin"] = torch.full_like(state[name], (state[f"{grid}space"].shape[1] - 1) / 2)
 
 
 class _PlaneFeatures(torch.autograd.Function):

@@ -102,6 +102,13 @@ def splat_bytes(g: Gaussians) -> bytes:
     return body
 
 
+def spz2_bytes(version3: bytes) -> bytes:
+    """Version 2 of an unpacked version 3 stream of degree 0, all rotations the same: x, y, z in bytes."""
+    _, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", version3)
+    before = version3[16 : 16 + 16 * count]
+    return struct.pack("<4sIIBBBB", b"NGSP", 2, count, degree, bits, flags, 0) + before + bytes([200, 128, 90]) * count
+
+
 def spz4_bytes(version3: bytes) -> bytes:
     """Version 4 of an unpacked version 3 stream: the same parts, each in a zstd stream."""
     _, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", version3)

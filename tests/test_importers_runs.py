@@ -82,7 +82,8 @@ def test_the_network_is_theirs(tmp_path: Path, blender: bool, depth: int):
     state = their_state(blender, depth)
     run = write_run(tmp_path / "run", state)
     assert recognise(run) == "deformgs"
-    model, info, step = load_model(write_model(run, "deformgs", tmp_path / "model.pt", QUIET))
+    assert write_model(run, "deformgs", tmp_path / "model.pt", QUIET) == []
+    model, info, step = load_model(tmp_path / "model.pt")
     g = some_gaussians(COUNT, 3, seed=40_000)
     assert (step, info.background, model.config.delta_space) == (40_000, (1.0, 1.0, 1.0), "activated")
     means, quats, scales = (torch.from_numpy(a).double() for a in (g.means, g.quats, g.scales))

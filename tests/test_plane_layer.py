@@ -32,7 +32,7 @@ def slow_features(planes: PlaneGrid, means: Tensor, t: float) -> np.ndarray:
     s, nodes = space.shape[1], time.shape[1]
     out = np.ones((len(means), space.shape[3]))
     for n, mean in enumerate(means.double().numpy()):
-        across = mean * planes.cells.item() + (s - 1) / 2
+        across = mean * planes.cells.numpy() + (s - 1) / 2
         places = [*np.clip(across, 0, s - 1), np.clip(t * (nodes - 1), 0, nodes - 1)]
         hats = [
             [max(0.0, 1 - abs(p - k)) for k in range(count)] for p, count in zip(places, [s, s, s, nodes], strict=True)
@@ -145,9 +145,11 @@ def test_flat_grids_and_straight_lines_in_time_are_smooth() -> None:
         assert float(planes.space_bends()) == pytest.approx((1 + 4 + 1) / 30)
 
 
-def test_grids_of_before_there_were_several_are_read() -> None:
+def test_grids_of_before_there_were_several_or_boxes_are_read() -> None:
     planes = layer()
     old = {name.replace("grids.0.", ""): value for name, value in planes.state_dict().items()}
+    old["cells"] = old["cells"][0]
+    del old["origin"]
     read = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8)
     read.load_state_dict(old)
     t = torch.tensor(0.2)

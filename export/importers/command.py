@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 from export.importers.recognise import KINDS_OF_RUNS, READERS, checked_kind, frame_files, read_splats, recognise
 from export.importers.runs import write_model
-from export.importers.scene import digest, static_scene, write_imported
+from export.importers.scene import digest, note_left_out, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
@@ -30,7 +30,11 @@ def model_or_import(path: Path, kind: str | None, output: Path, console: Console
         yield path / "model.pt" if path.is_dir() else path
     elif kind in KINDS_OF_RUNS:
         with tempfile.TemporaryDirectory(prefix="msdgs-import-") as folder:
-            yield write_model(path, kind, Path(folder) / "model.pt", console)
+            model = Path(folder) / "model.pt"
+            lost = write_model(path, kind, model, console)
+            yield model
+            if lost:
+                note_left_out(output, lost)
     else:
         if not output.parent.is_dir():
             raise InvalidInput("output", "in a folder that exists", str(output))

@@ -1,6 +1,7 @@
 """Runs of Deformable-3D-Gaussians: one MLP that reads encoded position and time, deltas in activated space."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,13 +18,15 @@ MOST_LAYERS = 64
 CHECKED_TIMES = 9
 
 
-def read_deformgs(run: Path, gaussians: CanonicalGaussians, iteration: int) -> tuple[DynamicGaussians, list[str]]:
+def read_deformgs(
+    run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
+) -> tuple[DynamicGaussians, list[str]]:
     """The model of an iteration, and notes. Raises `ImportFailed` for networks that are built otherwise."""
     file = run / "deform" / f"iteration_{iteration}" / "deform.pth"
     if not file.is_file():
         raise ImportFailed(run, f"has point_cloud/iteration_{iteration} but no deform/iteration_{iteration}/deform.pth")
     state = State(file)
-    if "branch_w.weight" in state:
+    if settings.get("is_6dof") or "branch_w.weight" in state:
         raise ImportFailed(file, "was trained with --is_6dof, whose screw motions no layer of this project has")
     depth = sum(name.startswith("linear.") and name.endswith(".weight") for name in state.names())
     if not 2 <= depth <= MOST_LAYERS:

@@ -166,7 +166,8 @@ class _Columns:
 
     def read(self, name: str) -> np.ndarray:
         """One column as float64. Raises `ImportFailed` where it is missing."""
-        return self._column(name).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # NaN that signals, as damaged files hold
+            return self._column(name).astype(np.float64)
 
     def packed(self, name: str) -> np.ndarray:
         column = self._column(name)

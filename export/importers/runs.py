@@ -13,58 +13,86 @@ from rich.console import Console
 
 from export.importers.deformgs import read_deformgs
 from export.importers.errors import ImportFailed
-from export.importers.ply import read_ply
+from export.importers.fourdgs import read_4dgs
+from export.importers.frozen import frozen
+from export.importers.recognise import read_splats
 from export.importers.scene import metadata_of
+from export.importers.splats import Splats
+from export.rendered_error import posed
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.checkpoint import SceneInfo, save_model
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians
 
-RUNS: dict[str, Callable[[Path, CanonicalGaussians, int], tuple[DynamicGaussians, list[str]]]] = {
-    "deformgs": read_deformgs,
-}
-"""Reads the network of an iteration's folder: the model, and what is to be said of it."""
+Reader = Callable[[Path, CanonicalGaussians, int, dict[str, Any]], tuple[DynamicGaussians, list[str]]]
+
+RUNS: dict[str, Reader] = {"deformgs": read_deformgs, "4dgs": read_4dgs}
+"""Reads the network of an iteration, given its canonical Gaussians and cfg_args: the model, and what to say of it."""
+
+WHITE_BY_DEFAULT = {"deformgs": False, "4dgs": True}
+"""Backgrounds, of runs without cfg_args."""
 
 MOST_CAMERAS = 1_000
+CHECKED_TIMES = 5
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
-def write_model(run: Path, kind: str, output: Path, console: Console) -> Path:
-    """Write the last iteration of a run of Deformable-3D-Gaussians (`deformgs`) as a model.pt; returns its path.
+def write_model(run: Path, kind: str, output: Path, console: Console) -> list[dict[str, Any]]:
+    """Write the last iteration of a run, of one of `RUNS`, as a model.pt; returns what a scene file of it has lost.
 
     Raises `ImportFailed` naming what is missing or differs.
     """
-    if kind not in RUNS:
-        raise ImportFailed(run, f"is a run of {kind}, which isn't read: its planes needn't span a cube")
-    clouds = {int(p.parent.name.rpartition("_")[2]): p for p in run.glob("point_cloud/iteration_*/point_cloud.ply")}
+    clouds = {
+        int(number[0]): p
+        for p in run.glob("point_cloud/iteration_*/point_cloud.ply")
+        if (number := re.findall(r"_([0-9]+)$", p.parent.name))
+    }
     if not clouds:
         raise ImportFailed(run, "has no point_cloud/iteration_*/point_cloud.ply")
     iteration = max(clouds)
-    source = read_ply(clouds[iteration])
+    source = read_splats(clouds[iteration], "ply")
     if source.dropped:
         raise ImportFailed(clouds[iteration], f"{source.dropped:,} Gaussians hold NaN, infinity or no direction")
     settings = _settings(run / "cfg_args")
-    model, notes = RUNS[kind](run, canonical(source.gaussians), iteration)
+    model, notes = RUNS[kind](run, canonical(source), iteration, settings)
+    _check_poses(run, model)
     metadata = metadata_of(source.gaussians.means, source.gaussians.sh_degree, "0" * 64)
     cameras = _cameras(run / "cameras.json") or [camera.to_plain() for camera in metadata.cameras]
     info = SceneInfo(
-        background=WHITE if settings.get("white_background") else BLACK,
+        background=WHITE if settings.get("white_background", WHITE_BY_DEFAULT[kind]) else BLACK,
         bounds=[list(b) for b in metadata.bounds],
         cameras=cameras,
     )
-    save_model(output, model, info, iteration)
     console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
+    lost = []
+    if model.config.opacity_head or model.config.sh_head:
+        with console.status("holding opacities and colours"):
+            held = frozen(model, info)
+        model, lost = held.model, [held.left_out()]
+        notes.append(held.note())
+    save_model(output, model, info, iteration)
     for note in notes:
         console.print(note, markup=False)
-    return output
+    return lost
 
 
-def canonical(g: Gaussians) -> CanonicalGaussians:
-    """Activated Gaussians back in storage space."""
+def _check_poses(run: Path, model: DynamicGaussians) -> None:
+    """Raise `ImportFailed` where a network sends Gaussians to where none can be: finite weights may be wild ones."""
+    for t in np.linspace(0, 1, CHECKED_TIMES).tolist():
+        try:
+            posed(model, t).validate()
+        except InvalidInput as error:
+            raise ImportFailed(run, f"its network gives Gaussians that can't be used at t = {t:g}: {error}") from error
+
+
+def canonical(source: Splats) -> CanonicalGaussians:
+    """Activated Gaussians back in storage space, their quaternions as long as they were stored."""
+    g = source.gaussians
+    lengths = np.ones(len(g), np.float32) if source.quat_lengths is None else source.quat_lengths
     opacities = g.opacities.astype(np.float64).clip(1e-7, 1 - 1e-7)
-    arrays = (g.means, np.log(g.scales), g.quats, np.log(opacities / (1 - opacities)), g.sh[:, :1], g.sh[:, 1:])
+    raw_opacities = np.log(opacities / (1 - opacities))
+    arrays = (g.means, np.log(g.scales), g.quats * lengths[:, None], raw_opacities, g.sh[:, :1], g.sh[:, 1:])
     return CanonicalGaussians(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
 
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -108,6 +109,16 @@ def write_imported(
         helper.set_model_props(contents, {name: json.dumps(value, allow_nan=False) for name, value in values.items()})
         temporary.write_bytes(contents.SerializeToString())
         return DeformationSession(temporary).scene
+
+
+def note_left_out(file: Path, lost: Sequence[dict[str, Any]]) -> None:
+    """Add to what a scene file lists as left out, before what the export left out of the rest."""
+    contents = onnx.load(file)
+    values = properties(contents)
+    values["left_out"] = [*lost, *values["left_out"]]
+    helper.set_model_props(contents, {name: json.dumps(value, allow_nan=False) for name, value in values.items()})
+    with replacing(file) as temporary:
+        temporary.write_bytes(contents.SerializeToString())
 
 
 def _differences(session: DeformationSession, expected: Gaussians, t: float, rows: slice) -> dict[str, float]:

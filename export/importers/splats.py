@@ -26,6 +26,7 @@ class Splats:
     gaussians: Gaussians
     dropped: int = 0  # had NaN, infinity or a quaternion without direction, and are not in `gaussians`
     antialiasing: str = "dilate"  # or "mip", where the file says that it was trained so
+    quat_lengths: FloatArray | None = None  # [N] of the stored quaternions; None: all 1
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -69,7 +70,7 @@ def splats(
         _float32(opacities[rows].clip(0, 1)),
         _float32(sh[rows]),
     )
-    return Splats(gaussians.validate(), len(good) - count, antialiasing)
+    return Splats(gaussians.validate(), len(good) - count, antialiasing, _float32(norms[rows]))
 
 
 def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:
