@@ -8,8 +8,10 @@ scenes lie where all see them. Ray's own proxy takes the connections: host, port
 drain_seconds are set there.
 """
 
+import asyncio
 import os
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 from msdgs_serve.threads import THREADS_VARIABLE
@@ -32,6 +34,13 @@ def application(arguments: Mapping[str, str]) -> Any:
     return deployment(Settings(**values), replicas, cores)
 
 
+Message = Any
+Send = Callable[[Message], Awaitable[None]]
+Receive = Callable[[], Awaitable[Message]]
+
+POLL_SECONDS = 0.05
+
+
 def deployment(settings: "Settings", replicas: int = 1, cores: int = 1) -> Any:
     """The service with these settings as a Ray Serve application, to be given to `serve.run`."""
     from ray import serve  # pyright: ignore[reportMissingImports]  # an extra
@@ -48,9 +57,41 @@ def deployment(settings: "Settings", replicas: int = 1, cores: int = 1) -> Any:
 
 
 def _service(settings: "Settings", cores: int) -> Any:
+    """The FastAPI application of `msdgs-serve`, which has begun when its scenes are loaded."""
     from msdgs_serve.api.app import create_app
+    from msdgs_serve.api.service import Phase
     from msdgs_serve.renderer import Renderer
     from msdgs_serve.store import SceneStore
 
     os.environ[THREADS_VARIABLE] = str(cores)
-    return create_app(SceneStore(settings.scenes), Renderer(settings.cache_megabytes << 20), settings)
+    app = create_app(SceneStore(settings.scenes), Renderer(settings.cache_megabytes << 20), settings)
+    service, begin = app.state.service, app.router.lifespan_context
+
+    @asynccontextmanager
+    async def loaded(app: Any) -> AsyncIterator[Any]:
+        async with begin(app) as state:
+            while service.phase is Phase.STARTING:
+                await asyncio.sleep(POLL_SECONDS)
+            if service.failure is not None:
+                raise service.failure
+            yield state
+
+    app.router.lifespan_context = loaded
+    app.add_middleware(_WithoutRequestId)
+    return app
+
+
+class _WithoutRequestId:
+    """Leaves the header out of answers: Ray's proxy, which has given the request its id, adds it too."""
+
+    def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]]) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        async def shorter(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = [each for each in message["headers"] if each[0].lower() != b"x-request-id"]
+                message = {**message, "headers": headers}
+            await send(message)
+
+        await self._app(scope, receive, shorter)

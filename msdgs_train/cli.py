@@ -152,6 +152,9 @@ class Compare:
     jobs: int | None = None
     """Runs side by side; left out: as many as have their threads' cores. Times of runs side by side disturb each other
     somewhat; those of frames are taken at the end, one after the other."""
+    ray: str | None = None
+    """Train on a Ray cluster: `auto`, that of this machine (one is started where there is none), or its address. DATA
+    and OUT must be seen by all its machines under the same names."""
 
 
 Command = (
@@ -300,6 +303,7 @@ def _steps(command: Steps) -> int:
 def _compare(command: Compare) -> int:
     from msdgs_serve.threads import thread_count
     from msdgs_train.comparison.matrix import Budget, make_runs, read_systems
+    from msdgs_train.comparison.pools import processes, ray_tasks
     from msdgs_train.comparison.report import HEADINGS, table, write_comparison
     from msdgs_train.comparison.results import collect
     from msdgs_train.comparison.runner import train_all
@@ -309,11 +313,14 @@ def _compare(command: Compare) -> int:
         command.steps, command.minutes, command.size, command.threads, command.init_count, command.max_gaussians
     )
     runs = make_runs(read_systems(command.systems, budget), command.data, command.seeds, command.out)
-    jobs = max(1, thread_count() // command.threads) if command.jobs is None else command.jobs
-    if jobs < 1:
-        raise InvalidInput("jobs", "1 or more", jobs)
+    if command.jobs is not None and command.jobs < 1:
+        raise InvalidInput("jobs", "1 or more", command.jobs)
+    if command.ray is None:
+        pool = processes(command.jobs or max(1, thread_count() // command.threads))
+    else:
+        pool = ray_tasks(command.ray, command.threads, command.jobs)
     with ComparisonProgress(console, len(runs)) as progress:
-        complete = train_all(runs, jobs, progress.ended)
+        complete = train_all(runs, pool, progress.ended)
     results = collect(runs)
     if results:
         paths = write_comparison(command.out, results, len(runs) - len(results))

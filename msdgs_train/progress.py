@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from msdgs_train.comparison.matrix import Run
-from msdgs_train.comparison.runner import Ended
+from msdgs_train.comparison.pools import Ended
 from msdgs_train.fit import Observer
 from msdgs_train.metrics import Quality
 from msdgs_train.trainer import StepResult

@@ -1,6 +1,7 @@
-"""The service on a port of this machine, in a thread."""
+"""The service on a port of this machine, in a thread; with MSDGS_TEST_SERVICE=ray on Ray Serve."""
 
 import contextlib
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from msdgs_serve.api.app import create_app
 from msdgs_serve.api.cli import bind
@@ -16,8 +18,10 @@ from msdgs_serve.api.service import Phase
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
+from tests.service_on_ray import serving_on_ray
 
 WATCH_SECONDS = 0.05
+SERVICE_VARIABLE = "MSDGS_TEST_SERVICE"
 
 
 @contextlib.contextmanager
@@ -26,6 +30,12 @@ def serving(
 ) -> Iterator[httpx.Client]:
     """A client of a service over these scenes, which ends on leaving. The server is added to `server`."""
     chosen = Settings(scenes=list(scenes), **{"watch_seconds": WATCH_SECONDS, "port": 0, **settings})
+    if os.environ.get(SERVICE_VARIABLE) == "ray":
+        if renderer is not None or server is not None or chosen.port:
+            pytest.skip("reaches into the process of the service, or says its port: not on Ray Serve")
+        with serving_on_ray(chosen) as client:
+            yield client
+        return
     app = create_app(SceneStore(scenes), renderer or Renderer(), chosen)
     listener = bind("127.0.0.1", chosen.port)
     running = Server(app, chosen)

@@ -16,9 +16,10 @@ import pytest
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train import cli
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
+from msdgs_train.comparison.pools import Ended, processes
 from msdgs_train.comparison.report import as_markdown, draw_layers, draw_time, table
 from msdgs_train.comparison.results import CurvePoint, Result, Spread
-from msdgs_train.comparison.runner import Ended, train_all
+from msdgs_train.comparison.runner import train_all
 from msdgs_train.presets import preset
 from tests.training_scene import write_scene
 
@@ -209,7 +210,7 @@ def test_no_jobs_are_refused(
 def test_a_run_that_fails_is_said_and_the_others_go_on(systems_file: Path, tmp_path: Path) -> None:
     ended: list[tuple[str, Ended]] = []
     runs = make_runs(read_systems([str(systems_file)], BUDGET), [tmp_path / "nowhere"], [0], tmp_path / "out")
-    assert train_all(runs, 1, lambda run, how: ended.append((run.system, how)))
+    assert train_all(runs, processes(1), lambda run, how: ended.append((run.system, how)))
     assert [system for system, _ in ended] == ["still", "k1", "k2 w=1"]
     assert all(how.status == "failed" and "nowhere" in how.message for _, how in ended)
 

@@ -1,36 +1,21 @@
-"""Trains the runs of a comparison, several side by side, each in a process of its own; goes on where it was stopped."""
+"""Trains the runs of a comparison, several side by side; goes on where it was stopped."""
 
 import json
-import multiprocessing
-import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import AbstractContextManager
 from dataclasses import replace
-from multiprocessing.synchronize import Event
-from typing import Any, NamedTuple
+from typing import Any
 
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError
-from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
-from msdgs_train.fit import CHECKPOINT, CONFIG, FINAL_METRICS, Observer, fit, stored_config
-
-_stop: Event | None = None  # of a worker process, set by its parent
-
-
-POLL_SECONDS = 0.5
+from msdgs_train.comparison.pools import Ended, Pool
+from msdgs_train.fit import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
 
 
-class Ended(NamedTuple):
-    """How a run has ended: "finished", "out of time", "interrupted", "was finished", or "failed" with its message."""
-
-    status: str
-    message: str = ""
-
-
-def train_all(runs: Sequence[Run], jobs: int, on_end: Callable[[Run, Ended], None]) -> bool:
-    """Train what isn't finished yet, `jobs` at a time; False where Ctrl-C has stopped it, with all checkpoints saved.
+def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, Ended], None]) -> bool:
+    """Train what isn't finished yet; False where Ctrl-C has stopped it, with all checkpoints saved.
 
     Raises `InvalidInput` before anything is trained where a folder holds a run with other settings.
     """
@@ -42,36 +27,24 @@ def train_all(runs: Sequence[Run], jobs: int, on_end: Callable[[Run, Ended], Non
             on_end(run, Ended("was finished"))
         else:
             waiting.append(run)
+    if not waiting:
+        return True
     interrupted = threading.Event()
-    old = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
-    context = multiprocessing.get_context("spawn")
-    stop = context.Event()
-    try:
-        with ProcessPoolExecutor(min(jobs, len(waiting) or 1), context, _prepare, (stop,)) as pool:
-            going: dict[Future[Ended], Run] = {}
-            while waiting or going:
+    with pool as trainers:
+        # after Ray, which has a handler of its own
+        old = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+        try:
+            while waiting or len(trainers):
                 if interrupted.is_set():
-                    stop.set()
+                    trainers.stop()
                     waiting.clear()
-                while waiting and len(going) < jobs:
-                    run = waiting.pop(0)
-                    going[pool.submit(train, run)] = run
-                for future in wait(going, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED).done:
-                    on_end(going.pop(future), future.result())
-    finally:
-        signal.signal(signal.SIGINT, old)
+                while waiting and len(trainers) < trainers.jobs:
+                    trainers.submit(waiting.pop(0))
+                for run, how in trainers.ended():
+                    on_end(run, how)
+        finally:
+            signal.signal(signal.SIGINT, old)
     return not interrupted.is_set()
-
-
-def train(run: Run) -> Ended:
-    """One run, begun or gone on with."""
-    os.environ[THREADS_VARIABLE] = str(run.config.threads)
-    run.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        outcome = fit(run.config, run.data, run.folder, resume=(run.folder / CHECKPOINT).exists(), observer=_Listener())
-    except MsdgsError as error:
-        return Ended("failed", str(error))
-    return Ended(outcome.status)
 
 
 def is_finished(run: Run) -> bool:
@@ -102,14 +75,3 @@ def _check_settings(run: Run) -> None:
             raise InvalidInput(
                 "out", "a new folder, or one of the same comparison", f"{run.folder} with other settings: {name}"
             )
-
-
-class _Listener(Observer):
-    def should_stop(self) -> bool:
-        return _stop is not None and _stop.is_set()
-
-
-def _prepare(stop: Event) -> None:
-    global _stop
-    _stop = stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all; the parent passes it on

@@ -1,0 +1,174 @@
+"""Where the runs of a comparison are trained: processes of this machine, or tasks of a Ray cluster."""
+
+import dataclasses
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from msdgs_serve.ray_tasks import RayTasks, ray_cluster
+from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_train.comparison.matrix import Run
+from msdgs_train.fit import CHECKPOINT, Observer, fit
+
+POLL_SECONDS = 0.5
+_stop: Event | None = None  # of a worker process, set by its parent
+
+
+class Ended(NamedTuple):
+    """How a run has ended: "finished", "out of time", "interrupted", "was finished", or "failed" with its message."""
+
+    status: str
+    message: str = ""
+
+
+class Pool(Protocol):
+    """Trains `jobs` runs at a time."""
+
+    jobs: int
+
+    def __len__(self) -> int:
+        """Runs that haven't ended."""
+        ...
+
+    def submit(self, run: Run) -> None:
+        """Begin, or go on with it."""
+        ...
+
+    def ended(self) -> Iterator[tuple[Run, Ended]]:
+        """What has ended, after waiting a moment for it."""
+        ...
+
+    def stop(self) -> None:
+        """Have all runs save their checkpoint and end."""
+        ...
+
+
+@contextmanager
+def processes(jobs: int) -> Iterator[Pool]:
+    """A process of this machine for each."""
+    context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    with ProcessPoolExecutor(jobs, context, _prepare, (stop,)) as executor:
+        yield _Processes(jobs, executor, stop)
+
+
+@contextmanager
+def ray_tasks(address: str, threads: int, jobs: int | None) -> Iterator[Pool]:
+    """Tasks of a Ray cluster, `threads` cores each; as many as it has cores for where `jobs` says nothing.
+
+    Data and runs lie where all its machines see them, under the same names. A run whose machine is lost goes on
+    elsewhere from its last checkpoint.
+    """
+    with ray_cluster(address) as cores:
+        yield _RayPool(jobs or max(1, cores // threads), threads)
+
+
+class _Processes:
+    def __init__(self, jobs: int, executor: ProcessPoolExecutor, stop: Event) -> None:
+        self.jobs = jobs
+        self._executor, self._stop = executor, stop
+        self._going: dict[Future[Ended], Run] = {}
+
+    def __len__(self) -> int:
+        return len(self._going)
+
+    def submit(self, run: Run) -> None:
+        self._going[self._executor.submit(_train_here, run)] = run
+
+    def ended(self) -> Iterator[tuple[Run, Ended]]:
+        for future in wait(self._going, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED).done:
+            yield self._going.pop(future), future.result()
+
+    def stop(self) -> None:
+        self._stop.set()
+
+
+class _RayPool:
+    def __init__(self, jobs: int, threads: int) -> None:
+        import ray  # pyright: ignore[reportMissingImports]  # an extra
+
+        self.jobs = jobs
+        self._flag = ray.remote(num_cpus=0)(_Flag).remote()
+        self._tasks: RayTasks[Run, Ended] = RayTasks(_train_on_ray, [self._flag], cores=threads)
+        self._given: dict[Path, Run] = {}
+
+    def __len__(self) -> int:
+        return len(self._tasks)
+
+    def submit(self, run: Run) -> None:
+        there = dataclasses.replace(run, folder=run.folder.absolute(), data=run.data.absolute())
+        self._given[there.folder] = run
+        self._tasks.submit(there)
+
+    def ended(self) -> Iterator[tuple[Run, Ended]]:
+        for there, how in self._tasks.ended(POLL_SECONDS):
+            yield self._given.pop(there.folder), how
+
+    def stop(self) -> None:
+        self._flag.set.remote()
+
+
+class _Flag:
+    """Lives on the cluster; the runs ask it whether they are to stop."""
+
+    def __init__(self) -> None:
+        self._is_set = False
+
+    def set(self) -> None:
+        self._is_set = True
+
+    def is_set(self) -> bool:
+        return self._is_set
+
+
+class _AskingFlag(Observer):
+    def __init__(self, flag: Any) -> None:
+        self._flag = flag
+        self._asked = 0.0
+
+    def should_stop(self) -> bool:
+        import ray  # pyright: ignore[reportMissingImports]
+
+        now = time.monotonic()
+        if now < self._asked + POLL_SECONDS:
+            return False
+        self._asked = now
+        return ray.get(self._flag.is_set.remote())
+
+
+class _AskingParent(Observer):
+    def should_stop(self) -> bool:
+        return _stop is not None and _stop.is_set()
+
+
+def _train_on_ray(flag: list[Any], run: Run) -> Ended:
+    return _train(run, _AskingFlag(flag[0]))
+
+
+def _train_here(run: Run) -> Ended:
+    return _train(run, _AskingParent())
+
+
+def _train(run: Run, observer: Observer) -> Ended:
+    """One run, begun or gone on with."""
+    os.environ[THREADS_VARIABLE] = str(run.config.threads)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        outcome = fit(run.config, run.data, run.folder, resume=(run.folder / CHECKPOINT).exists(), observer=observer)
+    except MsdgsError as error:
+        return Ended("failed", str(error))
+    return Ended(outcome.status)
+
+
+def _prepare(stop: Event) -> None:
+    global _stop
+    _stop = stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all; the parent passes it on
