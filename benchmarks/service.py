@@ -34,6 +34,7 @@ CATALOGUE = 96  # different requests of the mixed load
 FIRST = "first"  # of the scenes, the one that single measurements are made with
 PLACES = 20  # that the service has by default for work, in line and being done
 TOO_MUCH = 4
+KILLS = 5
 PACE = 0.5  # of the peak: below saturation
 
 
@@ -219,9 +220,9 @@ def kills(setting: Setting) -> Iterator[Row]:
     """kill -9 while scenes are uploaded and replaced."""
     folder = setting.work / "killed"
     folder.mkdir()
-    whole, uploads = promises.survives_kills(folder)
-    measured = f"{whole} of 10, amid {uploads} uploads"
-    yield Row("kill -9 during upload and replacement: a whole scene, nothing left", "all", measured, whole == 10)
+    whole, uploads = promises.survives_kills(folder, KILLS)
+    measured = f"{whole} of {KILLS}, amid {uploads} uploads"
+    yield Row("kill -9 during upload and replacement: a whole scene, nothing left", "all", measured, whole == KILLS)
 
 
 def counts(setting: Setting) -> Iterator[Row]:

@@ -89,9 +89,12 @@ class Running(NamedTuple):
 
 @contextmanager
 def service(*scenes: Path, **flags: Any) -> Iterator[Running]:
-    """`msdgs-serve` over these scenes, with `flag=value` for `--flag value`; it is stopped in the end."""
+    """`msdgs-serve` over these scenes, with `flag=value` for `--flag value`, or True; it is stopped in the end."""
     port = free_port()
-    options = [text for name, value in flags.items() for text in (f"--{name.replace('_', '-')}", str(value))]
+    options = [
+        text for name, value in flags.items()
+        for text in (f"--{name.replace('_', '-')}", *([] if value is True else [str(value)]))
+    ]  # fmt: skip
     command = [sys.executable, "-c", PROGRAM, *map(str, scenes), "--port", str(port), *options]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         running = Running(port, process)

@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -149,31 +149,38 @@ def reloads(folder: Path, count: int = 100, clients: int = 4) -> tuple[int, int,
     return seen.total(), sum(times for frame, times in seen.items() if frame not in known), statuses
 
 
-def survives_kills(folder: Path, times: int = 10) -> tuple[int, int]:
+def survives_kills(folder: Path, times: int = 5) -> tuple[int, int]:
     """The process is killed while a scene is uploaded again and again and half of another is on its way: after how many
     kills it served a whole version and nothing else was left; and how many uploads there were."""
-    contents = [write_scene(folder / f"{name}.other", static_color=color).read_bytes()
-                for name, color in (("red", (1.0, 0.0, 0.0)), ("blue", (0.0, 0.0, 1.0)))]  # fmt: skip
+    versions = [write_scene(folder / "red.other"), write_scene(folder / "blue.other", static_color=(0.0, 0.0, 1.0))]
+    contents = [version.read_bytes() for version in versions]
+    scene = folder / "scene.onnx"
+    scene.write_bytes(contents[0])
     whole, uploads = 0, 0
-    (folder / "scene.onnx").write_bytes(contents[0])
-    for number in range(times):
-        with service(folder, uploads="true") as running, _half_an_upload(running.port):
-            _until(lambda: len(list(folder.glob(".incoming-*"))) == 1)
-            kill = threading.Timer(0.5 + 0.05 * number, running.process.kill)
-            kill.start()
-            with contextlib.suppress(OSError, http.client.HTTPException):
-                connection = Connection(running.port)
-                while True:
-                    path = "/scenes?name=scene&replace=true"
-                    assert connection.send("POST", path, contents[uploads % 2]).status == 201
-                    uploads += 1
-            kill.join()
-        with service(folder, uploads="true") as running:
+    for number in range(times + 1):
+        with service(folder, uploads=True) as running:
             frame = running.ask("POST", "/render", {**SMALL, "scene": "scene"})
-            left = [path.name for path in folder.iterdir() if path.suffix != ".other"]
-            is_whole = (folder / "scene.onnx").read_bytes() in contents
-            whole += frame.status == 200 and is_whole and left == ["scene.onnx"]
+            left = sorted(path.name for path in folder.iterdir() if path.suffix != ".other")
+            whole += number > 0 and frame.status == 200 and scene.read_bytes() in contents and left == ["scene.onnx"]
+            if number < times:
+                uploads += _uploads_until_killed(running, folder, contents, 0.5 + 0.1 * number)
     return whole, uploads
+
+
+def _uploads_until_killed(running: Running, folder: Path, contents: Sequence[bytes], seconds: float) -> int:
+    uploads = 0
+    with _half_an_upload(running.port):
+        _until(lambda: len(list(folder.glob(".incoming-*"))) == 1)
+        kill = threading.Timer(seconds, running.process.kill)
+        kill.start()
+        connection = Connection(running.port)
+        with contextlib.suppress(OSError, http.client.HTTPException):
+            while True:
+                content = contents[uploads % len(contents)]
+                assert connection.send("POST", "/scenes?name=scene&replace=true", content).status == 201
+                uploads += 1
+        kill.join()
+    return uploads
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """The service over HTTP: responses are decoded and their pixels looked at."""
 
 import itertools
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -266,4 +267,13 @@ def test_the_documentation_is_whole(client: httpx.Client):
     }
     expected = {"200", "304", "400", "404", "408", "413", "422", "503", "504"}
     assert set(document["paths"]["/render"]["post"]["responses"]) == expected
-    assert "swagger" in client.get("/docs").text
+
+
+def test_pages_about_the_calls_need_nothing_from_elsewhere(client: httpx.Client):
+    for page in ("/docs", "/redoc"):
+        text = client.get(page).text
+        sources = re.findall(r"(?:src|href)=[\"']([^\"']+)", text)
+        assert [source for source in sources if source.endswith(".js")], text
+        for source in sources:
+            assert source.startswith("/"), source
+            assert client.get(source).status_code == 200, source

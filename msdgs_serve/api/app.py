@@ -1,6 +1,7 @@
 """The application: routes, error handlers and what they share, put together."""
 
 from fastapi import FastAPI
+from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
 
 from msdgs_serve import __version__
@@ -32,7 +33,7 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
     """
     keys = None if settings.api_keys_file is None else read_keys(settings.api_keys_file)
     service = Service(store, renderer, settings)
-    app = FastAPI(title="msdgs", version=__version__, description=DESCRIPTION, lifespan=service.lifespan)
+    app = FastAPIOffline(title="msdgs", version=__version__, description=DESCRIPTION, lifespan=service.lifespan)
     app.state.service = service
     for calls in (render, batch, video, scenes, health, viewer):
         app.include_router(calls.router)
