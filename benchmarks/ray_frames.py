@@ -110,7 +110,7 @@ def wait_for_cores(address: str, count: int) -> None:
     """Until so many cores are in the cluster."""
     code = f"import ray; ray.init({address!r}, log_to_driver=False, logging_level='error'); "
     code += "print(ray.cluster_resources().get('CPU', 0)); ray.shutdown()"
-    for _ in range(60):
+    for _ in range(120):
         done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
         if done.returncode == 0 and float(done.stdout.split()[-1]) >= count:
             return
