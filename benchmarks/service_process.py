@@ -44,7 +44,14 @@ class Connection:
         return self.send(method, path, json.dumps(body).encode(), {**JSON, **(headers or {})})
 
     def send(self, method: str, path: str, content: bytes | None, headers: dict[str, str] = NONE) -> Answer:
-        """With these very bytes."""
+        """With these very bytes; once more where the service has closed the connection, as it does after 5 idle s."""
+        try:
+            return self._once(method, path, content, headers)
+        except (BrokenPipeError, ConnectionResetError, http.client.RemoteDisconnected):
+            self._http.close()
+            return self._once(method, path, content, headers)
+
+    def _once(self, method: str, path: str, content: bytes | None, headers: dict[str, str]) -> Answer:
         self._http.request(method, path, content, headers)
         response = self._http.getresponse()
         return Answer(response.status, {k.lower(): v for k, v in response.getheaders()}, response.read())

@@ -81,6 +81,38 @@ def test_the_answer_says_what_was_used(client: httpx.Client):
     assert response.headers["Msdgs-Scene"] == "balls"
 
 
+def compared(psnr: float, **others: Any) -> dict[str, Any]:
+    return {"measured_error": {"rendered": {"psnr_worst": psnr}}, **others}
+
+
+def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
+    write_scene(tmp_path / "walk.onnx", **compared(60))
+    write_scene(tmp_path / "walk.fast.onnx", **compared(40, plan="lowrank:1"))
+    write_scene(tmp_path / "walk.slow.onnx", **compared(50, plan="int8"))
+    write_scene(tmp_path / "walk.other.onnx", **compared(70, checkpoint_sha256="1" * 64))
+    write_scene(tmp_path / "plain.onnx")
+    (tmp_path / "walk.broken.onnx").write_bytes(b"no scene")
+    points = [
+        {"plan": plan, "error": {"psnr_worst": psnr}, "milliseconds": {"total": {"min": milliseconds}}}
+        for plan, psnr, milliseconds in (("network", 60, 20.0), ("lowrank:1", 40, 5.0), ("int8", 50, 30.0))
+    ]
+    report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": points}
+    (tmp_path / "walk.report.json").write_text(json.dumps(report))
+    with serving(tmp_path) as client:
+        for max_error, name, error in ((30, "walk.fast", "40.00"), (45, "walk", "60.00"), (None, "walk", "60.00")):
+            answer = post(client, scene="walk", max_error=max_error)
+            assert (answer.status_code, answer.headers["Msdgs-Scene"]) == (200, name)
+            assert answer.headers["Msdgs-Error"] == error
+        link = client.get(f"/render?scene=walk&max_error=30&t=0.5&width={SIZE}&height={SIZE}")
+        assert (link.headers["Msdgs-Scene"], link.headers["Msdgs-Plan"]) == ("walk.fast", "lowrank:1")
+        for scene, max_error in (("walk", 65), ("plain", 10), ("walk", -1)):
+            refused = post(client, scene=scene, max_error=max_error)
+            assert refused.status_code == 422
+            check_problem(refused)
+            assert refused.json()["errors"][0]["field"] == "max_error"
+        assert "Msdgs-Error" not in post(client, scene="plain").headers
+
+
 def test_a_link_shows_what_the_body_would(client: httpx.Client):
     link = f"/render?azimuth=0&elevation=0&distance=5&fov_y=40&t=0.5&width={SIZE}&height={SIZE}"
     response = client.get(link)

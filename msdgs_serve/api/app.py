@@ -23,7 +23,8 @@ World and cameras have OpenCV axes: x right, y down, z forward. Angles are degre
 client's own where it sends a plain one."""
 
 STREAMED = (("POST", "/scenes"),)
-EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", "Msdgs-Scene", "Msdgs-Plan", "Msdgs-Channels", "Retry-After")
+SAID_OF_FRAMES = ("Msdgs-Scene", "Msdgs-Plan", "Msdgs-Error", "Msdgs-Channels")
+EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *SAID_OF_FRAMES, "Retry-After")
 
 
 def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> FastAPI:

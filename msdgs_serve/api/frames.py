@@ -12,6 +12,7 @@ import numpy as np
 
 from msdgs_serve import __version__
 from msdgs_serve.api.cameras import resolve_camera
+from msdgs_serve.api.choice import fastest_within, worst_decibels
 from msdgs_serve.api.schemas import RenderRequest
 from msdgs_serve.api.service import Service
 from msdgs_serve.imaging import FORMATS, Channel, DepthRange, Image, encode
@@ -47,18 +48,22 @@ class FramePlan:
 
     def headers(self, max_age: int) -> dict[str, str]:
         """What was used, whatever it took."""
+        error = worst_decibels(self.scene)
         return {
             "ETag": self.etag,
             "Cache-Control": f"public, max-age={max_age}" if max_age else "no-cache",
             "Msdgs-Scene": quote(self.scene.name),
             "Msdgs-Plan": self.scene.session.scene.metadata.plan,
             "Msdgs-Channels": ",".join(self.channels),
+            **({} if error is None else {"Msdgs-Error": f"{error:.2f}"}),
         }
 
 
 def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     """Check everything that can be wrong with a request; may load its scene. Raises the domain's errors."""
     scene = service.scene(request.scene)
+    if request.max_error is not None:
+        scene = fastest_within(service.store, scene, request.max_error)
     camera = resolve_camera(request, scene)
     times = request.t if isinstance(request.t, list) else [request.t]
     _check_amounts(service, request, camera, len(times))

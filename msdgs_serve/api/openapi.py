@@ -32,6 +32,7 @@ IMAGE_RESPONSE: Responses = {
                 "Server-Timing": "milliseconds by stage: queue, pose (from the cache or not), draw, encode",
                 "Msdgs-Scene": "the scene's name, percent-encoded",
                 "Msdgs-Plan": "how the scene's motion is computed",
+                "Msdgs-Error": "PSNR in dB of the file's worst frame against the whole model, where that was measured",
                 "Msdgs-Channels": "of the file, in order",
             }.items()
         },

@@ -18,6 +18,7 @@ Focal = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e8
 FieldOfView = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.01, le=179.0)]
 Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_PIXELS_PER_SIDE)]
 Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
+Decibels = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=200)]
 Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME_LENGTH)]
 LaxNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 LaxPixels = Annotated[int, Field(ge=1, le=MAX_PIXELS_PER_SIDE)]
@@ -147,6 +148,12 @@ class RenderRequest(Strict):
     """A frame to draw, or one for each time."""
 
     scene: Name | None = Field(default=None, description="which scene; may be left out where only one is served")
+    max_error: Decibels | None = Field(
+        default=None,
+        description="takes the fastest file of the scene's model whose worst frame has at least this PSNR in dB: "
+        "`walk.onnx`, or beside it `walk.….onnx`. `Msdgs-Scene`, `-Plan` and `-Error` say which it was",
+        examples=[40],
+    )
     camera: CameraSpec
     t: Times = Field(
         description="time, within the scene's `time_range`; or a list of them, answered with a ZIP file of one image "
@@ -195,6 +202,9 @@ class RenderQuery(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     scene: Name | None = Field(default=None, description="may be left out where only one is served")
+    max_error: Annotated[float, Field(allow_inf_nan=False, ge=0, le=200)] | None = Field(
+        default=None, description="dB, as in `POST /render`"
+    )
     t: LaxNumber | None = Field(default=None, description="default: the scene's first time")
     width: LaxPixels | None = Field(default=None, description="pixels")
     height: LaxPixels | None = Field(default=None, description="pixels")

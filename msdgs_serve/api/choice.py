@@ -1,0 +1,70 @@
+"""`max_error`: of the files that one model was exported to, the fastest whose measured error fits."""
+
+from collections.abc import Iterator
+
+from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.scene.baked import SceneMetadata
+from msdgs_serve.scene_report import read_report
+from msdgs_serve.store import SceneStore, ServedScene
+
+FIELD = "max_error"
+
+
+def fastest_within(store: SceneStore, scene: ServedScene, decibels: float) -> ServedScene:
+    """Of `walk.onnx` and, beside it, `walk.….onnx` of the same model: the fastest whose worst frame has at least so
+    many decibels (PSNR against the whole model). Times are those that reports beside the files have; where there are
+    none, the smallest file.
+
+    Raises `InvalidInput` where none fits or none says how its frames compare.
+    """
+    measured = [(each, error) for each in _of_one_model(store, scene) if (error := worst_decibels(each)) is not None]
+    if not measured:
+        raise InvalidInput(FIELD, f"left out, as no file of `{scene.name}` was compared with its model", decibels)
+    fitting = [each for each, error in measured if error >= decibels]
+    if not fitting:
+        best = max(error for _, error in measured)
+        raise InvalidInput(FIELD, f"at most {best:.1f} dB, which the best file of `{scene.name}` has", decibels)
+    milliseconds = _reported_milliseconds(store, [each for each, _ in measured])
+    unknown = float("inf")
+    return min(fitting, key=lambda each: (milliseconds.get(_key(each), unknown), store.file(each.name).stat().st_size))
+
+
+def worst_decibels(scene: ServedScene) -> float | None:
+    """PSNR of the worst frame that the exporter compared with the whole model's, as the file says."""
+    rendered = scene.session.scene.metadata.measured_error.get("rendered")
+    value = rendered.get("psnr_worst") if isinstance(rendered, dict) else None
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _of_one_model(store: SceneStore, scene: ServedScene) -> Iterator[ServedScene]:
+    yield scene
+    for name in store.names():
+        if name.startswith(f"{scene.name}."):
+            try:
+                other = store.get(name)
+            except SceneFileInvalid:
+                continue  # the store reports it
+            if _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
+                yield other
+
+
+def _reported_milliseconds(store: SceneStore, scenes: list[ServedScene]) -> dict[tuple[str, float], float]:
+    """Of a frame, by plan and error, as all reports beside the files say."""
+    found: dict[tuple[str, float], float] = {}
+    for scene in scenes:
+        try:
+            report = read_report(store.file(scene.name), _metadata(scene).checkpoint_sha256) or {}
+            for point in report.get("points", []):
+                key = (point["plan"], point["error"]["psnr_worst"])
+                found.setdefault(key, float(point["milliseconds"]["total"]["min"]))
+        except (SceneFileInvalid, LookupError, TypeError, ValueError):
+            continue  # a report of another shape: as if there were none
+    return found
+
+
+def _key(scene: ServedScene) -> tuple[str, float]:
+    return _metadata(scene).plan, worst_decibels(scene) or 0.0
+
+
+def _metadata(scene: ServedScene) -> SceneMetadata:
+    return scene.session.scene.metadata
