@@ -10,6 +10,9 @@ ARGS ?=
 
 SERVE := .venv-serve
 FULL := .venv
+CLUSTER := .venv-cluster
+HTTP_TESTS := $(addprefix tests/test_,$(addsuffix .py,api api_poison batch client motion openapi service_answers \
+	service_load slow_clients uploads video fuzz))
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package
 PINS := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt
@@ -17,10 +20,10 @@ DEMO_FLAGS = --port $(PORT) $(if $(filter-out 0,$(ONCE)),--once)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-train test lint format clean
+.PHONY: help demo demo-train test test-cluster lint format clean
 
 help:  ## show this list
-	@awk -F ':.*## +' '/^[a-z-]+:.*##/ { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## +' '/^[a-z-]+:.*##/ { printf "  make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 	@echo
 	@echo "  ONCE=1 stops a demo after its frame; PORT=$(PORT); SCENE=$(SCENE); PYTHON=$(PYTHON)"
 	@echo "  TORCH_INDEX=URL adds a package index for torch (on Linux: the CPU one); ARGS='-k name' goes to pytest"
@@ -34,6 +37,10 @@ demo-train: $(FULL)/.installed-train  ## make a moving scene, train, export, ser
 test: lint  ## install everything, check style, types and imports, run the tests
 	$(FULL)/bin/python -m pytest $(ARGS)
 
+test-cluster: $(CLUSTER)/.installed  ## Ray beside everything: the tests on a cluster of this machine, HTTP ones on Ray Serve
+	$(CLUSTER)/bin/python -m pytest -n 0 tests/test_ray.py $(ARGS)
+	MSDGS_TEST_SERVICE=ray $(CLUSTER)/bin/python -m pytest -n 0 -p no:randomly $(HTTP_TESTS) $(ARGS)
+
 lint: $(FULL)/.installed-dev  ## ruff, pyright and the import contracts
 	$(FULL)/bin/ruff check
 	$(FULL)/bin/ruff format --check
@@ -45,7 +52,7 @@ format: $(FULL)/.installed-dev  ## write the sources as ruff likes them
 	$(FULL)/bin/ruff format
 
 clean:  ## remove the environments and what the demos wrote
-	rm -rf $(SERVE) $(FULL) out
+	rm -rf $(SERVE) $(FULL) $(CLUSTER) out
 
 $(SERVE)/.installed: pyproject.toml constraints.txt
 	$(call make_environment,$(SERVE))
@@ -59,6 +66,13 @@ $(FULL)/.installed-train: pyproject.toml constraints.txt
 
 $(FULL)/.installed-dev: $(FULL)/.installed-train
 	$(PINS) $(FULL)/bin/python $(INSTALL) --editable '.[train,export,dev]'
+	@touch $@
+
+# Ray brings uvloop, on which the service would run in all tests, and 350 MB: it has an environment of its own.
+$(CLUSTER)/.installed: pyproject.toml constraints.txt
+	$(call make_environment,$(CLUSTER))
+	$(PINS) $(CLUSTER)/bin/python $(INSTALL) $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) \
+		--editable '.[cluster,train,export,dev]'
 	@touch $@
 
 define make_environment

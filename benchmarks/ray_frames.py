@@ -94,10 +94,15 @@ def two_nodes() -> Iterator[tuple[str, list[subprocess.Popen]]]:
     ray = [str(Path(sys.executable).with_name("ray")), "start", "--block", "--num-cpus=1", "--disable-usage-stats"]
     ray += [f"--object-store-memory={OBJECT_STORE_BYTES}", "--node-ip-address=127.0.0.1"]
     address, nodes = f"127.0.0.1:{port}", []
+    patience = {**os.environ, "RAY_agent_register_timeout_ms": "300000", "RAY_raylet_start_wait_time_s": "300"}
     try:
         for role in (["--head", f"--port={port}", "--include-dashboard=false"], [f"--address={address}"]):
-            no = subprocess.DEVNULL
-            nodes.append(subprocess.Popen([*ray, *role], stdout=no, stderr=no, start_new_session=True))
+            no, first = subprocess.DEVNULL, port + 10 * len(nodes)
+            # agents whose ports are known are not waited for, which fails on a machine that is busy
+            agents = [f"--dashboard-agent-grpc-port={first + 1}", f"--runtime-env-agent-port={first + 2}"]
+            agents += [f"--dashboard-agent-listen-port={first + 3}", f"--metrics-export-port={first + 4}"]
+            line = [*ray, *role, *agents]
+            nodes.append(subprocess.Popen(line, stdout=no, stderr=no, start_new_session=True, env=patience))
             wait_for_cores(address, len(nodes))
         yield address, nodes
     finally:

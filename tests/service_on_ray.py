@@ -45,6 +45,8 @@ def _cluster() -> int:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     os.environ["PYTHONPATH"] = str(ROOT)
+    os.environ.setdefault("RAY_agent_register_timeout_ms", "300000")  # Ray gives up early where others compute
+    os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")
     ray.init(
         address="local", include_dashboard=False, num_cpus=CORES, object_store_memory=OBJECT_STORE_BYTES,
         log_to_driver=False, logging_level="error",
