@@ -92,6 +92,7 @@ def two_nodes() -> Iterator[tuple[str, list[subprocess.Popen]]]:
     """A Ray cluster of two nodes with a core each; its address and the processes of its nodes, the head first."""
     port = 6479
     ray = [str(Path(sys.executable).with_name("ray")), "start", "--block", "--num-cpus=1", "--disable-usage-stats"]
+    ray += ["--no-monitor", "--include-log-monitor=false"]
     ray += [f"--object-store-memory={OBJECT_STORE_BYTES}", "--node-ip-address=127.0.0.1"]
     address, nodes = f"127.0.0.1:{port}", []
     patience = {**os.environ, "RAY_agent_register_timeout_ms": "300000", "RAY_raylet_start_wait_time_s": "300"}
