@@ -9,6 +9,7 @@ from enum import Enum
 from http import HTTPStatus
 from typing import Annotated
 
+import anyio.to_thread
 from fastapi import Depends, FastAPI, Request
 
 from msdgs_serve.api.cameras import resolve_camera
@@ -22,6 +23,9 @@ from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.store import SceneStore, ServedScene
 from msdgs_serve.threads import give_way
+
+LAST_LOOK_SECONDS = 2.0
+"""That the end waits for the thread that looks after files: cut off amid a call, libraries complain on the terminal."""
 
 logger = logging.getLogger("msdgs_serve")
 
@@ -60,6 +64,7 @@ class Service:
         finally:
             self._stopped.set()
             self.queue.shut_down()
+            await anyio.to_thread.run_sync(thread.join, LAST_LOOK_SECONDS)
 
     def drain(self) -> None:
         """Finish what there is, refuse what comes."""
