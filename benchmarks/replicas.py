@@ -7,6 +7,7 @@ that of benchmarks/scaling.py, and the simulation's hit rates stand beside. Need
 """
 
 import argparse
+import os
 import re
 import shutil
 import subprocess
@@ -114,6 +115,8 @@ def nginx(folder: Path, ports: list[int], routing: str) -> Iterator[int]:
     if routing != "affinity":
         text, count = re.subn(r"^\s*hash \$affinity;.*$", "", text, flags=re.MULTILINE)
         assert count == 1
+    if os.geteuid() == 0:  # else its workers are nobody, who may not write here
+        text = f"user root;\n{text}"
     (folder / "nginx.conf").write_text(text)
     (folder / "replicas.conf").write_text("".join(f"server 127.0.0.1:{each} max_fails=0;\n" for each in ports))
     command = ["nginx", "-p", str(folder), "-c", str(folder / "nginx.conf"), "-g", "daemon off;"]

@@ -38,7 +38,6 @@ CACHE_MEGABYTES = 32
 MAX_ERROR = 0.15
 LOAD = 0.7  # of what all cores could draw without any cache
 REPLICAS = (1, 3, 10, 30, 100, 300, 1000)
-REQUESTS = 100_000
 CATALOGUE, MOMENTS = 200, 300  # scenes and times of a large service
 LARGE_CACHE = 256  # megabytes
 DOLLARS_CORE_HOUR = 0.04  # an assumption, of rented x86 cores
@@ -79,7 +78,8 @@ def main() -> int:
     if abs(error) > MAX_ERROR:
         print("the simulation doesn't reproduce what was measured; nothing is extrapolated", file=sys.stderr)
         return 1
-    extrapolate(stages, pose_bytes, statistics.mean(turn.frame_bytes for turn in turns), options.out)
+    trace = heavy_tailed(options.requests, CATALOGUE, MOMENTS)
+    extrapolate(trace, stages, pose_bytes, statistics.mean(turn.frame_bytes for turn in turns), options.out)
     return 0
 
 
@@ -176,9 +176,8 @@ def fastest(turns: list[Measured]) -> Stages:
     return min((turn.stages for turn in turns), key=lambda stages: stages.hit.mean())
 
 
-def extrapolate(stages: Stages, pose_bytes: int, frame_bytes: float, out: Path) -> None:
+def extrapolate(trace: Trace, stages: Stages, pose_bytes: int, frame_bytes: float, out: Path) -> None:
     """A table and plots from one core to a thousand."""
-    trace = heavy_tailed(REQUESTS, CATALOGUE, MOMENTS)
     fleet = Fleet(1, poses=max(1, (LARGE_CACHE << 20) // pose_bytes))
     print(f"\n{CATALOGUE} scenes × {MOMENTS} times, 1/rank; {fleet.poses} poses a replica of one core; {LOAD:.0%} load")
     print("replicas | routing | hit rate | frames/s | refused | p50 ms | p99 ms | busiest/mean | Mbit/s | $ a million")
@@ -190,7 +189,7 @@ def extrapolate(stages: Stages, pose_bytes: int, frame_bytes: float, out: Path) 
             rows.setdefault(routing, []).append((count, outcome))
             p50, p99 = 1e3 * np.quantile(outcome.latencies, [0.5, 0.99])
             dollars = count * DOLLARS_CORE_HOUR / 3600 / outcome.rate * 1e6
-            refused, megabits = outcome.refused / REQUESTS, 8e-6 * frame_bytes * outcome.rate
+            refused, megabits = outcome.refused / len(trace.scenes), 8e-6 * frame_bytes * outcome.rate
             print(
                 f"{count} | {routing} | {outcome.hit_rate:.2f} | {outcome.rate:.0f} | {refused:.1%} | "
                 f"{p50:.0f} | {p99:.0f} | {outcome.busiest:.2f} | {megabits:.0f} | {dollars:.2f}"
@@ -229,6 +228,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--size", type=int, default=400, help="pixels a side")
     parser.add_argument("--frames", type=int, default=600, help="of each measurement")
     parser.add_argument("--repeats", type=int, default=3, help="turns")
+    parser.add_argument("--requests", type=int, default=100_000, help="that are simulated")
     return parser.parse_args()
 
 
