@@ -17,7 +17,7 @@ from rich.table import Column, Table
 from export.job import Candidate, Job, Unreachable
 from export.plans import parse
 from export.rendered_error import RenderedError
-from export.report import COLUMNS, report, rows, write_report
+from export.report import COLUMNS, gain, report, rows, write_report
 from export.trim import RULES
 from export.work_precision import Sweep
 from export.write import Exported, write_scene
@@ -88,6 +88,7 @@ def export(settings: Settings, console: Console) -> None:
         )
     if contents:
         _print_table(contents, console)
+        console.print(gain(contents), markup=False)
         for path in write_report(contents, settings.output):
             console.print(f"wrote {path}", markup=False)
     _print_chosen(chosen, error, exported, console)

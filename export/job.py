@@ -6,12 +6,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from export.plans import build
+import numpy as np
+
+from export.bake import Baked
+from export.plans import build, parse
+from export.plans.trajectories import SomeTrajectories, Trajectories, layers_digest
 from export.precision.assess import MAX_ERROR, StabilityReport, assess
-from export.rendered_error import ExactFrames, RenderedError
-from export.trim import RULES, Evidence, TrimmedModel, trim, trimmed_model
+from export.rendered_error import ExactFrames, RenderedError, posed
+from export.trim import RULES, Cut, Evidence, TrimmedModel, trim, trimmed_model, whole
 from export.trim.bake import bake_trimmed
-from export.trim.cut import untrimmed, with_sh_degree
+from export.trim.cut import rows, untrimmed, with_sh_degree
 from export.views import cameras_of, deciding_views, measuring_views
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
@@ -27,6 +31,9 @@ BACK_OFFS = 4
 
 BACK_OFF_DB = 0.5
 STABILITY_TIMES = 8
+SAMPLED_KEPT = 2
+"""Sets of trajectories that are kept; one takes up to 2 GiB."""
+
 Progress = Callable[[str, int], Callable[[], object]]
 """Called with what begins and how many steps it has; returns what is to be called after each."""
 
@@ -49,6 +56,11 @@ class Candidate:
     def session(self) -> DeformationSession:
         """The file, opened when it is first asked for."""
         return DeformationSession(self.path)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Of the file."""
+        return hashlib.sha256(self.path.read_bytes()).digest()
 
     def close(self) -> None:
         """Give back the memory of the open file."""
@@ -93,6 +105,7 @@ class Job:
         self._trimmed: dict[float | None, TrimmedModel] = {None: untrimmed(self.model)}
         self._stability: StabilityReport | None = None
         self._evidence: Evidence | None = None
+        self._sampled: list[tuple[bytes, np.ndarray, Trajectories]] = []
         self._exact: ExactFrames | None = None
 
     @property
@@ -159,16 +172,56 @@ class Job:
             if not left_out:
                 break
             trimmed = trimmed_model(self.evidence, cut, left_out)
-            checked = self._written("network", trim_db, trimmed)
-            error = self.error(checked)
-            checked.path.unlink()
-            if error.psnr_worst >= trim_db:
+            worst_db = self._worst_db(cut, trimmed)
+            if worst_db >= trim_db:
                 return trimmed
-            least_db += trim_db - error.psnr_worst + BACK_OFF_DB
+            least_db += trim_db - worst_db + BACK_OFF_DB
         return self._trimmed[None]
+
+    def _worst_db(self, cut: Cut, trimmed: TrimmedModel) -> float:
+        """PSNR of the worst of the measured frames of a trimmed model. Where its layers are all that there were, what
+        moves is where it was in the exact frames, and no layer is run again."""
+        layers_changed = cut.moves.any() and cut.network != whole(self.model).network
+        moving = cut.ids[: len(trimmed.moving.gaussians)]
+
+        def pose(t: float) -> Gaussians:
+            moved = posed(trimmed.moving, t) if layers_changed else rows(self.exact.kept(t), moving, 0)
+            still = trimmed.still
+            colors = rows(self.exact.kept(t), cut.ids, cut.sh_degree)
+            parts = ("means", "quats", "scales")
+            arrays = [np.concatenate([getattr(moved, part), getattr(still, part)]) for part in parts]
+            return Gaussians(*(a.astype(np.float32) for a in (*arrays, colors.opacities, colors.sh)))
+
+        return self.exact.measure(pose, trimmed.ids).psnr_worst
 
     def _written(self, plan: str, trim_db: float | None, trimmed: TrimmedModel) -> Candidate:
         self._files += 1
         path = self.folder / f"{self._files}.onnx"
-        path.write_bytes(build(plan, bake_trimmed(trimmed, self.info, self.sha256)).SerializeToString())
+        baked, sampled = bake_trimmed(trimmed, self.info, self.sha256), None
+        if parse(plan).fitted and len(baked.moving):
+            sampled = self._trajectories(baked, trimmed.ids[: len(baked.moving)])
+        path.write_bytes(build(plan, baked, sampled).SerializeToString())
         return Candidate(plan, trim_db, trimmed, path)
+
+    def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
+        """Those of the model's Gaussians `ids`, ascending, sampled once: what is trimmed further moves as before."""
+        layers = layers_digest(baked)
+        for known_layers, known, sampled in self._sampled:
+            if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
+                return SomeTrajectories(sampled, np.searchsorted(known, ids))
+        sampled = Trajectories(baked, self._on_time(len(ids)))
+        self._sampled = [*self._sampled[1 - SAMPLED_KEPT :], (layers, ids, sampled)]
+        return sampled
+
+    def _on_time(self, count: int) -> Callable[[int, int], object]:
+        """Tells of sampling; where motion is fast there is more to do than was known, which is another step."""
+        known, on_step = 0, self.progress("", 0)
+
+        def on_time(done: int, total: int) -> None:
+            nonlocal known, on_step
+            if total != known:
+                what = f"{count:,} trajectories" if not known else "faster ones, sampled more densely"
+                known, on_step = total, self.progress(what, total - known)
+            on_step()
+
+        return on_time

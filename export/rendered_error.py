@@ -17,7 +17,10 @@ from msdgs_train.metrics import psnr_from_mse
 from msdgs_train.model import DynamicGaussians, PosedGaussians
 
 MEMORY = 768e6
-"""Bytes of exact frames and positions that are kept; with larger pictures fewer views are."""
+"""Bytes of exact frames and poses that are kept; with larger pictures fewer views are."""
+
+POSE_BYTES = 52
+"""Of a Gaussian at one time: its mean in float64, the rest in float32."""
 
 Pose = Callable[[float], Gaussians]
 
@@ -59,11 +62,13 @@ class ExactFrames:
         self.background = background
         self.views = within_memory(views, len(model.gaussians))
         self._frames: list[FloatArray] = []
-        self._means: dict[float, FloatArray] = {}
+        self._poses: dict[float, Gaussians] = {}
         self._model = copy.deepcopy(model).double()
         for t, views_then in by_time(self.views):
             gaussians = self.pose(t)
-            self._means[t] = gaussians.means
+            quats, scales = gaussians.quats.astype(np.float32), gaussians.scales.astype(np.float32)
+            first = next(iter(self._poses.values()), gaussians)
+            self._poses[t] = Gaussians(gaussians.means, quats, scales, first.opacities, first.sh)
             for view in views_then:
                 self._frames.append(shown(gaussians, view.camera, background).astype(np.float32))
                 on_frame()
@@ -71,6 +76,10 @@ class ExactFrames:
     def pose(self, t: float) -> Gaussians:
         """All Gaussians of the model in float64."""
         return posed(self._model, t)
+
+    def kept(self, t: float) -> Gaussians:
+        """All Gaussians at one of the views' times; quaternions and scales rounded to float32."""
+        return self._poses[t]
 
     def measure(
         self,
@@ -87,7 +96,7 @@ class ExactFrames:
         frames = {id(view): frame for view, frame in chosen}
         for t, views in by_time([view for view, _ in chosen]):
             gaussians = pose(t)
-            exact_means = self._means[t][ids]
+            exact_means = self._poses[t].means[ids]
             distances = np.linalg.norm(gaussians.means - exact_means, axis=1)
             position = max(position, float(distances.max(initial=0)))
             for view in views:
@@ -110,8 +119,8 @@ def by_time(views: Sequence[View]) -> Iterator[tuple[float, list[View]]]:
 
 
 def within_memory(views: Sequence[View], gaussians: int) -> list[View]:
-    """As many of the views, evenly spread, as have room for their exact frames and positions."""
-    sizes = [12 * view.camera.width * view.camera.height + 24 * gaussians for view in views]
+    """As many of the views, evenly spread, as have room for their exact frames and poses."""
+    sizes = [12 * view.camera.width * view.camera.height + POSE_BYTES * gaussians for view in views]
     count = min(len(views), max(2, int(MEMORY / (sum(sizes) / len(sizes)))))
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
 

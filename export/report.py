@@ -92,6 +92,8 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
         *("| " + " | ".join(row) + " |" for row in rows(contents)),
         "",
         LEGEND,
+        gain(contents),
+        "",
         f"After a quick look {len(contents['dropped'])} more candidates were left: others were faster and closer.",
         "",
         "Left out of the chosen file:" if left_out else "Nothing was left out of the chosen file.",
@@ -99,6 +101,19 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
         *left_out,
     ]
     return "\n".join(lines) + "\n"
+
+
+def gain(contents: dict[str, Any]) -> str:
+    """One sentence: what the chosen point takes against all layers as trained, where these were measured."""
+    points, views = contents["points"], contents["views"]
+    chosen = next(point for point in points if point["chosen"])
+    whole = [p for p in points if p["plan"] == "network" and p["trim_db"] is None and not p["chosen"]]
+    took, drawing = (chosen["milliseconds"][part]["min"] for part in ("deformation", "rasterization"))
+    text = f"Deformation takes {took:.1f} ms a frame, drawing {drawing:.1f} ms at {views['width']} × {views['height']}"
+    if not whole:
+        return f"{text}."
+    before = whole[0]["milliseconds"]["deformation"]["min"]
+    return f"{text}; all layers for all Gaussians take {before:,.1f} ms, {before / max(took, 1e-3):,.1f} times as long."
 
 
 def rows(contents: dict[str, Any]) -> list[Sequence[str]]:

@@ -23,9 +23,6 @@ UNSTABLE = 0.25
 """A Gaussian is unstable where the model's own float32 is off from its float64 by more than this part of the
 tolerance: a chain of layers multiplies round-off. No file in float32 can be held to the tolerance there."""
 
-UNSTABLE_ALLOWED = 0.01
-"""Part of the Gaussians that may be unstable."""
-
 
 SMALLEST_PROMISE = 0.01
 """Pixels: what float32 and 16-bit poses may add to any promise."""
@@ -52,8 +49,8 @@ def verify(
     must be as close between the times that they were fitted to as they promise. The file may hold more Gaussians than
     the model, static ones after all others; they aren't compared. Errors of means are relative to the scene's half
     diagonal or, further out, to the largest coordinate; those of scales to the Gaussian's largest scale; those of
-    quaternions are absolute. Raises `VerificationFailed` where one is above `tolerance` for a stable Gaussian, too many
-    Gaussians are unstable, or a promise is broken.
+    quaternions are absolute. Raises `VerificationFailed` where one is above `tolerance` for a stable Gaussian, or a
+    promise is broken. Whether unstable ones can be seen is not asked here: frames tell, before a file is written.
     """
     stated = session.scene.metadata
     if stated.plan != "network":
@@ -84,11 +81,6 @@ def verify(
                     problem = f"`{name}` at t = {t} is off by {error:.3g} from the model in {precision}"
                     raise VerificationFailed(f"{problem}, allowed is {tolerance:g}")
         on_time()
-    if unstable.sum() > UNSTABLE_ALLOWED * count:
-        raise VerificationFailed(
-            f"{unstable.sum():,} of {count:,} Gaussians are unstable: the model's own float32 is off from its float64 "
-            f"by more than {UNSTABLE * tolerance:g}, a quarter of the tolerance"
-        )
     return {
         **apart.to_plain(),
         **worst["float64"],

@@ -21,8 +21,12 @@ from msdgs_serve.scene.metadata import SceneCamera
 if TYPE_CHECKING:
     from export.photographs import Photographs
 
-PLANS = ("int8", "lowrank:0.5", "keyframes:2.0", "keyframes:0.5")
-"""Besides `network` and every prefix of it; fitted ones by the pixels that they may be off by."""
+FITTED = ("lowrank:0.5", "lowrank:0.1", "keyframes:2.0", "keyframes:0.5", "keyframes:0.1", "keyframes:0.03")
+"""By the pixels that they may be off by. Besides them `network`, every prefix of it, and `int8` are tried."""
+
+INT8_SPEEDUP = 3.8
+DEAR = 4.0
+"""A plan that runs layers isn't tried where they would take so many times a whole frame of one that is close enough."""
 
 TRIM_STEPS = (20.0, 10.0, 5.0, 1.0, -5.0, -10.0, -15.0)
 """dB above or below the error allowed, at which trimming is tried."""
@@ -77,12 +81,12 @@ class Sweep:
         """
         levels = [self.max_error + step for step in TRIM_STEPS if self.max_error + step >= WORTH_DB]
         self._reachable(self._look("network", None))
-        self._tell("candidates: network", [(self._look, ("network", level)) for level in levels])
-        texts = [f"prefix:{k}" for k in range(1, len(self.job.model.deformation))]
-        texts += [text for text in PLANS if _known(text)]
         # the most careful trimming that leaves anything out: plans are fitted to what moves, not to still ground
         careful = next((level for level in levels if self.job.trimmed(level).left_out), None)
-        self._tell("candidates: other plans", [(self._look, (text, careful)) for text in texts])
+        self._tell("candidates: fitted plans", [(self._look, (text, careful)) for text in FITTED])
+        self._tell("candidates: network", [(self._look, ("network", level)) for level in levels])
+        texts = [f"prefix:{k}" for k in range(1, len(self.job.model.deformation))]
+        self._tell("candidates: other plans", [(self._look, (text, careful)) for text in (*texts, "int8")])
         alone = [look for look in self.looks if look.candidate.trim_db == careful]
         pairs = [pair for level in levels if level != careful for pair in self._pairs(alone, level)]
         self._tell("candidates: plans with trimming", [(self._look, pair) for pair in pairs])
@@ -92,6 +96,9 @@ class Sweep:
     def _look(self, plan: str, trim_db: float | None, sh_degree: int | None = None) -> Look | None:
         if plan != "network" and not len(self.job.trimmed(trim_db).moving.gaussians):
             return None  # nothing moves, so all plans are the same
+        if self.looks and (why := self._dear(plan, trim_db)):
+            self.refused.append((plan, why))
+            return None
         try:
             candidate = self.job.candidate(plan, trim_db, sh_degree)
         except MsdgsError as error:
@@ -105,6 +112,21 @@ class Sweep:
         candidate.close()
         self.looks.append(Look(candidate, DEFAULT_RASTERIZER, total, deformation, error.psnr_worst))
         return self.looks[-1]
+
+    def _dear(self, plan: str, trim_db: float | None) -> str | None:
+        """Why a plan that runs layers when a frame is served isn't worth a try, where it isn't."""
+        enough = [look for look in self.looks if look.worst_db >= self.max_error and parse(look.candidate.plan).fitted]
+        fastest = min(enough, key=lambda look: look.cpu, default=None)
+        if fastest is None or parse(plan).fitted:
+            return None
+        whole, model = self.looks[0], self.job.trimmed(trim_db).moving
+        layers = len(model.deformation) if plan in ("network", "int8") else (parse(plan).count or 0)
+        work = len(model.gaussians) * layers / max(len(self.job.model.gaussians) * len(self.job.model.deformation), 1)
+        expected = whole.cpu_deformation * work / (INT8_SPEEDUP if plan == "int8" else 1)
+        if expected < DEAR * fastest.cpu:
+            return None
+        taken = f"{fastest.candidate.plan} takes {fastest.cpu:.0f} ms for the whole frame"
+        return f"not tried: its layers would take about {expected:.0f} ms of processor time, where {taken}"
 
     def _lap(self, candidate: Candidate, view: View) -> tuple[float, float]:
         start = time.process_time()
@@ -199,12 +221,4 @@ class Sweep:
 
 def same(a: Candidate, b: Candidate) -> bool:
     """Whether two candidates are the same scene: trimming to less may leave out no more."""
-    return a.path.read_bytes() == b.path.read_bytes()
-
-
-def _known(plan: str) -> bool:
-    try:
-        parse(plan)
-    except InvalidInput:
-        return False
-    return True
+    return a.digest == b.digest

@@ -185,7 +185,7 @@ def test_a_file_that_is_not_its_model_is_found_out(scene_file: Path, name: str):
 
 
 @pytest.mark.parametrize("count", [1, 30])
-def test_a_few_gaussians_may_be_unstable_but_are_counted(tmp_path: Path, count: int):
+def test_unstable_gaussians_are_counted_and_what_is_seen_of_them_is_judged_by_frames_alone(tmp_path: Path, count: int):
     model = random_model(300, layers=("mlp",))
     heads, raw_quats = model.get_submodule("deformation.layers.0.heads"), model.gaussians.raw_quats
     assert isinstance(heads, torch.nn.Linear)
@@ -196,13 +196,9 @@ def test_a_few_gaussians_may_be_unstable_but_are_counted(tmp_path: Path, count: 
         raw_quats[:] = torch.tensor([0.0, 1.0, 0.0, 0.0])
         raw_quats[:count] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # its delta, 0.5 × -2, cancels all but the last digits
     checkpoint = saved(tmp_path, model)
-    if count > 3:
-        with pytest.raises(VerificationFailed, match=r"\d+ of 300 Gaussians are unstable"):
-            export_scene(checkpoint, tmp_path / "scene.onnx", times=4)
-    else:
-        unstable = export_scene(checkpoint, tmp_path / "scene.onnx", times=4).measured_error["unstable"]
-        assert unstable["count"] == count
-        assert unstable["error"] > tolerance("export.relative")
+    unstable = export_scene(checkpoint, tmp_path / "scene.onnx", times=4).measured_error["unstable"]
+    assert unstable["count"] == count
+    assert unstable["error"] > tolerance("export.relative")
 
 
 def interrupt() -> None:

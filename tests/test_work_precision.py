@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,9 +15,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from export.job import Job
-from export.points import DEFAULT_RASTERIZER, Point, choose, front
+from export.points import DEFAULT_RASTERIZER, Look, Point, choose, front
 from export.rendered_error import RenderedError
-from export.report import COLUMNS, FORMAT, report, rows, write_report
+from export.report import COLUMNS, FORMAT, gain, report, rows, write_report
 from export.timing import FrameTime, Milliseconds
 from export.to_onnx import main
 from export.work_precision import Sweep, SweepResult
@@ -91,7 +92,7 @@ def few_candidates() -> Iterator[None]:
     """As many as the tests look at."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.work_precision.TRIM_STEPS", (5.0, 1.0, -5.0))
-        patch.setattr("export.work_precision.PLANS", ("int8", "keyframes:2.0"))
+        patch.setattr("export.work_precision.FITTED", ("keyframes:2.0",))
         yield
 
 
@@ -112,6 +113,27 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
     chosen = result.points[result.chosen]
     assert chosen.milliseconds == min(p.milliseconds for p in within)
     assert any(p.candidate.session.scene.moving_count <= OBJECT for p in within)
+
+
+def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried(swept: tuple[Job, SweepResult]):
+    job, _ = swept
+    whole, fitted = job.candidate("network", None), job.candidate("keyframes:9", None)
+    sweep = Sweep(job, 45.0)
+    sweep.looks = [Look(whole, DEFAULT_RASTERIZER, 90_000, 89_000, 90), Look(fitted, DEFAULT_RASTERIZER, 50, 5, 60)]
+    assert sweep._look("network", 46.0) is None
+    assert sweep._look("int8", None) is None
+    assert [why for _, why in sweep.refused if "keyframes:9 takes 50 ms" in why] == [why for _, why in sweep.refused]
+    sweep.looks[1] = replace(sweep.looks[1], worst_db=44)  # too far off to do without the layers
+    assert sweep._dear("network", None) is None
+
+
+def test_the_report_says_what_was_gained(swept: tuple[Job, SweepResult]):
+    contents = report(*swept)
+    whole = next(p for p in contents["points"] if p["plan"] == "network" and p["trim_db"] is None)
+    chosen = next(p for p in contents["points"] if p["chosen"])
+    whole["milliseconds"]["deformation"]["min"], chosen["milliseconds"]["deformation"]["min"] = 1480.0, 3.7
+    assert "Deformation takes 3.7 ms a frame" in gain(contents)
+    assert "all layers for all Gaussians take 1,480.0 ms, 400.0 times as long." in gain(contents)
 
 
 def test_the_same_model_has_the_same_errors(swept: tuple[Job, SweepResult], tmp_path: Path):

@@ -78,6 +78,7 @@ TABLE = (
     Row("neighbour_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
     Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
+    Row("grown_layers", 2e-6, "the same products in float32, with zeros between, in another order"),
     Row("between_samples.factor", 2.0, "times a promise made at samples: between them a cubic is off by as much again"),
     Row("int8.relative", 0.2, "of the largest motion; 8 bits are 0.4 % of a range, and layers multiply it"),
     Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),

@@ -1,4 +1,4 @@
-"""The moving Gaussians of a baked scene at any time, in float64: what plans are fitted to and measured against."""
+"""The moving Gaussians of a baked scene at any time, in float64: what plans are fitted to."""
 
 import copy
 
@@ -21,16 +21,23 @@ Poses = npt.NDArray[np.float64]
 
 
 class ExactPoses:
-    """`at(t)`: the scene's layers run in float64 on the baked values, without any graph."""
+    """`at(t)`: the scene's layers run on the baked values in float64, or in another precision, without any graph."""
 
-    def __init__(self, baked: Baked) -> None:
+    def __init__(self, baked: Baked, dtype: torch.dtype = torch.float64) -> None:
         m = baked.moving
         self.count = len(m)
+        self._dtype = dtype
         self._raw = baked.scene.metadata.delta_space == "raw"
-        self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
+        self._means, self._log_scales, self._quats = (self._tensor(a) for a in (m.means, m.log_scales, m.quats))
         factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
-        self._factors = [None if f is None else _double(f) for f in factors]
-        self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
+        self._factors = [None if f is None else self._tensor(f) for f in factors]
+        self._deformation = MultiStepDeformation(copy.deepcopy(layer).to(dtype) for layer in baked.layers)
+
+    @property
+    def operations(self) -> int:
+        """About how many a pose takes: a product and a sum for each weight of a Linear."""
+        linears = [m for m in self._deformation.modules() if isinstance(m, torch.nn.Linear)]
+        return max(2 * sum(linear.weight.numel() for linear in linears), 1)
 
     def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
         """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`, or of all."""
@@ -44,7 +51,7 @@ class ExactPoses:
     @torch.no_grad()
     def _chunk(self, t: float, ids: torch.Tensor) -> np.ndarray:
         means, log_scales = self._means[ids], self._log_scales[ids]
-        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64))
+        deltas = self._deformation(means, torch.tensor(t, dtype=self._dtype))
         of_means, of_scales, of_quats = (
             delta if factors is None else factors[ids] * delta  # equation 12
             for factors, delta in zip(self._factors, (deltas.means, deltas.scales, deltas.quats), strict=True)
@@ -54,6 +61,9 @@ class ExactPoses:
         else:
             scales = (activated_scales(log_scales) + of_scales).clamp_min(SMALLEST_SCALE)
         return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).numpy()
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array).to(self._dtype)
 
 
 def pixel(baked: Baked) -> float:
@@ -69,7 +79,3 @@ def pixel(baked: Baked) -> float:
     ]
     size = max(float(np.linalg.norm(high - low)), 1e-30)
     return float(min((s for s in spans if s > 0), default=size / 400))
-
-
-def _double(array: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(array.astype(np.float64))

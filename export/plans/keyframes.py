@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 
 from export.bake import Baked
-from export.plans.own_poses import COUNTS, fitted, own_poses, worst
+from export.plans.own_poses import SHARED_COUNTS, fitted, own_poses, worst
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.size import Size
 from export.plans.splines import FEWEST
@@ -45,4 +45,4 @@ def _fewest_bytes(trajectories: Trajectories, pixels: float) -> int:
         _, errors = fitted(trajectories, ids, count)
         return 20 * count + OWN_BYTES * float((errors > pixels * trajectories.pixel).mean())
 
-    return min((FEWEST, *COUNTS), key=bytes_each)
+    return min((FEWEST, *SHARED_COUNTS), key=bytes_each)

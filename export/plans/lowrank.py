@@ -19,7 +19,7 @@ from export.plans.exact import POSE, QUATS
 from export.plans.own_poses import CHUNK, own_poses, worst
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.size import Size
-from export.plans.splines import design, fitting, samples_for, time_weights
+from export.plans.splines import along_time, design, fitting, samples_for, time_weights
 from export.plans.stored_poses import with_own_poses
 from export.plans.trajectories import Ids, Samples, Trajectories
 
@@ -108,7 +108,7 @@ class _Fit:
         for rows in _chunks(ids):
             matrix, means, samples = self._rows(rows)
             rebuilt = ((matrix @ functions) @ functions.T).reshape(len(rows), KNOTS, POSE) + means[:, None]
-            got = np.matmul(self._design, rebuilt) / self._units(rows)
+            got = along_time(self._design, rebuilt) / self._units(rows)
             got[..., QUATS] /= np.maximum(np.linalg.norm(got[..., QUATS], axis=-1, keepdims=True), 1e-8)
             errors[done : done + len(rows)] = self._trajectories.distances(rows, got - samples)
             done += len(rows)
@@ -128,7 +128,7 @@ class _Fit:
 
     def _rows(self, ids: Ids) -> tuple[np.ndarray, np.ndarray, Samples]:
         samples = self._trajectories.on_grid(self._times, ids)
-        control = np.matmul(self._fitting, samples) * self._units(ids)
+        control = along_time(self._fitting, samples) * self._units(ids)
         means = control.mean(axis=1)
         return (control - means[:, None]).reshape(len(ids), -1), means, samples
 

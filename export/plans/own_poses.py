@@ -2,12 +2,16 @@
 
 import numpy as np
 
-from export.plans.splines import design, fitting, samples_for
+from export.plans.exact import POSE
+from export.plans.splines import along_time, design, fitting, samples_for
 from export.plans.stored_poses import OwnPoses, StoredPoses
-from export.plans.trajectories import FINEST, Ids, Trajectories
+from export.plans.trajectories import FINEST, USUAL, Ids, Trajectories
 
-COUNTS = (7, 11, 19, 35, 67, 131, FINEST // 2 + 3)
+COUNTS = (7, 11, 19, 35, 67, 131, 259, 515, FINEST // 2 + 3)
 """Control points of the grids that a Gaussian may have."""
+
+SHARED_COUNTS = COUNTS[:6]
+"""Of the grid of all Gaussians, where an error chooses it: who needs more keeps poses of its own."""
 
 SHARE = 0.05
 """Part of the Gaussians that a plan with a given size corrects: those that it gets most wrong."""
@@ -15,7 +19,11 @@ SHARE = 0.05
 VISIBLE = 0.02
 """Pixels; a smaller error isn't corrected."""
 
+BLOCK = 4096
+"""Gaussians whose control points are held in float32 at a time."""
+
 CHUNK = 2048
+"""Gaussians at a time that are sampled as usual; fewer of those that are sampled more densely."""
 
 
 def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) -> Ids:
@@ -31,28 +39,35 @@ def own_poses(trajectories: Trajectories, ids: Ids, most: float) -> tuple[OwnPos
     errors = np.full(len(ids), np.inf)
     grids, left = [], np.arange(len(ids))
     for count in COUNTS:
-        if not len(left):
-            break
-        control, found = fitted(trajectories, ids[left], count)
-        done = (found <= most * trajectories.pixel) | (count == COUNTS[-1])
-        if done.any():
-            grids.append((left[done], StoredPoses.of(control[done])))
-            errors[left[done]] = found[done]
-        left = left[~done]
+        rows, poses = [], []
+        for block in np.array_split(left, -(-len(left) // BLOCK)) if len(left) else ():
+            control, found = fitted(trajectories, ids[block], count)
+            done = (found <= most * trajectories.pixel) | (count == COUNTS[-1])
+            rows.append(block[done])
+            poses.append(StoredPoses.of(control[done]))
+            errors[block[done]] = found[done]
+        done_rows = np.concatenate([left[:0], *rows])
+        if len(done_rows):
+            grids.append((done_rows, StoredPoses.joined(poses)))
+        left = np.setdiff1d(left, done_rows)
     return OwnPoses(ids, tuple(grids)), errors
 
 
 def fitted(trajectories: Trajectories, ids: Ids, count: int) -> tuple[np.ndarray, np.ndarray]:
     """[M, n, 10] control points as stored, and the largest error of each Gaussian at all its samples, scene units."""
-    times = samples_for(count)
-    checks = FINEST + 1
-    matrix, shown = fitting(count, times).astype(np.float32), design(count, checks).astype(np.float32)
-    control = np.empty((len(ids), count, 10), np.float32)
-    errors = np.empty(len(ids))
-    for start in range(0, len(ids), CHUNK):
-        rows = slice(start, start + CHUNK)
-        samples = trajectories.on_grid(checks, ids[rows])
-        control[rows] = np.matmul(matrix, samples[:, :: (checks - 1) // (times - 1)])
-        stored = StoredPoses.of(control[rows]).control()
-        errors[rows] = trajectories.distances(ids[rows], np.matmul(shown, stored) - samples)
+    control = np.empty((len(ids), count, POSE), np.float32)
+    errors, checks = np.empty(len(ids)), np.maximum(trajectories.checks(ids), samples_for(count))
+    for times in np.unique(checks):
+        same = np.flatnonzero(checks == times)
+        for rows in np.array_split(same, -(-len(same) * times // (CHUNK * USUAL))):
+            control[rows], errors[rows] = _fitted(trajectories, ids[rows], count, int(times))
     return control, errors
+
+
+def _fitted(trajectories: Trajectories, ids: Ids, count: int, checks: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same, compared at `checks` times."""
+    samples, times = trajectories.on_grid(checks, ids), samples_for(count)
+    matrix, shown = fitting(count, times).astype(np.float32), design(count, checks).astype(np.float32)
+    control = along_time(matrix, samples[:, :: (checks - 1) // (times - 1)])
+    stored = StoredPoses.of(control).control()
+    return control, trajectories.distances(ids, along_time(shown, stored) - samples)

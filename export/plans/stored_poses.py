@@ -1,5 +1,6 @@
 """Spline control points of poses in 16 bits, and the part of a graph that blends four of them for each Gaussian."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,11 @@ class StoredPoses:
         steps = np.maximum(np.maximum(high - middles, middles - low) / LEVELS, 1e-30).astype(np.float32)
         points = np.round((control - middles[:, None]) / steps[:, None])
         return cls(points.clip(-LEVELS, LEVELS).astype(np.int16), steps, middles)
+
+    @classmethod
+    def joined(cls, parts: Sequence["StoredPoses"]) -> "StoredPoses":
+        """Those of all parts, one after the other; of as many control points each."""
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("points", "steps", "middles")))
 
     def control(self) -> np.ndarray:
         """[M, n, 10] what a graph reads from them."""

@@ -1,9 +1,12 @@
 """Poses of the moving Gaussians, sampled over time as densely as each of them needs.
 
 All Gaussians are sampled at 65 times. Where a cubic misses a pose between them by more than a tenth of a pixel, that
-Gaussian is sampled again twice as densely, and so on up to 513 times: a fast motion that a coarse sampling misses is
+Gaussian is sampled again twice as densely, and so on up to 2,049 times: a fast motion that a coarse sampling misses is
 found at the times between, and only what moves fast pays for it. The times between are every second sample and a few
 that lie on no grid, which catch what repeats itself from sample to sample.
+
+The times on no grid are sampled in float64 and in float32. Where float32 is as good as exact there, all other samples
+are taken in it: a network of the paper's size takes seconds a time in float64.
 """
 
 import hashlib
@@ -12,18 +15,25 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from export.bake import Baked
-from export.plans.exact import MEANS, POSE, QUATS, SCALES, ExactPoses, pixel
+from export.plans.exact import MEANS, POSE, QUATS, SCALES, ExactPoses, Poses, pixel
 
-COARSE, FINEST = 64, 512
-"""Intervals between samples: of all Gaussians, and of the fastest."""
+COARSE, USUAL, FINEST = 64, 512, 2048
+"""Intervals between samples: of all Gaussians, what errors are looked at between, and of the fastest."""
 
 RESOLVED = 0.1
 """Pixels that a cubic may be off between the samples."""
 
+FLOAT32_ENOUGH = 0.005
+"""Pixels that float32 may be off at the times on no grid, for any Gaussian, where other samples are taken in it."""
+
 PROBES = 9
 """Times on no grid."""
+
+WORK = 1e13
+"""Operations of layers that samples beyond the coarse ones may take: about a minute of two cores."""
 
 MEMORY = 2 * 2**30
 """Bytes that samples beyond the coarse ones may take; the Gaussians with the largest errors come first."""
@@ -43,12 +53,11 @@ class Trajectories:
         self.time_range = baked.scene.metadata.time_range
         self.pixel = pixel(baked)
         self._done, self._total, self._on_time = 0, COARSE + 1 + PROBES, on_time
+        self._probe_parts = np.arange(1, PROBES + 1) * (np.sqrt(5) - 1) / 2 % 1
+        self._sampler, self._probes = self._probed(baked)
         samples = self._sampled(np.arange(self.count), np.linspace(*self.time_range, COARSE + 1))
         _give_one_sign(samples)
         self._levels = {COARSE: (np.arange(self.count), samples)}
-        self._probe_parts = np.arange(1, PROBES + 1) * (np.sqrt(5) - 1) / 2 % 1
-        t0, t1 = self.time_range
-        self._probes = self._sampled(np.arange(self.count), t0 + (t1 - t0) * self._probe_parts)
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
         self._misses = np.zeros(self.count)  # scene units, at the finest times between samples that were looked at
         self.rotation_weights = _rotation_weights(samples, self.pixel)
@@ -58,6 +67,10 @@ class Trajectories:
     def unresolved(self) -> Ids:
         """Gaussians that move faster than their finest sampling shows."""
         return np.flatnonzero(self._misses > RESOLVED * self.pixel)
+
+    def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
+        """[M] at how many evenly spread times fits are compared with each of these Gaussians."""
+        return np.maximum(self._depth[ids], USUAL) + 1
 
     def on_grid(self, times: int, ids: Ids) -> Samples:
         """[M, T, 10] poses at evenly spread times, a power of two of them and one more.
@@ -93,21 +106,20 @@ class Trajectories:
 
         Of means, of scales, and of how far a wrong rotation displaces the end of the longest axis.
         """
-        squares = np.square(differences)
-        turns = squares[..., QUATS].sum(-1).max(-1) * self.rotation_weights[ids] ** 2
-        moves = squares[..., MEANS].sum(-1).max(-1)
-        return np.sqrt(np.maximum(np.maximum(moves, turns), squares[..., SCALES].max((-1, -2))))
+        return distances(differences, self.rotation_weights[ids])
 
     def _refine(self) -> None:
         ids, samples = self._levels[COARSE]
         self._misses[:] = self._missed(ids, samples)
-        level, memory = COARSE, MEMORY
+        level, memory, work = COARSE, MEMORY, WORK
         while level < FINEST:
             level *= 2
             fast = np.flatnonzero((self._misses > RESOLVED * self.pixel) & (self._depth == level // 2))
-            fast = np.sort(fast[np.argsort(-self._misses[fast])[: memory // ((level + 1) * POSE * 4)]])
+            most = min(memory / ((level + 1) * POSE * 4), work / (level // 2 * self.exact.operations))
+            fast = np.sort(fast[np.argsort(-self._misses[fast])[: int(most)]])
             if not len(fast):
                 break
+            work -= len(fast) * (level // 2) * self.exact.operations
             coarse = samples[np.searchsorted(ids, fast)]
             self._total += level // 2
             between = self._sampled(fast, np.linspace(*self.time_range, level + 1)[1::2])
@@ -127,13 +139,59 @@ class Trajectories:
         probes[..., QUATS] *= np.where(turned, -1, 1)[..., None].astype(probes.dtype)
         return np.maximum(between, self.distances(ids, got - probes))
 
+    def _probed(self, baked: Baked) -> tuple[ExactPoses, Samples]:
+        """What all other samples are taken with, and the samples at the times on no grid."""
+        t0, t1 = self.time_range
+        single, close = ExactPoses(baked, torch.float32), True
+        every, probes = np.arange(self.count), np.empty((self.count, PROBES, POSE), np.float32)
+        for i, t in enumerate(t0 + (t1 - t0) * self._probe_parts):
+            probes[:, i] = exact = self.exact.at(float(t), every)
+            close = close and self._close(single.at(float(t), every), exact)
+            self._tell()
+        return (single if close else self.exact), probes
+
+    def _close(self, single: Poses, exact: Poses) -> bool:
+        turned = np.where(np.einsum("mc,mc->m", single[:, QUATS], exact[:, QUATS]) < 0, -1, 1)
+        single[:, QUATS] *= turned[:, None]
+        weights = _rotation_weights(exact[:, None], self.pixel)
+        off = distances(single[:, None] - exact[:, None], weights)
+        return bool((off <= FLOAT32_ENOUGH * self.pixel).all())
+
+    def _tell(self) -> None:
+        self._done += 1
+        self._on_time(self._done, self._total)
+
     def _sampled(self, ids: Ids, times: np.ndarray) -> Samples:
         samples = np.empty((len(ids), len(times), POSE), np.float32)
         for i, t in enumerate(times):
-            samples[:, i] = self.exact.at(float(t), ids)
-            self._done += 1
-            self._on_time(self._done, self._total)
+            samples[:, i] = self._sampler.at(float(t), ids)
+            self._tell()
         return samples
+
+
+class SomeTrajectories(Trajectories):
+    """Those of some of the Gaussians, `rows` of others that have been sampled already."""
+
+    def __init__(self, sampled: Trajectories, rows: Ids) -> None:
+        self._source, self._rows = sampled, rows
+        self.count, self.time_range, self.pixel = len(rows), sampled.time_range, sampled.pixel
+        self.rotation_weights, self._misses = sampled.rotation_weights[rows], sampled._misses[rows]
+
+    def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
+        """As of the others."""
+        return self._source.checks(self._rows[ids])
+
+    def on_grid(self, times: int, ids: Ids) -> Samples:
+        """As of the others."""
+        return self._source.on_grid(times, self._rows[ids])
+
+
+def distances(differences: np.ndarray, rotation_weights: np.ndarray) -> npt.NDArray[np.float64]:
+    """[M] the largest of differences from poses, [M, T, 10], as `Trajectories.distances` has it."""
+    squares = np.square(differences)
+    turns = squares[..., QUATS].sum(-1).max(-1) * rotation_weights**2
+    moves = squares[..., MEANS].sum(-1).max(-1)
+    return np.sqrt(np.maximum(np.maximum(moves, turns), squares[..., SCALES].max((-1, -2))))
 
 
 _KEPT = 2
@@ -142,18 +200,24 @@ _recent: dict[bytes, Trajectories] = {}
 
 def trajectories_of(baked: Baked) -> Trajectories:
     """Those of the scene's moving part, sampled once for all plans; those of the last two scenes are kept."""
-    digest = hashlib.sha256(repr((baked.scene.metadata.time_range, pixel(baked))).encode())
+    digest = hashlib.sha256(repr((baked.scene.metadata.time_range, pixel(baked))).encode() + layers_digest(baked))
     for part in vars(baked.moving).values():
         digest.update(b"" if part is None else part.tobytes())
-    for layer in baked.layers:
-        for name, values in layer.state_dict().items():
-            digest.update(name.encode() + values.cpu().numpy().tobytes())
     key = digest.digest()
     kept = _recent.pop(key, None) or Trajectories(baked)
     while len(_recent) >= _KEPT:
         del _recent[next(iter(_recent))]
     _recent[key] = kept
     return kept
+
+
+def layers_digest(baked: Baked) -> bytes:
+    """Of all that moves a Gaussian, besides its own values."""
+    digest = hashlib.sha256(repr(baked.moving.scale_modulation is None).encode())
+    for layer in baked.layers:
+        for name, values in layer.state_dict().items():
+            digest.update(name.encode() + values.cpu().numpy().tobytes())
+    return digest.digest()
 
 
 def _give_one_sign(samples: Samples) -> None:

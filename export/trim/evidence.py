@@ -1,7 +1,7 @@
 """What trimming decides by: how much of each Gaussian is seen, how far it moves in pixels, and frames to compare."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -12,20 +12,38 @@ from export.views import View
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
-from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
+from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.metrics import psnr_from_mse
 from msdgs_train.model import DynamicGaussians
 from msdgs_train.rasterization import rasterize
+
+MEMORY, POSE_BYTES = 2e9, 40
+"""Bytes of poses that are kept of smaller networks, for trimming to other errors, and of one Gaussian at one time."""
 
 SAMPLED_GAUSSIANS, SAMPLED_TIMES = 1000, 5
 """For the quick look at what a part of the network does."""
 
 
-class Poses(NamedTuple):
-    """All Gaussians at the deciding times, and as they would best stand still."""
+class Poses:
+    """All Gaussians at the deciding times, posed when they are first asked for, and as they would best stand still."""
 
-    at: dict[float, Gaussians]
-    still: Gaussians
+    def __init__(self, model: DynamicGaussians, times: Sequence[float]) -> None:
+        self.times, self._model = times, model
+        self._at: dict[float, Gaussians] = {}
+
+    @torch.no_grad()
+    def at(self, t: float) -> Gaussians:
+        """The Gaussians at one of the times."""
+        if t not in self._at:
+            g = as_gaussians(self._model.pose(t))
+            shared = next(iter(self._at.values()), g)
+            self._at[t] = Gaussians(g.means, g.quats, g.scales, shared.opacities, shared.sh)
+        return self._at[t]
+
+    @cached_property
+    def still(self) -> Gaussians:
+        """Where they are on average."""
+        return standing_still([self.at(t) for t in self.times])
 
 
 class Evidence:
@@ -41,32 +59,39 @@ class Evidence:
         self.model, self.background = model, background
         self._views = views
         self._order = list(range(len(views)))
-        self._last: tuple[Network, Poses] | None = None
+        self._kept: dict[Network, Poses] = {}
         network = whole(model).network
-        self._whole = network, self._posed(network, on_time)
-        self._frames = [shown(self._whole[1].at[view.t], view.camera, background) for view in views]
+        self._whole = network, self._posed(network)
+        for t in self._whole[1].times:
+            self._whole[1].at(t)
+            on_time()
+        self._frames = [shown(self._whole[1].at(view.t), view.camera, background) for view in views]
         self.peaks, self.amounts = self._seen()
 
     def poses(self, network: Network) -> Poses:
         """All Gaussians as this part of the network moves them."""
         if network == self._whole[0]:
             return self._whole[1]
-        if self._last is None or self._last[0] != network:
-            self._last = network, self._posed(network)
-        return self._last[1]
+        if network not in self._kept:
+            most = int(MEMORY / (POSE_BYTES * len(self._views) * max(len(self.model.gaussians), 1)))
+            while len(self._kept) >= max(most, 1):
+                del self._kept[next(iter(self._kept))]
+            self._kept[network] = self._posed(network)
+        return self._kept[network]
 
     def worst_db(self, cut: Cut, enough: float = -np.inf) -> float:
         """PSNR in dB of the worst deciding frame; where one is under `enough`, that of the first that is."""
         poses, worst = self.poses(cut.network), np.inf
         moving, still = np.flatnonzero(cut.moves), np.flatnonzero(cut.kept & ~cut.moves)
-        opacities, sh = poses.still.opacities[cut.ids], poses.still.sh[cut.ids, : sh_coefficients(cut.sh_degree)]
-        constants = poses.still.means[still], poses.still.quats[still], poses.still.scales[still]
+        colors = rows(self._whole[1].still, cut.ids, cut.sh_degree)
+        standing = rows(poses.still if len(still) else self._whole[1].still, still, 0)
+        constants = standing.means, standing.quats, standing.scales
         for i in list(self._order):
             view = self._views[i]
-            at = poses.at[view.t]
+            at = poses.at(view.t)
             changing = at.means[moving], at.quats[moving], at.scales[moving]
             means, quats, scales = (np.concatenate(pair) for pair in zip(changing, constants, strict=True))
-            frame = shown(Gaussians(means, quats, scales, opacities, sh), view.camera, self.background)
+            frame = shown(Gaussians(means, quats, scales, colors.opacities, colors.sh), view.camera, self.background)
             db = psnr_from_mse(float(np.mean(np.square(frame - self._frames[i], dtype=np.float64))))
             worst = min(worst, db)
             if worst < enough:
@@ -81,7 +106,7 @@ class Evidence:
         poses = self.poses(network)
         still_axes = half_axes(poses.still)
         furthest = np.zeros(len(poses.still), np.float32)
-        for at in poses.at.values():
+        for at in map(poses.at, poses.times):
             moved = np.linalg.norm(at.means - poses.still.means, axis=1)
             turned = np.linalg.norm(half_axes(at) - still_axes, axis=1).max(axis=1, initial=0)
             np.maximum(furthest, moved + turned, out=furthest)
@@ -92,10 +117,11 @@ class Evidence:
         """Pixels by which a few Gaussians, at a few times, are elsewhere on average if part of a network is missing;
         faint ones count less."""
         poses = self.poses(network)
-        ids = np.arange(0, len(poses.still), max(1, len(poses.still) // SAMPLED_GAUSSIANS))
+        count = len(self.model.gaussians)
+        ids = np.arange(0, count, max(1, count // SAMPLED_GAUSSIANS))
         model, change = with_network(self.model, smaller), 0.0
-        for t in list(poses.at)[:: max(1, len(poses.at) // SAMPLED_TIMES)]:
-            before = rows(poses.at[t], ids, self.model.config.sh_degree)
+        for t in poses.times[:: max(1, len(poses.times) // SAMPLED_TIMES)]:
+            before = rows(poses.at(t), ids, self.model.config.sh_degree)
             after = as_gaussians(model.pose(t, ids=torch.from_numpy(ids)))
             moved = np.linalg.norm(after.means - before.means, axis=1)
             turned = np.linalg.norm(half_axes(after) - half_axes(before), axis=1).max(axis=1, initial=0)
@@ -111,24 +137,15 @@ class Evidence:
             np.maximum(most, max(camera.fx, camera.fy) / np.maximum(distances, GSPLAT.near_plane), out=most)
         return most
 
-    @torch.no_grad()
-    def _posed(self, network: Network, on_time: Callable[[], object] = lambda: None) -> Poses:
-        model = with_network(self.model, network)
-        at = {}
-        for t in dict.fromkeys(view.t for view in sorted(self._views, key=lambda view: view.t)):
-            at[t] = as_gaussians(model.pose(t))
-            on_time()
-        first = next(iter(at.values()))
-        opacities, sh = first.opacities, first.sh
-        at = {t: Gaussians(g.means, g.quats, g.scales, opacities, sh) for t, g in at.items()}
-        return Poses(at, standing_still(list(at.values())))
+    def _posed(self, network: Network) -> Poses:
+        return Poses(with_network(self.model, network), sorted({view.t for view in self._views}))
 
     def _seen(self) -> tuple[FloatArray, FloatArray]:
         """[N] the most that a Gaussian covers of a pixel under its middle, and of how many pixels, over the views."""
         poses = self.poses(self._whole[0])
         peaks, amounts = np.zeros((2, len(poses.still)), np.float32)
         for view in self._views if len(peaks) else ():
-            g = poses.at[view.t]
+            g = poses.at(view.t)
             weights = blending_weights(g, view)
             # pixels that a Gaussian of these two largest axes fills; 0.3 px² is what the rasterizer adds
             sizes = np.sort(g.scales, axis=1)[:, 1:] * self.pixels_a_unit(g.means)[:, None]

@@ -45,7 +45,12 @@ def heads(evidence: Evidence, cut: Cut, enough: float) -> Cut:
 
 
 def layers(evidence: Evidence, cut: Cut, enough: float) -> Cut:
-    """Whole layers whose weighted step is invisible, the last ones first."""
+    """Whole layers whose weighted step is invisible: as many of the last ones as can go together, then single ones."""
+    last = len(cut.network.layers) - 1
+    while last > 0:
+        smaller = _if_enough(evidence, cut, _network(cut, layers=cut.network.layers[:-last]), enough)
+        last = min(last // 2, len(smaller.network.layers) - 1)
+        cut = smaller
     for k in reversed(cut.network.layers):
         if len(cut.network.layers) > 1:
             left = tuple(layer for layer in cut.network.layers if layer != k)
