@@ -6,6 +6,7 @@ python benchmarks/training_step.py data/scene --preset msdgs-mlp --gaussians 300
 
 Without a folder it trains on a synthetic scene that it makes. The parts are measured one after the other on the same
 step, repeat after repeat; least and median of the repeats are printed, and what the parts add up to beside whole steps.
+In turns with them, steps of several photographs side by side.
 """
 
 import argparse
@@ -45,10 +46,11 @@ def main() -> None:
     """Measure and print."""
     arguments = parse_arguments()
     with tempfile.TemporaryDirectory() as made:
-        trainer = make_trainer(arguments, Path(made))
+        several, trainer = (make_trainer(arguments, Path(made), n) for n in (arguments.photographs, 1))
         for _ in range(3):  # compiled, and Adam has its moments
             trainer.step()
-        repeats = [dict(measured(trainer)) for _ in range(arguments.repeats)]
+            several.step()
+        repeats = [dict(measured(trainer, several)) for _ in range(arguments.repeats)]
     show(repeats, arguments)
 
 
@@ -59,21 +61,24 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--gaussians", type=int, default=10_000)
     parser.add_argument("--size", type=int, default=200, help="width of the photographs in pixels")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--photographs", type=int, default=4, help="side by side, to compare with one after the other")
     parser.add_argument("--repeats", type=int, default=15)
     return parser.parse_args()
 
 
-def make_trainer(arguments: argparse.Namespace, made: Path) -> Trainer:
+def make_trainer(arguments: argparse.Namespace, made: Path, photographs: int) -> Trainer:
     """A trainer at a step at which all of the model takes part."""
     data = arguments.data
     if data is None:
         data = made / "scene"
-        generate(data, size=arguments.size, train_frames=8, test_frames=2)
+        if not data.exists():
+            generate(data, size=arguments.size, train_frames=8, test_frames=2)
     count = arguments.gaussians
     config = replace(
         preset(arguments.preset),
         init_count=count,
         max_gaussians=count,
+        photographs=photographs,
         threads=arguments.threads,
         warmup_fraction=0.0,
         densify_until_fraction=0.0,
@@ -81,8 +86,9 @@ def make_trainer(arguments: argparse.Namespace, made: Path) -> Trainer:
     return Trainer(config, load_scene(data, arguments.size))
 
 
-def measured(trainer: Trainer) -> Iterator[tuple[str, float]]:
-    """Seconds by part of one step, then of a whole one."""
+def measured(trainer: Trainer, several: Trainer) -> Iterator[tuple[str, float]]:
+    """Seconds by part of a step of one photograph, then of a whole one, and of one of several."""
+    torch.set_num_threads(trainer.config.threads)
     model, frame = trainer.model, trainer.frames[0]
     background = torch.zeros(3)
     truth = trainer._photograph(frame, background)
@@ -124,6 +130,9 @@ def measured(trainer: Trainer) -> Iterator[tuple[str, float]]:
     yield "optimiser", seconds
     _, seconds = timed(trainer.step)
     yield "whole step", seconds
+    torch.set_num_threads(1)
+    _, seconds = timed(several.step)
+    yield "several", seconds
 
 
 def show(repeats: list[dict[str, float]], arguments: argparse.Namespace) -> None:
@@ -147,6 +156,11 @@ def show(repeats: list[dict[str, float]], arguments: argparse.Namespace) -> None
     console.print(f"rasterizer: gradient / forward = {gradient / render:.2f}")
     step = least["whole step"] / (render + least["deformation"])
     console.print(f"whole step / (forward rendering + deformation) = {step:.2f}")
+    each = least["several"] / arguments.photographs
+    console.print(
+        f"{arguments.photographs} photographs side by side: {each:.1f} ms each, "
+        f"{least['whole step'] / each:.2f} times as many a second"
+    )
 
 
 if __name__ == "__main__":

@@ -18,13 +18,16 @@ class TrainConfig:
     """Settings of a run; the defaults suit a small scene, 200 pixels wide, on two cores in half an hour."""
 
     steps: int = 16_000
-    """Optimiser steps; one photograph each."""
+    """Optimiser steps."""
+    photographs: int = 4
+    """Photographs a step, rendered side by side on `threads`; their gradients are averaged."""
     size: int | None = None
     """Width in pixels to train at; the photographs' own width if not given."""
     seed: int = 0
     """Of the initial Gaussians, the order of the photographs, random backgrounds and splits."""
     threads: int = 2
-    """Threads that torch uses. The same seed gives the same bits for the same number of threads."""
+    """Threads that photographs of one step are shared among; with one photograph a step, threads that torch uses, and
+    then the same seed gives the same bits for the same number of threads."""
     max_minutes: float | None = None
     """Stop, evaluate and save after so many minutes in all, resumed parts included, even if steps are left."""
     background: Literal["white", "black", "random"] = "white"
@@ -123,7 +126,7 @@ class TrainConfig:
     """Steps between checkpoints; 0 leaves only the one at the end."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "threads", "init_count", "sh_interval", "max_gaussians", "log_every"):
+        for name in ("steps", "photographs", "threads", "init_count", "sh_interval", "max_gaussians", "log_every"):
             self._require(name, "a whole number above 0", lambda v: v >= 1)
         for name in ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed"):
             self._require(name, "0 or above", lambda v: v >= 0)

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from msdgs_train.losses import photometric_loss
 from msdgs_train.metrics import Quality, mean_quality, psnr_from_mse, quality
 from msdgs_train.model import SMALLEST_SCALE, Domain, DynamicGaussians, PosedGaussians
 from msdgs_train.optimizers import learning_rates, make_optimizer, set_learning_rates
-from msdgs_train.rasterization import rasterize
+from msdgs_train.rasterization import RasterizationInfo, rasterize
 from msdgs_train.rigidity import stretch
 
 MAX_SKIPPED_IN_A_ROW = 20
@@ -50,6 +51,17 @@ class StepResult(NamedTuple):
     floored: int  # Gaussians a scale of which came out at 0 or below in this step, and was set to e^-20
 
 
+class _Shot(NamedTuple):
+    """What one photograph has to say about the model."""
+
+    frame: Frame
+    loss: float
+    squared_error: float
+    gradients: tuple[Tensor | None, ...]  # of the model's parameters, in their order
+    info: RasterizationInfo
+    floored: int
+
+
 class Evaluated(NamedTuple):
     """A held-out frame: as photographed and as rendered, [H, W, 3] in [0, 1]."""
 
@@ -63,7 +75,7 @@ class Trainer:
     """The model, its optimiser, its density control and the order of the photographs, moved on by `step`."""
 
     def __init__(self, config: TrainConfig, scene: SceneData) -> None:
-        torch.set_num_threads(config.threads)
+        torch.set_num_threads(config.threads if config.photographs == 1 else 1)
         self.config = config
         self.scene = scene
         self.frames = scene.splits["train"]
@@ -82,25 +94,23 @@ class Trainer:
         self._pairs_generator = torch.Generator().manual_seed(config.seed + 2)
 
     def step(self) -> StepResult:
-        """Render one training photograph's view, pull the model towards the photograph, and control density."""
+        """Render the next photographs' views, pull the model towards them, and control density."""
         self._widen_window()
-        frame, background = self._next_frame(), self._next_background()
-        truth = self._photograph(frame, background)
         set_learning_rates(self.optimizer, self._learning_rates())
-        posed = self._pose(frame.t)
-        rgb, _, info = rasterize(*posed, frame.camera, background)
-        loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        shots = self._shots()
+        self._set_gradients(shots)
+        loss = sum(shot.loss for shot in shots) / len(shots)
         self.step_count += 1
         if self._is_finite(loss):
             if len(self.model.deformation):
                 # one outlier would stay in Adam's second moment, and slow the field down, for a thousand steps
                 clip_grad_norm_(self.model.deformation.parameters(), MAX_FIELD_GRADIENT)
             self.optimizer.step()
-            self._average(loss.item(), float((rgb.detach() - truth).square().mean()))
-            if info.means2d_grads is not None:
-                self.density.gather(info.means2d_grads, info.radii, frame.camera.width, frame.camera.height)
+            self._average(loss, sum(shot.squared_error for shot in shots) / len(shots))
+            for shot in shots:
+                if shot.info.means2d_grads is not None:
+                    camera = shot.frame.camera
+                    self.density.gather(shot.info.means2d_grads, shot.info.radii, camera.width, camera.height)
         self.density.after_step(self.model.gaussians, self.optimizer, self.step_count)
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         return StepResult(
@@ -109,8 +119,41 @@ class Trainer:
             psnr_from_mse(average_error),
             len(self.model.gaussians),
             self.skipped,
-            self._floored(posed),
+            max(shot.floored for shot in shots),
         )
+
+    def _shots(self) -> list[_Shot]:
+        """Render the next photographs' views and differentiate the loss of each, side by side."""
+        drawn = [
+            (self._next_frame(), self._next_background(), _offspring(self._pairs_generator))
+            for _ in range(self.config.photographs)
+        ]
+        if len(drawn) == 1:
+            return [self._shoot(*drawn[0])]
+        return list(self._workers.map(lambda photograph: self._shoot(*photograph), drawn))
+
+    @functools.cached_property
+    def _workers(self) -> ThreadPoolExecutor:
+        """Each runs torch on one core: small matrices shared among cores leave most of them waiting."""
+        return ThreadPoolExecutor(self.config.threads, "photograph", torch.set_num_threads, (1,))
+
+    def _shoot(self, frame: Frame, background: Tensor, pairs: torch.Generator) -> _Shot:
+        truth = self._photograph(frame, background)
+        posed = self._pose(frame.t)
+        rgb, _, info = rasterize(*posed, frame.camera, background)
+        loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed, pairs)
+        gradients = torch.autograd.grad(loss, self._parameters(), allow_unused=True)
+        squared_error = float((rgb.detach() - truth).square().mean())
+        return _Shot(frame, loss.item(), squared_error, gradients, info, self._floored(posed))
+
+    def _set_gradients(self, shots: list[_Shot]) -> None:
+        """The mean over the photographs, added up in their order, so that the same seed gives the same bits."""
+        for parameter, *gradients in zip(self._parameters(), *(shot.gradients for shot in shots), strict=True):
+            known = [gradient for gradient in gradients if gradient is not None]
+            parameter.grad = sum(known[1:], known[0]) / len(shots) if known else None
+
+    def _parameters(self) -> list[nn.Parameter]:
+        return list(self.model.parameters())
 
     @torch.no_grad()
     def evaluate(self, split: str) -> Iterator[Evaluated]:
@@ -204,7 +247,7 @@ class Trainer:
     def _deforms(self) -> bool:
         return self.step_count >= self.config.warmup_steps and len(self.model.deformation) > 0
 
-    def _priors(self, posed: PosedGaussians) -> Tensor | float:
+    def _priors(self, posed: PosedGaussians, pairs: torch.Generator) -> Tensor | float:
         """What is asked besides likeness to the photographs: few and small Gaussians, rigid motion, smooth grids."""
         c, total = self.config, 0.0
         if c.densify_strategy == "mcmc":
@@ -213,7 +256,7 @@ class Trainer:
             return total
         if c.rigidity_weight:
             means = self.model.gaussians.means
-            stretched = stretch(means, posed.means, self._half_extent, self._pairs_generator)
+            stretched = stretch(means, posed.means, self._half_extent, pairs)
             total = total + c.rigidity_weight * stretched
         for grid in self.model.plane_grids():
             for weight, roughness in (
@@ -273,9 +316,9 @@ class Trainer:
                 self._photographs[frame.image_path] = rgba
         return torch.from_numpy(composite(rgba, background.numpy()))
 
-    def _is_finite(self, loss: Tensor) -> bool:
+    def _is_finite(self, loss: float) -> bool:
         gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
-        if bool(torch.isfinite(loss.detach() + get_total_norm(gradients, foreach=True))):
+        if bool(torch.isfinite(loss + get_total_norm(gradients, foreach=True))):
             self._skipped_in_a_row = 0
             return True
         self.skipped += 1
@@ -317,6 +360,11 @@ class Trainer:
             return [[-self._half_extent] * 3, [self._half_extent] * 3]
         stacked = torch.stack(boxes)
         return [stacked[:, 0].amin(dim=0).tolist(), stacked[:, 1].amax(dim=0).tolist()]
+
+
+def _offspring(generator: torch.Generator) -> torch.Generator:
+    """One that a thread may draw from by itself."""
+    return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))
 
 
 def _distances_from_middle(time_range: tuple[float, float], frames: list[Frame]) -> Tensor:

@@ -85,7 +85,7 @@ def shrunk(config: TrainConfig) -> TrainConfig:
         plane_space_nodes=6, plane_time_nodes=5, plane_width=8, embedding_size=min(config.model.embedding_size, 4),
     )  # fmt: skip
     return dataclasses.replace(
-        config, model=model, steps=12, warmup_fraction=0.25, threads=1, init_count=60, max_gaussians=90, densify_from=4,
+        config, model=model, steps=12, warmup_fraction=0.25, threads=2, init_count=60, max_gaussians=90, densify_from=4,
         densify_every=4, sh_interval=4,
     )  # fmt: skip
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -185,6 +186,26 @@ def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.Mo
         _steps(trainer, 19)
 
 
+def test_photographs_of_a_step_share_it_evenly(data: Path) -> None:
+    config = small_config(warmup_fraction=0.0, window_until_fraction=0.0, densify_every=0, rigidity_weight=0.1)
+    scene = load_scene(data)
+
+    def gradients(photographs: int, threads: int) -> list[list[Tensor]]:
+        trainer = Trainer(dataclasses.replace(config, photographs=photographs, threads=threads), scene)
+        found = []
+        for _ in range(6 // photographs):
+            trainer._set_gradients(trainer._shots())
+            found.append([p.grad.clone() for p in trainer.model.parameters() if p.grad is not None])
+        return found
+
+    one_by_one, at_once = gradients(1, 1), gradients(6, 3)[0]
+    for single, together in zip(zip(*one_by_one, strict=True), at_once, strict=True):
+        mean = torch.stack(single).double().mean(0)
+        scale = float(torch.stack(single).abs().amax()) or 1.0
+        assert float((together - mean).abs().max()) <= scale * tolerance("float32.relative")
+    assert all(map(torch.equal, at_once, gradients(6, 2)[0])), "the same bits for any number of threads"
+
+
 class _Rollbacks(Observer):
     def __init__(self) -> None:
         self.seen: list[tuple[int, float]] = []
@@ -278,7 +299,9 @@ def test_what_is_added_to_the_loss(data: Path, mcmc: bool) -> None:
         if mcmc:
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(trainer.model.plane_grids()) == 2
-        assert float(trainer._priors(posed)) == pytest.approx(float(expected), rel=tolerance("float32.relative"))
+        assert float(trainer._priors(posed, torch.Generator())) == pytest.approx(
+            float(expected), rel=tolerance("float32.relative")
+        )
 
 
 def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
