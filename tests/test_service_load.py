@@ -88,7 +88,9 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
             check_problem(response)
             assert 1 <= int(response.headers["Retry-After"]) <= 60
         assert client.post("/render/batch", json={"frames": [FRAME]}).status_code == 503
-        assert client.post("/render", json={**FRAME, "t": 7}).status_code == 422, "what is wrong is wrong at any load"
+        assert client.post("/render", json={**FRAME, "width": 0}).status_code == 422, "wrong at any load"
+        have = client.post("/render", json=FRAME, headers={"If-None-Match": "*"})
+        assert have.status_code == 304, "what the client has costs no place"
         assert client.get("/live").status_code == 200
         assert client.get("/ready").status_code == 200
         poses.go_on.set()

@@ -68,6 +68,8 @@ async def answer(
     service: Service, request: Request, make_plan: Callable[[], FramePlan], if_none_match: str | None
 ) -> Response:
     """Draw what is planned, unless the client has it already or goes away."""
+    if if_none_match is None:
+        service.queue.check_open()  # before anything is worked out: what is refused must cost nearly nothing
     plan = await anyio.to_thread.run_sync(make_plan)
     headers = plan.headers(service.settings.frame_max_age)
     if is_unchanged(if_none_match, plan.etag):
