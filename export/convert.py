@@ -32,6 +32,10 @@ def main(
 
     python export/convert.py ball.onnx ball.spz          one moment, ten times smaller
 
+    python export/convert.py ball.onnx ball.glb          one moment, as glTF with KHR_gaussian_splatting
+
+    python export/convert.py ball.onnx ball.usdc         all of its time, as OpenUSD with a sample of poses a frame
+
     python export/convert.py ball.onnx frames/           a folder of numbered PLY files over the scene's time
 
     python export/convert.py ball.onnx ball.visionary.onnx     all of it, for Visionary in a browser
@@ -40,11 +44,11 @@ def main(
 
     Args:
         scene: A scene file (.onnx).
-        out: What to write: name.ply, name.spz, name.visionary.onnx, or a folder.
+        out: What to write: name.ply, name.spz, name.glb, name.usdc (or .usda, .usd), name.visionary.onnx, or a folder.
         t: The moment of a single file; by default the beginning of the scene's time.
-        frames: How many files in a folder, evenly over the scene's time, both ends among them.
-        min_psnr: What was written must be so close to the scene, dB, or nothing is; by default 60 for PLY, which
-            loses nothing, and 45 for others.
+        frames: How many files in a folder or frames of OpenUSD, evenly over the scene's time, both ends among them.
+        min_psnr: What was written must be so close to the scene, dB, or nothing is; by default 45 for SPZ and Visionary
+            and 60 for others, which lose nothing.
     """
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     try:

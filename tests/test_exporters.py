@@ -1,5 +1,7 @@
 """What is written for other viewers is the scene: read back, and held to the rules of each format."""
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,9 @@ from rich.console import Console
 
 from export.bake import bake
 from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
+from export.exporters.gltf import EXTENSION, read_gltf
 from export.exporters.proof import ConversionFailed, visionary_of
+from export.exporters.usd import read_usd
 from export.exporters.visionary import VisionaryInvalid, check_visionary, visionary_model
 from export.importers import read_splats
 from export.plans import build
@@ -78,6 +82,54 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
     assert turned.max() < tolerance("spz_rotation")
 
 
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_gltf_is_that_moment(tmp_path: Path, degree: int):
+    scene = scene_file(tmp_path, sh_degree=degree)
+    run(scene, tmp_path / "a.glb", t=0.4)
+    assert_same(read_gltf(tmp_path / "a.glb"), DeformationSession(scene).gaussians(0.4))
+    contents = (tmp_path / "a.glb").read_bytes()
+    magic, version, size, text = struct.unpack_from("<4sIII", contents)
+    assert (magic, version, size) == (b"glTF", 2, len(contents))
+    document = json.loads(contents[20 : 20 + text])
+    (primitive,) = document["meshes"][0]["primitives"]
+    attributes = {name.removeprefix("KHR_gaussian_splatting:") for name in primitive["attributes"]}
+    assert {"POSITION", "ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"} <= attributes
+    assert sum(name.startswith("SH_DEGREE") for name in attributes) == (degree + 1) ** 2
+    assert document["extensionsUsed"] == list(primitive["extensions"]) == ["KHR_gaussian_splatting"]
+    assert {"mode": 0, "kernel": "ellipse"}.items() <= {**primitive, **primitive["extensions"][EXTENSION]}.items()
+    assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
+    assert (20 + text) % 4 == 0
+
+
+def assert_same(got: Gaussians, expected: Gaussians) -> None:
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), atol=tolerance("splat_values"))
+
+
+@pytest.mark.parametrize("ending", ["usdc", "usda"])
+def test_usd_has_a_sample_a_frame(tmp_path: Path, ending: str):
+    usd = pytest.importorskip("pxr.Usd")
+    scene, out = scene_file(tmp_path, sh_degree=1), tmp_path / f"a.{ending}"
+    run(scene, out, frames=5)
+    stage = usd.Stage.Open(str(out))
+    prim = stage.GetDefaultPrim()
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetMetadata("upAxis")) == (0, 4, "Y")
+    assert prim.GetAttribute("positions").GetTimeSamples() == [0, 1, 2, 3, 4]
+    assert len(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get()) == 300 * 4
+    session, shown = DeformationSession(scene), read_usd(out)
+    for frame in range(5):
+        assert_same(shown(frame), session.gaussians(frame / 4))
+    first = session.gaussians(0.0)
+    turned = prim.GetAttribute("orientations").Get(0)[0]  # by half a turn about x, with OpenCV's y pointing down
+    assert turned.GetReal() == pytest.approx(float(first.quats[0, 0]))
+    assert turned.GetImaginary()[1] == pytest.approx(-float(first.quats[0, 2]))
+    run(scene, tmp_path / f"still.{ending}", t=0.4)
+    still = usd.Stage.Open(str(tmp_path / f"still.{ending}"))
+    assert still.GetDefaultPrim().GetAttribute("positions").GetTimeSamples() == []
+    assert_same(read_usd(tmp_path / f"still.{ending}")(0), session.gaussians(0.4))
+
+
 def test_what_is_not_close_enough_does_not_replace_a_file(tmp_path: Path):
     scene, out = scene_file(tmp_path), tmp_path / "a.spz"
     out.write_text("old")
@@ -142,7 +194,10 @@ def test_a_quantised_plan_is_refused_with_what_to_do(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("out", "message"),
-    [("a.mp4", r"msdgs-render"), ("a.obj", r"a folder, or named .ply, .spz or .visionary.onnx")],
+    [
+        ("a.mp4", r"msdgs-render"),
+        ("a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd or .visionary.onnx"),
+    ],
 )
 def test_other_endings_say_what_there_is(tmp_path: Path, out: str, message: str):
     with pytest.raises(InvalidInput, match=message):

@@ -46,7 +46,7 @@ QUIET = Console(quiet=True)
 DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "30"))
 """Files of each kind."""
 
-COUNT = 300 if DAMAGED < 1000 else 5_000
+COUNT = 300 if DAMAGED < 1000 else 1_000
 """Gaussians a file."""
 
 ENDS = 1024

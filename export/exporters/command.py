@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress, track
 
+from export.exporters.gltf import read_gltf, write_gltf
 from export.exporters.ply import write_ply
-from export.exporters.proof import Proof, require, splats_of, visionary_of
+from export.exporters.proof import Proof, require, visionary_of
 from export.exporters.spz import write_spz
+from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
+from export.importers.recognise import read_splats
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -21,6 +24,8 @@ LOSSLESS, LOSSY = 60.0, 45.0
 """dB that what was written must have by default."""
 
 VISIONARY = ".visionary.onnx"
+SINGLE = (".ply", ".spz", ".glb")
+USD = (".usdc", ".usda", ".usd")
 FILMS = (".mp4", ".webm")
 COMPARED = 5
 """Times at which a model that moves is compared."""
@@ -46,26 +51,29 @@ def convert(settings: Settings, console: Console) -> None:
     session = DeformationSession(settings.scene)
     if out.name.endswith(VISIONARY):
         _visionary(session, settings, console)
-    elif out.suffix in (".ply", ".spz"):
+    elif out.suffix in USD:
+        _usd(session, settings, console)
+    elif out.suffix in SINGLE:
         t0, _ = session.scene.metadata.time_range
         psnr = _one(session, out, t0 if settings.t is None else settings.t, settings.min_psnr)
         console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {psnr:.1f} dB from the scene", markup=False)
     elif not out.suffix:
         _sequence(session, settings, console)
     else:
-        raise InvalidInput("out", f"a folder, or named .ply, .spz or {VISIONARY}", out.name)
+        raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD))} or {VISIONARY}", out.name)
 
 
 def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | None) -> float:
     gaussians, metadata = session.gaussians(t), session.scene.metadata
     mip = metadata.antialiasing == "mip"
     with replacing(file) as temporary:
-        if file.suffix == ".ply":
-            write_ply(temporary, gaussians)
-        else:
+        if file.suffix == ".spz":
             write_spz(temporary, gaussians, metadata.antialiasing)
-        default = LOSSLESS if file.suffix == ".ply" else LOSSY
-        psnr = Proof(session, mip=mip).psnr(splats_of(temporary)(t), t)
+        else:
+            (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
+        default = LOSSY if file.suffix == ".spz" else LOSSLESS
+        written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
+        psnr = Proof(session, mip=mip).psnr(written, t)
         require(psnr, default if min_psnr is None else min_psnr, file.name)
     return psnr
 
@@ -85,6 +93,25 @@ def _sequence(session: DeformationSession, settings: Settings, console: Console)
         for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
     )
     console.print(f"{out}: {len(times)} files, the worst {worst:.1f} dB from the scene", markup=False)
+
+
+def _usd(session: DeformationSession, settings: Settings, console: Console) -> None:
+    """All of the scene's time, or the moment asked for."""
+    out, (t0, t1) = settings.out, session.scene.metadata.time_range
+    moves = session.scene.moving_count and settings.t is None
+    if moves and settings.frames < 2:
+        raise InvalidInput("frames", "2 or more", settings.frames)
+    times = np.linspace(t0, t1, settings.frames).tolist() if moves else [t0 if settings.t is None else settings.t]
+    proof = Proof(session, mip=session.scene.metadata.antialiasing == "mip")
+    with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
+        task = progress.add_task("writing frames", total=len(times))
+        write_usd(temporary, session.gaussians, times, lambda: progress.advance(task))
+        shown = read_usd(temporary)
+        compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
+        worst = min(proof.psnr(shown(number), times[number]) for number in compared)
+        require(worst, LOSSLESS if settings.min_psnr is None else settings.min_psnr, out.name)
+    size = out.stat().st_size / 1e6
+    console.print(f"{out}: {len(times)} frames, {size:.2f} MB, {worst:.1f} dB from the scene", markup=False)
 
 
 def _visionary(session: DeformationSession, settings: Settings, console: Console) -> None:

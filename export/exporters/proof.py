@@ -7,7 +7,6 @@ import numpy as np
 import onnxruntime as ort
 
 from export.exporters.visionary import COLORS, COUNT, GAUSSIANS, unpacked
-from export.importers.recognise import read_splats
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT, rasterize
@@ -50,12 +49,6 @@ class Proof:
         )
         first, second = (frame.astype(np.float64) for frame in frames)
         return psnr_from_mse(float(np.square(first - second).mean()))
-
-
-def splats_of(file: Path) -> Callable[[float], Gaussians]:
-    """What a splat file shows, at any time."""
-    gaussians = read_splats(file).gaussians
-    return lambda t: gaussians
 
 
 def visionary_of(file: Path) -> Callable[[float], Gaussians]:

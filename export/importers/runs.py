@@ -34,7 +34,7 @@ WHITE_BY_DEFAULT = {"deformgs": False, "4dgs": True}
 """Backgrounds, of runs without cfg_args."""
 
 MOST_CAMERAS = 1_000
-CHECKED_TIMES = 5
+CHECKED_TIMES = 3
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 

@@ -1,0 +1,103 @@
+"""One moment as binary glTF with KHR_gaussian_splatting: a cloud of points whose attributes are Gaussians."""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from export.importers.axes import from_right_up_back
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.spherical_harmonics import SH_C0
+
+EXTENSION = "KHR_gaussian_splatting"
+HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+FLOAT, BYTE, POINTS = 5126, 5121, 0
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+COLUMNS = {name: columns for columns, name in TYPES.items()}
+PRIMITIVE = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
+
+
+def write_gltf(file: Path, gaussians: Gaussians) -> None:
+    """All Gaussians, activated, float32; axes right, up, back. Viewers without the extension see coloured points."""
+    means, quats, sh = from_right_up_back(gaussians.means, gaussians.quats, gaussians.sh)
+    colors = np.concatenate([SH_C0 * sh[:, 0] + 0.5, gaussians.opacities[:, None]], axis=1)
+    attributes = {
+        "POSITION": means,
+        "COLOR_0": np.round(255 * colors.clip(0, 1)).astype(np.uint8),
+        f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": gaussians.scales,
+        f"{EXTENSION}:OPACITY": gaussians.opacities,
+        **{name: sh[:, i] for i, name in enumerate(_sh_names(gaussians.sh_degree))},
+    }
+    accessors, views, parts, at = [], [], [], 0
+    for name, values in attributes.items():
+        part = np.ascontiguousarray(values, values.dtype if values.dtype == np.uint8 else "<f4")
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": part.nbytes})
+        accessors.append(_accessor(name, part, len(views) - 1))
+        parts.append(part.tobytes())
+        at += part.nbytes
+    document = {
+        "asset": {"version": "2.0", "generator": "msdgs"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [_primitive(list(attributes))]}],
+        "buffers": [{"byteLength": at}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    with file.open("wb") as stream:
+        stream.write(HEADER.pack(b"glTF", 2, HEADER.size + 2 * CHUNK.size + len(text) + at))
+        stream.write(CHUNK.pack(len(text), b"JSON") + text + CHUNK.pack(at, b"BIN\0"))
+        for part in parts:
+            stream.write(part)
+
+
+def read_gltf(file: Path) -> Gaussians:
+    """What `write_gltf` has written."""
+    contents = file.read_bytes()
+    size, _ = CHUNK.unpack_from(contents, HEADER.size)
+    start = HEADER.size + CHUNK.size
+    document, body = json.loads(contents[start : start + size]), contents[start + size + CHUNK.size :]
+    (primitive,) = document["meshes"][0]["primitives"]
+
+    def read(name: str) -> np.ndarray:
+        accessor = document["accessors"][primitive["attributes"][name]]
+        view, columns = document["bufferViews"][accessor["bufferView"]], COLUMNS[accessor["type"]]
+        values = np.frombuffer(body, "<f4", accessor["count"] * columns, view["byteOffset"])
+        return values.reshape(-1, columns)
+
+    degree = max(int(name.split("_")[-3]) for name in primitive["attributes"] if "SH_DEGREE" in name)
+    sh = np.stack([read(name) for name in _sh_names(degree)], axis=1)
+    quats = read(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]]
+    turned = (array.astype(np.float32) for array in from_right_up_back(read("POSITION"), quats, sh))
+    means, quats, sh = turned
+    return Gaussians(means, quats, read(f"{EXTENSION}:SCALE"), read(f"{EXTENSION}:OPACITY")[:, 0], sh).validate()
+
+
+def _sh_names(degree: int) -> list[str]:
+    return [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}" for band in range(degree + 1) for i in range(2 * band + 1)]
+
+
+def _primitive(names: list[str]) -> dict[str, Any]:
+    attributes = {name: i for i, name in enumerate(names)}
+    return {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: PRIMITIVE}}
+
+
+def _accessor(name: str, part: np.ndarray, view: int) -> dict[str, Any]:
+    columns = part.shape[1] if part.ndim == 2 else 1
+    accessor = {"bufferView": view, "count": len(part), "type": TYPES[columns]}
+    accessor |= {"componentType": FLOAT} if part.dtype != np.uint8 else {"componentType": BYTE, "normalized": True}
+    if name == "POSITION":
+        accessor |= {"min": part.min(axis=0).tolist(), "max": part.max(axis=0).tolist()}
+    return accessor

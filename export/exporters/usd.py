@@ -1,0 +1,88 @@
+"""A scene over its time as OpenUSD: one ParticleField3DGaussianSplat with a sample of its poses a frame."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from export.importers.axes import from_right_up_back
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.gaussians import Gaussians
+
+FRAMES_A_SECOND = 24
+PRIM = "/Splats"
+"""Also the default prim."""
+
+
+def write_usd(
+    file: Path,
+    gaussians: Callable[[float], Gaussians],
+    times: Sequence[float],
+    on_frame: Callable[[], object] = lambda: None,
+) -> None:
+    """The Gaussians at some times, frames 0, 1, …; one time makes a still. float32, activated; y is up.
+
+    Opacities and harmonics are those of the first time. Raises `InvalidInput` where OpenUSD, or its schema, is missing.
+    """
+    usd, vol, geom, vt = _modules(file)
+    stage = usd.Stage.CreateInMemory()
+    geom.SetStageUpAxis(stage, geom.Tokens.y)
+    field = vol.ParticleField3DGaussianSplat.Define(stage, PRIM)
+    prim = field.GetPrim()
+    stage.SetDefaultPrim(prim)
+    for number, t in enumerate(times):
+        g = gaussians(t)
+        means, quats, sh = from_right_up_back(g.means, g.quats, g.sh)
+        samples = {
+            "positions": vt.Vec3fArray.FromNumpy(_float32(means)),
+            "orientations": vt.QuatfArray.FromNumpy(_float32(quats[:, [1, 2, 3, 0]])),
+            "scales": vt.Vec3fArray.FromNumpy(_float32(g.scales)),
+        }
+        for name, values in samples.items():
+            prim.GetAttribute(name).Set(values, *([number] if len(times) > 1 else []))
+        if not number:
+            harmonics = "radiance:sphericalHarmonics"
+            prim.GetAttribute("opacities").Set(vt.FloatArray.FromNumpy(_float32(g.opacities)))
+            prim.GetAttribute(f"{harmonics}Degree").Set(g.sh_degree)
+            prim.GetAttribute(f"{harmonics}Coefficients").Set(vt.Vec3fArray.FromNumpy(_float32(sh).reshape(-1, 3)))
+        on_frame()
+    if len(times) > 1:
+        stage.SetTimeCodesPerSecond(FRAMES_A_SECOND)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(len(times) - 1)
+    stage.Export(str(file))
+
+
+def read_usd(file: Path) -> Callable[[int], Gaussians]:
+    """What `write_usd` has written, by the number of the frame."""
+    usd, *_ = _modules(file)
+    stage = usd.Stage.Open(str(file))  # prims live as long as it does
+
+    def read(name: str, frame: int = 0) -> np.ndarray:
+        return np.array(stage.GetDefaultPrim().GetAttribute(name).Get(frame))
+
+    def shown(frame: int) -> Gaussians:
+        degree = stage.GetDefaultPrim().GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+        means, opacities = read("positions", frame), read("opacities")
+        sh = read("radiance:sphericalHarmonicsCoefficients").reshape(len(means), (degree + 1) ** 2, 3)
+        quats = read("orientations", frame)[:, [3, 0, 1, 2]]
+        means, quats, sh = (_float32(array) for array in from_right_up_back(means, quats, sh))
+        return Gaussians(means, quats, _float32(read("scales", frame)), _float32(opacities), sh).validate()
+
+    return shown
+
+
+def _modules(file: Path) -> tuple[Any, ...]:
+    """Of OpenUSD, typed loosely: it has no stubs."""
+    try:
+        from pxr import Usd, UsdGeom, UsdVol, Vt
+    except ModuleNotFoundError:
+        raise InvalidInput("out", "something else, or pip install '.[usd]'", f"{file.name} without OpenUSD") from None
+    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
+        raise InvalidInput("out", "something else, or OpenUSD of 26.3 and later", f"{file.name} with an older one")
+    return Usd, UsdVol, UsdGeom, Vt
+
+
+def _float32(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array, np.float32)
