@@ -2,9 +2,9 @@
 
     python benchmarks/scaling.py examples/toybench.onnx --out scaling/
 
-One `msdgs-serve` with one thread and one render at a time, kept on one core; its clients are on another. Stages are
-measured with one client, apart from the rate that the simulation has to reproduce, in turns with it. A simulation that
-misses the measured rate by more than 15 % extrapolates nothing: exit status 1.
+`msdgs-serve` with one thread and one render at a time is kept on one core; its clients are on another. Stages are
+measured with one client, and the rate that the simulation has to reproduce with several at another such service, in
+turns. A simulation that misses it by more than 15 % extrapolates nothing: exit status 1.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from msdgs_serve.scene.baked import SceneMetadata
 SCENES, TIMES = 8, 64  # of the trace that is measured
 CLIENTS = 4
 CACHE_MEGABYTES = 32
+IN_TURN = 25  # frames
 MAX_ERROR = 0.15
 LOAD = 0.7  # of what all cores could draw without any cache
 REPLICAS = (1, 3, 10, 30, 100, 300, 1000)
@@ -63,13 +64,13 @@ def main() -> int:
     trace = heavy_tailed(options.frames, SCENES, TIMES)
     fleet = Fleet(1, poses=poses)
     turns = measure(options, session.scene.metadata, trace)
-    best = max(turns, key=lambda turn: turn.rate)
-    simulated = simulate_clients(trace, fleet, fastest(turns), CLIENTS)
+    best = max(turns, key=lambda turn: turn.rate)  # disturbed least
+    simulated = simulate_clients(trace, fleet, best.stages, CLIENTS)
     error = simulated.rate / best.rate - 1
     print(
         f"{options.scene.name}, {options.size} × {options.size}, JPEG; {poses} poses of {pose_bytes / 1e6:.2f} MB fit"
     )
-    stages = fastest(turns)
+    stages = best.stages
     print(
         f"a frame: {1e3 * stages.hit.mean():.1f} ms where it is posed already, {1e3 * stages.miss.mean():.1f} ms else"
     )
@@ -84,28 +85,38 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace, metadata: SceneMetadata, trace: Trace) -> list[Measured]:
-    """Each turn: stages with one client, then the rate with several, both from an empty cache."""
+    """Each turn with fresh services, whose caches are empty."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for number in range(SCENES):
             shutil.copyfile(options.scene, folder / f"scene{number}.onnx")
-        turns = []
         cores = sorted(os.sched_getaffinity(0))
+        flags = {"threads": 1, "concurrent_renders": 1, "cache_megabytes": CACHE_MEGABYTES, "queued_renders": 64}
+        turns = []
         for _ in range(options.repeats):
-            flags = {"threads": 1, "concurrent_renders": 1, "cache_megabytes": CACHE_MEGABYTES, "queued_renders": 64}
-            with on_core(cores[0]), service(folder, **flags) as running:
+            with on_core(cores[0]), service(folder, **flags) as alone, service(folder, **flags) as busy:
                 os.sched_setaffinity(0, {cores[-1]})
-                for number in range(SCENES):  # opened, and kernels loaded
-                    ask(Connection(running.port), metadata, trace, number, options.size, scene=number)
-                stages, size = stages_of(running, metadata, trace, options)
-            with on_core(cores[0]), service(folder, **flags) as running:
-                os.sched_setaffinity(0, {cores[-1]})
-                for number in range(SCENES):
-                    ask(Connection(running.port), metadata, trace, number, options.size, scene=number)
-                rate, hit_rate = rate_of(running, metadata, trace, options)
-            turns.append(Measured(stages, rate, hit_rate, size))
-        os.sched_setaffinity(0, set(cores))
+                for running in (alone, busy):
+                    for number in range(SCENES):  # opened, and kernels loaded
+                        ask(Connection(running.port), metadata, trace, number, options.size, scene=number)
+                turns.append(one_turn(alone, busy, metadata, trace, options))
         return turns
+
+
+def one_turn(
+    alone: Running, busy: Running, metadata: SceneMetadata, trace: Trace, options: argparse.Namespace
+) -> Measured:
+    """A few frames of one client, then of several, and so on, so that what else runs disturbs both alike."""
+    seconds, sizes = dict[str, list[float]](hit=[], miss=[]), list[int]()
+    spent, hits = 0.0, list[bool]()
+    for start in range(0, options.frames, IN_TURN):
+        numbers = range(start, min(start + IN_TURN, options.frames))
+        stages_of(alone, metadata, trace, numbers, options.size, seconds, sizes)
+        started = time.perf_counter()
+        ask_together(busy, metadata, trace, numbers, options.size, hits)
+        spent += time.perf_counter() - started
+    stages = Stages(np.array(seconds["hit"]), np.array(seconds["miss"]))
+    return Measured(stages, options.frames / spent, statistics.mean(hits), statistics.mean(sizes))
 
 
 @contextmanager
@@ -120,40 +131,38 @@ def on_core(core: int) -> Iterator[None]:
 
 
 def stages_of(
-    running: Running, metadata: SceneMetadata, trace: Trace, options: argparse.Namespace
-) -> tuple[Stages, float]:
-    """Seconds from call to answer of one client, which has nobody to wait for; bytes of a frame."""
-    connection, seconds, sizes = Connection(running.port), dict[str, list[float]](hit=[], miss=[]), []
-    for number in range(options.frames):
+    running: Running, metadata: SceneMetadata, trace: Trace, numbers: range, size: int,
+    seconds: dict[str, list[float]], sizes: list[int],
+) -> None:  # fmt: skip
+    """Seconds from call to answer of one client, which has nobody to wait for; bytes of each frame."""
+    connection = Connection(running.port)
+    for number in numbers:
         started = time.perf_counter()
-        timing, size = ask(connection, metadata, trace, number, options.size)
+        timing, count = ask(connection, metadata, trace, number, size)
         seconds["miss" if "miss" in timing else "hit"].append(time.perf_counter() - started)
-        sizes.append(size)
-    return Stages(np.array(seconds["hit"]), np.array(seconds["miss"])), statistics.mean(sizes)
+        sizes.append(count)
 
 
-def rate_of(
-    running: Running, metadata: SceneMetadata, trace: Trace, options: argparse.Namespace
-) -> tuple[float, float]:
-    """Frames a second of several clients that share the trace, and how many were posed already."""
-    numbers, lock, hits = iter(range(options.frames)), threading.Lock(), []
+def ask_together(
+    running: Running, metadata: SceneMetadata, trace: Trace, numbers: range, size: int, hits: list[bool]
+) -> None:
+    """Several clients that share the frames; notes which were posed already."""
+    waiting, lock = iter(numbers), threading.Lock()
 
     def client() -> None:
         connection = Connection(running.port)
         while True:
             with lock:
-                number = next(numbers, None)
+                number = next(waiting, None)
             if number is None:
                 return
-            hits.append("miss" not in ask(connection, metadata, trace, number, options.size)[0])
+            hits.append("miss" not in ask(connection, metadata, trace, number, size)[0])
 
     threads = [threading.Thread(target=client) for _ in range(CLIENTS)]
-    started = time.perf_counter()
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    return options.frames / (time.perf_counter() - started), statistics.mean(hits)
 
 
 def ask(
@@ -169,11 +178,6 @@ def ask(
     if answer.status != 200:
         raise SystemExit(f"the service answered {answer.status}: {answer.body[:200]!r}")
     return answer.headers["server-timing"], len(answer.body)
-
-
-def fastest(turns: list[Measured]) -> Stages:
-    """Of the turn that was disturbed least."""
-    return min((turn.stages for turn in turns), key=lambda stages: stages.hit.mean())
 
 
 def extrapolate(trace: Trace, stages: Stages, pose_bytes: int, frame_bytes: float, out: Path) -> None:

@@ -21,6 +21,8 @@ CORES = 2
 @pytest.fixture(scope="module", autouse=True)
 def cluster() -> Iterator[None]:
     """Found by `auto`; small, with an object store to match."""
+    patch = pytest.MonkeyPatch()
+    patch.setenv("RAY_AUTH_MODE", "disabled")  # nothing but this machine reaches it
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's own
         import ray  # pyright: ignore[reportMissingImports]
@@ -28,9 +30,9 @@ def cluster() -> Iterator[None]:
 
         arguments = {"num_cpus": CORES, "object_store_memory": 80 << 20, "include_dashboard": False}
         nodes = Cluster(initialize_head=True, head_node_args=arguments)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_ADDRESS", nodes.address)
-        yield
+    patch.setenv("RAY_ADDRESS", nodes.address)
+    yield
+    patch.undo()
     ray.shutdown()
     nodes.shutdown()
 
