@@ -9,6 +9,7 @@ Times mean something on a machine that does nothing else. Clients run on the sam
 
 import argparse
 import re
+import signal
 import statistics
 import sys
 import tempfile
@@ -64,6 +65,7 @@ def main() -> None:
         for name, part in PARTS.items():
             print(f"{name:10} {(part.__doc__ or '').splitlines()[0]}")
         return
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that services are ended too
     console = Console()
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as work:
