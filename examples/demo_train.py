@@ -50,9 +50,8 @@ def fit_flags(arguments: argparse.Namespace) -> list[object]:
     """Settings for minutes rather than for quality: few Gaussians, narrow layers, too small to share among threads."""
     sizes = ["--init-count", 2500, "--max-gaussians", 4000, "--model.width", 48, "--model.time-width", 32]
     pace = ["--densify-from", 200, "--densify-gradient", 1e-3, "--sh-interval", 500, "--field-rate-end", 2e-4]
-    rest = ["--window-until-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500]
-    one_core = ["--photographs", 1, "--threads", 1]
-    return ["--steps", arguments.steps, "--max-minutes", arguments.minutes, *sizes, *pace, *rest, *one_core]
+    rest = ["--window-until-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500, "--threads", 1]
+    return ["--steps", arguments.steps, "--max-minutes", arguments.minutes, *sizes, *pace, *rest]
 
 
 def compare(url: str, frames: list[Frame], folder: Path, out: Path) -> None:

@@ -15,7 +15,6 @@ PAPER_LAYERS = 10
 
 _FIELD = TrainConfig(
     steps=40_000,
-    photographs=1,
     background="black",
     init_count=100_000,
     max_gaussians=150_000,
