@@ -1,6 +1,5 @@
 """Work on a Ray cluster of this machine: the same bytes as drawn here, and what a worker that dies costs."""
 
-import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +8,8 @@ import pytest
 
 from msdgs_serve.ray_tasks import MAX_LOSSES, RayTasks, WorkLost, in_turns, ray_cluster
 from msdgs_serve.render_cli import main
-from msdgs_serve.scene import InvalidInput, MsdgsError
+from msdgs_serve.scene import MsdgsError
+from tests.ray_work import always_dies, dies_once, refuses
 from tests.scene_files import write_scene
 
 pytest.importorskip("ray", reason="needs Ray: make test-cluster")
@@ -60,23 +60,6 @@ def test_frames_are_the_same_bytes_and_are_not_drawn_twice(tmp_path: Path, capsy
     printed = capsys.readouterr()
     assert "8 of 9 frames are there already" in printed.out
     assert "frame 1 of 1" in printed.err
-
-
-def dies_once(folder: Path, number: int) -> int:
-    """Its worker, the first time that the marked item is worked on."""
-    marker = folder / "died"
-    if number == 3 and not marker.exists():
-        marker.touch()
-        os._exit(1)
-    return number * number
-
-
-def always_dies(number: int) -> int:
-    os._exit(number)
-
-
-def refuses(number: int) -> int:
-    raise InvalidInput("number", "another", number)
 
 
 def test_a_worker_that_dies_costs_its_task_alone(tmp_path: Path):
