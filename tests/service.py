@@ -22,6 +22,8 @@ from tests.service_on_ray import serving_on_ray
 
 WATCH_SECONDS = 0.05
 SERVICE_VARIABLE = "MSDGS_TEST_SERVICE"
+ON_RAY = os.environ.get(SERVICE_VARIABLE) == "ray"
+in_this_process = pytest.mark.skipif(ON_RAY, reason="reaches into the process of the service: not on Ray Serve")
 
 
 @contextlib.contextmanager
@@ -30,7 +32,7 @@ def serving(
 ) -> Iterator[httpx.Client]:
     """A client of a service over these scenes, which ends on leaving. The server is added to `server`."""
     chosen = Settings(scenes=list(scenes), **{"watch_seconds": WATCH_SECONDS, "port": 0, **settings})
-    if os.environ.get(SERVICE_VARIABLE) == "ray":
+    if ON_RAY:
         if renderer is not None or server is not None or chosen.port:
             pytest.skip("reaches into the process of the service, or says its port: not on Ray Serve")
         with serving_on_ray(chosen) as client:

@@ -276,4 +276,4 @@ def test_pages_about_the_calls_need_nothing_from_elsewhere(client: httpx.Client)
         assert [source for source in sources if source.endswith(".js")], text
         for source in sources:
             assert source.startswith("/"), source
-            assert client.get(source).status_code == 200, source
+            assert client.get(client.base_url.copy_with(path=source)).status_code == 200, source

@@ -10,7 +10,7 @@ import pytest
 
 from msdgs_serve.api.errors import MAX_BODY_BYTES
 from tests.scene_files import write_scene
-from tests.service import serving
+from tests.service import in_this_process, serving
 
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
 LOOK_AT = {"type": "look_at", "eye": [5, 0, 0], "target": [0, 0, 0], "up": [0, 0, 1]}
@@ -290,6 +290,7 @@ def test_extreme_but_valid_cameras_are_drawn(client: httpx.Client, camera: dict[
     assert response.status_code == 200, response.text
 
 
+@in_this_process
 def test_a_failure_of_the_server_says_nothing_of_its_inside(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):

@@ -1,5 +1,6 @@
 """What answers say beside the frame: versions, times, ids, keys, metrics."""
 
+import asyncio
 import io
 import json
 import logging
@@ -12,13 +13,17 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
 
+from msdgs_serve.api.body_limit import BodyLimit
+from msdgs_serve.api.keys import KeyCheck
 from msdgs_serve.api.observe import JsonLines, request_id
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
 from msdgs_serve.imaging.pictures import FARTHEST_GREY
 from tests.images import decode
 from tests.scene_files import metadata, write_scene
-from tests.service import serving
+from tests.service import in_this_process, serving
 from tests.test_api import eventually
 from tests.test_api_poison import check_problem
 
@@ -243,6 +248,7 @@ def test_an_exr_file_knows_its_camera_and_its_time(client: httpx.Client):
     np.testing.assert_allclose(np.array(spec.getattribute("msdgs:camera_to_world")).reshape(4, 4).T, pose, atol=1e-6)
 
 
+@in_this_process
 def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixture):
     assert client.get("/live", headers={"X-Request-ID": "abc-1.2_3"}).headers["X-Request-ID"] == "abc-1.2_3"
     for bad in ("x" * 65, "a b", '"'):
@@ -283,6 +289,23 @@ def test_without_a_key_nothing_but_health_is_answered(scene: Path, tmp_path: Pat
         assert "401" in document["paths"]["/render"]["post"]["responses"]
 
 
+def test_under_a_prefix_paths_mean_the_same():
+    async def inside(scope: Scope, receive: Receive, send: Send) -> None:
+        await Response(status_code=204)(scope, receive, send)
+
+    app = BodyLimit(KeyCheck(inside, KEYS), max_bytes=4, seconds=5, streamed=[("POST", "/live")])
+    transport = httpx.ASGITransport(app, root_path="/scenes")
+
+    async def status(method: str, path: str, body: bytes = b"") -> int:
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return (await client.request(method, path, content=body)).status_code
+
+    assert asyncio.run(status("GET", "/scenes/live")) == asyncio.run(status("GET", "/live")) == 204
+    assert asyncio.run(status("GET", "/scenes/render")) == asyncio.run(status("GET", "/other/live")) == 401
+    assert asyncio.run(status("POST", "/scenes/live", b"12345")) == 204
+    assert asyncio.run(status("POST", "/scenes/ready", b"12345")) == 413
+
+
 def test_other_web_pages_may_call_only_where_they_are_named(scene: Path, client: httpx.Client):
     origin = {"Origin": "https://example.org"}
     assert "access-control-allow-origin" not in client.post("/render", json=FRAME, headers=origin).headers
@@ -314,8 +337,12 @@ def test_metrics_are_what_the_client_counted(scene: Path):
         lookups = numbers(client, "msdgs_pose_cache_lookups_total")
         assert sum(lookups.values()) == count + 1, "and one frame drawn at the start"
         assert numbers(client, "msdgs_scenes") == {'{state="known"}': 1, '{state="loaded"}': 1, '{state="broken"}': 0}
-        assert client.request("BREW", "/render").status_code == 405
-        assert 'method="other"' in client.get("/metrics").text
+
+
+@in_this_process
+def test_methods_that_nobody_knows_are_counted_as_one(client: httpx.Client):
+    assert client.request("BREW", "/render").status_code == 405
+    assert 'method="other"' in client.get("/metrics").text
 
 
 def test_a_service_is_ready_when_scenes_are_loaded(client: httpx.Client):

@@ -7,6 +7,7 @@ from http import HTTPStatus
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from msdgs_serve.api.errors import KIND, FieldError, problem_response
+from msdgs_serve.api.prefix import route_path
 
 DRAINED_BYTES = 64 << 20
 """Of a body that is too large this much is read and thrown away: most clients look for an answer only after sending."""
@@ -27,7 +28,7 @@ class BodyLimit:
         self._streamed = streamed
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or (scope["method"], scope["path"]) in self._streamed:
+        if scope["type"] != "http" or (scope["method"], route_path(scope)) in self._streamed:
             await self._app(scope, receive, send)
             return
         try:

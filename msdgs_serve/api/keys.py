@@ -9,6 +9,7 @@ from pathlib import Path
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from msdgs_serve.api.errors import KIND, problem_response
+from msdgs_serve.api.prefix import route_path
 from msdgs_serve.scene import InvalidInput
 
 OPEN_PATHS = ("/live", "/ready", "/")
@@ -27,7 +28,7 @@ class KeyCheck:
         self._digests = [_digest(key.encode()) for key in keys]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_open(scope["path"]) or self._fits(scope):
+        if scope["type"] != "http" or _is_open(route_path(scope)) or self._fits(scope):
             await self._app(scope, receive, send)
             return
         scope[KIND] = "unauthorized"
