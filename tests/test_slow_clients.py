@@ -1,5 +1,6 @@
 """Clients that send or read too slowly are let go, and disturb nobody."""
 
+import contextlib
 import socket
 import time
 from collections.abc import Iterator
@@ -51,21 +52,24 @@ def rest_of(connection: socket.socket) -> bytes:
     ids=["nothing", "headers", "body"],
 )
 def test_slow_senders_are_closed_and_others_are_served(client: httpx.Client, first: bytes, drip: bytes, status: int):
-    connections = [connect(client) for _ in range(SOCKETS)]
-    started = time.monotonic()
-    for connection in connections:
-        connection.sendall(first)
-    for _ in range(3):
+    assert client.post("/render", json=FRAME).status_code == 200, "kernels are compiled before seconds count"
+    with contextlib.ExitStack() as open_sockets:
+        connections = [open_sockets.enter_context(connect(client)) for _ in range(SOCKETS)]
+        started = time.monotonic()
         for connection in connections:
-            connection.sendall(drip)
-        assert client.post("/render", json=FRAME).status_code == 200
-        time.sleep(SECONDS / 10)
-    for connection in connections:
-        answer = rest_of(connection)
-        assert answer.startswith(b"HTTP/1.1 %d " % status), answer[:100]
-        assert b"application/problem+json" in answer
-        connection.close()
-    assert time.monotonic() - started < SECONDS + 2
+            connection.sendall(first)
+        for _ in range(3):
+            if time.monotonic() - started > SECONDS / 2:
+                break  # on a busy machine: what is sent to a closed connection would lose its answer
+            for connection in connections:
+                connection.sendall(drip)
+            assert client.post("/render", json=FRAME).status_code == 200
+            time.sleep(SECONDS / 10)
+        for connection in connections:
+            answer = rest_of(connection)
+            assert answer.startswith(b"HTTP/1.1 %d " % status), answer[:100]
+            assert b"application/problem+json" in answer
+        assert time.monotonic() - started < SECONDS + 2
 
 
 def test_a_drip_after_an_answer_is_closed_too(client: httpx.Client):
