@@ -4,7 +4,6 @@ import statistics
 import sys
 import time
 from collections import defaultdict
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +16,6 @@ from rich.table import Table
 from export.views import GOLDEN
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
-from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import MsdgsError
 
 
@@ -58,19 +56,13 @@ def _lap(session: DeformationSession, width: int, part: float) -> tuple[float, f
     """Milliseconds that posing and drawing a frame at a part of the whole time take."""
     metadata = session.scene.metadata
     t0, t1 = metadata.time_range
-    camera = resized(metadata.cameras[0].camera, width)
+    stored = metadata.cameras[0].camera
+    camera = stored.resized(width, max(1, round(stored.height * width / stored.width)))
     start = time.perf_counter()
     gaussians = session.gaussians(t0 + (t1 - t0) * part)
     posed = time.perf_counter()
     rasterize(gaussians, camera, background=metadata.background)
     return 1e3 * (posed - start), 1e3 * (time.perf_counter() - posed)
-
-
-def resized(camera: Camera, width: int) -> Camera:
-    """The same view in a picture of another width."""
-    by = width / camera.width
-    scaled = {name: by * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
-    return replace(camera, **scaled, width=width, height=round(by * camera.height))
 
 
 if __name__ == "__main__":

@@ -28,11 +28,13 @@ from export.rendered_error import posed, shown
 from export.views import cameras_of, deciding_views
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.checkpoint import SceneInfo, load, load_model, save_atomic, save_model
+from msdgs_train.densification import rotate
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.layers import MLPLayer
 from msdgs_train.metrics import psnr_from_mse
 from msdgs_train.model import DynamicGaussians, unit_quats
 from msdgs_train.presets import PRESETS
+from msdgs_train.steps import camera_of
 
 SHRINK = 0.6
 """Of a part's axes against those of the Gaussian it is a part of. Centres are spread by √(1 − 0.6²) of them, so that
@@ -89,7 +91,7 @@ class SmoothMotion:
         weights = BSpline.design_matrix(np.array([(t - t0) / (t1 - t0)]), self._knots, 3).toarray()[0]
         pose = torch.einsum("c,mck->mk", torch.from_numpy(weights).float(), self._control[self._splits.parents[ids]])
         quats = unit_quats(pose[:, QUATS])
-        offsets = _turned(quats, self._splits.places[ids] * pose[:, LOG_SCALES].exp())
+        offsets = rotate(quats, self._splits.places[ids] * pose[:, LOG_SCALES].exp())
         return torch.cat([pose[:, MEANS] + offsets, pose[:, LOG_SCALES] + np.log(SHRINK), quats], dim=1)
 
 
@@ -188,7 +190,6 @@ def main(
     """
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     torch.set_num_threads(threads)
-    torch.set_flush_denormal(True)
     fit = None
     saved = output.with_suffix(".fit.pt")
     try:
@@ -224,7 +225,7 @@ def densified(small: DynamicGaussians, splits: Splits) -> DynamicGaussians:
     Opacities are such that a ray through all parts of a Gaussian loses as much light as through the whole.
     """
     g, parents = small.gaussians, splits.parents
-    offsets = _turned(unit_quats(g.raw_quats[parents]), splits.places * g.log_scales[parents].exp())
+    offsets = rotate(unit_quats(g.raw_quats[parents]), splits.places * g.log_scales[parents].exp())
     parts = torch.bincount(parents, minlength=len(g))[parents]
     clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MOST_OPACITY)).log() / (parts * SHRINK**2)
     tensors = {
@@ -356,23 +357,15 @@ def _pose_rows(model: DynamicGaussians, t: float) -> Tensor:
     return torch.cat([pose.means, pose.scales.log(), pose.quats], dim=1)
 
 
-def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
-    """[M, 3] vectors turned by unit quaternions."""
-    w, axis = quats[:, :1], quats[:, 1:]
-    across = 2 * torch.cross(axis, vectors, dim=1)
-    return vectors + w * across + torch.cross(axis, across, dim=1)
-
-
 def _pixel(model: DynamicGaussians, info: SceneInfo) -> float:
     middle = model.gaussians.means.median(dim=0).values.numpy()
     cameras = [camera for _, camera in cameras_of(info)]
     return float(min(np.linalg.norm(c.position - middle) / max(c.fx, c.fy) for c in cameras))
 
 
-def _resized(camera: dict, width: int) -> dict:
-    by = width / camera["width"]
-    scaled = {name: camera[name] * by for name in ("fx", "fy", "cx", "cy")}
-    return camera | scaled | {"width": width, "height": round(camera["height"] * by)}
+def _resized(entry: dict, width: int) -> dict:
+    camera = camera_of(entry, width)
+    return entry | {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -23,9 +22,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.scaling import SCENES, TIMES, ask
+from benchmarks.scaling import SCENES, TIMES, ask_together, bytes_of_poses, copies
 from benchmarks.service_process import Connection, free_port, service
-from benchmarks.traffic import Fleet, Routing, Stages, Trace, heavy_tailed, simulate_clients
+from benchmarks.traffic import Fleet, Routing, Stages, heavy_tailed, simulate_clients
 from msdgs_serve.deformation import DeformationSession
 
 REPLICAS = 3
@@ -40,16 +39,12 @@ def main() -> None:
     if shutil.which("nginx") is None:
         sys.exit("needs nginx")
     session = DeformationSession(options.scene)
-    pose_bytes = 40 * (session.scene.moving_count + len(session.scene.static_means))
-    poses = (options.cache_megabytes << 20) // pose_bytes
+    poses = (options.cache_megabytes << 20) // bytes_of_poses(session)
     trace = heavy_tailed(options.frames, SCENES, TIMES)
     print(f"{REPLICAS} replicas, {poses} poses each, {options.frames} frames of {SCENES} scenes × {TIMES} times")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        scenes = folder / "scenes"
-        scenes.mkdir()
-        for number in range(SCENES):
-            shutil.copyfile(options.scene, scenes / f"scene{number}.onnx")
+        scenes = copies(options.scene, folder / "scenes")
         routings: tuple[Routing, ...] = ("affinity", "round robin")
         for routing in routings:
             flags = {"threads": 1, "concurrent_renders": 1, "cache_megabytes": options.cache_megabytes}
@@ -58,7 +53,7 @@ def main() -> None:
                 proxy = stack.enter_context(nginx(folder / routing.replace(" ", "_"), ports, routing))
                 before = lookups(ports)
                 started = time.perf_counter()
-                ask_all(proxy, session, trace, options)
+                ask_together(proxy, session.scene.metadata, trace, range(options.frames), options.size, CLIENTS)
                 seconds = time.perf_counter() - started
                 hits, misses = (after - first for after, first in zip(lookups(ports), before, strict=True))
             one = Stages(np.array([0.01]), np.array([0.01]))  # times don't matter to who is asked
@@ -67,32 +62,6 @@ def main() -> None:
                 f"  {routing:12} hit rate {hits / (hits + misses):.3f} (simulated {expected:.3f}), "
                 f"{options.frames / seconds:.1f} frames a second on this machine's cores"
             )
-
-
-def ask_all(port: int, session: DeformationSession, trace: Trace, options: argparse.Namespace) -> None:
-    """The whole trace, by several clients that share it."""
-    numbers, lock, failures = iter(range(options.frames)), threading.Lock(), []
-
-    def client() -> None:
-        connection = Connection(port)
-        while True:
-            with lock:
-                number = next(numbers, None)
-            if number is None:
-                return
-            try:
-                ask(connection, session.scene.metadata, trace, number, options.size)
-            except (SystemExit, OSError) as error:
-                failures.append(str(error))
-                return
-
-    threads = [threading.Thread(target=client) for _ in range(CLIENTS)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if failures:
-        sys.exit(f"FAILED: {failures[0]}")
 
 
 def lookups(ports: list[int]) -> tuple[float, float]:

@@ -16,6 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +60,7 @@ def main() -> int:
     mpl.use("agg")
     options.out.mkdir(parents=True, exist_ok=True)
     session = DeformationSession(options.scene)
-    pose_bytes = 40 * (session.scene.moving_count + len(session.scene.static_means))
+    pose_bytes = bytes_of_poses(session)
     poses = max(1, (CACHE_MEGABYTES << 20) // pose_bytes)
     trace = heavy_tailed(options.frames, SCENES, TIMES)
     fleet = Fleet(1, poses=poses)
@@ -84,12 +85,23 @@ def main() -> int:
     return 0
 
 
+def bytes_of_poses(session: DeformationSession) -> int:
+    """That a scene takes in a replica's cache, posed at one time."""
+    return 40 * (session.scene.moving_count + len(session.scene.static_means))
+
+
+def copies(scene: Path, folder: Path) -> Path:
+    """A folder of one scene under the names of the trace's."""
+    folder.mkdir()
+    for number in range(SCENES):
+        shutil.copyfile(scene, folder / f"scene{number}.onnx")
+    return folder
+
+
 def measure(options: argparse.Namespace, metadata: SceneMetadata, trace: Trace) -> list[Measured]:
     """Each turn with fresh services, whose caches are empty."""
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        for number in range(SCENES):
-            shutil.copyfile(options.scene, folder / f"scene{number}.onnx")
+        folder = copies(options.scene, Path(temporary) / "scenes")
         cores = sorted(os.sched_getaffinity(0))
         flags = {"threads": 1, "concurrent_renders": 1, "cache_megabytes": CACHE_MEGABYTES, "queued_renders": 64}
         turns = []
@@ -113,7 +125,7 @@ def one_turn(
         numbers = range(start, min(start + IN_TURN, options.frames))
         stages_of(alone, metadata, trace, numbers, options.size, seconds, sizes)
         started = time.perf_counter()
-        ask_together(busy, metadata, trace, numbers, options.size, hits)
+        hits += ask_together(busy.port, metadata, trace, numbers, options.size, CLIENTS)
         spent += time.perf_counter() - started
     stages = Stages(np.array(seconds["hit"]), np.array(seconds["miss"]))
     return Measured(stages, options.frames / spent, statistics.mean(hits), statistics.mean(sizes))
@@ -144,25 +156,18 @@ def stages_of(
 
 
 def ask_together(
-    running: Running, metadata: SceneMetadata, trace: Trace, numbers: range, size: int, hits: list[bool]
-) -> None:
-    """Several clients that share the frames; notes which were posed already."""
-    waiting, lock = iter(numbers), threading.Lock()
+    port: int, metadata: SceneMetadata, trace: Trace, numbers: range, size: int, clients: int
+) -> list[bool]:
+    """Which of these frames were posed already; clients share them. What goes wrong with one is raised."""
+    own = threading.local()
 
-    def client() -> None:
-        connection = Connection(running.port)
-        while True:
-            with lock:
-                number = next(waiting, None)
-            if number is None:
-                return
-            hits.append("miss" not in ask(connection, metadata, trace, number, size)[0])
+    def was_posed(number: int) -> bool:
+        if not hasattr(own, "connection"):
+            own.connection = Connection(port)
+        return "miss" not in ask(own.connection, metadata, trace, number, size)[0]
 
-    threads = [threading.Thread(target=client) for _ in range(CLIENTS)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(clients) as pool:
+        return list(pool.map(was_posed, numbers))
 
 
 def ask(
