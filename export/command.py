@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,8 +60,11 @@ def export(settings: Settings, console: Console) -> None:
         tempfile.TemporaryDirectory(prefix="msdgs-export-") as folder,
         Progress(console=console, transient=True) as progress,
     ):
+        started = time.monotonic()
 
         def track(what: str, steps: int) -> Callable[[], object]:
+            if steps and not console.is_terminal:  # a log shows no bars
+                console.print(f"{time.monotonic() - started:5.0f} s  {what} …", markup=False)
             task = progress.add_task(what, total=steps)
             return lambda: progress.advance(task)
 

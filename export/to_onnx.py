@@ -49,7 +49,7 @@ def main(
 
     msdgs-serve scenes/ball.onnx
 
-    Scenes of others are recognised by what is in them: INRIA's and SuperSplat's .ply, .spz, SOG and .splat files,
+    Scenes of others are recognised by what is in them: INRIA's and SuperSplat's .ply, .spz, SOG, .splat and .ksplat,
     numbered sequences of them, and runs of Deformable-3D-Gaussians and 4DGaussians (docs/formats.md):
 
     python export/to_onnx.py garden.ply -o scenes/garden.onnx

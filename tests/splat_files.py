@@ -102,6 +102,21 @@ def splat_bytes(g: Gaussians) -> bytes:
     return body
 
 
+def ksplat_bytes(g: Gaussians) -> bytes:
+    """`.ksplat` 0.1 of one section, degree 0, compression level 0: nothing but colours is rounded."""
+    header, section = bytearray(4096), bytearray(1024)
+    header[:2] = (0, 1)
+    struct.pack_into("<4I", header, 4, 1, 1, len(g), len(g))
+    struct.pack_into("<2I", section, 0, len(g), len(g))
+    body = b""
+    for i in range(len(g)):
+        rgb = (g.sh[i, 0] * 0.28209479177387814 + 0.5) * 255
+        color = np.append(rgb, 255 * g.opacities[i]).round().clip(0, 255).astype(np.uint8)
+        body += struct.pack("<10f", *g.means[i], *g.scales[i], *g.quats[i]) + color.tobytes()
+    struct.pack_into("<I", section, 28, len(body))
+    return bytes(header + section) + body
+
+
 def spz2_bytes(version3: bytes) -> bytes:
     """Version 2 of an unpacked version 3 stream of degree 0, all rotations the same: x, y, z in bytes."""
     _, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", version3)

@@ -25,6 +25,7 @@ from tests.images import psnr
 from tests.splat_files import (
     compressed_ply_bytes,
     inria_columns,
+    ksplat_bytes,
     ply_bytes,
     some_gaussians,
     splat_bytes,
@@ -54,6 +55,8 @@ def made(folder: Path, kind: str, g: Gaussians) -> Path:
         return write(folder, "a.compressed.ply", compressed_ply_bytes(g))
     if kind == "splat":
         return write(folder, "a.splat", splat_bytes(g))
+    if kind == "ksplat":
+        return write(folder, "a.ksplat", ksplat_bytes(g))
     if kind == "sog":
         return write(folder, "a.sog", zipped(write_sog(folder / "sog", g)))
     write_spz(folder / "a.spz", g, "dilate")
@@ -62,7 +65,7 @@ def made(folder: Path, kind: str, g: Gaussians) -> Path:
     return folder / "a.spz"
 
 
-FORMATS = ("ply", "compressed ply", "splat", "sog", "spz 3", "spz 4")
+FORMATS = ("ply", "compressed ply", "splat", "ksplat", "sog", "spz 3", "spz 4")
 
 
 def drawn(g: Gaussians) -> np.ndarray:
@@ -147,7 +150,8 @@ def test_a_header_that_promises_too_much_takes_no_memory(tmp_path: Path, form: s
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", r"no element `vertex`"),
         ("a.spz", struct.pack("<4sIIBBBB", b"NGSP", 9, 1, 0, 12, 0, 0), r"SPZ version 9"),
         ("a.spz", struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0), r"SH of degree 4"),
-        ("a.ksplat", bytes(5000), r"splat-transform"),
+        ("a.ksplat", bytes(5000), r"a.ksplat: unsupported version"),
+        ("a.onnx", b"scene", r"is a scene file already"),
         ("a.txt", b"nothing of ours", r"--from says what it is, one of model, ply"),
     ],
 )

@@ -31,6 +31,7 @@ from tests import test_importers_4dgs, test_importers_runs
 from tests.splat_files import (
     compressed_ply_bytes,
     inria_columns,
+    ksplat_bytes,
     ply_bytes,
     some_gaussians,
     splat_bytes,
@@ -131,6 +132,7 @@ KINDS = {
     "text ply": one("a.ply", lambda g: ply_bytes(inria_columns(g), "ascii"), "ply"),
     "compressed ply": one("a.compressed.ply", compressed_ply_bytes, "ply"),
     "splat": one("a.splat", splat_bytes, "splat"),
+    "ksplat": one("a.ksplat", ksplat_bytes, "ksplat"),
     "spz 2": one("a.spz", lambda g: gzip.compress(spz2_bytes(gzip.decompress(spz3(g)))), "spz"),
     "spz 3": one("a.spz", spz3, "spz"),
     "spz 3, bare": one("a.spz", lambda g: gzip.decompress(spz3(g)), "spz"),

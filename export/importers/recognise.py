@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from export.importers.errors import ImportFailed
+from export.importers.ksplat import read_ksplat
 from export.importers.ply import read_ply
 from export.importers.sog import META, read_sog
 from export.importers.splat import read_splat
@@ -18,6 +19,7 @@ READERS: dict[str, Callable[[Path], Splats]] = {
     "spz": read_spz,
     "sog": read_sog,
     "splat": read_splat,
+    "ksplat": read_ksplat,
 }
 """Of one set of Gaussians, by the name of the format."""
 
@@ -25,12 +27,7 @@ KINDS_OF_RUNS = ("deformgs", "4dgs")
 KINDS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *KINDS_OF_RUNS)
 """All that can be imported: our own model.pt, one set of Gaussians, a folder of them, and runs of other trainers."""
 
-FRAMES = (".ply", ".sog", ".spz", ".splat")
-
-UNREADABLE = {
-    ".ksplat": "`.ksplat` can't be read; `npx @playcanvas/splat-transform in.ksplat out.ply` makes a PLY of it",
-    ".onnx": "is a scene file already; export/convert.py writes it as other formats",
-}
+FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat")
 
 
 def recognise(path: Path) -> str:
@@ -38,8 +35,8 @@ def recognise(path: Path) -> str:
     if not path.exists():
         raise ImportFailed(path, "no such file or folder")
     kind = _folder(path) if path.is_dir() else _file(path)
-    if kind is None and path.suffix.lower() in UNREADABLE:
-        raise ImportFailed(path, UNREADABLE[path.suffix.lower()])
+    if kind is None and path.suffix.lower() == ".onnx":
+        raise ImportFailed(path, "is a scene file already; export/convert.py writes it as other formats")
     if kind is None:
         raise ImportFailed(path, f"isn't recognised; --from says what it is, one of {', '.join(KINDS)}")
     return kind
@@ -85,7 +82,7 @@ def _file(path: Path) -> str | None:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             return "sog" if any(name.rsplit("/", 1)[-1] == META for name in archive.namelist()) else "model"
-    if path.suffix.lower() in (".splat", ".sog", ".spz"):
+    if path.suffix.lower() in (".splat", ".ksplat", ".sog", ".spz"):
         return path.suffix.lower()[1:]
     return "model" if path.suffix.lower() in (".pt", ".pth") else None
 
