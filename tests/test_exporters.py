@@ -9,6 +9,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 from export.bake import bake
 from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
@@ -19,6 +20,7 @@ from export.exporters.visionary import VisionaryInvalid, check_visionary, vision
 from export.importers import read_splats
 from export.plans import build
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
@@ -154,6 +156,21 @@ def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str):
 def covariances(g: Gaussians) -> np.ndarray:
     axes = to_matrix(g.quats.astype(np.float64)) * g.scales[:, None, :]
     return axes @ axes.transpose(0, 2, 1)
+
+
+def test_visionary_scene_stands_upright_about_what_its_cameras_look_at(tmp_path: Path):
+    scene = scene_file(tmp_path)
+    run(scene, tmp_path / "a.visionary.onnx")
+    stated = json.loads((tmp_path / "a.scene.json").read_text())
+    metadata = DeformationSession(scene).scene.metadata
+    (asset,) = stated["assets"]
+    assert (tmp_path / asset["path"]).is_file()
+    assert stated["env"]["bgColor"] == [*metadata.background, 1]
+    x, y, z = asset["transform"]["rotationEulerRad"]
+    turns = [Rotation.from_rotvec(angle * axis).as_matrix() for angle, axis in zip((x, y, z), np.eye(3), strict=True)]
+    matrix, view = turns[0] @ turns[1] @ turns[2], framing(metadata)
+    np.testing.assert_allclose(matrix @ view.up, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(matrix @ view.target + asset["transform"]["position"], 0, atol=1e-12)
 
 
 def test_visionary_pads_with_nothing(tmp_path: Path):

@@ -1,5 +1,6 @@
 """What `convert.py` does."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from export.exporters.proof import Proof, require, visionary_of
 from export.exporters.spz import write_spz
 from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
+from export.exporters.visionary_scene import visionary_scene
 from export.importers.recognise import read_splats
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
@@ -121,7 +123,11 @@ def _visionary(session: DeformationSession, settings: Settings, console: Console
         temporary.write_bytes(model.SerializeToString())
         worst = _worst(session, visionary_of(temporary))
         require(worst, LOSSY if settings.min_psnr is None else settings.min_psnr, out.name)
+    scene_json = out.with_name(f"{out.name.removesuffix(VISIONARY)}.scene.json")
+    with replacing(scene_json) as temporary:
+        temporary.write_text(json.dumps(visionary_scene(out.name, metadata), indent=2) + "\n")
     console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {worst:.1f} dB from the scene", markup=False)
+    console.print(f"{scene_json}: the scene.json of a folder for Visionary's editor", markup=False)
     if metadata.antialiasing == "mip":
         console.print("its anti-aliasing isn't in this format: thin parts come out brighter")
     if session.scene.moving_count and metadata.plan.partition(":")[0] in ("network", "prefix"):

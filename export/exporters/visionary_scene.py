@@ -1,0 +1,35 @@
+"""The `scene.json` that opens a model in Visionary's editor: where it stands, and what is behind it."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from msdgs_serve.framing import framing
+from msdgs_serve.scene.metadata import SceneMetadata
+
+VERSION = 1
+
+
+def visionary_scene(model: str, metadata: SceneMetadata) -> dict[str, Any]:
+    """A scene of one model, the name of a file beside it.
+
+    The model is turned so that its up is y, as three.js has it, and what its cameras look at is moved to the origin.
+    Rotations are Euler angles in radians, turned about x, then the turned y, then the turned z. Keys and their meaning
+    are those of the example that comes with Visionary.
+    """
+    view = framing(metadata)
+    turn = Rotation.align_vectors([[0.0, 1.0, 0.0]], view.up[None])[0]
+    transform = {
+        "position": (-turn.apply(view.target)).tolist(),
+        "rotationEulerRad": np.asarray(turn.as_euler("XYZ")).tolist(),
+        "scale": [1.0, 1.0, 1.0],
+    }
+    asset = {"name": model, "type": "onnx", "path": model, "dynamic": True, "transform": transform}
+    return {
+        "version": VERSION,
+        "meta": {"app": "msdgs", "createdAt": datetime.now(UTC).isoformat(timespec="milliseconds")},
+        "env": {"bgColor": [*metadata.background, 1.0], "gaussianScale": 1.0},
+        "assets": [asset],
+    }
