@@ -103,7 +103,7 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Make a moving scene, train on it, export, serve, compare.")
     parser.add_argument("--port", type=int, default=8000, help="another one is used where it is taken")
     parser.add_argument("--size", type=int, default=100, help="width and height of the photographs")
-    parser.add_argument("--steps", type=int, default=4000, help="of training")
+    parser.add_argument("--steps", type=int, default=2500, help="of training")
     parser.add_argument("--minutes", type=float, default=3.0, help="of training, at most")
     parser.add_argument("--out", type=Path, default=Path("out/demo_train.png"))
     parser.add_argument("--once", action="store_true", help="stop after the frames")

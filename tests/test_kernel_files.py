@@ -25,11 +25,23 @@ print(double(21.0), len(double.stats.cache_misses))
 """
 
 
-@pytest.fixture
-def room(tmp_path: Path) -> Path:
-    (tmp_path / "room").mkdir()
-    (tmp_path / "room" / "caller.py").write_text(KERNEL)
-    return tmp_path
+pytestmark = pytest.mark.xdist_group("kernel files")  # one worker, so that the room is compiled once
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("kernels")
+    (folder / "room").mkdir()
+    (folder / "room" / "caller.py").write_text(KERNEL)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compiled(room: Path) -> Path:
+    """A folder of machine code that a process has filled and another one has used."""
+    assert call(room, room / "cache") == (42.0, True)
+    assert call(room, room / "cache") == (42.0, False)
+    return room / "cache"
 
 
 def call(room: Path, cache: Path | str) -> tuple[float, bool]:
@@ -52,28 +64,29 @@ def flip(contents: bytes) -> bytes:
     [(".nbi", cut), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", lambda _: b""), (".nbc", flip)],
     ids=["index cut", "index empty", "code cut", "code empty", "code flipped"],
 )
-def test_a_damaged_file_is_compiled_anew_and_mended(room: Path, suffix: str, damage: Callable[[bytes], bytes]):
-    cache = room / "cache"
-    assert call(room, cache) == (42.0, True)
-    assert call(room, cache) == (42.0, False)
+def test_a_damaged_file_is_compiled_anew_and_mended(
+    room: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes]
+):
+    cache = tmp_path / "cache"
+    shutil.copytree(compiled, cache)
     (file,) = cache.rglob(f"*.double-*{suffix}")
     file.write_bytes(damage(file.read_bytes()))
     assert call(room, cache) == (42.0, True)
     assert call(room, cache) == (42.0, False)
 
 
-def test_a_folder_that_cannot_be_written_is_no_obstacle(room: Path):
-    (room / "file").touch()
-    assert not is_writable(room / "file" / "cache")
-    assert call(room, room / "file" / "cache") == (42.0, True)
+def test_a_folder_that_cannot_be_written_is_no_obstacle(room: Path, tmp_path: Path):
+    (tmp_path / "file").touch()
+    assert not is_writable(tmp_path / "file" / "cache")
+    assert call(room, tmp_path / "file" / "cache") == (42.0, True)
 
 
-def test_nothing_that_can_be_written_is_no_obstacle(room: Path):
-    (room / "file").touch()
+def test_nothing_that_can_be_written_is_no_obstacle(room: Path, tmp_path: Path):
+    (tmp_path / "file").touch()
     value = run_python(
         "import tempfile; tempfile.tempdir = '/nonexistent'\n" + CALL.replace(", len(double.stats.cache_misses)", ""),
         room,
-        NUMBA_CACHE_DIR=str(room / "file" / "cache"),
+        NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"),
     )
     assert float(value) == 42.0
 

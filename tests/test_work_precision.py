@@ -26,6 +26,8 @@ from msdgs_train.checkpoint import save_model
 from tests.models import SCENE, random_model
 from tests.moving_object import GROUND, OBJECT, moving_object
 
+pytestmark = pytest.mark.xdist_group("work precision")  # one worker, so that it sweeps once
+
 POINT_FIELDS = {
     "front": bool,
     "chosen": bool,
