@@ -10,9 +10,6 @@ from export.bake import Baked
 from msdgs_train.deformation import MultiStepDeformation
 from msdgs_train.model import SMALLEST_SCALE, activated_scales, unit_quats
 
-CHUNK = 4096
-"""Gaussians at a time: an activation of 256 columns in float64 is 8 MiB."""
-
 POSE = 10
 """Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""
 MEANS, SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
@@ -41,15 +38,10 @@ class ExactPoses:
 
     def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
         """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`, or of all."""
-        ids = np.arange(self.count) if ids is None else ids
-        posed = np.empty((len(ids), POSE))
-        for start in range(0, len(ids), CHUNK):
-            rows = slice(start, start + CHUNK)
-            posed[rows] = self._chunk(t, torch.from_numpy(ids[rows]))
-        return posed
+        return self._posed(t, torch.from_numpy(np.arange(self.count) if ids is None else ids))
 
     @torch.no_grad()
-    def _chunk(self, t: float, ids: torch.Tensor) -> np.ndarray:
+    def _posed(self, t: float, ids: torch.Tensor) -> Poses:
         means, log_scales = self._means[ids], self._log_scales[ids]
         deltas = self._deformation(means, torch.tensor(t, dtype=self._dtype))
         of_means, of_scales, of_quats = (
@@ -60,7 +52,7 @@ class ExactPoses:
             scales = activated_scales(log_scales + of_scales)
         else:
             scales = (activated_scales(log_scales) + of_scales).clamp_min(SMALLEST_SCALE)
-        return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).numpy()
+        return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).double().numpy()
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(array).to(self._dtype)
