@@ -24,14 +24,14 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 
-Channel = Literal["rgb", "alpha", "depth", "motion"]
+Channel = Literal["rgb", "alpha", "depth", "motion", "gaussians"]
 Format = Literal["png", "jpeg", "webp", "exr", "npy"]
 Color = tuple[float, float, float]
 Background = Color | Literal["auto", "scene", "transparent"]
 FloatArray = npt.NDArray[np.floating]
 
 DEFAULT_CHANNELS: tuple[Channel, ...] = ("rgb", "alpha", "depth")
-WIDTHS: dict[str, int] = {"rgb": 3, "alpha": 1, "depth": 1, "motion": 2}
+WIDTHS: dict[str, int] = {"rgb": 3, "alpha": 1, "depth": 1, "motion": 2, "gaussians": 1}
 DEFAULT_SECONDS = 60.0
 TRIES = 4
 OVERLOADED = 503
@@ -122,6 +122,7 @@ class Frame:
     alpha: FloatArray | None  # [H, W]
     depth: FloatArray | None  # [H, W] along the camera's axis, scene units, infinite where nothing is
     motion: FloatArray | None  # [H, W, 2] pixels to the right and down, to where things are at t + dt
+    gaussians: FloatArray | None  # [H, W] how many add to each pixel
     plan: str  # how the scene's motion is computed
     milliseconds: dict[str, float]  # by stage: queue, pose, draw, encode
 
@@ -275,8 +276,7 @@ def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Heade
     found = {name: part if WIDTHS[name] > 1 else part[..., 0] for name, part in parts.items()}
     stages = [stage.split(";") for stage in headers.get("Server-Timing", "").split(", ") if stage]
     milliseconds = {name: float(duration.removeprefix("dur=")) for name, duration, *_ in stages}
-    rgb, alpha, depth, motion = (found.get(name) for name in WIDTHS)
-    return Frame(rgb, alpha, depth, motion, headers.get("Msdgs-Plan", ""), milliseconds)
+    return Frame(*(found.get(name) for name in WIDTHS), headers.get("Msdgs-Plan", ""), milliseconds)
 
 
 def _array(content: bytes) -> np.ndarray:

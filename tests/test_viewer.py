@@ -233,9 +233,9 @@ def test_it_stops_at_the_end_without_loop(opened: Page):
     assert opened.locator("#time-text").inner_text() == "t 1.000"
 
 
-def test_depth_and_motion(opened: Page):
+def test_depth_count_and_motion(opened: Page):
     asked = bodies(opened)
-    for label, channel in (("Depth", "depth"), ("Motion", "motion")):
+    for label, channel in (("Depth", "depth"), ("Count", "gaussians"), ("Motion", "motion")):
         before = picture(opened)
         with opened.expect_response("**/render") as answer:
             opened.get_by_text(label, exact=True).click()

@@ -174,9 +174,10 @@ class RenderRequest(Strict):
     )
     channels: Channels | None = Field(
         default=None,
-        description="`rgb`, `alpha`, `depth`, `motion`, in the order of the file. Default for `exr` and `npy`: the "
-        "first three. The others hold a single one as a picture; depth is lighter the nearer it is, the hue of "
-        "motion is its direction. Motion is in pixels to the right and down, in `exr` as forward.u and forward.v",
+        description="`rgb`, `alpha`, `depth`, `motion`, `gaussians`, in the order of the file. Default for `exr` and "
+        "`npy`: the first three. The others hold a single one as a picture; depth is lighter the nearer it is, the "
+        "hue of motion is its direction. Motion is in pixels to the right and down, in `exr` as forward.u and "
+        "forward.v. `gaussians` is how many add to each pixel: where the time goes",
     )
     depth_range: tuple[Number, Number] | None = Field(
         default=None, description="depths drawn white and darkest in a picture of depth; default: those of the frame"

@@ -39,6 +39,7 @@ EXR_NAMES: dict[Channel, tuple[str, ...]] = {
     "alpha": ("A",),
     "depth": ("Z",),
     "motion": ("forward.u", "forward.v"),
+    "gaussians": ("gaussians",),
 }
 
 
@@ -57,8 +58,8 @@ def encode(
 
     PNG, JPEG and WebP hold an 8-bit picture: sRGB with straight alpha where the image is transparent (JPEG can't be),
     or a single channel. EXR holds any channels as 32-bit floats: scene-linear Rec.709 premultiplied R, G, B, A and
-    depth Z, motion as forward.u and forward.v, with the camera and the time in its header. NPY holds float32 [H, W, C]
-    as rendered: sRGB-encoded colour.
+    depth Z, motion as forward.u and forward.v, gaussians, with the camera and the time in its header. NPY holds float32
+    [H, W, C] as rendered: sRGB-encoded colour.
     `quality` in [1, 100] is for JPEG and WebP. Raises `InvalidInput` naming the parameter.
     """
     check_encodable(image.width, image.height, image.transparent, image_format, quality, channels)

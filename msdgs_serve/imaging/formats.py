@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 ImageFormat = Literal["png", "jpeg", "webp", "exr", "npy"]
-Channel = Literal["rgb", "alpha", "depth", "motion"]
+Channel = Literal["rgb", "alpha", "depth", "motion", "gaussians"]
 
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 

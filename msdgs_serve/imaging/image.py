@@ -24,6 +24,7 @@ class Image:
     camera: Camera | None = None  # that saw it, for formats that can say so
     t: float | None = None  # when, in the scene's time
     motion: FloatArray | None = None  # [H, W, 2] pixels to the right and down, to where it is later; 0 for nothing
+    gaussians: FloatArray | None = None  # [H, W] how many add to each pixel
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3:
@@ -61,14 +62,17 @@ class Image:
 
 
 def average(images: Iterable[Image]) -> Image:
-    """The mean of frames of one camera: colour in linear light, depth weighted by alpha. Keeps one frame at a time."""
+    """The mean of frames of one camera: colour in linear light, depth weighted by alpha, numbers of
+    Gaussians. Keeps one frame at a time."""
     count, first = 0, None
-    light = coverage = depth = np.zeros(())
+    light = coverage = depth = gaussians = np.zeros(())
     for image in images:
         first = first or image
         count += 1
         light = light + image.linear_rgb().astype(np.float64)
         coverage = coverage + image.alpha.astype(np.float64)
+        if image.gaussians is not None:
+            gaussians = gaussians + image.gaussians
         depth = depth + np.where(image.alpha > 0, image.depth, 0).astype(np.float64) * image.alpha
     if first is None:
         raise InvalidInput("images", "at least one", 0)
@@ -78,7 +82,14 @@ def average(images: Iterable[Image]) -> Image:
     mean_depth = np.full(alpha.shape, np.inf)
     np.divide(depth, coverage, out=mean_depth, where=coverage > 0)
     dtype = first.rgb.dtype
-    return replace(first, motion=None, rgb=rgb.astype(dtype), alpha=alpha.astype(dtype), depth=mean_depth.astype(dtype))
+    return replace(
+        first,
+        motion=None,
+        rgb=rgb.astype(dtype),
+        alpha=alpha.astype(dtype),
+        depth=mean_depth.astype(dtype),
+        gaussians=None if first.gaussians is None else (gaussians / count).astype(dtype),
+    )
 
 
 def srgb_to_linear(encoded: FloatArray) -> FloatArray:

@@ -20,13 +20,16 @@ class DepthRange(NamedTuple):
 
 
 def picture(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
-    """8 bits: [H, W, 3], [H, W, 4] with straight alpha for transparent colour, or [H, W, 1] for alpha and depth.
+    """8 bits: [H, W, 3], [H, W, 4] with straight alpha for transparent colour, or [H, W, 1] for all of one number.
 
     Motion is black where nothing moves; the hue is its direction, and the brightest is the fastest of this very image.
 
     Depth is lighter the nearer it is, over `depth_range` or, where None, over the depths of this very image.
 
-    Both are darker where the image is thin (alpha below 1), so that what is hardly seen in colour is hardly seen here.
+    These two are darker where the image is thin (alpha below 1), so that what is hardly seen in colour is hardly seen
+    here.
+
+    Numbers of Gaussians are white where they are highest in this very image.
     """
     if channel == "rgb":
         return image.display_pixels()
@@ -34,6 +37,9 @@ def picture(image: Image, channel: Channel, depth_range: DepthRange | None = Non
         return to_8_bits(image.alpha)[..., None]
     if channel == "motion":
         return _motion_colors(channel_of(image, "motion") * image.alpha[..., None])
+    if channel == "gaussians":
+        counts = channel_of(image, "gaussians")
+        return to_8_bits(counts / max(float(counts.max(initial=0.0)), 1.0))[..., None]
     near, far = depth_range or depths_of(image)
     seen = np.isfinite(image.depth)
     place = np.clip((np.where(seen, image.depth, far) - near) / max(far - near, 1e-12), 0, 1)
@@ -41,10 +47,10 @@ def picture(image: Image, channel: Channel, depth_range: DepthRange | None = Non
 
 
 def channel_of(image: Image, channel: Channel) -> np.ndarray:
-    """The numbers of a channel. Raises `InvalidInput` for motion where the image was drawn without."""
+    """The numbers of a channel. Raises `InvalidInput` for one that the image was drawn without."""
     values = getattr(image, channel)
     if values is None:
-        raise InvalidInput("channels", "without motion, as it was not drawn", channel)
+        raise InvalidInput("channels", f"without {channel}, which was not drawn", channel)
     return values
 
 

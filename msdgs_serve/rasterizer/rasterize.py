@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from msdgs_serve.rasterizer.compositing import composite
+from msdgs_serve.rasterizer.counts import count_splats
 from msdgs_serve.rasterizer.projection import BLUE, RED, Splats, project
 from msdgs_serve.rasterizer.tiles import TileLists, bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
@@ -22,6 +23,7 @@ class Rendering(NamedTuple):
     depth: np.ndarray  # [H, W] expected distance along the camera axis, scene units, infinite where alpha is 0
     median_depth: np.ndarray  # [H, W] distance of the splat that takes half of the light, else infinite; [0, 0] unasked
     extra: np.ndarray  # [H, W, C] what was asked for besides, weighted as colours are; divide by alpha for a mean
+    counts: np.ndarray  # [H, W] Gaussians that add to each pixel; [0, 0] unasked
 
 
 def rasterize(
@@ -31,12 +33,14 @@ def rasterize(
     background: npt.ArrayLike = (0.0, 0.0, 0.0),
     median_depth: bool = False,
     extra: np.ndarray | None = None,
+    counts: bool = False,
     options: RasterizerOptions = GSPLAT,
 ) -> Rendering:
     """Draw the Gaussians (equations 1 and 2) over a background colour.
 
     `extra` [N, C] is any C numbers of each Gaussian, drawn as if they were colours over nothing; three of them take as
-    long as the colours do. Depth is always drawn: its part of the time is too small to measure.
+    long as the colours do. Depth is always drawn: its part of the time is too small to measure. `counts` take a pass
+    of their own.
 
     Safe to call from several threads; the same input gives the same bytes, whatever the number of threads.
 
@@ -54,7 +58,9 @@ def rasterize(
     tiles = bin_into_tiles(splats, camera.width, camera.height)
     size = (camera.width, camera.height)
     frame = composite(splats, tiles, *size, background, options, median_depth=median_depth)
-    return Rendering(*frame, _drawn_extra(extra, splats, tiles, camera, options))
+    dtype = splats.records.dtype
+    counted = count_splats(splats, tiles, *size, options).blended if counts else np.empty((0, 0), dtype)
+    return Rendering(*frame, _drawn_extra(extra, splats, tiles, camera, options), counted)
 
 
 def _checked_extra(extra: np.ndarray | None, gaussians: Gaussians) -> np.ndarray:

@@ -17,7 +17,7 @@ import { Timeline } from "./timeline.js";
 
 const LOOK_EVERY = 3000; // milliseconds, for changed scenes
 const NOTICE_FOR = 2500;
-const VIEWS = ["rgb", "depth", "motion"];
+const VIEWS = ["rgb", "depth", "motion", "gaussians"];
 
 const find = (id) => document.getElementById(id);
 const state = { scene: null, camera: null, player: new Player(), view: "rgb" };

@@ -9,6 +9,7 @@ export function frameBody({ scene, camera, player, view }) {
   const body = { scene: scene.name, camera: camera.spec, t: player.t };
   if (view === "depth") return { ...body, channels: ["depth"], depth_range: depthRange(camera, scene.bounds) };
   if (view === "motion") return { ...body, channels: ["motion"], ...motionTimes(player) };
+  if (view === "gaussians") return { ...body, channels: ["gaussians"] };
   return body;
 }
 
@@ -19,9 +20,9 @@ function motionTimes(player) {
   return { t: Math.min(player.t, last), dt };
 }
 
-/** The same for a file that holds numbers: colour, alpha and depth, and motion where it is looked at. */
+/** The same for a file that holds numbers: colour, alpha and depth, and what else is looked at. */
 export function numbersBody(state) {
   const { depth_range: _, channels, ...body } = frameBody(state);
-  const extra = channels?.includes("motion") ? ["motion"] : [];
-  return { ...body, channels: ["rgb", "alpha", "depth", ...extra], format: "exr" };
+  const all = new Set(["rgb", "alpha", "depth", ...(channels ?? [])]);
+  return { ...body, channels: [...all], format: "exr" };
 }

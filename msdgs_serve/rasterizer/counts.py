@@ -1,0 +1,94 @@
+"""How many splats each pixel blends: a picture of where a frame's work is. Apart from the drawing, which it slows."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.rasterizer.compositing import (
+    BLOCK_SIDE,
+    BLOCKS,
+    PIXELS,
+    PixelLimits,
+    grid_of_a_tile,
+    log2_alpha,
+    pixel_limits,
+    touched_blocks,
+)
+from msdgs_serve.rasterizer.exponential import exp2
+from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.lanes import (
+    LANES,
+    bits_of,
+    filled,
+    first_of,
+    fma,
+    load,
+    minimum,
+    negative,
+    pair,
+    select,
+    spread,
+    store,
+)
+from msdgs_serve.rasterizer.projection import RECORD, Splats
+from msdgs_serve.rasterizer.tiles import TileLists
+from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
+from msdgs_serve.threads import run_parallel, split_evenly, thread_count
+
+
+class Counts(NamedTuple):
+    """Of one frame."""
+
+    blended: np.ndarray  # [H, W] splats that add to a pixel, in the splats' dtype
+    lanes: int  # a splat in a pixel of a 4 × 4 block that its ellipse touches and that is not done: the arithmetic
+
+
+def count_splats(splats: Splats, tiles: TileLists, width: int, height: int, options: RasterizerOptions) -> Counts:
+    """Take the decisions of the compositing, and count instead of blending."""
+    limits = pixel_limits(options, splats.records.dtype)
+    blended = np.empty((height, width), splats.records.dtype)
+    ranges = split_evenly(len(tiles.offsets) - 1, 8 * thread_count())
+    lanes = run_parallel(_count_tiles, [(*part, splats.records, tiles, limits, blended) for part in ranges])
+    return Counts(blended, sum(lanes))
+
+
+@kernel
+def _count_tiles(
+    start: int, stop: int, records: np.ndarray, tiles: TileLists, limits: PixelLimits, blended: np.ndarray
+) -> int:
+    grid = grid_of_a_tile(records)
+    record, origin = np.zeros(RECORD, records.dtype), np.zeros(RECORD, records.dtype)
+    state, added = np.empty(PIXELS, records.dtype), np.empty(PIXELS, records.dtype)
+    flat = records.reshape(-1)
+    height, width = blended.shape
+    lanes = 0
+    for tile in range(start, stop):
+        x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
+        origin[0], origin[1] = x0, y0
+        state[:] = 1
+        added[:] = 0
+        for entry in range(tiles.offsets[tile], tiles.offsets[tile + 1]):
+            store(record, 0, load(flat, np.uint64(tiles.splat_ids[entry]) * np.uint64(RECORD)) - load(origin, 0))
+            touched = bits_of(touched_blocks(record, np.uint64(0), grid, limits.log2_alpha_min))
+            for block in range(BLOCKS):
+                left = load(state, LANES * block)
+                if touched >> np.uint64(block) & np.uint64(1) == np.uint64(0) or bits_of(left > 0) == np.uint64(0):
+                    continue
+                x, y = load(grid, 32) + grid[block], load(grid, 48) + grid[16 + block]
+                exponent = log2_alpha(record, np.uint64(0), x, y)
+                # 32 lanes as the compositing has them, so that LLVM makes the same instructions
+                alpha = first_of(exp2(pair(exponent, exponent), limits.exp2))
+                alpha = minimum(alpha, spread(limits.alpha_max))
+                drawn = (exponent >= limits.log2_alpha_min) & (left > 0)
+                after = fma(-alpha, left, left)
+                goes_on = drawn & (after > limits.transmittance_min)
+                store(state, LANES * block, select(goes_on, after, select(drawn, negative(left), left)))
+                count = load(added, LANES * block)
+                store(added, LANES * block, count + select(goes_on, filled(1, count), filled(0, count)))
+                lanes += LANES
+        for row in range(min(TILE, height - y0)):
+            for column in range(min(TILE, width - x0)):
+                block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
+                place = block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE
+                blended[y0 + row, x0 + column] = added[place]
+    return lanes
