@@ -21,6 +21,7 @@ from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
+from msdgs_serve.scene.spherical_harmonics import sh_basis
 from tests.images import psnr
 from tests.splat_files import (
     compressed_ply_bytes,
@@ -83,6 +84,22 @@ def test_each_format_shows_what_was_put_into_it(tmp_path: Path, kind: str):
     assert len(read) == len(g)
     quantity = "splat_file_db" if kind == "ply" else "quantised_splat_file_db"
     assert psnr(drawn(read.gaussians), drawn(g)) >= tolerance(quantity)
+
+
+def test_an_spz_that_was_written_without_turning_it_can_be_read_so(tmp_path: Path):
+    g = some_gaussians(30, 3)
+    write_spz(tmp_path / "a.spz", g, "dilate")
+    plain, unturned = (read_splats(tmp_path / "a.spz", kind).gaussians for kind in ("spz", "spz:unturned"))
+    np.testing.assert_array_equal(unturned.means, plain.means * np.float32([1, -1, -1]))
+    half_turn = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+    np.testing.assert_allclose(to_matrix(unturned.quats), half_turn @ to_matrix(plain.quats), atol=1e-6)
+    seen = np.random.default_rng(0).normal(size=(30, 3))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    colors = [
+        np.einsum("nc,ncd->nd", sh_basis(way, 3), each.sh)
+        for way, each in ((seen, plain), (seen @ half_turn, unturned))
+    ]
+    np.testing.assert_allclose(colors[0], colors[1], atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", FORMATS)

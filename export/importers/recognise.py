@@ -3,6 +3,7 @@
 import re
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from export.importers.errors import ImportFailed
@@ -17,6 +18,7 @@ from msdgs_serve.scene.errors import InvalidInput
 READERS: dict[str, Callable[[Path], Splats]] = {
     "ply": read_ply,
     "spz": read_spz,
+    "spz:unturned": partial(read_spz, turned=False),
     "sog": read_sog,
     "splat": read_splat,
     "ksplat": read_ksplat,

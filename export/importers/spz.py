@@ -42,8 +42,11 @@ class Header(NamedTuple):
         return [self.count * each for each in (9, 1, 3, 3, rotation, rest)]
 
 
-def read_spz(file: Path) -> Splats:
-    """The Gaussians of an SPZ file. Raises `ImportFailed` for other versions, SH above degree 3 and cut-off files."""
+def read_spz(file: Path, *, turned: bool = True) -> Splats:
+    """The Gaussians of an SPZ file, turned from its axes to those of a PLY, or as they are.
+
+    Raises `ImportFailed` for other versions, SH above degree 3 and cut-off files.
+    """
     contents = file.read_bytes()
     if contents.startswith(GZIP):
         header, parts = _one_stream(file, _Gzip(file, contents))
@@ -55,7 +58,7 @@ def read_spz(file: Path) -> Splats:
             header, parts = _one_stream(file, _Plain(file, contents))
     else:
         raise ImportFailed(file, "isn't an SPZ file: it begins neither as gzip nor with NGSP")
-    return _decoded(file, header, parts)
+    return _decoded(file, header, parts, turned)
 
 
 class _Plain:
@@ -180,14 +183,16 @@ def _zstd(file: Path, number: int, packed: bytes, size: int) -> bytes:
     return bytes(found)
 
 
-def _decoded(file: Path, header: Header, parts: list[bytes]) -> Splats:
+def _decoded(file: Path, header: Header, parts: list[bytes], turned: bool) -> Splats:
     positions, opacities, colors, scales, rotations, rest = (np.frombuffer(part, np.uint8) for part in parts)
     n = header.count
     low, middle, high = positions.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
     fixed = ((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000  # two's complement of 24 bits
     dc = (colors.reshape(n, 1, 3) / 255 - 0.5) / COLOR_SCALE
     sh = np.concatenate([dc, (rest.reshape(n, -1, 3).astype(np.float64) - 128) / 128], axis=1)
-    means, quats, sh = from_right_up_back(fixed / 2**header.fractional_bits, _quats(header, rotations), sh)
+    means, quats = fixed / 2**header.fractional_bits, _quats(header, rotations)
+    if turned:
+        means, quats, sh = from_right_up_back(means, quats, sh)
     return splats(
         file,
         means,
