@@ -276,7 +276,8 @@ def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Heade
     found = {name: part if WIDTHS[name] > 1 else part[..., 0] for name, part in parts.items()}
     stages = [stage.split(";") for stage in headers.get("Server-Timing", "").split(", ") if stage]
     milliseconds = {name: float(duration.removeprefix("dur=")) for name, duration, *_ in stages}
-    return Frame(*(found.get(name) for name in WIDTHS), headers.get("Msdgs-Plan", ""), milliseconds)
+    drawn = {name: found.get(name) for name in WIDTHS}
+    return Frame(**drawn, plan=headers.get("Msdgs-Plan", ""), milliseconds=milliseconds)
 
 
 def _array(content: bytes) -> np.ndarray:

@@ -35,8 +35,9 @@ class MultiStepDeformation(nn.Module):
         """Deltas of canonical means, [N, 3], at time `t`, a scalar tensor; after the first `steps` layers if given."""
         if torch.is_grad_enabled() or len(means) <= CHUNK:
             return self._chain(means, t, steps)
-        parts = zip(*(self._chain(rows, t, steps) for rows in means.split(CHUNK)), strict=True)
-        return Deltas(*(None if part[0] is None else torch.cat(part) for part in parts))
+        parts = [self._chain(rows, t, steps) for rows in means.split(CHUNK)]
+        columns = [[column for column in columns if column is not None] for columns in zip(*parts, strict=True)]
+        return Deltas(*(torch.cat(column) if column else None for column in columns))  # pyright: ignore
 
     def _chain(self, means: Tensor, t: Tensor, steps: int | None) -> Deltas:
         deltas = Deltas(torch.zeros_like(means), torch.zeros_like(means), means.new_zeros(len(means), 4))

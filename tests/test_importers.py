@@ -90,9 +90,9 @@ def test_an_spz_that_was_written_without_turning_it_can_be_read_so(tmp_path: Pat
     g = some_gaussians(30, 3)
     write_spz(tmp_path / "a.spz", g, "dilate")
     plain, unturned = (read_splats(tmp_path / "a.spz", kind).gaussians for kind in ("spz", "spz:unturned"))
-    np.testing.assert_array_equal(unturned.means, plain.means * np.float32([1, -1, -1]))
-    half_turn = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-    np.testing.assert_allclose(to_matrix(unturned.quats), half_turn @ to_matrix(plain.quats), atol=1e-6)
+    np.testing.assert_array_equal(unturned.means, plain.means * np.array([1, -1, -1], np.float32))
+    half_turn = np.diag([1, -1, -1])  # of the axes; a Gaussian is the same with its own ones turned about
+    np.testing.assert_allclose(to_matrix(unturned.quats), half_turn @ to_matrix(plain.quats) @ half_turn, atol=1e-6)
     seen = np.random.default_rng(0).normal(size=(30, 3))
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     colors = [
