@@ -1,6 +1,7 @@
 """`python export/stability.py model.pt`: does float32, or less, show what the model itself would show in float64?"""
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -9,10 +10,12 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
 try:
-    import torch  # noqa: F401
     import tyro
     from rich.console import Console
     from rich.progress import Progress
+
+    if find_spec("torch") is None:  # not loaded yet: --help is printed at once
+        raise ModuleNotFoundError(name="torch")
 except ModuleNotFoundError as error:
     raise SystemExit(f"stability.py needs {error.name}, which serving alone doesn't: pip install '.[export]'") from None
 

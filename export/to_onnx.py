@@ -1,6 +1,7 @@
 """`python export/to_onnx.py model.pt`: one ONNX scene file from a trained model, as fast as its error may be."""
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -9,9 +10,11 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
 try:
-    import torch  # noqa: F401
     import tyro
     from rich.console import Console
+
+    if find_spec("torch") is None:  # not loaded yet: --help is printed at once
+        raise ModuleNotFoundError(name="torch")
 except ModuleNotFoundError as error:
     raise SystemExit(f"to_onnx.py needs {error.name}, which serving alone does not: pip install '.[export]'") from None
 
@@ -61,8 +64,8 @@ def main(
     Args:
         model: The `model.pt` of a training run, or a file or folder of another program.
         output: The scene file to write; by default beside the model, ending in .onnx.
-        kind: What the input is, where it isn't recognised: model, ply, spz, sog, splat, sequence, sequence:blend,
-            sequence:switch, deformgs, 4dgs.
+        kind: What the input is, where it isn't recognised: model, ply, spz, spz:unturned, sog, splat, ksplat, sequence,
+            sequence:blend, sequence:switch, deformgs, 4dgs.
         max_error: PSNR in dB that the worst frame must have against the exact network; differences are invisible from
             about 50. Lower is faster and less exact.
         plan: Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.model import ModelConfig
+from msdgs_train.model_config import ModelConfig
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 

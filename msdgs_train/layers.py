@@ -6,24 +6,10 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from msdgs_train.heads import PAPER_HEADS, Heads
+
 SILENCE, PLACE_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
 """Of a new layer: bias of the hidden units, and what the first Linear's columns are multiplied by."""
-
-
-class Heads(NamedTuple):
-    """What a layer predicts besides deltas of means, scales and quaternions."""
-
-    weight: bool = True  # without it every step counts in full, w = 1
-    opacity: bool = False
-    sh: int = 0  # coefficients (degree + 1)² a channel; 0: none
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Columns of: means, scales, quats, opacity, sh, weight before its sigmoid. 0 for what isn't there."""
-        return (3, 3, 4, int(self.opacity), 3 * self.sh, int(self.weight))
-
-
-PAPER_HEADS = Heads()
 
 
 class LayerStep(NamedTuple):

@@ -5,10 +5,10 @@ from typing import Any, Literal, get_args
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.layers import Heads
-from msdgs_train.modulation import ModulationTarget
+from msdgs_train.heads import Heads
 
 LayerKind = Literal["mlp", "plane"]
+ModulationTarget = Literal["means", "scales", "quats"]
 DeltaSpace = Literal["raw", "activated"]
 LEAST = {
     "width": 1,

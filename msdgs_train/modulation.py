@@ -1,15 +1,16 @@
 """Time-invariant modulation of what the layers change (paper, section 3.4)."""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 from torch import Tensor, nn
+
+from msdgs_train.model_config import ModulationTarget
 
 MAX_LOG_FACTOR = 2.0
 """Factors stay in [e^-2, e^2]. Left alone they grew to 5,000 in 2,000 steps on one scene, and the loss blew up: a small
 change of a layer then changes some scale by orders of magnitude."""
 
-ModulationTarget = Literal["means", "scales", "quats"]
 COLUMNS: dict[ModulationTarget, int] = {"means": 3, "scales": 3, "quats": 4}
 
 

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.threads import run_parallel, split_evenly
-from msdgs_train.layers import PAPER_HEADS, Heads, LayerStep
+from msdgs_train.heads import PAPER_HEADS, Heads
+from msdgs_train.layers import LayerStep
 from msdgs_train.plane_kernels import plane_features, plane_gradients
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from msdgs_train.deformation import MultiStepDeformation
-from msdgs_train.layers import Heads, MLPLayer, PositionalEncoding, octaves
+from msdgs_train.heads import Heads
+from msdgs_train.layers import MLPLayer, PositionalEncoding, octaves
 from msdgs_train.modulation import Modulation
 from tests.tolerances import assert_close, tolerance
 

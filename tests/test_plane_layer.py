@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from msdgs_train.layers import Heads
+from msdgs_train.heads import Heads
 from msdgs_train.plane_layer import PlaneGrid, PlaneLayer
 
 
