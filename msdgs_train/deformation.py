@@ -57,3 +57,9 @@ def _sum(total: Tensor | None, weight: Tensor, delta: Tensor | None) -> Tensor |
     if delta is None:
         return total
     return weight * delta if total is None else torch.addcmul(total, weight, delta)
+
+
+def operations(layers: Iterable[nn.Module]) -> int:
+    """About how many layers take for a Gaussian: a product and a sum for each weight of a Linear."""
+    linears = [module for layer in layers for module in layer.modules() if isinstance(module, nn.Linear)]
+    return 2 * sum(linear.weight.numel() for linear in linears)

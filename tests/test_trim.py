@@ -94,6 +94,15 @@ def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str)
         assert scene.metadata.sh_degree == 1
 
 
+def test_layers_whose_trial_would_be_too_dear_stay_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("export.trim.rules.WORK", 0.0)
+    trimmed = job_of(tmp_path, moving_object()).trimmed(45.0)
+    left_out = {entry["rule"] for entry in trimmed.left_out}
+    assert "layers" not in left_out
+    assert "still" in left_out
+    assert len(trimmed.moving.deformation) == 2
+
+
 def test_without_rules_nothing_is_left_out(tmp_path: Path):
     candidate = job_of(tmp_path, with_hidden_one(moving_object()), rules=()).candidate("network", 20.0)
     assert candidate.session.scene.moving_count == GROUND + OBJECT

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import torch
 
 from export.bake import Baked
-from msdgs_train.deformation import MultiStepDeformation
+from msdgs_train.deformation import MultiStepDeformation, operations
 from msdgs_train.model import SMALLEST_SCALE, activated_scales, unit_quats
 
 POSE = 10
@@ -32,9 +32,8 @@ class ExactPoses:
 
     @property
     def operations(self) -> int:
-        """About how many a pose takes: a product and a sum for each weight of a Linear."""
-        linears = [m for m in self._deformation.modules() if isinstance(m, torch.nn.Linear)]
-        return max(2 * sum(linear.weight.numel() for linear in linears), 1)
+        """About how many a pose takes."""
+        return max(operations(self._deformation.layers), 1)
 
     def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
         """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`, or of all."""

@@ -13,6 +13,7 @@ from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
+from msdgs_train.deformation import operations
 from msdgs_train.metrics import psnr_from_mse
 from msdgs_train.model import DynamicGaussians
 from msdgs_train.rasterization import rasterize
@@ -78,6 +79,11 @@ class Evidence:
                 del self._kept[next(iter(self._kept))]
             self._kept[network] = self._posed(network)
         return self._kept[network]
+
+    def operations(self, network: Network) -> float:
+        """About how many it takes to pose all Gaussians at the deciding times as this part of the network does."""
+        layers = [self.model.deformation.layers[k] for k in network.layers]
+        return operations(layers) * len(self.model.gaussians) * len(self._whole[1].times)
 
     def worst_db(self, cut: Cut, enough: float = -np.inf) -> float:
         """PSNR in dB of the worst deciding frame; where one is under `enough`, that of the first that is."""

@@ -17,6 +17,10 @@ HOPELESS = 1.0
 VISIBLE_MOTION = 2.0
 """Pixels. What moves further stays in motion however faint it is in the frames: from elsewhere it may not be."""
 
+WORK = 2e13
+"""Operations of layers that trials without some of them may take, in each trimming: minutes of two cores. Beyond it the
+rule leaves in what it has not tried; a scene of the paper's size would be posed anew for half an hour."""
+
 Rule = Callable[[Evidence, Cut, float], Cut]
 """Leaves out of a cut what it can while the worst deciding frame stays at so many dB or more."""
 
@@ -46,15 +50,22 @@ def heads(evidence: Evidence, cut: Cut, enough: float) -> Cut:
 
 def layers(evidence: Evidence, cut: Cut, enough: float) -> Cut:
     """Whole layers whose weighted step is invisible: as many of the last ones as can go together, then single ones."""
+    work = WORK
+
+    def tried(left: tuple[int, ...]) -> Cut:
+        nonlocal work
+        smaller = _network(cut, layers=left)
+        work -= evidence.operations(smaller.network)
+        return _if_enough(evidence, cut, smaller, enough) if work >= 0 else cut
+
     last = len(cut.network.layers) - 1
     while last > 0:
-        smaller = _if_enough(evidence, cut, _network(cut, layers=cut.network.layers[:-last]), enough)
+        smaller = tried(cut.network.layers[:-last])
         last = min(last // 2, len(smaller.network.layers) - 1)
         cut = smaller
     for k in reversed(cut.network.layers):
         if len(cut.network.layers) > 1:
-            left = tuple(layer for layer in cut.network.layers if layer != k)
-            cut = _if_enough(evidence, cut, _network(cut, layers=left), enough)
+            cut = tried(tuple(layer for layer in cut.network.layers if layer != k))
     return cut
 
 
