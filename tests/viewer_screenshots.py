@@ -15,6 +15,7 @@ SHOTS = (
     ("colour_light", DESKTOP, "light", "rgb"),
     ("depth_dark", DESKTOP, "dark", "depth"),
     ("motion_dark", DESKTOP, "dark", "motion"),
+    ("count_dark", DESKTOP, "dark", "gaussians"),
     ("phone_dark", PHONE, "dark", "rgb"),
 )
 THUMBNAIL = "() => document.querySelector('#scenes canvas').getContext('2d').getImageData(0, 0, 1, 1).data[3] > 0"
