@@ -18,8 +18,17 @@ from coverage import Coverage
 from tests.processes import ROOT
 from tests.tolerances import tolerance
 
-FILES = ("test_lanes.py", "test_rasterizer_oracle.py", "test_rasterizer_gsplat.py", "test_gradients.py")
-NAMES = "operations or memory or powers or behind or opacity or 6-1-53 or 12-15-53 or harmonics or none_and or camera"
+FILES = (
+    "test_lanes.py",
+    "test_rasterizer_oracle.py",
+    "test_rasterizer_gsplat.py",
+    "test_gradients.py",
+    "test_rasterizer_counts.py",
+)
+NAMES = (
+    "operations or memory or powers or behind or opacity or 6-1-53 or 12-15-53 or harmonics or none_and or camera "
+    "or 40-21-20"
+)
 """Of the tests, those that are small enough for plain Python."""
 
 BUILDS_CODE = ("def .*builder: Any", "@lower_builtin", "@type_callable", "@register_model", "def _(typed|lowered)")
