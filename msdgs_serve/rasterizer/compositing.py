@@ -194,6 +194,13 @@ def grid_of_a_tile(like: np.ndarray) -> np.ndarray:
 
 
 @kernel
+def place_in_tile(row: int, column: int) -> int:
+    """Where a pixel of a tile is in the tile's state: block by block."""
+    block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
+    return block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE
+
+
+@kernel
 def _prefetch_tile(x0: int, y0: int, rows: int, frame: Frame) -> None:
     """Fetch what the tile will be written to while it is blended: a row's pixels are a page away from the next's."""
     width = frame.alpha.shape[1]
@@ -367,8 +374,7 @@ def _write_tile(
     if not whole:
         for row in range(rows):
             for column in range(columns):
-                block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
-                place = block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE
+                place = place_in_tile(row, column)
                 frame.alpha[y0 + row, x0 + column] = state[place]
                 for channel in range(3):
                     frame.rgb[y0 + row, x0 + column, channel] = state[place + PIXELS * (channel + 1)]

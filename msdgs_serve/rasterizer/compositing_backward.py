@@ -9,7 +9,6 @@ import numpy as np
 
 from msdgs_serve.rasterizer.atomic import fetch_add
 from msdgs_serve.rasterizer.compositing import (
-    BLOCK_SIDE,
     BLOCKS,
     PIXELS,
     TILES_A_TURN,
@@ -18,6 +17,7 @@ from msdgs_serve.rasterizer.compositing import (
     grid_of_a_tile,
     log2_alpha,
     pixel_limits,
+    place_in_tile,
     touched_blocks,
 )
 from msdgs_serve.rasterizer.exponential import exp2
@@ -121,8 +121,7 @@ def _tiles_backward(
             state[:PIXELS] = 1
             for row in range(min(TILE, height - y0)):
                 for column in range(min(TILE, width - x0)):
-                    block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
-                    pixel = np.uint64(block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE)
+                    pixel = np.uint64(place_in_tile(row, column))
                     y, x = y0 + row, x0 + column
                     behind = alpha[y, x] * grad_alpha[y, x]
                     for channel in range(3):

@@ -5,13 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.compositing import (
-    BLOCK_SIDE,
     BLOCKS,
     PIXELS,
     PixelLimits,
     grid_of_a_tile,
     log2_alpha,
     pixel_limits,
+    place_in_tile,
     touched_blocks,
 )
 from msdgs_serve.rasterizer.exponential import exp2
@@ -88,7 +88,5 @@ def _count_tiles(
                 lanes += LANES
         for row in range(min(TILE, height - y0)):
             for column in range(min(TILE, width - x0)):
-                block = (row // BLOCK_SIDE) * BLOCK_SIDE + column // BLOCK_SIDE
-                place = block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE
-                blended[y0 + row, x0 + column] = added[place]
+                blended[y0 + row, x0 + column] = added[place_in_tile(row, column)]
     return lanes
