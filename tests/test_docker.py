@@ -4,11 +4,14 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
@@ -23,7 +26,7 @@ PIN = re.compile(r"^([\w.-]+)==([^\s;\\]+)", re.MULTILINE)
 
 
 def pins(path: Path) -> dict[str, str]:
-    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in PIN.findall(path.read_text())}
+    return {canonicalize_name(name): version for name, version in PIN.findall(path.read_text())}
 
 
 @pytest.mark.parametrize("name", ["build", "serve", "train"])
@@ -36,6 +39,14 @@ def test_every_requirement_is_a_tested_version_with_hashes(name: str):
     blocks = re.split(r"\n(?=\S)", path.read_text().strip())
     assert len(blocks) == len(locked)
     assert all("--hash=sha256:" in block for block in blocks)
+
+
+@pytest.mark.parametrize(("name", "extras"), [("serve", ()), ("train", ("train", "export"))])
+def test_everything_that_the_package_asks_for_is_locked(name: str, extras: tuple[str, ...]):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *(d for extra in extras for d in project["optional-dependencies"][extra])]
+    names = {canonicalize_name(Requirement(text).name) for text in asked}
+    assert names - pins(DOCKER / "requirements" / f"{name}.txt").keys() <= {"torch"}, "docker/lock.sh makes them anew"
 
 
 def test_what_serves_has_no_torch():
