@@ -83,6 +83,11 @@ def test_a_drip_after_an_answer_is_closed_too(client: httpx.Client):
     connection.close()
 
 
+def test_who_offers_another_protocol_is_answered_in_this_one(client: httpx.Client):
+    offer = {"Connection": "Upgrade, HTTP2-Settings", "Upgrade": "h2c", "HTTP2-Settings": "AAMAAABkAAQCAAAAAAIAAAAA"}
+    assert client.post("/render", json=FRAME, headers=offer).status_code == 200
+
+
 def test_a_reader_that_stands_still_is_closed(client: httpx.Client, server: list[Server]):
     before = len(server[0].server_state.connections)
     connection = connect(client)
