@@ -11,9 +11,11 @@ from scipy.interpolate import BSpline
 from export.bake import Baked, bake
 from export.plans import Trajectories, build
 from export.plans import trajectories as module
-from export.plans.exact import ExactPoses
+from export.plans.exact import ExactPoses, pixel
+from export.plans.single import SinglePoses
 from export.plans.splines import design, fitting, samples_for
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.models import SCENE, random_model
 from tests.tolerances import assert_close, tolerance
 
@@ -39,7 +41,8 @@ def sampled(monkeypatch: pytest.MonkeyPatch) -> Callable[[Motion], tuple[Baked, 
     baked = bake(random_model(COUNT), SCENE, "0" * 64)
 
     def sample(motion: Motion) -> tuple[Baked, Trajectories]:
-        monkeypatch.setattr(module, "ExactPoses", lambda baked, dtype=None: Made(baked, motion))
+        for precision in ("ExactPoses", "SinglePoses"):
+            monkeypatch.setattr(module, precision, lambda baked: Made(baked, motion))
         return baked, Trajectories(baked)
 
     return sample
@@ -100,6 +103,26 @@ def test_amplitudes_far_apart_keep_the_same_error(sampled, tmp_path: Path, plan:
         off = np.linalg.norm(session.pose(t)[0] - motion(float(np.float32(t))), axis=1)
         resolution = tolerance("float32.relative") * sizes  # of the file's own numbers and its time
         assert (off <= 0.05 * trajectories.pixel * tolerance("between_samples.factor") + 10 * resolution).all()
+
+
+@pytest.mark.parametrize("how", ["refused", "overflows", "a hundredth of a pixel off"])
+def test_where_float32_is_not_exact_enough_no_sample_is_taken_in_it(monkeypatch: pytest.MonkeyPatch, how: str):
+    class Wrong(SinglePoses):
+        def __init__(self, baked: Baked) -> None:
+            if how == "refused":
+                raise SceneFileInvalid("scene", "means", "overflow")
+            super().__init__(baked)
+
+        def at(self, t: float, ids: np.ndarray) -> np.ndarray:
+            if how == "overflows":
+                raise SceneFileInvalid("scene", "means", "overflow")
+            return super().at(t, ids) + np.float32(0.01 * pixel(baked)) * (np.arange(10) < 3)
+
+    monkeypatch.setattr(module, "SinglePoses", Wrong)
+    baked = bake(random_model(COUNT), SCENE, "0" * 64)
+    got = Trajectories(baked).on_grid(module.COARSE + 1, np.arange(COUNT))
+    want = ExactPoses(baked).at(7 / module.COARSE)
+    assert_close(got[:, 7, :3], want[:, :3].astype(np.float32), "float32.relative")
 
 
 def test_a_scene_is_sampled_once_for_all_plans():

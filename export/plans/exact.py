@@ -18,17 +18,16 @@ Poses = npt.NDArray[np.float64]
 
 
 class ExactPoses:
-    """`at(t)`: the scene's layers run on the baked values in float64, or in another precision, without any graph."""
+    """`at(t)`: the scene's layers run on the baked values in float64, without any graph."""
 
-    def __init__(self, baked: Baked, dtype: torch.dtype = torch.float64) -> None:
+    def __init__(self, baked: Baked) -> None:
         m = baked.moving
         self.count = len(m)
-        self._dtype = dtype
         self._raw = baked.scene.metadata.delta_space == "raw"
-        self._means, self._log_scales, self._quats = (self._tensor(a) for a in (m.means, m.log_scales, m.quats))
+        self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
         factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
-        self._factors = [None if f is None else self._tensor(f) for f in factors]
-        self._deformation = MultiStepDeformation(copy.deepcopy(layer).to(dtype) for layer in baked.layers)
+        self._factors = [None if f is None else _double(f) for f in factors]
+        self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
 
     @property
     def operations(self) -> int:
@@ -42,7 +41,7 @@ class ExactPoses:
     @torch.no_grad()
     def _posed(self, t: float, ids: torch.Tensor) -> Poses:
         means, log_scales = self._means[ids], self._log_scales[ids]
-        deltas = self._deformation(means, torch.tensor(t, dtype=self._dtype))
+        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64))
         of_means, of_scales, of_quats = (
             delta if factors is None else factors[ids] * delta  # equation 12
             for factors, delta in zip(self._factors, (deltas.means, deltas.scales, deltas.quats), strict=True)
@@ -51,10 +50,11 @@ class ExactPoses:
             scales = activated_scales(log_scales + of_scales)
         else:
             scales = (activated_scales(log_scales) + of_scales).clamp_min(SMALLEST_SCALE)
-        return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).double().numpy()
+        return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).numpy()
 
-    def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(array).to(self._dtype)
+
+def _double(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(array).double()
 
 
 def pixel(baked: Baked) -> float:

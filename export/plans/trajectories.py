@@ -6,19 +6,21 @@ found at the times between, and only what moves fast pays for it. The times betw
 that lie on no grid, which catch what repeats itself from sample to sample.
 
 The times on no grid are sampled in float64 and in float32. Where float32 is as good as exact there, all other samples
-are taken in it: a network of the paper's size takes seconds a time in float64.
+are taken in it: a network of the paper's size takes ten seconds a time in float64, one to two in float32.
 """
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from export.bake import Baked
 from export.plans.exact import MEANS, POSE, QUATS, SCALES, ExactPoses, Poses, pixel
+from export.plans.single import SinglePoses
+from msdgs_serve.scene.errors import SceneFileInvalid
 
 COARSE, USUAL, FINEST = 64, 512, 2048
 """Intervals between samples: of all Gaussians, what errors are looked at between, and of the fastest."""
@@ -32,8 +34,8 @@ FLOAT32_ENOUGH = 0.005
 PROBES = 9
 """Times on no grid."""
 
-WORK = 1e13
-"""Operations of layers that samples beyond the coarse ones may take: about a minute of two cores."""
+WORK = 1e14
+"""Operations of layers that samples beyond the coarse ones may take: about ten minutes of two cores."""
 
 MEMORY = 2 * 2**30
 """Bytes that samples beyond the coarse ones may take; the Gaussians with the largest errors come first."""
@@ -139,18 +141,25 @@ class Trajectories:
         probes[..., QUATS] *= np.where(turned, -1, 1)[..., None].astype(probes.dtype)
         return np.maximum(between, self.distances(ids, got - probes))
 
-    def _probed(self, baked: Baked) -> tuple[ExactPoses, Samples]:
+    def _probed(self, baked: Baked) -> tuple[ExactPoses | SinglePoses, Samples]:
         """What all other samples are taken with, and the samples at the times on no grid."""
         t0, t1 = self.time_range
-        single, close = ExactPoses(baked, torch.float32), True
         every, probes = np.arange(self.count), np.empty((self.count, PROBES, POSE), np.float32)
+        single: SinglePoses | None = None
+        with suppress(SceneFileInvalid):
+            single = SinglePoses(baked)
         for i, t in enumerate(t0 + (t1 - t0) * self._probe_parts):
             probes[:, i] = exact = self.exact.at(float(t), every)
-            close = close and self._close(single.at(float(t), every), exact)
+            if single and not self._close(single, float(t), exact):
+                single = None
             self._tell()
-        return (single if close else self.exact), probes
+        return single or self.exact, probes
 
-    def _close(self, single: Poses, exact: Poses) -> bool:
+    def _close(self, sampler: SinglePoses, t: float, exact: Poses) -> bool:
+        try:
+            single = sampler.at(t, np.arange(self.count))
+        except SceneFileInvalid:
+            return False
         turned = np.where(np.einsum("mc,mc->m", single[:, QUATS], exact[:, QUATS]) < 0, -1, 1)
         single[:, QUATS] *= turned[:, None]
         weights = _rotation_weights(exact[:, None], self.pixel)
