@@ -1,14 +1,15 @@
 """A scene of the paper's size from a small trained one: 106,500 Gaussians, ten layers, motion and image as trained.
 
-Each Gaussian is split into smaller ones that ride on it. A field of `msdgs-mlp`'s size begins as the small model's, its
-layers made wider and deeper without a change of what they compute (Net2Net, Chen et al. 2016), and all ten layers are
-trained: regression on the small model's trajectories, smoothed in time, over batches drawn by lot.
+Each Gaussian is split into smaller ones, which the small model's field moves from where they are. A field of the size
+of `msdgs-mlp` begins as the small one, its layers made wider and deeper without a change of what they compute (Net2Net,
+Chen et al. 2016), and all ten layers are trained: regression on these trajectories, smoothed in time, over batches
+drawn by lot.
 """
 
 import math
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -54,56 +55,49 @@ SAVE_SECONDS = 60.0
 OCTAVE_DAMPING = 0.5
 """First weights of each next octave of the encoding, of those before it: a new field is smooth in place and time."""
 
+CHUNK = 8192
+"""Gaussians whose trajectories are held at a time."""
+
 MEANS, LOG_SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
 
 
-@dataclass(frozen=True)
-class Splits:
-    """Parts of the small model's Gaussians: which one each rides on, and where on it in units of its axes."""
-
-    parents: Tensor  # [N] int64
-    places: Tensor  # [N, 3]
-
-    @classmethod
-    def drawn(cls, gaussians: int, count: int, generator: torch.Generator) -> "Splits":
-        """`count` parts, as many of each Gaussian as of any other, or one more."""
-        parents = torch.arange(count) * gaussians // count
-        spread = (1 - SHRINK**2) ** 0.5
-        return cls(parents, spread * torch.randn(count, 3, generator=generator).clamp(-2.5, 2.5))
-
-
 class SmoothMotion:
-    """Trajectories of the small model through a low-pass: cubic splines of few control points, least squares."""
+    """Trajectories of a model through a low-pass: cubic splines of few control points, least squares."""
 
-    def __init__(self, model: DynamicGaussians, info: SceneInfo, splits: Splits, control: int) -> None:
-        self._time_range, self._splits = info.time_range, splits
-        samples = torch.stack([_pose_rows(model, t) for t in np.linspace(*info.time_range, SAMPLES)])
-        same = torch.where((samples[1:, :, QUATS] * samples[:-1, :, QUATS]).sum(-1) < 0, -1.0, 1.0)
-        samples[1:, :, QUATS] *= same.cumprod(0)[..., None]
+    def __init__(self, model: DynamicGaussians, info: SceneInfo, control: int) -> None:
+        self._time_range = info.time_range
         matrix = torch.from_numpy(fitting(control, SAMPLES)).float()
-        self._control = torch.einsum("ct,tnk->nck", matrix, samples)
+        parts = [self._sampled(model, ids) for ids in torch.arange(len(model.gaussians)).split(CHUNK)]
+        self._control = torch.cat([torch.einsum("ct,tnk->nck", matrix, samples) for samples in parts])
         self._knots = np.concatenate([np.zeros(3), np.linspace(0, 1, control - 2), np.ones(3)])
-        self.travel = (samples[..., MEANS].amax(0) - samples[..., MEANS].amin(0)).norm(dim=1)  # [parents]
+        spans = [samples[..., MEANS].amax(0) - samples[..., MEANS].amin(0) for samples in parts]
+        self.travel = torch.cat(spans).norm(dim=1)  # [N]
 
     def at(self, t: float, ids: Tensor) -> Tensor:
-        """[M, 10] means, log-scales and unit quaternions of parts at a time."""
+        """[M, 10] means, log-scales and unit quaternions at a time."""
         t0, t1 = self._time_range
         weights = BSpline.design_matrix(np.array([(t - t0) / (t1 - t0)]), self._knots, 3).toarray()[0]
-        pose = torch.einsum("c,mck->mk", torch.from_numpy(weights).float(), self._control[self._splits.parents[ids]])
-        quats = unit_quats(pose[:, QUATS])
-        offsets = rotate(quats, self._splits.places[ids] * pose[:, LOG_SCALES].exp())
-        return torch.cat([pose[:, MEANS] + offsets, pose[:, LOG_SCALES] + np.log(SHRINK), quats], dim=1)
+        pose = torch.einsum("c,mck->mk", torch.from_numpy(weights).float(), self._control[ids])
+        return torch.cat([pose[:, :6], unit_quats(pose[:, QUATS])], dim=1)
+
+    @torch.no_grad()
+    def _sampled(self, model: DynamicGaussians, ids: Tensor) -> Tensor:
+        """[T, M, 10] the same, of one sign along time."""
+        poses = [model.pose(t, ids=ids) for t in np.linspace(*self._time_range, SAMPLES)]
+        samples = torch.stack([torch.cat([p.means, p.scales.log(), p.quats], dim=1) for p in poses])
+        same = torch.where((samples[1:, :, QUATS] * samples[:-1, :, QUATS]).sum(-1) < 0, -1.0, 1.0)
+        samples[1:, :, QUATS] *= same.cumprod(0)[..., None]
+        return samples
 
 
 class Fit:
     """The large model, and how far its training is. Saved now and then, so that another run goes on with it."""
 
-    def __init__(self, model: DynamicGaussians, motion: SmoothMotion, splits: Splits, info: SceneInfo) -> None:
+    def __init__(self, model: DynamicGaussians, motion: SmoothMotion, info: SceneInfo) -> None:
         self.model, self.motion, self.info = model, motion, info
         self.seconds, self.steps, self.pixels = 0.0, 0, float("nan")
         self.pixel = _pixel(model, info)
-        travel = motion.travel[splits.parents]
-        self._moving = torch.nonzero(travel > self.pixel)[:, 0]
+        self._moving = torch.nonzero(motion.travel > self.pixel)[:, 0]
         self._parameters = [p.requires_grad_(True) for p in model.deformation.parameters()]
         self._optimizer = torch.optim.Adam(self._parameters, lr=RATE, eps=1e-15)
         self._generator = torch.Generator().manual_seed(1)
@@ -171,7 +165,7 @@ def main(
     """Make a scene of the paper's size from a small trained one, to measure exports on (docs/work_precision.md).
 
     Its Gaussians are split until there are as many as in the paper, 106,500. A field of ten MLP layers of 4 × 256, the
-    preset msdgs-mlp, learns the small model's motion, smoothed in time. How near it came is printed.
+    preset msdgs-mlp, learns how the small one moves them, smoothed in time. How near it came is printed.
 
     python benchmarks/paper_sized.py runs/toybench/model.pt runs/paper_sized/model.pt
 
@@ -196,15 +190,14 @@ def main(
         small, info, _ = load_model(model)
         if count < len(small.gaussians):
             raise InvalidInput("count", f"{len(small.gaussians):,} or more, the model's Gaussians", count)
-        splits = Splits.drawn(len(small.gaussians), count, torch.Generator().manual_seed(0))
         info = replace(info, cameras=[_resized(camera, size) for camera in info.cameras])
-        large = densified(small, splits)
-        fit = Fit(large, SmoothMotion(small, info, splits, control), splits, info)
+        parts = split(small, count, torch.Generator().manual_seed(0))
+        fit = Fit(grown(parts), SmoothMotion(parts, info, control), info)
         if saved.exists():
             fit.resume(saved)
             console.print(f"going on after {fit.steps:,} steps, {fit.seconds / 60:.1f} minutes", markup=False)
         _train(fit, 60 * minutes, saved, console)
-        save_model(output, large, info, fit.steps)
+        save_model(output, fit.model, info, fit.steps)
         saved.unlink(missing_ok=True)
         _describe(fit, small, console)
     except KeyboardInterrupt:
@@ -219,13 +212,14 @@ def main(
 
 
 @torch.no_grad()
-def densified(small: DynamicGaussians, splits: Splits) -> DynamicGaussians:
-    """A model of the preset msdgs-mlp, untrained, with a small model's Gaussians in parts.
+def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> DynamicGaussians:
+    """The model with `count` Gaussians, as many parts of each as of any other or one more, under the same layers.
 
     Opacities are such that a ray through all parts of a Gaussian loses as much light as through the whole.
     """
-    g, parents = small.gaussians, splits.parents
-    offsets = rotate(unit_quats(g.raw_quats[parents]), splits.places * g.log_scales[parents].exp())
+    g, parents = small.gaussians, torch.arange(count) * len(small.gaussians) // count
+    places = (1 - SHRINK**2) ** 0.5 * torch.randn(count, 3, generator=generator).clamp(-2.5, 2.5)
+    offsets = rotate(unit_quats(g.raw_quats[parents]), places * g.log_scales[parents].exp())
     parts = torch.bincount(parents, minlength=len(g))[parents]
     clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MOST_OPACITY)).log() / (parts * SHRINK**2)
     tensors = {
@@ -238,6 +232,15 @@ def densified(small: DynamicGaussians, splits: Splits) -> DynamicGaussians:
     }
     if g.embeddings is not None:
         tensors["embeddings"] = g.embeddings[parents]
+    model = DynamicGaussians(small.config, CanonicalGaussians(**tensors)).requires_grad_(requires_grad=False)
+    model.deformation, model.modulation = small.deformation, small.modulation
+    return model
+
+
+@torch.no_grad()
+def grown(small: DynamicGaussians) -> DynamicGaussians:
+    """A model of the preset msdgs-mlp that does what the small one does; of its ten layers the last ones move nothing
+    yet."""
     paper = PRESETS["msdgs-mlp"].model
     config = replace(
         paper,
@@ -247,7 +250,7 @@ def densified(small: DynamicGaussians, splits: Splits) -> DynamicGaussians:
         delta_space=small.config.delta_space,
     )
     torch.manual_seed(0)
-    large = DynamicGaussians(config, CanonicalGaussians(**tensors)).requires_grad_(requires_grad=False)
+    large = DynamicGaussians(config, small.gaussians).requires_grad_(requires_grad=False)
     large.modulation = small.modulation
     for layer in _mlp_layers(large):
         damping = OCTAVE_DAMPING ** torch.arange(config.xyz_frequencies).repeat_interleave(3)
@@ -343,18 +346,12 @@ def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
             steps.append((step.weight * step.delta_means).norm(dim=1).mean() / fit.pixel)
     layers = torch.stack(steps).view(5, -1).mean(0)
     console.print(f"pixels that a layer moves, mean: {', '.join(f'{v:.2f}' for v in layers)}", markup=False)
-    console.print(f"{len(moving):,} of {len(small.gaussians):,} Gaussians of the small model move", markup=False)
+    console.print(f"{len(moving):,} of {len(fit.motion.travel):,} Gaussians move by a pixel", markup=False)
     psnrs = []
     for view in deciding_views(cameras_of(fit.info), fit.info.time_range, 9):
         frames = [shown(posed(m, view.t), view.camera, fit.info.background) for m in (small, fit.model)]
         psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
     console.print(f"pictures against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
-
-
-@torch.no_grad()
-def _pose_rows(model: DynamicGaussians, t: float) -> Tensor:
-    pose = model.pose(t)
-    return torch.cat([pose.means, pose.scales.log(), pose.quats], dim=1)
 
 
 def _pixel(model: DynamicGaussians, info: SceneInfo) -> float:
