@@ -169,11 +169,13 @@ class Client:
         background: Background = "auto",
         shutter: Shutter | None = None,
         dt: float | None = None,
+        steps: float | None = None,
     ) -> Frame:
-        """A frame as arrays. The channel `motion` needs `dt`, in scene time. Raises `Problem` or `Unreachable`."""
+        """A frame as arrays. The channel `motion` needs `dt`, in scene time; `steps` is how many of the scene's layers
+        are applied. Raises `Problem` or `Unreachable`."""
         body = request_body(
             camera, t, scene=scene, width=width, height=height, channels=channels, background=background,
-            shutter=shutter, dt=dt, format="npy",
+            shutter=shutter, dt=dt, steps=steps, format="npy",
         )  # fmt: skip
         response = self._call("POST", "/render", json=body)
         pixels = _array(response.content)
@@ -252,12 +254,13 @@ def request_body(
     background: Background = "auto",
     shutter: Shutter | None = None,
     dt: float | None = None,
+    steps: float | None = None,
 ) -> dict[str, Any]:
     """The JSON of `POST /render`; what is None is left out."""
     values = {
         "scene": scene, "camera": _plain(camera), "t": t, "width": width, "height": height, "format": format,
         "quality": quality, "channels": None if channels is None else list(channels), "background": background,
-        "dt": dt, "shutter": None if shutter is None else _plain(shutter),
+        "dt": dt, "steps": steps, "shutter": None if shutter is None else _plain(shutter),
     }  # fmt: skip
     return {name: value for name, value in values.items() if value is not None}
 

@@ -6,7 +6,14 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, INPUTS, MOVING_OUTPUTS, BakedScene, SceneMetadata
+from msdgs_serve.scene.baked import (
+    CONSTANT_OUTPUTS,
+    INPUTS,
+    MOVING_OUTPUTS,
+    OPTIONAL_INPUT,
+    BakedScene,
+    SceneMetadata,
+)
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.onnx_constants import Malformed, read_constants
@@ -16,7 +23,7 @@ CHUNK = 2048
 """Gaussians a call. The widest activation of a call is CHUNK × width, whatever the scene's size."""
 
 _SIZES = {"means": 3, "quats": 4, "scales": 3}
-_INPUT_TYPES = {"t": "tensor(float)", "ids": "tensor(int64)"}
+_INPUT_TYPES = {"t": "tensor(float)", "ids": "tensor(int64)", OPTIONAL_INPUT: "tensor(float)"}
 
 
 class DeformationSession:
@@ -50,18 +57,38 @@ class DeformationSession:
         for t in metadata.time_range:
             self._check_sample(t)
 
-    def pose(self, t: float, ids: npt.ArrayLike | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
+    @property
+    def most_steps(self) -> int:
+        """How many deformation layers can be applied one after the other; 0 where the scene's plan doesn't run them."""
+        return len(self.scene.metadata.layers) if self._has_steps else 0
+
+    def check_steps(self, steps: float | None) -> None:
+        """Raise `InvalidInput` where the scene can't be posed after so many layers."""
+        if steps is None:
+            return
+        if not self.most_steps:
+            plan = self.scene.metadata.plan
+            raise InvalidInput("steps", f"left out: the plan {plan} doesn't run layers one by one", steps)
+        if not 0 <= steps <= self.most_steps:
+            raise InvalidInput("steps", f"in [0, {self.most_steps}], the scene's layers", steps)
+
+    def pose(
+        self, t: float, ids: npt.ArrayLike | None = None, steps: float | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Means [M, 3], unit wxyz quaternions [M, 4] and scales [M, 3] of the moving Gaussians `ids`, [M], or of all.
 
-        Raises `InvalidInput` for a time outside the scene's range or an id that isn't there, and `SceneFileInvalid`
-        where the deformation overflows.
+        After `steps` of the scene's layers, of the last one a part where that is no whole number; or after all.
+
+        Raises `InvalidInput` for a time outside the scene's range, an id that isn't there or steps that it can't make,
+        and `SceneFileInvalid` where the deformation overflows.
         """
         t = self._checked_time(t)
+        self.check_steps(steps)
         every = np.arange(self.scene.moving_count) if ids is None else self._checked_ids(ids)
         posed = {name: np.empty((len(every), _SIZES[name]), np.float32) for name in MOVING_OUTPUTS}
 
         def run(start: int, stop: int) -> None:
-            outputs = self._run(MOVING_OUTPUTS, t, every[start:stop])
+            outputs = self._run(MOVING_OUTPUTS, t, every[start:stop], steps)
             for name, output in zip(MOVING_OUTPUTS, outputs, strict=True):
                 expected = posed[name][start:stop]
                 if output.shape != expected.shape:
@@ -72,9 +99,9 @@ class DeformationSession:
         self._check_finite(t, posed)
         return posed["means"], posed["quats"], posed["scales"]
 
-    def gaussians(self, t: float) -> Gaussians:
-        """All Gaussians at time `t`, moving and static, ready to draw."""
-        return self.scene.gaussians(*self.pose(t))
+    def gaussians(self, t: float, steps: float | None = None) -> Gaussians:
+        """All Gaussians at time `t`, moving and static, ready to draw; moving ones as `pose` has them."""
+        return self.scene.gaussians(*self.pose(t, steps=steps))
 
     def _checked_time(self, t: float) -> float:
         t0, t1 = self.scene.metadata.time_range
@@ -143,7 +170,10 @@ class DeformationSession:
                 raise SceneFileInvalid(self._file, name, "is missing from the inputs")
             if inputs[name].type != _INPUT_TYPES[name]:
                 raise SceneFileInvalid(self._file, name, f"is {inputs[name].type}, not {_INPUT_TYPES[name]}")
-        unknown = sorted(set(inputs) - set(INPUTS))
+        self._has_steps = OPTIONAL_INPUT in inputs
+        if self._has_steps:
+            self._check_steps_input(inputs[OPTIONAL_INPUT])
+        unknown = sorted(set(inputs) - {*INPUTS, OPTIONAL_INPUT})
         if unknown:
             raise SceneFileInvalid(self._file, unknown[0], "isn't an input of this contract")
         outputs = {o.name: o for o in self._session.get_outputs()}
@@ -152,6 +182,12 @@ class DeformationSession:
                 raise SceneFileInvalid(self._file, name, "is missing from the outputs")
             if outputs[name].type != "tensor(float)":
                 raise SceneFileInvalid(self._file, name, f"is {outputs[name].type}, not tensor(float)")
+
+    def _check_steps_input(self, steps: ort.NodeArg) -> None:
+        if steps.type != _INPUT_TYPES[OPTIONAL_INPUT]:
+            raise SceneFileInvalid(self._file, OPTIONAL_INPUT, f"is {steps.type}, not {_INPUT_TYPES[OPTIONAL_INPUT]}")
+        if OPTIONAL_INPUT in [i.name for i in self._session.get_inputs()]:
+            raise SceneFileInvalid(self._file, OPTIONAL_INPUT, "has no default of all layers")
 
     def _read_scene(self, metadata: SceneMetadata, moving_count: int) -> BakedScene:
         arrays = self._run(CONSTANT_OUTPUTS, metadata.time_range[0], np.empty(0, np.int64))
@@ -166,9 +202,14 @@ class DeformationSession:
             name = error.field.removeprefix("gaussians.")
             raise SceneFileInvalid(self._file, name, f"can't be used at t = {t}: {error}") from error
 
-    def _run(self, outputs: tuple[str, ...], t: float, ids: npt.NDArray[np.int64]) -> list[FloatArray]:
+    def _run(
+        self, outputs: tuple[str, ...], t: float, ids: npt.NDArray[np.int64], steps: float | None = None
+    ) -> list[FloatArray]:
+        inputs = {"t": np.array([t], np.float32), "ids": ids}
+        if steps is not None:
+            inputs[OPTIONAL_INPUT] = np.array([steps], np.float32)
         try:
-            arrays = self._session.run(outputs, {"t": np.array([t], np.float32), "ids": ids})
+            arrays = self._session.run(outputs, inputs)
         except Exception as error:
             raise SceneFileInvalid(self._file, "file", f"can't be run by onnxruntime: {error}") from error
         return [np.asarray(array) for array in arrays]

@@ -10,7 +10,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import Gaussians, InvalidInput
 from msdgs_serve.watch import Interrupted, Watch
 
-PoseKey = tuple[weakref.ref[DeformationSession], float]
+PoseKey = tuple[weakref.ref[DeformationSession], float, float | None]
 
 STAGE = "pose"
 
@@ -46,15 +46,15 @@ class PoseCache:
         with self._lock:
             return CacheUse(len(self._sizes), sum(self._sizes.values()), self._hits, self._misses)
 
-    def get(self, session: DeformationSession, t: float, watch: Watch) -> Gaussians:
-        """The scene's Gaussians at `t`; notes `hit` or `miss` with the watch."""
-        key = (weakref.ref(session), t)  # a scene that was replaced is not kept alive
+    def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
+        """The scene's Gaussians at `t`, perhaps after some of its layers; notes `hit` or `miss` with the watch."""
+        key = (weakref.ref(session), t, steps)  # a scene that was replaced is not kept alive
         with watch.stage(STAGE):
             while True:
                 future, mine = self._claim(key)
                 watch.notes[STAGE] = "miss" if mine else "hit"
                 if mine:
-                    self._compute(session, t, key, future, watch)
+                    self._compute(session, key, future)
                 try:
                     return future.result()
                 except Interrupted:
@@ -72,11 +72,9 @@ class PoseCache:
             self._misses += mine
             return future, mine
 
-    def _compute(
-        self, session: DeformationSession, t: float, key: PoseKey, future: Future[Gaussians], watch: Watch
-    ) -> None:
+    def _compute(self, session: DeformationSession, key: PoseKey, future: Future[Gaussians]) -> None:
         try:
-            gaussians = session.gaussians(t)
+            gaussians = session.gaussians(*key[1:])
         except BaseException as error:
             with self._lock:
                 self._forget(key)

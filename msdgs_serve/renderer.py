@@ -47,6 +47,7 @@ class RenderOptions:
     shutter: Shutter | None = None  # motion blur; None: one moment
     motion_dt: float | None = None  # draw motion vectors too, to this much later; not together with a shutter
     counts: bool = False  # count the Gaussians that add to each pixel too
+    steps: float | None = None  # after so many of the scene's layers; None: all
     rasterizer: RasterizerOptions = GSPLAT
 
 
@@ -75,7 +76,8 @@ class Renderer:
         `watch` times the stages `pose` and `draw` and may end the work between them.
 
         Raises:
-            InvalidInput: if `t` or a moment of the shutter is outside of the scene's time range.
+            InvalidInput: if `t` or a moment of the shutter is outside of the scene's time range, or it has no such
+                steps.
             Interrupted: if the watch was stopped.
         """
         watch = watch or Watch()
@@ -85,15 +87,18 @@ class Renderer:
         moments = options.shutter.times(t)
         return average(self._moment(session, camera, t, moment, options, watch) for moment in moments)
 
-    def posed(self, session: DeformationSession, t: float, watch: Watch | None = None) -> Gaussians:
+    def posed(
+        self, session: DeformationSession, t: float, watch: Watch | None = None, steps: float | None = None
+    ) -> Gaussians:
         """The scene's Gaussians at `t`, from the cache where it has them."""
-        return self.cache.get(session, t, watch or Watch())
+        return self.cache.get(session, t, watch or Watch(), steps)
 
     def _moment(
         self, session: DeformationSession, camera: Camera, t: float, moment: float, options: RenderOptions, watch: Watch
     ) -> Image:
-        gaussians = self.posed(session, moment, watch)
-        later = None if options.motion_dt is None else self.posed(session, moment + options.motion_dt, watch)
+        gaussians, later = self.posed(session, moment, watch, options.steps), None
+        if options.motion_dt is not None:
+            later = self.posed(session, moment + options.motion_dt, watch, options.steps)
         with watch.stage("draw"):
             background = resolve_background(session, options.background)
             constants = options.rasterizer._replace(mip=session.scene.metadata.antialiasing == "mip")

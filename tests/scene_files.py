@@ -44,8 +44,11 @@ def metadata(**changes: Any) -> SceneMetadata:
     return replace(plain, **changes)
 
 
-def write_scene(path: Path, *, static_color: Color = RED, moving: bool = True, **changes: Any) -> Path:
-    """A ball at the origin, `static_color`, and if `moving` a green one that goes from (0, 0, -1) to (0, 0, 1)."""
+def write_scene(
+    path: Path, *, static_color: Color = RED, moving: bool = True, steps: bool = False, **changes: Any
+) -> Path:
+    """A ball at the origin, `static_color`, and if `moving` a green one that goes from (0, 0, -1) to (0, 0, 1); with
+    `steps` by a layer that may be applied in part."""
     count = int(moving)
     constants = {
         "base": np.array([[0, 0, -1]], np.float32)[:count],
@@ -53,6 +56,7 @@ def write_scene(path: Path, *, static_color: Color = RED, moving: bool = True, *
         "moving_quats": np.array([[1, 0, 0, 0]], np.float32)[:count],
         "moving_scales": np.full((count, 3), 0.15, np.float32),
         "ids": np.arange(count, dtype=np.int64),
+        "steps" if steps else "one": np.ones(1, np.float32),
         "all_static_means": np.zeros((1, 3), np.float32),
         "all_static_quats": np.array([[1, 0, 0, 0]], np.float32),
         "all_static_scales": np.full((1, 3), 0.15, np.float32),
@@ -62,7 +66,8 @@ def write_scene(path: Path, *, static_color: Color = RED, moving: bool = True, *
     nodes = [
         helper.make_node("Gather", ["base", "ids"], ["at_rest"]),
         helper.make_node("Gather", ["velocity", "ids"], ["velocities"]),
-        helper.make_node("Mul", ["velocities", "t"], ["moved"]),
+        helper.make_node("Mul", ["t", "steps" if steps else "one"], ["applied"]),
+        helper.make_node("Mul", ["velocities", "applied"], ["moved"]),
         helper.make_node("Add", ["at_rest", "moved"], ["means"]),
         helper.make_node("Gather", ["moving_quats", "ids"], ["quats"]),
         helper.make_node("Gather", ["moving_scales", "ids"], ["scales"]),
@@ -77,6 +82,7 @@ def write_scene(path: Path, *, static_color: Color = RED, moving: bool = True, *
         [
             helper.make_tensor_value_info("t", TensorProto.FLOAT, [1]),
             helper.make_tensor_value_info("ids", TensorProto.INT64, ["M"]),
+            *([helper.make_tensor_value_info("steps", TensorProto.FLOAT, [1])] if steps else []),
         ],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
         [numpy_helper.from_array(array, name) for name, array in constants.items()],

@@ -81,6 +81,20 @@ def test_backgrounds(client: httpx.Client):
     assert np.isinf(linear[corner][4])
 
 
+def test_layers_are_applied_one_after_the_other(tmp_path: Path, client: httpx.Client):
+    with serving(write_scene(tmp_path / "balls.onnx", steps=True)) as by_layers:
+        assert by_layers.get("/scenes/balls").json()["steps"] == 1
+        for t, steps in ((0.75, 0), (0.75, 0.5), (0.75, 1)):
+            assert np.array_equal(render(by_layers, t=t, steps=steps), render(client, t=t * steps))
+        link = {**{name: value for name, value in LEVEL.items() if name != "type"}, "width": SIZE, "height": SIZE}
+        answer = by_layers.get("/render", params={**link, "t": 0.75, "steps": 0.5})
+        assert np.array_equal(decode(answer.content, "png")[0], render(client, t=0.375))
+        problem = by_layers.post("/render", json={**FRAME, "steps": 2})
+        assert (problem.status_code, problem.json()["errors"][0]["field"]) == (422, "steps")
+    assert client.get("/scenes/balls").json()["steps"] == 0
+    assert client.post("/render", json={**FRAME, "steps": 0}).json()["errors"][0]["field"] == "steps"
+
+
 def test_one_view_said_in_four_ways(client: httpx.Client):
     pose = level_pose()
     focal = SIZE / 2 / np.tan(np.radians(20))

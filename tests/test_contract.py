@@ -159,6 +159,22 @@ def test_ids_must_be_an_input(tmp_path: Path):
     assert refusal(tmp_path / "scene.onnx", remove).field == "ids"
 
 
+def test_steps_need_a_default_of_their_type(tmp_path: Path):
+    def remove(model: onnx.ModelProto) -> None:
+        model.graph.initializer.remove(constant(model, "steps"))
+
+    def whole_numbers(model: onnx.ModelProto) -> None:
+        given = next(i for i in model.graph.input if i.name == "steps")
+        given.type.tensor_type.elem_type = TensorProto.INT64
+        replace_constant(model, "steps", lambda steps: steps.astype(np.int64))
+        for node in model.graph.node:
+            node.input[:] = ["as_before" if name == "steps" else name for name in node.input]
+        model.graph.node.insert(0, helper.make_node("Cast", ["steps"], ["as_before"], to=TensorProto.FLOAT))
+
+    assert "has no default" in str(refusal(tmp_path / "scene.onnx", remove))
+    assert "is tensor(int64), not tensor(float)" in str(refusal(tmp_path / "scene.onnx", whole_numbers))
+
+
 def test_another_input_is_refused(tmp_path: Path):
     def add(model: onnx.ModelProto) -> None:
         model.graph.input.append(helper.make_tensor_value_info("speed", TensorProto.FLOAT, [1]))

@@ -72,6 +72,42 @@ def test_times_outside_the_range_are_refused(session: DeformationSession, t: flo
             ask(t)
 
 
+def test_layers_may_be_applied_one_after_the_other(tmp_path: Path):
+    model = random_model(200, layers=("mlp", "plane", "mlp"))
+    session = DeformationSession(written(tmp_path / "scene.onnx", model))
+    assert session.most_steps == 3
+    for steps in range(4):
+        with torch.no_grad():
+            want = model.pose(0.37, steps=steps)
+        got = dict(zip(("means", "quats", "scales"), session.pose(0.37, steps=steps), strict=True))
+        for part, values in got.items():
+            assert np.abs(values - getattr(want, part).detach().numpy()).max() <= tolerance("export.relative")
+    for part, every in zip(session.pose(0.37, steps=3), session.pose(0.37), strict=True):
+        assert np.array_equal(part, every)
+
+
+def test_a_layer_may_be_applied_in_part(tmp_path: Path):
+    session = DeformationSession(written(tmp_path / "scene.onnx", random_model(200, layers=("mlp", "mlp"))))
+    start, first = (session.pose(0.37, steps=steps)[0] for steps in (0, 1))
+    assert np.abs(first - start).max() > 10 * tolerance("export.relative")
+    part = session.pose(0.37, steps=0.25)[0]
+    assert np.abs(part - (start + 0.25 * (first - start))).max() <= tolerance("export.relative")
+
+
+@pytest.mark.parametrize("steps", [-0.1, 3.1, float("nan"), float("inf")])
+def test_steps_that_the_scene_has_not_are_refused(session: DeformationSession, steps: float):
+    with pytest.raises(InvalidInput, match=rf"`steps` must be in \[0, {session.most_steps}\], the scene's layers"):
+        session.gaussians(0.5, steps)
+
+
+@pytest.mark.parametrize("steps", [0.0, 1.0, float("nan")])
+def test_a_scene_without_layers_has_no_steps(tmp_path: Path, steps: float):
+    session = DeformationSession(write_scene(tmp_path / "scene.onnx"))
+    assert session.most_steps == 0
+    with pytest.raises(InvalidInput, match="`steps` must be left out: the plan network doesn't run layers one by one"):
+        session.pose(0.5, steps=steps)
+
+
 def test_the_scene_has_its_own_range_of_times(tmp_path: Path):
     session = DeformationSession(written(tmp_path / "scene.onnx", random_model(9), time_range=(0.2, 0.6)))
     session.pose(0.2)

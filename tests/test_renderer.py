@@ -40,7 +40,7 @@ class CountingSession(DeformationSession):
         self.release.set()
         self.failure: Exception | None = None
 
-    def gaussians(self, t: float) -> Gaussians:
+    def gaussians(self, t: float, steps: float | None = None) -> Gaussians:
         self.times.append(t)
         assert self.release.wait(10)
         if self.failure:

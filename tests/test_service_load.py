@@ -36,7 +36,7 @@ class SlowPoses(PoseCache):
         self.step = 0.0
         self.begun = 0
 
-    def get(self, session: DeformationSession, t: float, watch: Watch) -> Gaussians:
+    def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
         watch.check()
         if self.slow:
             self.begun += 1

@@ -43,7 +43,7 @@ REPORT = {
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    write_scene(folder / "balls.onnx")
+    write_scene(folder / "balls.onnx", steps=True)
     write_scene(folder / "it's.onnx", static_color=(0.0, 0.0, 1.0), moving=False)
     (folder / "balls.report.json").write_text(json.dumps(REPORT))
     return folder
@@ -246,6 +246,26 @@ def test_depth_count_and_motion(opened: Page):
     opened.locator("#time").fill("1")
     opened.wait_for_function("() => location.hash.includes('t=1&')")
     assert asked[-1]["t"] + asked[-1]["dt"] == 1, "motion at the end of time leads beyond it"
+
+
+def test_the_slider_of_layers(opened: Page):
+    asked = bodies(opened)
+    opened.locator("#time").fill("1")
+    opened.wait_for_function("() => location.hash.includes('t=1&')")
+    all_layers = picture(opened)
+    opened.locator("#steps").fill("0.5")
+    opened.wait_for_function("() => location.hash.includes('steps=0.5&')")
+    assert opened.locator("#steps-text").inner_text() == "0.5 of 1"
+    assert asked[-1]["steps"] == 0.5
+    assert np.abs(picture(opened).astype(int) - all_layers).max() > 50
+    opened.locator("#steps").fill("1")
+    opened.wait_for_function("() => !location.hash.includes('steps')")
+    assert "steps" not in asked[-1]
+    opened.goto(opened.url.split("#")[0] + "#scene=balls&t=0.25&steps=0.25")
+    opened.get_by_text("0.25 of 1").wait_for()
+    opened.locator("#scenes").get_by_text("it's").click()
+    opened.wait_for_function("() => location.hash.includes('scene=it')")
+    assert not opened.locator("#layers").is_visible()
 
 
 def test_a_camera_of_the_scene_keeps_its_proportions(opened: Page):

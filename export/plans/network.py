@@ -31,12 +31,14 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...], delt
     quats = graph.node("Gather", [graph.constant("canonical_quats", moving.quats), "ids"], "ids.quats")
     time = graph.node("Reshape", ["t", graph.constant("time_shape", np.array([1, 1], np.int64))], "time")
 
+    steps = graph.constant("steps", np.array([len(layers)], np.float32))
     used = used_heads(layers)
     sizes = [DELTAS[part].stop - DELTAS[part].start for part in used]
     deltas, moved, parts = "", means, dict[str, str]()
     for k, layer in enumerate(layers, start=1):
         name = f"layer{k}"
-        step = _layer(graph, name, layer, moved, time, used)  # equation 7
+        share = _share(graph, name, steps, k)
+        step = _layer(graph, name, layer, moved, time, used, share)  # equation 7
         deltas = graph.node("Add", [deltas, step], f"{name}.deltas") if deltas else step  # equation 9
         parts = dict(zip(used, graph.split(deltas, [f"{name}.{part}" for part in used], sizes), strict=True))
         if k < len(layers) and "means" in parts:
@@ -93,18 +95,26 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_spac
         graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], "scales")
 
 
-def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str, used: list[str]) -> str:
-    """One layer at the means [M, 3]: the deltas of the heads that are used, times its weight if it predicts one."""
+def _share(graph: GraphBuilder, name: str, steps: str, k: int) -> str:
+    """[1] how much of layer k is applied after `steps`: all, nothing, or a part of the last one."""
+    before = graph.constant(f"{name}.before", np.array([k - 1], np.float32))
+    limits = [graph.constant(f"{name}.share.{n}", np.array(v, np.float32)) for n, v in (("min", 0), ("max", 1))]
+    return graph.node("Clip", [graph.node("Sub", [steps, before], f"{name}.steps"), *limits], f"{name}.share")
+
+
+def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str, used: list[str], share: str) -> str:
+    """One layer at the means [M, 3]: the deltas of the heads that are used, times its share, and its weight if it
+    predicts one."""
     rows = _rows(layer, used)
     if isinstance(layer, MLPLayer):
         heads = _mlp_heads(graph, name, layer, means, time, rows)
     else:
         heads = plane_heads(graph, name, layer, means, time, rows)
     if not layer.outputs.weight:
-        return heads
+        return graph.node("Mul", [heads, share], f"{name}.shared")
     deltas, logit = graph.split(heads, [f"{name}.unweighted", f"{name}.logit"], [len(rows) - 1, 1])
     weight = graph.node("Sigmoid", [logit], f"{name}.weight")
-    return graph.node("Mul", [weight, deltas], f"{name}.weighted")
+    return graph.node("Mul", [graph.node("Mul", [weight, share], f"{name}.shared"), deltas], f"{name}.weighted")
 
 
 def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str, rows: np.ndarray) -> str:

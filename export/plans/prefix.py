@@ -13,4 +13,6 @@ def prefix(baked: Baked, count: int) -> onnx.ModelProto:
     """The scene with its first `count` layers. Raises `InvalidInput` where it hasn't as many."""
     if count > len(baked.layers):
         raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
-    return network(replace(baked, layers=baked.layers[:count]), f"prefix:{count}")
+    metadata = replace(baked.scene.metadata, layers=baked.scene.metadata.layers[:count])
+    scene = replace(baked.scene, metadata=metadata)
+    return network(replace(baked, layers=baked.layers[:count], scene=scene), f"prefix:{count}")

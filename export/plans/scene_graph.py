@@ -34,6 +34,8 @@ def finished(graph: GraphBuilder, baked: Baked, plan: str, promise: dict[str, An
         graph.constant(name, array)
         outputs[name] = list(array.shape)
     inputs = {"t": (TensorProto.FLOAT, [1]), "ids": (TensorProto.INT64, ["M"])}
+    if "steps" in graph.constants:
+        inputs["steps"] = (TensorProto.FLOAT, [1])
     return graph.model(
         inputs, outputs, replace(scene.metadata, plan=plan, measured_error=promise or {}).to_properties()
     )

@@ -79,7 +79,8 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
         raise InvalidInput("dt", expected, "nothing" if request.dt is None else request.dt)
     for t in times:
         check_times(scene.session, t, shutter, request.dt)
-    options = RenderOptions(background, shutter, request.dt, counts="gaussians" in channels)
+    scene.session.check_steps(request.steps)
+    options = RenderOptions(background, shutter, request.dt, "gaussians" in channels, request.steps)
     etag = _etag(scene, request)
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
 

@@ -20,6 +20,7 @@ Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_PIXELS_PER_SIDE)]
 Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
 Decibels = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=200)]
 Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME_LENGTH)]
+Steps = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1000)]
 LaxNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 LaxPixels = Annotated[int, Field(ge=1, le=MAX_PIXELS_PER_SIDE)]
 Vector = tuple[Number, Number, Number]
@@ -186,6 +187,11 @@ class RenderRequest(Strict):
         default=None, description="`motion` leads to where things are at `t + dt`; needed for it, scene time"
     )
     shutter: ShutterSpec | None = Field(default=None, description="motion blur; default: a single moment")
+    steps: Steps | None = Field(
+        default=None,
+        description="after so many of the scene's deformation layers: 0 as the Gaussians are stored, 1.5 the first and "
+        "half of what the second does. Default: all. For scenes with `steps`, see `GET /scenes/{name}`",
+    )
     quality: Annotated[int, Field(strict=True, ge=1, le=100)] | None = Field(
         default=None, description="for `jpeg` and `webp` only; default 90"
     )
@@ -207,6 +213,9 @@ class RenderQuery(BaseModel):
         default=None, description="dB, as in `POST /render`"
     )
     t: LaxNumber | None = Field(default=None, description="default: the scene's first time")
+    steps: Annotated[float, Field(allow_inf_nan=False, ge=0, le=1000)] | None = Field(
+        default=None, description="as in `POST /render`"
+    )
     width: LaxPixels | None = Field(default=None, description="pixels")
     height: LaxPixels | None = Field(default=None, description="pixels")
     format: ImageFormat = Field(default="png", description="as in `POST /render`")
@@ -319,6 +328,7 @@ class SceneDetail(SceneEntry):
     contract: str
     plan: str = Field(description="how the deformation is computed")
     layers: list[str] = Field(description="kinds of the deformation steps, in order")
+    steps: int = Field(description="how many of them frames can be drawn after; 0 where the plan doesn't run them")
     gaussians: GaussianCounts
     sh_degree: int
     time_range: tuple[float, float]

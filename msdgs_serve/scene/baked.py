@@ -14,12 +14,14 @@ __all__ = [
     "CONTRACT",
     "INPUTS",
     "MOVING_OUTPUTS",
+    "OPTIONAL_INPUT",
     "BakedScene",
     "SceneCamera",
     "SceneMetadata",
 ]
 
 INPUTS = ("t", "ids")
+OPTIONAL_INPUT = "steps"
 MOVING_OUTPUTS = ("means", "quats", "scales")
 CONSTANT_OUTPUTS = ("static_means", "static_quats", "static_scales", "opacities", "sh")
 

@@ -7,6 +7,7 @@ import { Controls } from "./controls.js";
 import { drawDiagram } from "./diagram.js";
 import { showFacts } from "./facts.js";
 import { Frames } from "./frames.js";
+import { Layers } from "./layers.js";
 import { Pace } from "./pace.js";
 import { Player } from "./player.js";
 import { frameBody, numbersBody } from "./request.js";
@@ -20,7 +21,8 @@ const NOTICE_FOR = 2500;
 const VIEWS = ["rgb", "depth", "motion", "gaussians"];
 
 const find = (id) => document.getElementById(id);
-const state = { scene: null, camera: null, player: new Player(), view: "rgb" };
+const layers = new Layers({ changed: () => changed() });
+const state = { scene: null, camera: null, player: new Player(), layers, view: "rgb" };
 const pace = new Pace();
 const stage = new Stage(find("picture"), find("status"));
 const timeline = new Timeline(state.player, { changed: () => changed(), started: run });
@@ -49,7 +51,9 @@ async function open(name, look = {}) {
     state.camera = new Camera(scene.view);
     state.camera.aspect = stage.aspect();
     state.player.seek(0);
+    layers.set(null);
   }
+  layers.open(scene.steps);
   applyLook(look);
   describe();
   connection.say("");
@@ -58,8 +62,9 @@ async function open(name, look = {}) {
   await showReport(scene);
 }
 
-function applyLook({ t = null, at = null, sceneCamera = null, view = null }) {
+function applyLook({ t = null, steps = null, at = null, sceneCamera = null, view = null }) {
   if (t !== null) state.player.seekTime(t);
+  if (steps !== null) layers.set(steps);
   if (at) [state.camera.azimuth, state.camera.elevation, state.camera.distance] = at;
   if (at) state.camera.target = at.slice(3);
   if (sceneCamera in state.scene.cameras) state.camera.take(state.scene.cameras[sceneCamera], sceneCamera);

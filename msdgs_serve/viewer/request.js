@@ -4,9 +4,10 @@ import { depthRange } from "./camera.js";
 
 const MOTION_SHARE = 1 / 50; // of the scene's time, over which motion is shown
 
-/** A body without size and format. `state` has the scene's detail, camera, player and the view's name. */
-export function frameBody({ scene, camera, player, view }) {
-  const body = { scene: scene.name, camera: camera.spec, t: player.t };
+/** A body without size and format. `state` has the scene's detail, camera, player, layers and the view's name. */
+export function frameBody({ scene, camera, player, layers, view }) {
+  const some = layers.steps === null ? {} : { steps: layers.steps };
+  const body = { scene: scene.name, camera: camera.spec, t: player.t, ...some };
   if (view === "depth") return { ...body, channels: ["depth"], depth_range: depthRange(camera, scene.bounds) };
   if (view === "motion") return { ...body, channels: ["motion"], ...motionTimes(player) };
   if (view === "gaussians") return { ...body, channels: ["gaussians"] };

@@ -35,23 +35,25 @@ export async function download(body, name) {
 }
 
 /** What is shown, as the part of the address after #. */
-export function toHash({ scene, camera, player, view }) {
+export function toHash({ scene, camera, player, layers, view }) {
   const { azimuth, elevation, distance, target, sceneCamera } = camera;
   const lengths = [distance, ...target].map((x) => short(x, distance));
   const free = [short(azimuth), short(elevation), ...lengths].join(",");
   const at = sceneCamera === null ? { at: free } : { camera: sceneCamera };
-  return `#${new URLSearchParams({ scene: scene.name, t: player.t, view, ...at })}`.replaceAll("%2C", ",");
+  const steps = layers.steps === null ? {} : { steps: layers.steps };
+  return `#${new URLSearchParams({ scene: scene.name, t: player.t, ...steps, view, ...at })}`.replaceAll("%2C", ",");
 }
 
 /** The reverse; what is missing or makes no sense is left out. */
 export function fromHash(hash) {
   const given = new URLSearchParams(hash.slice(1));
   const at = (given.get("at") ?? "").split(",").map(Number);
-  const [t, sceneCamera] = ["t", "camera"].map((name) => (given.has(name) ? Number(given.get(name)) : NaN));
+  const [t, steps, sceneCamera] = ["t", "steps", "camera"].map((name) => (given.has(name) ? Number(given.get(name)) : NaN));
   return {
     scene: given.get("scene"),
     view: given.get("view"),
     t: Number.isFinite(t) ? t : null,
+    steps: Number.isFinite(steps) ? steps : null,
     sceneCamera: Number.isInteger(sceneCamera) ? sceneCamera : null,
     at: at.length === 6 && at.every(Number.isFinite) && at[2] > 0 ? at : null,
   };

@@ -165,6 +165,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         contract=metadata.contract,
         plan=metadata.plan,
         layers=list(metadata.layers),
+        steps=served.session.most_steps,
         gaussians=counts,
         sh_degree=metadata.sh_degree,
         time_range=metadata.time_range,
