@@ -3,7 +3,6 @@
 Every file is written beside its place and moved over it, so that a reader finds the old one or the new one whole.
 """
 
-import pickle
 import zipfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -98,7 +97,9 @@ def load(path: str | Path) -> Any:
         raise CheckpointInvalid(path, "no such file") from error
     except OSError as error:
         raise CheckpointInvalid(path, f"can't be read: {error.strerror or error}") from error
-    except (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, EOFError, ValueError, KeyError) as error:
+    except CheckpointInvalid:
+        raise
+    except Exception as error:  # where bits are turned its stack machine stumbles in any way
         raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
 
 

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,16 @@ def test_files_of_others_are_refused(tmp_path: Path):
 def test_what_is_no_file_is_refused(tmp_path: Path, name: str):
     with pytest.raises(CheckpointInvalid):
         load_model(tmp_path / name)
+
+
+@pytest.mark.parametrize("opcodes", [b"\x80\x02u.", b"\x80\x02(u.", b"\x80\x02e.", b"\x80\x02r", b"\x80\x02\x85."])
+def test_a_stream_that_makes_no_sense_is_refused(tmp_path: Path, opcodes: bytes):
+    torch.save({}, tmp_path / "sound.pt")
+    with zipfile.ZipFile(tmp_path / "sound.pt") as sound, zipfile.ZipFile(tmp_path / "model.pt", "w") as changed:
+        for name in sound.namelist():
+            changed.writestr(name, opcodes if name.endswith("data.pkl") else sound.read(name))
+    with pytest.raises(CheckpointInvalid, match="isn't a whole torch checkpoint"):
+        load(tmp_path / "model.pt")
 
 
 class Trap:

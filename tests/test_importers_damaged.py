@@ -26,8 +26,9 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.checkpoint import load_model
+from msdgs_train.checkpoint import CheckpointInvalid, load_model, save_model
 from tests import test_importers_4dgs, test_importers_runs
+from tests.models import SCENE, random_model
 from tests.splat_files import (
     compressed_ply_bytes,
     inria_columns,
@@ -127,7 +128,22 @@ def read_run(kind: str) -> Callable[[Path, list[Path]], Gaussians]:
     return read
 
 
+def our_model(folder: Path, g: Gaussians) -> list[Path]:
+    save_model(folder / "model.pt", random_model(len(g)), SCENE, 1)
+    return [folder / "model.pt"]
+
+
+def read_our_model(folder: Path, files: list[Path]) -> Gaussians:
+    try:
+        model = load_model(files[0]).model
+    except CheckpointInvalid as error:
+        raise ImportFailed(files[0], str(error)) from error
+    with torch.no_grad():
+        return as_gaussians(model.pose(0.5))
+
+
 KINDS = {
+    "model": Kind(our_model, read_our_model),
     "ply": one("a.ply", lambda g: ply_bytes(inria_columns(g)), "ply"),
     "text ply": one("a.ply", lambda g: ply_bytes(inria_columns(g), "ascii"), "ply"),
     "compressed ply": one("a.compressed.ply", compressed_ply_bytes, "ply"),
