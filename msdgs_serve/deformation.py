@@ -20,7 +20,7 @@ from msdgs_serve.scene.onnx_constants import Malformed, read_constants
 from msdgs_serve.threads import run_parallel
 
 CHUNK = 2048
-"""Gaussians a call. The widest activation of a call is CHUNK × width, whatever the scene's size."""
+"""Gaussians a call where layers run. The widest activation of a call is CHUNK × width, whatever the scene's size."""
 
 _SIZES = {"means": 3, "quats": 4, "scales": 3}
 _INPUT_TYPES = {"t": "tensor(float)", "ids": "tensor(int64)", OPTIONAL_INPUT: "tensor(float)"}
@@ -29,17 +29,19 @@ _INPUT_TYPES = {"t": "tensor(float)", "ids": "tensor(int64)", OPTIONAL_INPUT: "t
 class DeformationSession:
     """One scene file, loaded and checked; may be asked from several threads at once, though not from inside the pool.
 
-    The file's graph deforms the Gaussians it is asked for in one go. The loop over chunks of them is here: each chunk
-    is one single-threaded onnxruntime call, and the process-wide pool runs the chunks. The chunks don't depend on the
-    number of threads, so neither do the results.
+    The file's graph deforms the Gaussians it is asked for in one go. Where it runs layers the loop over chunks of them
+    is here: each chunk is one single-threaded onnxruntime call, and the process-wide pool runs the chunks. The chunks
+    don't depend on the number of threads, so neither do the results. Other graphs blend what is stored of all Gaussians
+    whatever they are asked for, and are called once.
     """
 
-    def __init__(self, path: str | Path, *, chunk: int = CHUNK, contents: bytes | None = None) -> None:
-        """`contents` are the file's, where they came by another way and `path` is but its name.
+    def __init__(self, path: str | Path, *, chunk: int | None = None, contents: bytes | None = None) -> None:
+        """`contents` are the file's, where they came by another way and `path` is but its name. `chunk` is how many
+        Gaussians a call takes, by default what suits the file's graph.
 
         Raises `SceneFileInvalid` naming the field where the file isn't a whole, finite `msdgs/1` scene.
         """
-        if chunk < 1:
+        if chunk is not None and chunk < 1:
             raise InvalidInput("chunk", "1 or more", chunk)
         self.path = Path(path)
         self._chunk = chunk
@@ -95,7 +97,8 @@ class DeformationSession:
                     raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
                 expected[:] = output
 
-        run_parallel(run, [(i, min(i + self._chunk, len(every))) for i in range(0, len(every), self._chunk)])
+        chunk = self._chunk or (CHUNK if self._has_steps else max(len(every), 1))
+        run_parallel(run, [(i, min(i + chunk, len(every))) for i in range(0, len(every), chunk)])
         self._check_finite(t, posed)
         return posed["means"], posed["quats"], posed["scales"]
 

@@ -25,6 +25,7 @@ from export.rendered_error import as_gaussians
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.checkpoint import CheckpointInvalid, load_model, save_model
 from tests import test_importers_4dgs, test_importers_runs
@@ -135,11 +136,10 @@ def our_model(folder: Path, g: Gaussians) -> list[Path]:
 
 def read_our_model(folder: Path, files: list[Path]) -> Gaussians:
     try:
-        model = load_model(files[0]).model
-    except CheckpointInvalid as error:
+        with torch.no_grad():
+            return as_gaussians(load_model(files[0]).model.pose(0.5)).validate()
+    except (CheckpointInvalid, InvalidInput) as error:
         raise ImportFailed(files[0], str(error)) from error
-    with torch.no_grad():
-        return as_gaussians(model.pose(0.5))
 
 
 KINDS = {

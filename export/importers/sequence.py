@@ -23,7 +23,7 @@ from export.importers.splats import Splats
 from export.plans.exact import POSE, QUATS
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.splines import design
-from export.plans.stored_poses import StoredPoses, shared_grid
+from export.plans.stored_poses import GriddedPoses, StoredPoses, of_ids
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.model import SMALLEST_SCALE
@@ -162,7 +162,7 @@ def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
     baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving], None), ())
     graph = new_graph(baked)
-    activated(graph, shared_grid(graph, StoredPoses.of(control), metadata.time_range))
+    activated(graph, of_ids(graph, GriddedPoses.on_one(StoredPoses.of(control)), metadata.time_range))
     return finished(graph, baked, f"keyframes:{count + 2}")
 
 

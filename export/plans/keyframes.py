@@ -1,48 +1,40 @@
 """Plan `keyframes:n`: n stored poses a Gaussian, the control points of a cubic spline over time.
 
 Positions, scales and quaternions of one sign are splines, the quaternions made unit after blending: the shortest way.
-A call reads the four poses next to its time. Gaussians that n poses get most wrong keep more of their own.
+A call reads the four poses next to its time. With a number of poses, Gaussians that these get most wrong keep more;
+with an error, each keeps as few as it needs.
 """
 
 import numpy as np
 import onnx
 
 from export.bake import Baked
-from export.plans.own_poses import SHARED_COUNTS, fitted, own_poses, worst
+from export.plans.own_poses import fitted, own_poses, worst
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.size import Size
-from export.plans.splines import FEWEST
-from export.plans.stored_poses import StoredPoses, shared_grid, with_own_poses
-from export.plans.trajectories import Trajectories
-
-OWN_BYTES = 5_000
-"""Of a Gaussian with poses of its own, roughly; for choosing n."""
-
-SAMPLED = 4_096
-"""Gaussians at which n is chosen."""
+from export.plans.stored_poses import GriddedPoses, StoredPoses, of_ids
+from export.plans.trajectories import Ids, Trajectories
 
 
 def keyframes(baked: Baked, trajectories: Trajectories, size: Size) -> onnx.ModelProto:
-    """The scene with `size.count` poses for all, or with as many as take the fewest bytes for `size.pixels`."""
-    count = size.count or _fewest_bytes(trajectories, size.pixels or 0)
+    """The scene with `size.count` poses for all, or with as few of each Gaussian as are within `size.pixels`."""
     every = np.arange(trajectories.count)
-    control, errors = fitted(trajectories, every, count)
-    chosen = worst(trajectories, errors, size.pixels)
-    most = size.pixels or np.delete(errors, chosen).max(initial=0) / trajectories.pixel
-    own, own_errors = own_poses(trajectories, chosen, most)
-    errors[chosen] = own_errors
+    if size.count is None:
+        poses, errors = own_poses(trajectories, every, size.pixels or 0)
+    else:
+        poses, errors = _mostly_of_one_size(trajectories, every, size.count)
     graph, time_range = new_graph(baked), baked.scene.metadata.time_range
-    pose = shared_grid(graph, StoredPoses.of(control), time_range)
-    activated(graph, with_own_poses(graph, pose, own, trajectories.count, time_range))
-    return finished(graph, baked, str(size), trajectories.promise(errors, len(own)))
+    activated(graph, of_ids(graph, poses, time_range))
+    own = len(every) - max(len(rows) for rows, _ in poses.grids)
+    return finished(graph, baked, str(size), trajectories.promise(errors, own))
 
 
-def _fewest_bytes(trajectories: Trajectories, pixels: float) -> int:
-    stride = -(-trajectories.count // SAMPLED)
-    ids = np.arange(0, trajectories.count, stride)
-
-    def bytes_each(count: int) -> float:
-        _, errors = fitted(trajectories, ids, count)
-        return 20 * count + OWN_BYTES * float((errors > pixels * trajectories.pixel).mean())
-
-    return min((FEWEST, *SHARED_COUNTS), key=bytes_each)
+def _mostly_of_one_size(trajectories: Trajectories, every: Ids, count: int) -> tuple[GriddedPoses, np.ndarray]:
+    """So many poses for all but the worst, which keep as few as are no worse than any other; and all errors, [N]."""
+    control, errors = fitted(trajectories, every, count)
+    chosen = worst(trajectories, errors, None)
+    rest = np.delete(every, chosen)
+    own, own_errors = own_poses(trajectories, chosen, errors[rest].max(initial=0) / trajectories.pixel)
+    errors[chosen] = own_errors
+    grids = [(chosen[rows], stored) for rows, stored in own.grids]
+    return GriddedPoses(((rest, StoredPoses.of(control[rest])), *grids)), errors

@@ -20,7 +20,7 @@ from export.plans.own_poses import CHUNK, own_poses, worst
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.size import Size
 from export.plans.splines import along_time, design, fitting, samples_for, time_weights
-from export.plans.stored_poses import with_own_poses
+from export.plans.stored_poses import at_time
 from export.plans.trajectories import Ids, Samples, Trajectories
 
 KNOTS = 131
@@ -52,7 +52,10 @@ def lowrank(baked: Baked, trajectories: Trajectories, size: Size) -> onnx.ModelP
     errors[chosen] = own_errors
     graph, time_range = new_graph(baked), baked.scene.metadata.time_range
     pose = _product(graph, fit.table(functions), fit.basis(functions), time_range)
-    activated(graph, with_own_poses(graph, pose, own, trajectories.count, time_range))
+    if len(own):
+        places = graph.constant("own.places", chosen[own.order][:, None])
+        pose = graph.node("ScatterND", [pose, places, at_time(graph, own, time_range)], "own.merged")
+    activated(graph, graph.node("Gather", [pose, "ids"], "ids.pose"))
     return finished(graph, baked, str(size), trajectories.promise(errors, len(own)))
 
 
@@ -66,7 +69,7 @@ def _cheapest(trajectories: Trajectories, fit: "_Fit", functions: np.ndarray, pi
 
 
 def _product(graph: GraphBuilder, table: np.ndarray, basis: np.ndarray, time_range: tuple[float, float]) -> str:
-    """[M, 10] rows of a table of coefficients and mean poses, times the functions at `t` above an identity."""
+    """[N, 10] a table of coefficients and mean poses, times the functions at `t` above an identity."""
     rank = basis.shape[1]
     cells, weights = time_weights(graph, "terms.clock", time_range, [KNOTS])
     near = graph.node("Add", [cells, graph.constant("terms.neighbours", np.arange(4, dtype=np.int64))], "terms.near")
@@ -75,8 +78,7 @@ def _product(graph: GraphBuilder, table: np.ndarray, basis: np.ndarray, time_ran
     functions = graph.node("Reshape", [graph.node("MatMul", [weights, control], "terms.flat"), shape], "terms.now")
     identity = graph.constant("terms.mean", np.eye(POSE, dtype=np.float32))
     factors = graph.node("Concat", [functions, identity], "terms.factors", axis=0)
-    rows = graph.node("Gather", [graph.constant("coefficients", table), "ids"], "ids.coefficients")
-    return graph.node("MatMul", [rows, factors], "terms.pose")
+    return graph.node("MatMul", [graph.constant("coefficients", table), factors], "terms.pose")
 
 
 class _Fit:

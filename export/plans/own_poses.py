@@ -1,17 +1,14 @@
-"""Which Gaussians keep poses of their own, so that the worst case of a plan is bounded and not only its mean."""
+"""How many poses a Gaussian keeps, so that the worst case of a plan is bounded and not only its mean."""
 
 import numpy as np
 
 from export.plans.exact import POSE
 from export.plans.splines import along_time, design, fitting, samples_for
-from export.plans.stored_poses import OwnPoses, StoredPoses
+from export.plans.stored_poses import GriddedPoses, StoredPoses
 from export.plans.trajectories import FINEST, USUAL, Ids, Trajectories
 
 COUNTS = (7, 11, 19, 35, 67, 131, 259, 515, FINEST // 2 + 3)
 """Control points of the grids that a Gaussian may have."""
-
-SHARED_COUNTS = COUNTS[:6]
-"""Of the grid of all Gaussians, where an error chooses it: who needs more keeps poses of its own."""
 
 SHARE = 0.05
 """Part of the Gaussians that a plan with a given size corrects: those that it gets most wrong."""
@@ -34,7 +31,7 @@ def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) ->
     return np.sort(over[np.argsort(-errors[over])[: int(np.ceil(SHARE * trajectories.count))]])
 
 
-def own_poses(trajectories: Trajectories, ids: Ids, most: float) -> tuple[OwnPoses, np.ndarray]:
+def own_poses(trajectories: Trajectories, ids: Ids, most: float) -> tuple[GriddedPoses, np.ndarray]:
     """Poses of the Gaussians `ids`, each on the coarsest grid that is within `most` pixels, and their errors [H]."""
     errors = np.full(len(ids), np.inf)
     grids, left = [], np.arange(len(ids))
@@ -50,7 +47,7 @@ def own_poses(trajectories: Trajectories, ids: Ids, most: float) -> tuple[OwnPos
         if len(done_rows):
             grids.append((done_rows, StoredPoses.joined(poses)))
         left = np.setdiff1d(left, done_rows)
-    return OwnPoses(ids, tuple(grids)), errors
+    return GriddedPoses(tuple(grids)), errors
 
 
 def fitted(trajectories: Trajectories, ids: Ids, count: int) -> tuple[np.ndarray, np.ndarray]:
