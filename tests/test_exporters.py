@@ -18,6 +18,7 @@ from export.exporters.proof import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import VisionaryInvalid, check_visionary, visionary_model
 from export.importers import read_splats
+from export.importers.sequence import read_sequence, sequence_scene
 from export.plans import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
@@ -25,6 +26,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
 from tests.models import SCENE, random_model
+from tests.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.tolerances import tolerance
 
 QUIET = Console(quiet=True)
@@ -65,6 +67,23 @@ def test_a_sequence_covers_the_scenes_time(tmp_path: Path):
     assert np.abs(read_splats(files[-1]).gaussians.means - last.means).max() < tolerance("splat_values")
     with pytest.raises(InvalidInput, match=r"a folder without PLY files"):
         run(scene, tmp_path / "frames", frames=3)
+
+
+def test_of_switched_frames_only_the_one_that_is_shown_is_written(tmp_path: Path):
+    folder, scene = tmp_path / "frames", tmp_path / "scene.onnx"
+    folder.mkdir()
+    frames = [some_gaussians(count, sh_degree=0) for count in (120, 80, 200)]
+    for number, frame in enumerate(frames):
+        (folder / f"frame_{number}.ply").write_bytes(ply_bytes(inria_columns(frame)))
+    scene.write_bytes(sequence_scene(read_sequence(folder), "0" * 64).SerializeToString())
+    assert DeformationSession(scene).scene.metadata.plan == "frames:3"
+    for name, read in (("a.ply", read_splats), ("a.spz", read_splats), ("a.glb", None)):
+        run(scene, tmp_path / name, t=0.5)
+        got = read(tmp_path / name).gaussians if read else read_gltf(tmp_path / name)
+        assert len(got) == 80
+        assert np.abs(got.means - frames[1].means).max() < tolerance("spz_position")
+    with pytest.raises(InvalidInput, match="USD would blend them"):
+        run(scene, tmp_path / "a.usdc")
 
 
 @pytest.mark.parametrize("antialiasing", ["dilate", "mip"])

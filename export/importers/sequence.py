@@ -35,6 +35,9 @@ APART = 3.0
 """How many times as far from its nearest neighbour a Gaussian may be in the next frame, at nine in ten."""
 
 SAMPLED = 5_000
+SWITCHED = "frames"
+"""The plan of scenes whose frames are switched, `frames:n`."""
+
 PARKED_AT = 1e6
 """Half diagonals of the scene's bounds below its middle."""
 
@@ -102,6 +105,14 @@ def shown_rows(sequence: Frames, number: int) -> slice:
         return slice(None)
     start = sum(map(len, sequence.gaussians[:number]))
     return slice(start, start + len(sequence.gaussians[number]))
+
+
+def of_the_moment(gaussians: Gaussians, plan: str) -> Gaussians:
+    """Without those of other frames, which scenes of the plan `frames:n` park far below."""
+    if not plan.startswith(f"{SWITCHED}:"):
+        return gaussians
+    here = np.flatnonzero((gaussians.scales > SMALLEST_SCALE).any(axis=1))
+    return Gaussians(*(getattr(gaussians, part)[here] for part in ("means", "quats", "scales", "opacities", "sh")))
 
 
 def _why_not_blended(frames: tuple[Gaussians, ...], dropped: bool) -> str | None:
@@ -190,7 +201,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
         for name in ("means", "quats", "scales", "opacities", "sh")
     )
     metadata = metadata_of(means, frames[0].sh_degree, sha256, sequence.antialiasing, sequence.dropped)
-    plan = f"frames:{len(frames)}"
+    plan = f"{SWITCHED}:{len(frames)}"
     empty = np.empty((0, 3), np.float32)
     scene = BakedScene(
         replace(metadata, plan=plan), len(means), empty, np.empty((0, 4), np.float32), empty, opacities, sh
