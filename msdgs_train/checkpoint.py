@@ -92,6 +92,10 @@ def load(path: str | Path) -> Any:
             raise CheckpointInvalid(path, "is empty")
         if not zipfile.is_zipfile(path):
             raise CheckpointInvalid(path, f"isn't a torch checkpoint, or is cut off after {size:,} bytes")
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+        if unpacked > size:  # it could unpack to anything
+            raise CheckpointInvalid(path, f"is packed: it holds {unpacked:,} bytes; torch.save packs nothing")
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise CheckpointInvalid(path, "no such file") from error

@@ -12,6 +12,7 @@ import pytest
 
 from export.exporters.spz import write_spz
 from export.importers import ImportFailed, read_splats, recognise
+from export.importers.recognise import frame_files
 from export.importers.scene import digest, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
 from msdgs_serve.deformation import DeformationSession
@@ -183,6 +184,63 @@ def test_a_sog_reads_no_files_outside_of_its_folder(tmp_path: Path):
     (folder / "meta.json").write_text(meta.replace('"quats.webp"', '"../sog/quats.webp"'))
     with pytest.raises(ImportFailed, match=r"`quats.files` must be a list of 1 names of files beside it"):
         read_splats(folder)
+
+
+@pytest.mark.parametrize("ending", [".sog", ".zip"])
+@pytest.mark.parametrize("damage", [{0: 0}, {6: 255}, {9: 8, 46: 255}], ids=["magic", "version", "a name's encoding"])
+def test_a_zip_whose_directory_is_damaged_is_refused_unnamed(tmp_path: Path, ending: str, damage: dict[int, int]):
+    contents = bytearray(zipped(write_sog(tmp_path / "sog", some_gaussians(20, 0))))
+    directory = contents.index(b"PK\x01\x02")
+    for at, value in damage.items():
+        contents[directory + at] = value
+    file = write(tmp_path, f"a{ending}", bytes(contents))
+    with pytest.raises(ImportFailed, match=r"a\..*: isn't a whole zip"):
+        read_splats(file)
+
+
+def test_a_sog_is_stored_or_deflated(tmp_path: Path):
+    folder = write_sog(tmp_path / "sog", some_gaussians(20, 0))
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_LZMA) as archive:
+        for file in folder.iterdir():
+            archive.write(file, file.name)
+    with pytest.raises(ImportFailed, match=r"its meta.json is packed in a way that no SOG is: 14"):
+        read_splats(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("inria_native_9080.ply", "playbot_4.ply"),
+        ("one.spz", "three.spz", "two.spz"),
+        ("frame_1.ply", "frame_2.spz"),
+        ("frame_1_near.ply", "frame_2_far.ply"),
+        ("take1_frame1.ply", "take2_frame2.ply"),
+        ("frame_1.ply", "frame_2.ply", "ground.ply"),
+        ("a.PLY", "a.ply"),
+    ],
+)
+def test_splat_files_of_other_names_are_no_sequence(tmp_path: Path, names: tuple[str, ...]):
+    for name in names:
+        write(tmp_path, name, POINTS)
+    for read in (recognise, read_sequence):
+        with pytest.raises(ImportFailed, match=rf"{names[0]} and .* differ in more than a number"):
+            read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("frame_9.ply", "frame_010.PLY", "frame_11.ply"),
+        ("1.spz", "2.spz"),
+        ("lod3_frame2.compressed.ply", "lod3_frame10.compressed.ply"),
+        ("frame2_lod3.sog", "frame10_lod3.sog"),
+    ],
+)
+def test_frames_are_in_the_order_of_the_number_that_differs(tmp_path: Path, names: tuple[str, ...]):
+    for name in (*names, "notes_1.txt", ".hidden.ply"):
+        write(tmp_path, name, b"")
+    assert [file.name for file in frame_files(tmp_path)] == list(names)
+    assert recognise(tmp_path) == "sequence"
 
 
 def test_a_static_scene_is_the_file_and_can_be_drawn_without_saying_from_where(tmp_path: Path):

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor
 
-from export.importers import ImportFailed, recognise
+from export.importers import ImportFailed, fourdgs, recognise
 from export.importers.command import model_or_import
 from export.importers.runs import write_model
 from export.to_onnx import main as to_onnx
@@ -20,6 +20,7 @@ from export.write import properties
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.camera import orbit
 from msdgs_train.checkpoint import load_model
+from tests import test_importers_runs
 from tests.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.tolerances import tolerance
 
@@ -188,3 +189,42 @@ def test_switches_that_make_another_network_are_named(tmp_path: Path):
     with pytest.raises(ImportFailed, match=r"apply_rotation"):
         write_model(run, "4dgs", tmp_path / "model.pt", QUIET)
     assert not (tmp_path / "model.pt").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"feature_out.0.bias": torch.zeros(4_096)}, r"feature_out.0.weight` has shape \(16, 6\), not 4096 × 6"),
+        ({"feature_out.0.bias": torch.zeros(50_000)}, r"has 50,000 units a layer and 1 grids of 6 channels"),
+        ({"feature_out.0.bias": torch.zeros(0)}, r"has 0 units a layer"),
+        ({"grid.grids.0.2": torch.ones(1, 5_000, 12, 8)}, r"1 grids of 5,000 channels"),
+        ({"grid.grids.0.2": torch.ones(1, 6, 12, 4_096)}, r"grids.0.0` has shape \(1, 6, 8, 8\), not 1 × 6 × 4096"),
+    ],
+)
+def test_sizes_that_do_not_agree_are_named_before_memory_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Tensor], message: str
+):
+    changed = {f"deformation_net.{name}": tensor for name, tensor in change.items()}
+    run = write_run(tmp_path / "run", their_state((1,)) | changed)
+    built = test_importers_runs.on_which_device(monkeypatch, fourdgs)
+    with pytest.raises(ImportFailed, match=message):
+        write_model(run, "4dgs", tmp_path / "model.pt", QUIET)
+    assert set(built) <= {"meta"}
+
+
+@pytest.mark.parametrize(
+    "contents",
+    [
+        "[" * 100_000,
+        json.dumps([camera(0) | {"width": float("inf")}]),
+        json.dumps([camera(0) | {"height": 10**400}]),
+        json.dumps([camera(0) | {"fx": 10**400}]),
+        "{}",
+    ],
+    ids=["deep", "infinite", "huge", "huge fx", "no list"],
+)
+def test_cameras_that_cannot_be_are_refused_by_the_name_of_their_file(tmp_path: Path, contents: str):
+    run = write_run(tmp_path / "run", their_state((1,)))
+    (run / "cameras.json").write_text(contents)
+    with pytest.raises(ImportFailed, match=r"cameras.json: isn't a list of cameras"):
+        write_model(run, "4dgs", tmp_path / "model.pt", QUIET)

@@ -4,6 +4,7 @@
 """
 
 import gzip
+import json
 import os
 import tempfile
 import time
@@ -31,6 +32,7 @@ from msdgs_train.checkpoint import CheckpointInvalid, load_model, save_model
 from tests import test_importers_4dgs, test_importers_runs
 from tests.models import SCENE, random_model
 from tests.splat_files import (
+    _write_webp,
     compressed_ply_bytes,
     inria_columns,
     ksplat_bytes,
@@ -52,6 +54,9 @@ DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "30"))
 COUNT = 300 if DAMAGED < 1000 else 1_000
 """Gaussians a file."""
 
+PALETTE = 64
+"""Sets of harmonics in a SOG."""
+
 ENDS = 1024
 """Bytes at both ends, where headers and tables are and half of the damage is done."""
 
@@ -65,14 +70,14 @@ class Kind(NamedTuple):
     read: Callable[[Path, list[Path]], Gaussians]  # of the folder and these files
 
 
-def one(name: str, contents: Callable[[Gaussians], bytes], reader: str) -> Kind:
-    """A format of one file."""
+def one(name: str, contents: Callable[[Gaussians], bytes]) -> Kind:
+    """A format of one file, which is recognised by what is left of it."""
 
     def make(folder: Path, g: Gaussians) -> list[Path]:
         (folder / name).write_bytes(contents(g))
         return [folder / name]
 
-    return Kind(make, lambda folder, files: read_splats(files[0], reader).gaussians)
+    return Kind(make, lambda folder, files: read_splats(files[0]).gaussians)
 
 
 def spz3(g: Gaussians) -> bytes:
@@ -81,12 +86,30 @@ def spz3(g: Gaussians) -> bytes:
         return (Path(folder) / "a.spz").read_bytes()
 
 
+def spz2(g: Gaussians) -> bytes:
+    """With the harmonics of version 3, which come after 20 bytes a Gaussian."""
+    stream = gzip.decompress(spz3(g))
+    return gzip.compress(spz2_bytes(stream) + stream[16 + 20 * len(g) :])
+
+
 def sog_folder(folder: Path, g: Gaussians) -> list[Path]:
-    return sorted(write_sog(folder / "sog", g).iterdir())
+    return sorted(with_harmonics(write_sog(folder / "sog", g), g).iterdir())
+
+
+def with_harmonics(folder: Path, g: Gaussians) -> Path:
+    """Degree 1 in a SOG folder: those of the first Gaussians are the palette of all."""
+    bytes_of = np.round((g.sh[:PALETTE, 1:].reshape(-1, 3) + 2) / 4 * 255)
+    _write_webp(folder / "shN_centroids.webp", bytes_of)
+    _write_webp(folder / "shN_labels.webp", np.arange(len(g))[:, None] % PALETTE * np.array([1, 0]))
+    meta = json.loads((folder / "meta.json").read_text())
+    files, codebook = ["shN_centroids.webp", "shN_labels.webp"], np.linspace(-2, 2, 256).tolist()
+    meta["shN"] = {"bands": 1, "count": PALETTE, "codebook": codebook, "files": files}
+    (folder / "meta.json").write_text(json.dumps(meta))
+    return folder
 
 
 def sog_zip(folder: Path, g: Gaussians) -> list[Path]:
-    (folder / "a.sog").write_bytes(zipped(write_sog(folder / "sog", g)))
+    (folder / "a.sog").write_bytes(zipped(with_harmonics(write_sog(folder / "sog", g), g)))
     return [folder / "a.sog"]
 
 
@@ -144,17 +167,17 @@ def read_our_model(folder: Path, files: list[Path]) -> Gaussians:
 
 KINDS = {
     "model": Kind(our_model, read_our_model),
-    "ply": one("a.ply", lambda g: ply_bytes(inria_columns(g)), "ply"),
-    "text ply": one("a.ply", lambda g: ply_bytes(inria_columns(g), "ascii"), "ply"),
-    "compressed ply": one("a.compressed.ply", compressed_ply_bytes, "ply"),
-    "splat": one("a.splat", splat_bytes, "splat"),
-    "ksplat": one("a.ksplat", ksplat_bytes, "ksplat"),
-    "spz 2": one("a.spz", lambda g: gzip.compress(spz2_bytes(gzip.decompress(spz3(g)))), "spz"),
-    "spz 3": one("a.spz", spz3, "spz"),
-    "spz 3, bare": one("a.spz", lambda g: gzip.decompress(spz3(g)), "spz"),
-    "spz 4": one("a.spz", lambda g: spz4_bytes(gzip.decompress(spz3(g))), "spz"),
-    "sog": Kind(sog_zip, lambda folder, files: read_splats(files[0], "sog").gaussians),
-    "sog folder": Kind(sog_folder, lambda folder, files: read_splats(folder / "sog", "sog").gaussians),
+    "ply": one("a.ply", lambda g: ply_bytes(inria_columns(g))),
+    "text ply": one("a.ply", lambda g: ply_bytes(inria_columns(g), "ascii")),
+    "compressed ply": one("a.compressed.ply", compressed_ply_bytes),
+    "splat": one("a.splat", splat_bytes),
+    "ksplat": one("a.ksplat", ksplat_bytes),
+    "spz 2": one("a.spz", spz2),
+    "spz 3": one("a.spz", spz3),
+    "spz 3, bare": one("a.spz", lambda g: gzip.decompress(spz3(g))),
+    "spz 4": one("a.spz", lambda g: spz4_bytes(gzip.decompress(spz3(g)))),
+    "sog": Kind(sog_zip, lambda folder, files: read_splats(files[0]).gaussians),
+    "sog folder": Kind(sog_folder, lambda folder, files: read_splats(folder / "sog").gaussians),
     "sequence": Kind(frames, read_frames),
     "deformgs": Kind(
         run_of(test_importers_runs.write_run, test_importers_runs.their_state(True)), read_run("deformgs")
@@ -166,7 +189,7 @@ KINDS = {
 @pytest.mark.parametrize("name", KINDS)
 def test_damaged_files_are_refused_or_drawn(tmp_path: Path, name: str):
     kind, rng = KINDS[name], np.random.default_rng(sum(name.encode()))
-    files = kind.make(tmp_path, some_gaussians(COUNT, sh_degree=0))
+    files = kind.make(tmp_path, some_gaussians(COUNT, sh_degree=1))
     whole = {file: file.read_bytes() for file in files}
     drawn(kind.read(tmp_path, files))  # compiles
     sound = max(measured(lambda: kind.read(tmp_path, files))[1] for _ in range(3))

@@ -1,16 +1,23 @@
 """Runs of Deformable-3D-Gaussians: their network, said again here in a few lines, and what becomes of it."""
 
+import zipfile
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from export.importers import ImportFailed, recognise
+from export.importers import ImportFailed, deformgs, recognise
 from export.importers.runs import write_model
+from export.importers.unbent import bent
+from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.checkpoint import load_model
+from msdgs_train.model import DynamicGaussians
 from tests.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.tolerances import tolerance
 
@@ -82,7 +89,9 @@ def test_the_network_is_theirs(tmp_path: Path, blender: bool, depth: int):
     state = their_state(blender, depth)
     run = write_run(tmp_path / "run", state)
     assert recognise(run) == "deformgs"
-    assert write_model(run, "deformgs", tmp_path / "model.pt", QUIET) == []
+    (lost,) = write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+    assert (lost["rule"], lost["count"]) == ("unbent", COUNT)
+    assert 10 < lost["worst_frame_db"] < 100
     model, info, step = load_model(tmp_path / "model.pt")
     g = some_gaussians(COUNT, 3, seed=40_000)
     assert (step, info.background, model.config.delta_space) == (40_000, (1.0, 1.0, 1.0), "activated")
@@ -95,6 +104,22 @@ def test_the_network_is_theirs(tmp_path: Path, blender: bool, depth: int):
         assert (posed.scales - (scales + d_scales).clamp_min(2.1e-9)).abs().max() < tolerance("import.network")
         theirs = quats + d_quats
         assert (posed.quats - theirs / theirs.norm(dim=1, keepdim=True)).abs().max() < tolerance("import.network")
+
+
+def test_shapes_are_compared_with_those_that_they_draw(tmp_path: Path):
+    state = their_state(True)
+    write_model(write_run(tmp_path / "run", state), "deformgs", tmp_path / "model.pt", QUIET)
+    model, g = load_model(tmp_path / "model.pt").model, some_gaussians(COUNT, 3, seed=40_000)
+    drawn, off = bent(model, 0.37)
+    _, d_quats, d_scales = (d.numpy() for d in their_deltas(state, torch.from_numpy(g.means).double(), 0.37))
+    quats, scales = g.quats + d_quats, g.scales + d_scales
+    squares = np.square(quats).sum(1)[:, None, None]  # a matrix of a length s is I + s² (R - I)
+    matrices = (1 - squares) * np.eye(3) + squares * Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    wanted = matrices @ (np.square(scales)[:, :, None] * matrices.transpose(0, 2, 1))
+    axes = to_matrix(drawn.quats.astype(np.float64)) * drawn.scales[:, None, :]
+    size = np.abs(wanted).max((1, 2))
+    assert (np.abs(axes @ axes.transpose(0, 2, 1) - wanted).max((1, 2)) <= tolerance("import.network") * size).all()
+    assert off == pytest.approx(np.abs(np.linalg.norm(quats, axis=1) - 1).max(), rel=tolerance("import.network"))
 
 
 def test_what_differs_is_named(tmp_path: Path):
@@ -113,6 +138,83 @@ def test_what_differs_is_named(tmp_path: Path):
     network.unlink()
     with pytest.raises(ImportFailed, match=r"no deform/iteration_40000/deform.pth"):
         write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+
+
+def test_two_layers_whose_heads_read_the_input_again_are_refused(tmp_path: Path):
+    run = write_run(tmp_path / "run", their_state(True, depth=2))
+    with pytest.raises(ImportFailed, match=r"has 2 hidden layers; from 3 to 64"):
+        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+
+
+UNLIKE_STORED = [
+    (torch.zeros(1).expand(10_000_000, 10_000_000), r"isn't stored in full: it shares 4 bytes"),
+    (torch.zeros(3, 3).to_sparse(), r"isn't a dense tensor of plain numbers"),
+    (torch.zeros(3, dtype=torch.complex64), r"isn't a dense tensor of plain numbers"),
+    (torch.zeros(3, device="meta"), r"isn't a dense tensor of plain numbers"),
+    (torch.zeros(3).to(torch.float8_e4m3fn), r"isn't a dense tensor of plain numbers"),
+]
+
+
+@pytest.mark.parametrize(("tensor", "message"), UNLIKE_STORED)
+def test_tensors_that_are_not_rows_of_stored_numbers_are_named(tmp_path: Path, tensor: Tensor, message: str):
+    run = write_run(tmp_path / "run", their_state(True) | {"more": tensor})
+    with pytest.raises(ImportFailed, match=rf"`more` .*{message}"):
+        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+
+
+def test_a_storage_is_no_two_tensors(tmp_path: Path):
+    state = their_state(True)
+    run = write_run(tmp_path / "run", state | {"linear.3.weight": state["linear.2.weight"]})
+    with pytest.raises(ImportFailed, match=r"`linear.3.weight` .*isn't stored in full"):
+        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+
+
+def test_a_checkpoint_that_unpacks_to_more_than_itself_is_refused(tmp_path: Path):
+    run = write_run(tmp_path / "run", {"linear.0.weight": torch.zeros(1_000_000)})
+    network = run / "deform" / "iteration_40000" / "deform.pth"
+    with zipfile.ZipFile(network) as whole:
+        parts = {name: whole.read(name) for name in whole.namelist()}
+    with zipfile.ZipFile(network, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, contents in parts.items():
+            packed.writestr(name, contents)
+    with pytest.raises(ImportFailed, match=r"is packed: it holds 4,\d{3},\d{3} bytes"):
+        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+
+
+@pytest.mark.parametrize(
+    ("blender", "change", "message"),
+    [
+        (True, {"linear.0.bias": torch.zeros(4_096)}, r"`linear.0.weight` has shape \(64, 93\), not 4096 × 93"),
+        (True, {"linear.0.bias": torch.zeros(50_000)}, r"has 50,000 units a layer"),
+        (True, {"linear.0.bias": torch.zeros(0)}, r"has 0 units a layer"),
+        (True, {"timenet.0.bias": torch.zeros(1)}, r"`timenet.0.bias` has shape \(1,\), not 256"),
+        (True, {"timenet.0.bias": torch.zeros(5)}, r"`timenet.0.bias` has shape \(5,\), not 256"),
+        (True, {"timenet.2.bias": torch.zeros(4_096)}, r"`timenet.2.weight` has shape \(30, 256\), not 4096 × 256"),
+        (True, {"timenet.0.weight": torch.zeros(256, 2_051)}, r"reads 1,025 frequencies of time"),
+        (False, {"linear.0.weight": torch.zeros(64, 2_064)}, r"reads 1,000 frequencies of time"),
+    ],
+)
+def test_sizes_that_do_not_agree_are_named_before_memory_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blender: bool, change: dict[str, Tensor], message: str
+):
+    run = write_run(tmp_path / "run", their_state(blender) | change)
+    built = on_which_device(monkeypatch, deformgs)
+    with pytest.raises(ImportFailed, match=message):
+        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+    assert set(built) <= {"meta"}
+
+
+def on_which_device(monkeypatch: pytest.MonkeyPatch, importer: ModuleType) -> list[str]:
+    """Where the networks of models are from now on made; on `meta` they take no memory."""
+    built: list[str] = []
+
+    def model(*given: Any) -> DynamicGaussians:
+        made = DynamicGaussians(*given)
+        built.append(next(made.deformation.parameters()).device.type)
+        return made
+
+    monkeypatch.setattr(importer, "DynamicGaussians", model)
+    return built
 
 
 class Evil:

@@ -14,9 +14,11 @@ from msdgs_train.layers import MLPLayer
 from msdgs_train.model import DynamicGaussians, ModelConfig
 
 XYZ_FREQUENCIES = 10
-MOST_LAYERS = 64
-CHECKED_TIMES, CHECKED_GAUSSIANS = 9, 10_000
-"""At which lengths of quaternions are looked at."""
+LEAST_LAYERS, MOST_LAYERS = 3, 64
+"""With two, the heads would read the input once more; ours don't."""
+
+MOST_UNITS, MOST_FREQUENCIES = 4_096, 64
+"""Sixteen times the usual width; what is above 2⁶⁴ turns in unit time is noise in float32."""
 
 
 def read_deformgs(
@@ -30,11 +32,16 @@ def read_deformgs(
     if settings.get("is_6dof") or "branch_w.weight" in state:
         raise ImportFailed(file, "was trained with --is_6dof, whose screw motions no layer of this project has")
     depth = sum(name.startswith("linear.") and name.endswith(".weight") for name in state.names())
-    if not 2 <= depth <= MOST_LAYERS:
-        raise ImportFailed(file, f"has {depth} hidden layers; from 2 to {MOST_LAYERS} can be read")
+    if not LEAST_LAYERS <= depth <= MOST_LAYERS:
+        raise ImportFailed(file, f"has {depth} hidden layers; from {LEAST_LAYERS} to {MOST_LAYERS} can be read")
     width = len(state.read("linear.0.bias", None))
     by_network = "timenet.0.weight" in state
     time_width, time_features, frequencies = _time_sizes(state, by_network, width)
+    if not all(1 <= size <= MOST_UNITS for size in (width, time_width, time_features)):
+        found = f"{width:,} units a layer, and {time_width:,} and {time_features:,} for time"
+        raise ImportFailed(file, f"has {found}; from 1 to {MOST_UNITS:,} can be read")
+    if not 0 <= frequencies <= MOST_FREQUENCIES:
+        raise ImportFailed(file, f"reads {frequencies:,} frequencies of time; up to {MOST_FREQUENCIES} can be read")
     config = ModelConfig(
         sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
         layers=("mlp",),
@@ -48,12 +55,12 @@ def read_deformgs(
         embedding_size=0,
         delta_space="activated",
     )
+    with torch.device("meta"):
+        shapes_only = DynamicGaussians(config, gaussians)
+    _fill(shapes_only, state, by_network)  # all tensors must fit before memory is taken for any
     model = DynamicGaussians(config, gaussians)
-    layer = model.deformation.layers[0]
-    assert isinstance(layer, MLPLayer)
-    with torch.no_grad():
-        _fill(layer, state, by_network)
-    return model, [_quaternion_note(model)]
+    _fill(model, state, by_network)
+    return model, []
 
 
 def _time_sizes(state: State, by_network: bool, width: int) -> tuple[int, int, int]:
@@ -67,16 +74,20 @@ def _time_sizes(state: State, by_network: bool, width: int) -> tuple[int, int, i
     return 2 * encoded, encoded, (encoded - 1) // 2
 
 
-def _fill(layer: MLPLayer, state: State, by_network: bool) -> None:
+@torch.no_grad()
+def _fill(model: DynamicGaussians, state: State, by_network: bool) -> None:
     """Their tensors in the layer's places. Their encoding has sine and cosine of a frequency side by side."""
+    layer = model.deformation.layers[0]
+    assert isinstance(layer, MLPLayer)
     order = _octave_order(3, XYZ_FREQUENCIES)
     times = _octave_order(1, (layer.time_hidden.in_features - 1) // 2)
     features = layer.input_features - layer.xyz_features
     inputs = torch.cat([order, layer.xyz_features + (torch.arange(features) if by_network else times)])
     if by_network:
         hidden, out = layer.time_hidden, layer.time_output
-        _set(hidden, state.read("timenet.0.weight", *hidden.weight.shape)[:, times], state.read("timenet.0.bias", None))
-        _set(out, state.read("timenet.2.weight", *out.weight.shape), state.read("timenet.2.bias", None))
+        weight, bias = (state.read(f"timenet.0.{kind}", *getattr(hidden, kind).shape) for kind in ("weight", "bias"))
+        _set(hidden, weight[:, times], bias)
+        _set(out, *(state.read(f"timenet.2.{kind}", *getattr(out, kind).shape) for kind in ("weight", "bias")))
     else:  # the encoded time itself: x = relu(x) − relu(−x)
         eye = torch.eye(features)
         _set(layer.time_hidden, torch.cat([eye, -eye]), torch.zeros(2 * features))
@@ -104,20 +115,3 @@ def _octave_order(dimensions: int, frequencies: int) -> Tensor:
 def _set(linear: nn.Linear, weight: Tensor, bias: Tensor) -> None:
     linear.weight.copy_(weight)
     linear.bias.copy_(bias)
-
-
-@torch.no_grad()
-def _quaternion_note(model: DynamicGaussians) -> str:
-    """How far covariances of unit quaternions are from theirs, which uses normalize(q) + Δq as it is."""
-    layer, count = model.deformation.layers[0], len(model.gaussians)
-    g = model.gaussians.rows(torch.arange(0, count, max(1, count // CHECKED_GAUSSIANS)))
-    quats = g.raw_quats / torch.linalg.vector_norm(g.raw_quats, dim=1, keepdim=True)
-    worst = torch.zeros(len(quats))
-    for t in torch.linspace(0, 1, CHECKED_TIMES):
-        lengths = torch.linalg.vector_norm(quats + layer(g.means, t).delta_quats, dim=1)
-        worst = torch.maximum(worst, (lengths - 1).abs())
-    share = float((worst > 0.01).double().mean())
-    return (
-        f"their renderer takes quaternions of any length, a scene file unit ones: lengths differ from 1 by up to "
-        f"{float(worst.max()):.3g}, by more than 0.01 at {share:.1%} of the Gaussians; their shapes are drawn unbent"
-    )

@@ -31,6 +31,9 @@ SH_DEGREE = 3
 SPACE, TIME = (0, 1, 3), (2, 4, 5)
 """Which of its six planes are xy, xz, yz, and xt, yt, zt."""
 
+MOST_UNITS = 4_096
+"""A layer, and channels of all grids: sixteen times the usual and more."""
+
 UNIT = 1e-4
 """Quaternions that are nearer to unit length all count as such: float32 as training leaves it."""
 
@@ -81,11 +84,14 @@ def read_4dgs(
     if scaled:
         tensors = {name: parameter.detach() for name, parameter in gaussians.named_parameters()}
         gaussians = CanonicalGaussians(**tensors | {"embeddings": -norms.log()[:, None]})
+    heads_off = [name for name, switch in HEADS.items() if off[switch]]
+    with torch.device("meta"):
+        shapes_only = DynamicGaussians(config, gaussians)
+    _fill(shapes_only, state, sizes, heads_off, first, since)  # all tensors must fit before memory is taken for any
     model = DynamicGaussians(config, gaussians)
-    with torch.no_grad():
-        _fill(model, state, sizes, [name for name, switch in HEADS.items() if off[switch]], first, since)
-        if scaled:
-            _divide_by_lengths(model)
+    _fill(model, state, sizes, heads_off, first, since)
+    if scaled:
+        _divide_by_lengths(model)
     return model, _notes(settings, norms)
 
 
@@ -130,6 +136,9 @@ def _sizes(state: State) -> _Sizes:
         nodes.append(plane.shape[3])
     if not nodes or min(*nodes, time_nodes) < 2 or channels < 1 or math.gcd(*nodes) < 2:
         raise ImportFailed(state.file, f"has planes of {nodes} nodes over space and {time_nodes} over time")
+    if not (1 <= width <= MOST_UNITS and channels * len(nodes) <= MOST_UNITS):
+        found = f"{width:,} units a layer and {len(nodes):,} grids of {channels:,} channels"
+        raise ImportFailed(state.file, f"has {found}; from 1 to {MOST_UNITS:,} of each in all can be read")
     return _Sizes(channels, nodes, time_nodes, width)
 
 
@@ -142,6 +151,7 @@ def _read_times(nodes: int) -> tuple[int, float]:
     return first, 2 * first / (nodes - 1) - 1
 
 
+@torch.no_grad()
 def _fill(model: DynamicGaussians, state: State, sizes: _Sizes, off: list[str], first: int, since: float) -> None:
     layer = model.deformation.layers[0]
     assert isinstance(layer, PlaneLayer)

@@ -9,7 +9,7 @@ from pathlib import Path
 from export.importers.errors import ImportFailed
 from export.importers.ksplat import read_ksplat
 from export.importers.ply import read_ply
-from export.importers.sog import META, read_sog
+from export.importers.sog import META, ZIP_PROBLEMS, read_sog
 from export.importers.splat import read_splat
 from export.importers.splats import Splats
 from export.importers.spz import read_spz
@@ -36,7 +36,10 @@ def recognise(path: Path) -> str:
     """The kind of `path`, one of `KINDS`. Raises `ImportFailed` saying what can be read where it is none."""
     if not path.exists():
         raise ImportFailed(path, "no such file or folder")
-    kind = _folder(path) if path.is_dir() else _file(path)
+    try:
+        kind = _folder(path) if path.is_dir() else _file(path)
+    except OSError as error:
+        raise ImportFailed(path, f"can't be read: {error.strerror or error}") from error
     if kind is None and path.suffix.lower() == ".onnx":
         raise ImportFailed(path, "is a scene file already; export/convert.py writes it as other formats")
     if kind is None:
@@ -63,13 +66,28 @@ def read_splats(path: Path, kind: str | None = None) -> Splats:
 
 
 def frame_files(folder: Path) -> list[Path]:
-    """The numbered files of a sequence in the order of their numbers: those of the ending that most of them have."""
-    by_ending: dict[str, list[Path]] = {}
-    for file in folder.iterdir():
-        if file.suffix.lower() in FRAMES and re.search(r"[0-9]+\D*$", file.stem) and not file.name.startswith("."):
-            by_ending.setdefault(file.suffix.lower(), []).append(file)
-    files = max(by_ending.values(), key=len, default=[])
-    return sorted(files, key=lambda file: (int(re.findall(r"[0-9]+", file.stem)[-1]), file.name))
+    """The splat files of a folder in the order of the number in which alone their names differ.
+
+    Raises `ImportFailed` naming two that differ in anything else: they are scenes of their own, not frames of one.
+    """
+    if not folder.is_dir():
+        raise ImportFailed(folder, "isn't a folder of frames")
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in FRAMES and not f.name.startswith("."))
+    if len(files) < 2:
+        return files
+    names = [_name_and_numbers(file) for file in files]
+    place = max((i for i in range(1, min(map(len, names[:2])), 2) if names[0][i] != names[1][i]), default=0)
+    for file, name in zip(files[1:], names[1:], strict=True):
+        if not place or name[:place] + name[place + 1 :] != names[0][:place] + names[0][place + 1 :]:
+            problem = f"{files[0].name} and {file.name} differ in more than a number"
+            raise ImportFailed(folder, f"its splat files aren't frames of one sequence: {problem}")
+    return sorted(files, key=lambda file: (int(_name_and_numbers(file)[place]), file.name))
+
+
+def _name_and_numbers(file: Path) -> list[str]:
+    """What is between numbers at even places, numbers at odd ones, the ending last."""
+    parts = re.split(r"([0-9]+)", file.stem)
+    return [*parts[:-1], f"{parts[-1]}{file.suffix.lower()}"]
 
 
 def _file(path: Path) -> str | None:
@@ -81,9 +99,12 @@ def _file(path: Path) -> str | None:
         return "spz"
     if path.name == META:
         return "sog"
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            return "sog" if any(name.rsplit("/", 1)[-1] == META for name in archive.namelist()) else "model"
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                return "sog" if any(name.rsplit("/", 1)[-1] == META for name in archive.namelist()) else "model"
+    except ZIP_PROBLEMS as error:
+        raise ImportFailed(path, f"isn't a whole zip: {error}") from error
     if path.suffix.lower() in (".splat", ".ksplat", ".sog", ".spz"):
         return path.suffix.lower()[1:]
     return "model" if path.suffix.lower() in (".pt", ".pth") else None

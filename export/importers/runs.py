@@ -18,6 +18,7 @@ from export.importers.frozen import frozen
 from export.importers.recognise import read_splats
 from export.importers.scene import metadata_of
 from export.importers.splats import Splats
+from export.importers.unbent import unbent
 from export.rendered_error import posed
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
@@ -71,6 +72,11 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> list[di
             held = frozen(model, info)
         model, lost = held.model, [held.left_out()]
         notes.append(held.note())
+    if kind == "deformgs":
+        with console.status("comparing shapes"):
+            shapes = unbent(model, info)
+        lost.append(shapes.left_out())
+        notes.append(shapes.note())
     save_model(output, model, info, iteration)
     for note in notes:
         console.print(note, markup=False)
@@ -126,5 +132,5 @@ def _cameras(file: Path) -> list[dict[str, Any]]:
             name = re.sub(r"\s+", " ", str(stored["img_name"])) or "camera"
             cameras.append({"name": name, "t": 0.0, **intrinsics, "camera_to_world": pose.tolist()})
         return cameras
-    except (OSError, ValueError, KeyError, TypeError, InvalidInput) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError, InvalidInput) as error:
         raise ImportFailed(file, f"isn't a list of cameras as INRIA's trainer writes it: {error!r}") from error

@@ -28,6 +28,16 @@ COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 A_ROW = 64
 """Entries of the palette of harmonics side by side."""
 
+ZIP_PROBLEMS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    RuntimeError,
+    UnicodeDecodeError,  # names of files
+    OverflowError,  # places beyond 2⁶³
+)
+"""What zipfile raises for damaged files."""
+
 
 def read_sog(path: Path) -> Splats:
     """The Gaussians of a SOG folder, its meta.json or a zip. Raises `ImportFailed`."""
@@ -37,7 +47,7 @@ def read_sog(path: Path) -> Splats:
     try:
         with zipfile.ZipFile(path) as archive:
             return _decoded(path, lambda name, most: _from_zip(path, archive, name, most))
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except ZIP_PROBLEMS as error:
         raise ImportFailed(path, f"isn't a whole zip: {error}") from error
 
 
@@ -55,6 +65,8 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, name: str, most: int) -> byt
     found = [entry for entry in archive.infolist() if entry.filename.rsplit("/", 1)[-1] == name]
     if len(found) != 1:
         raise ImportFailed(path, f"holds {len(found)} files named {name}, not one")
+    if found[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ImportFailed(path, f"its {name} is packed in a way that no SOG is: {found[0].compress_type}")
     if found[0].file_size > most:
         raise ImportFailed(path, f"its {name} has {found[0].file_size:,} bytes where {most:,} would do")
     with archive.open(found[0]) as member:
