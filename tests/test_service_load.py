@@ -88,7 +88,7 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
             check_problem(response)
             assert 1 <= int(response.headers["Retry-After"]) <= 60
         assert client.post("/render/batch", json={"frames": [FRAME]}).status_code == 503
-        assert client.post("/render", json={**FRAME, "width": 0}).status_code == 422, "wrong at any load"
+        assert client.post("/render", json={**FRAME, "width": 0}).status_code == 503, "a body is not even looked at"
         have = client.post("/render", json=FRAME, headers={"If-None-Match": "*"})
         assert have.status_code == 304, "what the client has costs no place"
         assert client.get("/live").status_code == 200

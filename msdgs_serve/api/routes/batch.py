@@ -12,6 +12,7 @@ from fastapi import APIRouter, Header
 from fastapi.responses import StreamingResponse
 from pydantic import ValidationError
 
+from msdgs_serve.api.admission import QueuedRoute
 from msdgs_serve.api.errors import problem_of
 from msdgs_serve.api.frames import FramePlan, draw_frame, plan_frame, server_timing
 from msdgs_serve.api.openapi import BATCH_RESPONSE, problems
@@ -24,7 +25,7 @@ BOUNDARY = "msdgs-frame"
 NDJSON = "application/x-ndjson"
 MULTIPART = "multipart/mixed"
 
-router = APIRouter(tags=["frames"])
+router = APIRouter(tags=["frames"], route_class=QueuedRoute)
 
 
 class Item:
@@ -63,7 +64,6 @@ async def render_batch(
     """
     if len(body.frames) > service.settings.max_batch:
         raise InvalidInput("frames", f"at most {service.settings.max_batch}", len(body.frames))
-    service.queue.check_open()
     multipart = MULTIPART in (accept or "")
     media_type = f"{MULTIPART}; boundary={BOUNDARY}" if multipart else NDJSON
     return StreamingResponse(_written(service, body.frames, multipart), media_type=media_type)

@@ -8,6 +8,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 
+from msdgs_serve.api.admission import QueuedRoute
 from msdgs_serve.api.frames import FramePlan, draw_frame, is_unchanged, plan_frame, server_timing
 from msdgs_serve.api.openapi import IMAGE_RESPONSE, NOT_MODIFIED, problems
 from msdgs_serve.api.queries import request_of
@@ -33,7 +34,7 @@ RESPONSES = {
     ),
 }
 
-router = APIRouter(tags=["frames"])
+router = APIRouter(tags=["frames"], route_class=QueuedRoute)
 
 
 @router.post("/render", summary="A frame, for any camera and any time", response_class=Response, responses=RESPONSES)
@@ -68,8 +69,6 @@ async def answer(
     service: Service, request: Request, make_plan: Callable[[], FramePlan], if_none_match: str | None
 ) -> Response:
     """Draw what is planned, unless the client has it already or goes away."""
-    if if_none_match is None:
-        service.queue.check_open()  # before anything is worked out: what is refused must cost nearly nothing
     plan = await anyio.to_thread.run_sync(make_plan)
     headers = plan.headers(service.settings.frame_max_age)
     if is_unchanged(if_none_match, plan.etag):

@@ -8,6 +8,7 @@ import numpy as np
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
+from msdgs_serve.api.admission import QueuedRoute
 from msdgs_serve.api.cameras import resolve_camera
 from msdgs_serve.api.frames import check_pixels
 from msdgs_serve.api.openapi import VIDEO_RESPONSE, problems
@@ -21,7 +22,7 @@ from msdgs_serve.store import ServedScene
 from msdgs_serve.video import VIDEO_FORMATS, check_video, write_video
 from msdgs_serve.watch import Watch
 
-router = APIRouter(tags=["frames"])
+router = APIRouter(tags=["frames"], route_class=QueuedRoute)
 
 
 @router.post(
@@ -48,7 +49,6 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
     For long films `msdgs-render` on the machine itself shows its progress and goes on where it was stopped.
     """
     check_video(body.format)
-    service.queue.check_open()
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
     film = await unless_gone(request, _film(service, body, scene, path))
     return Response(film, media_type=VIDEO_FORMATS[body.format].media_type)
