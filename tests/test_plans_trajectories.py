@@ -12,8 +12,10 @@ from export.bake import Baked, bake
 from export.plans import Trajectories, build
 from export.plans import trajectories as module
 from export.plans.exact import ExactPoses, pixel
+from export.plans.own_poses import fitted, own_poses
 from export.plans.single import SinglePoses
 from export.plans.splines import design, fitting, samples_for
+from export.plans.trajectories import SomeTrajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.models import SCENE, random_model
@@ -123,6 +125,27 @@ def test_where_float32_is_not_exact_enough_no_sample_is_taken_in_it(monkeypatch:
     got = Trajectories(baked).on_grid(module.COARSE + 1, np.arange(COUNT))
     want = ExactPoses(baked).at(7 / module.COARSE)
     assert_close(got[:, 7, :3], want[:, :3].astype(np.float32), "float32.relative")
+
+
+def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def motion(t: float) -> np.ndarray:
+        return np.stack([np.sin((1 + i) * t) * np.array([1, 0.5, 0]) for i in range(COUNT)])
+
+    _, trajectories = sampled(motion)
+    every, some, tried = np.arange(COUNT), np.arange(3, COUNT, 4), list[int]()
+    poses, errors = own_poses(trajectories, every, 0.05)
+    assert len(poses.grids) > 1
+
+    def counted(trajectories: Trajectories, ids: np.ndarray, count: int):
+        tried.extend([count] * len(ids))
+        return fitted(trajectories, ids, count)
+
+    monkeypatch.setattr("export.plans.own_poses.fitted", counted)
+    again, errors_again = own_poses(SomeTrajectories(trajectories, some), np.arange(len(some)), 0.05)
+    assert len(tried) == len(some)
+    assert np.array_equal(errors_again, errors[some])
+    sizes = {int(i): stored.points.shape[1] for rows, stored in poses.grids for i in rows}
+    assert all(sizes[some[i]] == stored.points.shape[1] for rows, stored in again.grids for i in rows)
 
 
 def test_a_scene_is_sampled_once_for_all_plans():

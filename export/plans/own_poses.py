@@ -33,20 +33,23 @@ def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) ->
 
 def own_poses(trajectories: Trajectories, ids: Ids, most: float) -> tuple[GriddedPoses, np.ndarray]:
     """Poses of the Gaussians `ids`, each on the coarsest grid that is within `most` pixels, and their errors [H]."""
-    errors = np.full(len(ids), np.inf)
+    errors, fewest = np.full(len(ids), np.inf), trajectories.fewest_poses(most, ids)
     grids, left = [], np.arange(len(ids))
     for count in COUNTS:
         rows, poses = [], []
-        for block in np.array_split(left, -(-len(left) // BLOCK)) if len(left) else ():
+        tried = left[fewest[left] <= count]
+        for block in np.array_split(tried, -(-len(tried) // BLOCK)) if len(tried) else ():
             control, found = fitted(trajectories, ids[block], count)
             done = (found <= most * trajectories.pixel) | (count == COUNTS[-1])
             rows.append(block[done])
             poses.append(StoredPoses.of(control[done]))
             errors[block[done]] = found[done]
         done_rows = np.concatenate([left[:0], *rows])
+        fewest[done_rows] = count
         if len(done_rows):
             grids.append((done_rows, StoredPoses.joined(poses)))
         left = np.setdiff1d(left, done_rows)
+    trajectories.remember_poses(most, ids, fewest)
     return GriddedPoses(tuple(grids)), errors
 
 

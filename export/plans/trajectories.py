@@ -61,6 +61,7 @@ class Trajectories:
         _give_one_sign(samples)
         self._levels = {COARSE: (np.arange(self.count), samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
+        self._fewest: dict[float, npt.NDArray[np.int64]] = {}  # by pixels
         self._misses = np.zeros(self.count)  # scene units, at the finest times between samples that were looked at
         self.rotation_weights = _rotation_weights(samples, self.pixel)
         self._refine()
@@ -102,6 +103,14 @@ class Trajectories:
                 "error_too_fast": float(errors[self.unresolved].max(initial=0)),
             }
         }
+
+    def fewest_poses(self, most: float, ids: Ids) -> npt.NDArray[np.int64]:
+        """[M] how many control points each needs to be within `most` pixels, where that was found before, or 0."""
+        return self._fewest.get(most, np.zeros(self.count, np.int64))[ids]
+
+    def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
+        """What another plan of the same error, of what is trimmed further, need not find again."""
+        self._fewest.setdefault(most, np.zeros(self.count, np.int64))[ids] = counts
 
     def distances(self, ids: Ids, differences: np.ndarray) -> npt.NDArray[np.float64]:
         """[M] the largest of differences from poses, [M, T, 10], in scene units.
@@ -189,6 +198,14 @@ class SomeTrajectories(Trajectories):
     def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
         """As of the others."""
         return self._source.checks(self._rows[ids])
+
+    def fewest_poses(self, most: float, ids: Ids) -> npt.NDArray[np.int64]:
+        """As of the others."""
+        return self._source.fewest_poses(most, self._rows[ids])
+
+    def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
+        """With the others."""
+        self._source.remember_poses(most, self._rows[ids], counts)
 
     def on_grid(self, times: int, ids: Ids) -> Samples:
         """As of the others."""
