@@ -13,6 +13,7 @@ PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "i
 AT = "t=0.6&at=30,20,3.4,0,0,0"
 SHOTS = (
     ("colour_light", DESKTOP, "light", "rgb"),
+    ("layers_light", DESKTOP, "light", "rgb&steps=1"),
     ("depth_dark", DESKTOP, "dark", "depth"),
     ("motion_dark", DESKTOP, "dark", "motion"),
     ("count_dark", DESKTOP, "dark", "gaussians"),
