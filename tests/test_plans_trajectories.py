@@ -145,7 +145,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
     assert len(tried) == len(some)
     assert np.array_equal(errors_again, errors[some])
     sizes = {int(i): stored.points.shape[1] for rows, stored in poses.grids for i in rows}
-    assert all(sizes[some[i]] == stored.points.shape[1] for rows, stored in again.grids for i in rows)
+    assert all(sizes[int(some[i])] == stored.points.shape[1] for rows, stored in again.grids for i in rows)
 
 
 def test_a_scene_is_sampled_once_for_all_plans():
