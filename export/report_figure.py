@@ -11,6 +11,9 @@ from export.points import DEFAULT_RASTERIZER
 
 DB_STEP = 10
 CLOSEST = 100.0
+LABEL_SIZE = np.array([250, 15])
+"""Pixels of room for a name."""
+
 COLORS = {"network": "#4269d0", "prefix": "#6cc5b0", "int8": "#ff725c", "lowrank": "#3ca951", "keyframes": "#a463f2"}
 OTHER = "#9498a0"
 
@@ -36,9 +39,10 @@ def draw(contents: dict[str, Any], path: Path) -> None:
     axes.text(
         0.995, _rms(budget), f"allowed: {budget:g} dB ", transform=axes.get_yaxis_transform(), va="bottom", ha="right"
     )
-    _label(axes, points)
     _axes(axes, points, contents)
     axes.legend(loc="upper right", framealpha=0.95)
+    figure.draw_without_rendering()  # where labels come to lie is known from here on
+    _label(axes, points)
     figure.savefig(path, dpi=110, format="png")
 
 
@@ -50,11 +54,15 @@ def _front_line(axes: Any, points: list[dict[str, Any]]) -> None:
 
 
 def _label(axes: Any, points: list[dict[str, Any]]) -> None:
-    """Names of the points on the front, and of the whole network."""
-    for point in points:
-        if point["front"] or point["trim_db"] is None:
-            x, y = _places([point])
+    """Names of the points on the front, and of the whole network, as far as there is room; the chosen one's first."""
+    taken: list[np.ndarray] = []
+    named = [point for point in points if point["front"] or point["trim_db"] is None]
+    for point in sorted(named, key=lambda point: not point["chosen"]):
+        x, y = _places([point])
+        place = axes.transData.transform((x[0], y[0]))
+        if all((np.abs(place - other) > LABEL_SIZE).any() for other in taken):
             axes.annotate(_text(point), (x[0], y[0]), xytext=(9, -11), textcoords="offset points", fontsize=8, zorder=5)
+            taken.append(place)
 
 
 def _text(point: dict[str, Any]) -> str:
