@@ -67,11 +67,13 @@ class SmoothMotion:
     def __init__(self, model: DynamicGaussians, info: SceneInfo, control: int) -> None:
         self._time_range = info.time_range
         matrix = torch.from_numpy(fitting(control, SAMPLES)).float()
-        parts = [self._sampled(model, ids) for ids in torch.arange(len(model.gaussians)).split(CHUNK)]
-        self._control = torch.cat([torch.einsum("ct,tnk->nck", matrix, samples) for samples in parts])
+        controls, travels = [], []
+        for ids in torch.arange(len(model.gaussians)).split(CHUNK):
+            samples = self._sampled(model, ids)
+            controls.append(torch.einsum("ct,tnk->nck", matrix, samples))
+            travels.append((samples[..., MEANS].amax(0) - samples[..., MEANS].amin(0)).norm(dim=1))
+        self._control, self.travel = torch.cat(controls), torch.cat(travels)  # [N, n, 10], [N]
         self._knots = np.concatenate([np.zeros(3), np.linspace(0, 1, control - 2), np.ones(3)])
-        spans = [samples[..., MEANS].amax(0) - samples[..., MEANS].amin(0) for samples in parts]
-        self.travel = torch.cat(spans).norm(dim=1)  # [N]
 
     def at(self, t: float, ids: Tensor) -> Tensor:
         """[M, 10] means, log-scales and unit quaternions at a time."""

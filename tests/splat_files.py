@@ -156,7 +156,7 @@ def write_sog(folder: Path, g: Gaussians) -> Path:
         "sh0.webp": np.column_stack([np.round((g.sh[:, 0] + 2) / 4 * 255), np.round(255 * g.opacities)]),
     }
     for name, values in textures.items():
-        _write_webp(folder / name, values)
+        write_webp(folder / name, values)
     meta = {
         "version": 2,
         "count": len(g),
@@ -178,7 +178,7 @@ def zipped(folder: Path) -> bytes:
     return contents.getvalue()
 
 
-def _write_webp(file: Path, values: np.ndarray) -> None:
+def write_webp(file: Path, values: np.ndarray) -> None:
     width = int(np.ceil(np.sqrt(len(values))))
     pixels = np.full((width * width, 4), 255, np.uint8)
     pixels[: len(values), : values.shape[1]] = values.clip(0, 255)

@@ -32,7 +32,6 @@ from msdgs_train.checkpoint import CheckpointInvalid, load_model, save_model
 from tests import test_importers_4dgs, test_importers_runs
 from tests.models import SCENE, random_model
 from tests.splat_files import (
-    _write_webp,
     compressed_ply_bytes,
     inria_columns,
     ksplat_bytes,
@@ -42,6 +41,7 @@ from tests.splat_files import (
     spz2_bytes,
     spz4_bytes,
     write_sog,
+    write_webp,
     zipped,
 )
 from tests.tolerances import tolerance
@@ -99,8 +99,8 @@ def sog_folder(folder: Path, g: Gaussians) -> list[Path]:
 def with_harmonics(folder: Path, g: Gaussians) -> Path:
     """Degree 1 in a SOG folder: those of the first Gaussians are the palette of all."""
     bytes_of = np.round((g.sh[:PALETTE, 1:].reshape(-1, 3) + 2) / 4 * 255)
-    _write_webp(folder / "shN_centroids.webp", bytes_of)
-    _write_webp(folder / "shN_labels.webp", np.arange(len(g))[:, None] % PALETTE * np.array([1, 0]))
+    write_webp(folder / "shN_centroids.webp", bytes_of)
+    write_webp(folder / "shN_labels.webp", np.arange(len(g))[:, None] % PALETTE * np.array([1, 0]))
     meta = json.loads((folder / "meta.json").read_text())
     files, codebook = ["shN_centroids.webp", "shN_labels.webp"], np.linspace(-2, 2, 256).tolist()
     meta["shN"] = {"bands": 1, "count": PALETTE, "codebook": codebook, "files": files}

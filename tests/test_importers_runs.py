@@ -15,6 +15,7 @@ from torch import Tensor
 from export.importers import ImportFailed, deformgs, recognise
 from export.importers.runs import write_model
 from export.importers.unbent import bent
+from export.rendered_error import posed
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.checkpoint import load_model
 from msdgs_train.model import DynamicGaussians
@@ -110,7 +111,7 @@ def test_shapes_are_compared_with_those_that_they_draw(tmp_path: Path):
     state = their_state(True)
     write_model(write_run(tmp_path / "run", state), "deformgs", tmp_path / "model.pt", QUIET)
     model, g = load_model(tmp_path / "model.pt").model, some_gaussians(COUNT, 3, seed=40_000)
-    drawn, off = bent(model, 0.37)
+    drawn, off = bent(model, 0.37, posed(model, 0.37))
     _, d_quats, d_scales = (d.numpy() for d in their_deltas(state, torch.from_numpy(g.means).double(), 0.37))
     quats, scales = g.quats + d_quats, g.scales + d_scales
     squares = np.square(quats).sum(1)[:, None, None]  # a matrix of a length s is I + s² (R - I)

@@ -167,7 +167,7 @@ def test_a_rotation_past_half_a_turn_has_one_sign_along_time():
     angles = np.linspace(0, 2 * np.pi, 9)
     quats = np.stack([np.cos(angles), np.sin(angles), 0 * angles, 0 * angles], axis=1)
     samples[0, :, 6:] = quats * np.where(np.arange(9) % 2, -1, 1)[:, None]
-    module._give_one_sign(samples)
+    module.give_one_sign(samples)
     assert_close(samples[0, :, 6:], quats.astype(np.float32), "encoding.float32")
 
 

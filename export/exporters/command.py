@@ -17,7 +17,7 @@ from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
 from export.importers.recognise import read_splats
-from export.importers.sequence import SWITCHED, of_the_moment
+from export.importers.sequence import is_switched, of_the_moment
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -103,7 +103,8 @@ def _usd(session: DeformationSession, settings: Settings, console: Console) -> N
     """All of the scene's time, or the moment asked for."""
     out, (t0, t1) = settings.out, session.scene.metadata.time_range
     moves = session.scene.moving_count and settings.t is None
-    if moves and session.scene.metadata.plan.startswith(f"{SWITCHED}:"):
+    plan = session.scene.metadata.plan
+    if moves and is_switched(plan):
         raise InvalidInput("t", "given: frames of this scene are switched, and USD would blend them", "nothing")
     if moves and settings.frames < 2:
         raise InvalidInput("frames", "2 or more", settings.frames)
@@ -111,7 +112,6 @@ def _usd(session: DeformationSession, settings: Settings, console: Console) -> N
     proof = Proof(session, mip=session.scene.metadata.antialiasing == "mip")
     with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
         task = progress.add_task("writing frames", total=len(times))
-        plan = session.scene.metadata.plan
         write_usd(temporary, lambda t: of_the_moment(session.gaussians(t), plan), times, lambda: progress.advance(task))
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()

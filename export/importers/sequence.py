@@ -20,10 +20,10 @@ from export.importers.errors import ImportFailed
 from export.importers.recognise import frame_files, read_splats
 from export.importers.scene import UP, metadata_of
 from export.importers.splats import Splats
-from export.plans.exact import POSE, QUATS
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.splines import design
 from export.plans.stored_poses import GriddedPoses, StoredPoses, of_ids
+from export.plans.trajectories import give_one_sign
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.model import SMALLEST_SCALE
@@ -35,8 +35,6 @@ APART = 3.0
 """How many times as far from its nearest neighbour a Gaussian may be in the next frame, at nine in ten."""
 
 SAMPLED = 5_000
-SWITCHED = "frames"
-"""The plan of scenes whose frames are switched, `frames:n`."""
 
 PARKED_AT = 1e6
 """Half diagonals of the scene's bounds below its middle."""
@@ -107,9 +105,14 @@ def shown_rows(sequence: Frames, number: int) -> slice:
     return slice(start, start + len(sequence.gaussians[number]))
 
 
+def is_switched(plan: str) -> bool:
+    """Whether a scene of this plan shows one frame after the other, of which nothing lies between."""
+    return plan.startswith("frames:")
+
+
 def of_the_moment(gaussians: Gaussians, plan: str) -> Gaussians:
     """Without those of other frames, which scenes of the plan `frames:n` park far below."""
-    if not plan.startswith(f"{SWITCHED}:"):
+    if not is_switched(plan):
         return gaussians
     here = np.flatnonzero((gaussians.scales > SMALLEST_SCALE).any(axis=1))
     return Gaussians(*(getattr(gaussians, part)[here] for part in ("means", "quats", "scales", "opacities", "sh")))
@@ -169,7 +172,7 @@ def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
         first.sh[order],
     ).validate("the imported sequence")
     poses = np.stack([np.concatenate([f.means, f.scales, f.quats], axis=1)[moving] for f in frames], axis=1)
-    _give_one_sign(poses)
+    give_one_sign(poses)
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
     baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving], None), ())
     graph = new_graph(baked)
@@ -187,13 +190,6 @@ def _through(count: int) -> np.ndarray:
     return np.linalg.inv(np.concatenate([rows, ends]))[:, :count]
 
 
-def _give_one_sign(poses: np.ndarray) -> None:
-    quats = poses[..., QUATS]
-    turned = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
-    quats[:, 1:] *= np.cumprod(turned, axis=1)[..., None].astype(poses.dtype)
-    assert poses.shape[2] == POSE
-
-
 def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
     frames = sequence.gaussians
     means, quats, scales, opacities, sh = (
@@ -201,7 +197,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
         for name in ("means", "quats", "scales", "opacities", "sh")
     )
     metadata = metadata_of(means, frames[0].sh_degree, sha256, sequence.antialiasing, sequence.dropped)
-    plan = f"{SWITCHED}:{len(frames)}"
+    plan = f"frames:{len(frames)}"
     empty = np.empty((0, 3), np.float32)
     scene = BakedScene(
         replace(metadata, plan=plan), len(means), empty, np.empty((0, 4), np.float32), empty, opacities, sh

@@ -15,7 +15,7 @@ from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
 from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.metrics import psnr_from_mse
-from msdgs_train.model import SMALLEST_SCALE, DynamicGaussians, activated_scales
+from msdgs_train.model import SMALLEST_SCALE, DynamicGaussians, activated_scales, unit_quats
 
 FRAMES = 12
 """That are compared, each of another camera and time."""
@@ -46,26 +46,26 @@ def unbent(model: DynamicGaussians, info: SceneInfo) -> Unbent:
     """Of a model with one layer that adds to scales and to unit quaternions."""
     psnrs, longest = [], 0.0
     for view in deciding_views(cameras_of(info), info.time_range, FRAMES):
-        theirs, off = bent(model, view.t)
-        frames = [shown(each, view.camera, info.background) for each in (theirs, posed(model, view.t))]
+        ours = posed(model, view.t)
+        theirs, off = bent(model, view.t, ours)
+        frames = [shown(each, view.camera, info.background) for each in (theirs, ours)]
         psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
         longest = max(longest, off)
     return Unbent(float(np.mean(psnrs)), min(psnrs), longest, len(model.gaussians))
 
 
 @torch.no_grad()
-def bent(model: DynamicGaussians, t: float) -> tuple[Gaussians, float]:
-    """The Gaussians as the program that trained them draws them, and by how much a quaternion's length is off 1."""
-    g, at = model.gaussians, model.pose(t)
+def bent(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaussians, float]:
+    """`ours` as the program that trained them draws them, and by how much a quaternion's length is off 1."""
+    g = model.gaussians
     step = model.deformation.layers[0](g.means, torch.tensor(t, dtype=g.means.dtype))
-    quats = (g.raw_quats / torch.linalg.vector_norm(g.raw_quats, dim=1, keepdim=True) + step.delta_quats).double()
+    quats = (unit_quats(g.raw_quats) + step.delta_quats).double()
     scales = (activated_scales(g.log_scales) + step.delta_scales).double()
     axes, lengths, _ = torch.linalg.svd(_as_it_is(quats) * scales[:, None, :])
     axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
     off = float((torch.linalg.vector_norm(quats, dim=1) - 1).abs().max()) if len(quats) else 0.0
-    arrays = (at.means, lengths.clamp_min(SMALLEST_SCALE), at.opacities, at.sh)
-    means, sizes, opacities, sh = (a.float().numpy() for a in arrays)
-    return Gaussians(means, from_matrix(axes.numpy()).astype(np.float32), sizes, opacities, sh), off
+    turned, sizes = from_matrix(axes.numpy()).astype(np.float32), lengths.clamp_min(SMALLEST_SCALE).float().numpy()
+    return Gaussians(ours.means, turned, sizes, ours.opacities, ours.sh), off
 
 
 def _as_it_is(quats: torch.Tensor) -> torch.Tensor:

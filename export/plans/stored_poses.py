@@ -43,10 +43,6 @@ class StoredPoses:
         """[M, n, 10] what a graph reads from them."""
         return self.points * self.steps[:, None] + self.middles[:, None]
 
-    @property
-    def nbytes(self) -> int:
-        return self.points.nbytes + self.steps.nbytes + self.middles.nbytes
-
 
 @dataclass(frozen=True)
 class GriddedPoses:

@@ -58,7 +58,7 @@ class Trajectories:
         self._probe_parts = np.arange(1, PROBES + 1) * (np.sqrt(5) - 1) / 2 % 1
         self._sampler, self._probes = self._probed(baked)
         samples = self._sampled(np.arange(self.count), np.linspace(*self.time_range, COARSE + 1))
-        _give_one_sign(samples)
+        give_one_sign(samples)
         self._levels = {COARSE: (np.arange(self.count), samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
         self._fewest: dict[float, npt.NDArray[np.int64]] = {}  # by pixels
@@ -135,7 +135,7 @@ class Trajectories:
             self._total += level // 2
             between = self._sampled(fast, np.linspace(*self.time_range, level + 1)[1::2])
             fine = _with_between(coarse, between)
-            _give_one_sign(fine)
+            give_one_sign(fine)
             memory -= fine.nbytes
             self._misses[fast] = self._missed(fast, fine)
             self._levels[level], self._depth[fast] = (fast, fine), level
@@ -246,7 +246,7 @@ def layers_digest(baked: Baked) -> bytes:
     return digest.digest()
 
 
-def _give_one_sign(samples: Samples) -> None:
+def give_one_sign(samples: Samples) -> None:
     """A quaternion and its negative are one rotation: let each be the one nearer to that before it."""
     quats = samples[..., QUATS]
     turned = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
