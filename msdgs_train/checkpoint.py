@@ -4,13 +4,13 @@ Every file is written beside its place and moved over it, so that a reader finds
 """
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from msdgs_serve import __version__
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
@@ -19,6 +19,10 @@ from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians, ModelConfig
 
 FORMAT = "msdgs-model/1"
+
+PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
+PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
+"""Types of numbers."""
 
 
 class CheckpointInvalid(MsdgsError):
@@ -68,6 +72,7 @@ def load_model(path: str | Path) -> LoadedModel:
         raise CheckpointInvalid(path, f"isn't a model of format {FORMAT} (found {found!r})")
     try:
         state = contents["state"]
+        refuse_unlike_stored(path, state)
         _refuse_not_finite(path, state)
         model = _build(ModelConfig(**contents["config"]), state)
         scene = SceneInfo(**contents["scene"])
@@ -107,10 +112,36 @@ def load(path: str | Path) -> Any:
         raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
 
 
+def refuse_unlike_stored(path: str | Path, tensors: Mapping[str, Tensor]) -> None:
+    """Raise `CheckpointInvalid` for what isn't rows of plain numbers, or claims more of a storage than there is of it.
+
+    Strides of 0 make a few stored bytes a tensor of any size.
+    """
+    claimed: dict[int, int] = {}
+    for name, tensor in tensors.items():
+        if not _is_plain(tensor):
+            raise CheckpointInvalid(path, f"`{name}` isn't a dense tensor of plain numbers")
+        storage = tensor.untyped_storage()
+        claimed.setdefault(storage.data_ptr(), 0)
+        claimed[storage.data_ptr()] += tensor.numel() * tensor.element_size()
+        if claimed[storage.data_ptr()] > storage.nbytes():
+            problem = f"of shape {tuple(tensor.shape)} isn't stored in full: it shares {storage.nbytes():,} bytes"
+            raise CheckpointInvalid(path, f"`{name}` {problem}")
+
+
+def _is_plain(tensor: Any) -> bool:
+    plain = type(tensor) in (Tensor, nn.Parameter) and tensor.layout is torch.strided and not tensor.is_nested
+    return plain and tensor.device.type == "cpu" and tensor.dtype in PLAIN
+
+
 def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
     """A model of this configuration and these tensors; RuntimeError names what is missing or too much."""
     prefix = "gaussians."
     gaussians = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
+    if "mlp" in config.layers and config.depth > len(state):
+        raise InvalidInput("model.depth", f"at most {len(state)}, the number of tensors that are stored", config.depth)
+    with torch.device("meta"):  # sizes that aren't what is stored may be any, and take no memory here
+        DynamicGaussians(config, CanonicalGaussians(**gaussians)).load_state_dict(state, assign=True)
     model = DynamicGaussians(config, CanonicalGaussians(**gaussians))
     model.load_state_dict(state)
     return model

@@ -55,7 +55,7 @@ def ply_bytes(columns: dict[str, np.ndarray], form: str = "binary_little_endian"
 
 
 def compressed_ply_bytes(g: Gaussians) -> bytes:
-    """SuperSplat's: one chunk a 256 Gaussians, degree 0."""
+    """SuperSplat's: one chunk a 256 Gaussians, bytes of -4 to 4 for harmonics beyond degree 0."""
     chunks, packed = [], []
     colors = g.sh[:, 0] * 0.28209479177387814 + 0.5
     for start in range(0, len(g), 256):
@@ -79,8 +79,12 @@ def compressed_ply_bytes(g: Gaussians) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
     lines += [f"property float {name}" for name in names] + [f"element vertex {len(g)}"]
     lines += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)  # a channel's come together
+    if rest.size:
+        lines += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
     header = "\n".join([*lines, "end_header", ""]).encode()
-    return header + np.array(chunks, "<f4").tobytes() + np.array(packed, "<u4").tobytes()
+    body = np.array(chunks, "<f4").tobytes() + np.array(packed, "<u4").tobytes()
+    return header + body + ((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).tobytes()
 
 
 def _field(values: np.ndarray, ends: tuple[np.ndarray, np.ndarray], bits: tuple[int, ...]) -> int:
@@ -117,11 +121,13 @@ def ksplat_bytes(g: Gaussians) -> bytes:
     return bytes(header + section) + body
 
 
-def spz2_bytes(version3: bytes) -> bytes:
-    """Version 2 of an unpacked version 3 stream of degree 0, all rotations the same: x, y, z in bytes."""
-    _, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", version3)
-    before = version3[16 : 16 + 16 * count]
-    return struct.pack("<4sIIBBBB", b"NGSP", 2, count, degree, bits, flags, 0) + before + bytes([200, 128, 90]) * count
+def spz2_bytes(version3: bytes, quats: np.ndarray) -> bytes:
+    """Version 2 of an unpacked version 3 stream: bytes of x, y and z of rotations, whose axes are right, up, back."""
+    _, _, count, *rest = struct.unpack_from("<4sIIBBBB", version3)
+    xyz = quats[:, 1:] * np.where(quats[:, :1] < 0, -1, 1) * np.array([1, -1, -1])
+    rotations = np.round((xyz + 1) * 127.5).astype(np.uint8).tobytes()
+    header = struct.pack("<4sIIBBBB", b"NGSP", 2, count, *rest)
+    return header + version3[16 : 16 + 16 * count] + rotations + version3[16 + 20 * count :]
 
 
 def spz4_bytes(version3: bytes) -> bytes:
@@ -138,8 +144,9 @@ def spz4_bytes(version3: bytes) -> bytes:
     return header + table + b"".join(packed)
 
 
-def write_sog(folder: Path, g: Gaussians) -> Path:
-    """A SOG folder, degree 0: codebooks of evenly spread numbers."""
+def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
+    """A SOG folder: codebooks of evenly spread numbers. Harmonics beyond degree 0 are those of the first `palette`
+    Gaussians in turns, or each its own."""
     folder.mkdir()
     logs = np.sign(g.means) * np.log1p(np.abs(g.means))
     mins, maxs = logs.min(0), logs.max(0)
@@ -165,6 +172,13 @@ def write_sog(folder: Path, g: Gaussians) -> Path:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
     }
+    if g.sh.shape[1] > 1:
+        entries, files = palette or len(g), ["shN_centroids.webp", "shN_labels.webp"]
+        labels, wide = np.arange(len(g)) % entries, 64 * (g.sh.shape[1] - 1)  # 64 entries side by side
+        write_webp(folder / files[0], np.round((g.sh[:entries, 1:].reshape(-1, 3) + 2) / 4 * 255), wide)
+        write_webp(folder / files[1], np.column_stack([labels & 255, labels >> 8]))
+        bands = int(np.sqrt(g.sh.shape[1])) - 1
+        meta["shN"] = {"bands": bands, "count": entries, "codebook": colors.tolist(), "files": files}
     (folder / "meta.json").write_text(json.dumps(meta))
     return folder
 
@@ -178,15 +192,17 @@ def zipped(folder: Path) -> bytes:
     return contents.getvalue()
 
 
-def write_webp(file: Path, values: np.ndarray) -> None:
-    width = int(np.ceil(np.sqrt(len(values))))
-    pixels = np.full((width * width, 4), 255, np.uint8)
+def write_webp(file: Path, values: np.ndarray, width: int | None = None) -> None:
+    """Lossless, a row of values a pixel; square where no width is given."""
+    width = width or int(np.ceil(np.sqrt(len(values))))
+    height = -(-len(values) // width)
+    pixels = np.full((height * width, 4), 255, np.uint8)
     pixels[: len(values), : values.shape[1]] = values.clip(0, 255)
-    spec = oiio.ImageSpec(width, width, 4, oiio.UINT8)
+    spec = oiio.ImageSpec(width, height, 4, oiio.UINT8)
     spec.attribute("compression", "lossless:100")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     writer = oiio.ImageOutput.create(str(file))
     assert writer is not None
     assert writer.open(str(file), spec), writer.geterror()
-    assert writer.write_image(pixels.reshape(width, width, 4))
+    assert writer.write_image(pixels.reshape(height, width, 4))
     writer.close()

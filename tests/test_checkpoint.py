@@ -141,6 +141,25 @@ class Unsavable:
         raise KeyboardInterrupt
 
 
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [({"width": 10_000_000}, r"size mismatch"), ({"depth": 10_000_000}, r"`model.depth` must be at most \d+")],
+)
+def test_sizes_that_are_not_stored_take_no_memory(model_file: Path, config: dict[str, int], message: str):
+    contents = torch.load(model_file, weights_only=True)
+    rewritten(model_file, config=contents["config"] | config)
+    with pytest.raises(CheckpointInvalid, match=message):
+        load_model(model_file)
+
+
+def test_tensors_that_are_not_stored_in_full_are_named(model_file: Path):
+    state = torch.load(model_file, weights_only=True)["state"]
+    state["gaussians.means"] = torch.zeros(1).expand(1_000_000_000_000, 3)
+    rewritten(model_file, state=state)
+    with pytest.raises(CheckpointInvalid, match=r"`gaussians.means` of shape .* isn't stored in full"):
+        load_model(model_file)
+
+
 def test_an_interrupted_save_leaves_the_old_file_alone(model_file: Path):
     before = model_file.read_bytes()
     with pytest.raises(KeyboardInterrupt):

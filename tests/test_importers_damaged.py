@@ -4,7 +4,6 @@
 """
 
 import gzip
-import json
 import os
 import tempfile
 import time
@@ -41,7 +40,6 @@ from tests.splat_files import (
     spz2_bytes,
     spz4_bytes,
     write_sog,
-    write_webp,
     zipped,
 )
 from tests.tolerances import tolerance
@@ -87,29 +85,15 @@ def spz3(g: Gaussians) -> bytes:
 
 
 def spz2(g: Gaussians) -> bytes:
-    """With the harmonics of version 3, which come after 20 bytes a Gaussian."""
-    stream = gzip.decompress(spz3(g))
-    return gzip.compress(spz2_bytes(stream) + stream[16 + 20 * len(g) :])
+    return gzip.compress(spz2_bytes(gzip.decompress(spz3(g)), g.quats))
 
 
 def sog_folder(folder: Path, g: Gaussians) -> list[Path]:
-    return sorted(with_harmonics(write_sog(folder / "sog", g), g).iterdir())
-
-
-def with_harmonics(folder: Path, g: Gaussians) -> Path:
-    """Degree 1 in a SOG folder: those of the first Gaussians are the palette of all."""
-    bytes_of = np.round((g.sh[:PALETTE, 1:].reshape(-1, 3) + 2) / 4 * 255)
-    write_webp(folder / "shN_centroids.webp", bytes_of)
-    write_webp(folder / "shN_labels.webp", np.arange(len(g))[:, None] % PALETTE * np.array([1, 0]))
-    meta = json.loads((folder / "meta.json").read_text())
-    files, codebook = ["shN_centroids.webp", "shN_labels.webp"], np.linspace(-2, 2, 256).tolist()
-    meta["shN"] = {"bands": 1, "count": PALETTE, "codebook": codebook, "files": files}
-    (folder / "meta.json").write_text(json.dumps(meta))
-    return folder
+    return sorted(write_sog(folder / "sog", g, PALETTE).iterdir())
 
 
 def sog_zip(folder: Path, g: Gaussians) -> list[Path]:
-    (folder / "a.sog").write_bytes(zipped(with_harmonics(write_sog(folder / "sog", g), g)))
+    (folder / "a.sog").write_bytes(zipped(write_sog(folder / "sog", g, PALETTE)))
     return [folder / "a.sog"]
 
 

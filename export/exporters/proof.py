@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import onnxruntime as ort
 
-from export.exporters.visionary import COLORS, COUNT, GAUSSIANS, unpacked
+from export.exporters.visionary import unpacked
+from export.exporters.visionary_rules import COLORS, COUNT, GAUSSIANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT, rasterize

@@ -11,36 +11,33 @@ import onnx
 import onnxruntime as ort
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
+from export.exporters.visionary_rules import (
+    COLOR_COLUMNS,
+    COLORS,
+    COLUMNS,
+    COUNT,
+    GAUSSIANS,
+    MULTIPLE,
+    OPSET,
+    check_visionary,
+)
 from export.graph import GraphBuilder
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 
-OPSET, IR_VERSION = 17, 8
-MULTIPLE = 256
-"""Rows are padded to a whole number of these, by Gaussians of opacity 0."""
-
-COLUMNS, COLOR_COLUMNS = 10, 48
-GAUSSIANS, COLORS, COUNT = "gaussian_f32", "color_f16", "num_points"
+IR_VERSION = 8
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Rows and columns of the covariance that are kept: xx xy xz yy yz zz."""
-
-CONTROL_FLOW = {"If", "Loop", "Scan", "SequenceMap"}
-QUANTISED = {"QuantizeLinear", "DequantizeLinear"}
-RESERVED = ("sh", "color", "rgb")
-
-
-class VisionaryInvalid(MsdgsError):
-    """A model breaks a rule of Visionary's."""
 
 
 def visionary_model(scene_file: Path) -> onnx.ModelProto:
     """The model of a scene file. Raises `InvalidInput` for the plan `int8`, whose graph no browser runs on its GPU."""
     scene = DeformationSession(scene_file).scene
     source = onnx.load(scene_file)
-    if any(node.op_type in QUANTISED for node in source.graph.node):
+    if any(node.op_type in ("QuantizeLinear", "DequantizeLinear") for node in source.graph.node):
         raise InvalidInput("scene", "of another plan than int8, as lowrank: to_onnx.py --plan lowrank", "int8")
     graph = GraphBuilder()
     rows = []
@@ -163,55 +160,6 @@ def _model(graph: GraphBuilder, rows: int) -> onnx.ModelProto:
     model = helper.make_model(contents, opset_imports=imports, ir_version=IR_VERSION, producer_name="msdgs")
     onnx.checker.check_model(model)
     return model
-
-
-def check_visionary(model: onnx.ModelProto) -> None:
-    """Raise `VisionaryInvalid` listing every rule of Visionary's that a model breaks."""
-    problems = [*_interface_problems(model), *_graph_problems(model)]
-    if problems:
-        raise VisionaryInvalid("; ".join(problems))
-
-
-def _interface_problems(model: onnx.ModelProto) -> list[str]:
-    problems = []
-    opsets = {each.domain: each.version for each in model.opset_import}
-    if opsets != {"": OPSET}:
-        problems.append(f"operator sets {opsets} instead of {OPSET} alone")
-    if [_kind(each) for each in model.graph.input] != [("time", TensorProto.FLOAT, [1])]:
-        problems.append("its input must be `time`, float32 [1], alone")
-    outputs = {name: (kind, shape) for name, kind, shape in map(_kind, model.graph.output)}
-    rows = outputs.get(GAUSSIANS, (0, [0]))[1][0]
-    expected = {
-        GAUSSIANS: (TensorProto.FLOAT, [rows, COLUMNS]),
-        COLORS: (TensorProto.FLOAT16, [rows, COLOR_COLUMNS]),
-        COUNT: (TensorProto.INT32, [1]),
-    }
-    problems += [f"output `{name}` must be {kind}" for name, kind in expected.items() if outputs.get(name) != kind]
-    if not rows or rows % MULTIPLE:
-        problems.append(f"{rows} rows are no multiple of {MULTIPLE}")
-    others = [name for name in outputs if name not in expected and any(word in name for word in RESERVED)]
-    return problems + [f"output `{name}` would be taken for colours" for name in others]
-
-
-def _graph_problems(model: onnx.ModelProto) -> list[str]:
-    graph = model.graph
-    problems = [f"{node.op_type} is control flow" for node in graph.node if node.op_type in CONTROL_FLOW]
-    problems += [f"{node.op_type} isn't float32" for node in graph.node if node.op_type in QUANTISED]
-    to_outputs = {name for node in graph.node if COLORS in node.output for name in node.input}
-    allowed = {TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL}
-    for each in graph.initializer:
-        if each.data_type not in allowed and not (each.name in to_outputs and each.data_type == TensorProto.FLOAT16):
-            problems.append(f"constant `{each.name}` is {TensorProto.DataType.Name(each.data_type)}, not float32")
-        elif each.data_location == TensorProto.EXTERNAL:
-            problems.append(f"constant `{each.name}` lies in another file")
-        elif not np.isfinite(numpy_helper.to_array(each)).all():
-            problems.append(f"constant `{each.name}` holds NaN or infinity")
-    return problems
-
-
-def _kind(value: onnx.ValueInfoProto) -> tuple[str, int, list[int]]:
-    tensor = value.type.tensor_type
-    return value.name, tensor.elem_type, [each.dim_value for each in tensor.shape.dim]
 
 
 def unpacked(gaussians: np.ndarray, colors: np.ndarray, count: int) -> Gaussians:

@@ -7,14 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from export.importers.errors import ImportFailed
-from msdgs_train.checkpoint import CheckpointInvalid, load
-
-PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
-PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
-"""Types of numbers."""
+from msdgs_train.checkpoint import CheckpointInvalid, load, refuse_unlike_stored
 
 
 class State:
@@ -24,11 +20,11 @@ class State:
         self.file = file
         try:
             values = load(file)
+            if not isinstance(values, Mapping) or not all(isinstance(v, Tensor) for v in values.values()):
+                raise ImportFailed(file, "isn't the state of a network: tensors by name")
+            refuse_unlike_stored(file, values)
         except CheckpointInvalid as error:
             raise ImportFailed(file, str(error).removeprefix(f"{file}: ")) from error
-        if not isinstance(values, Mapping) or not all(isinstance(v, Tensor) for v in values.values()):
-            raise ImportFailed(file, "isn't the state of a network: tensors by name")
-        _refuse_unlike_stored(file, values)
         for name, tensor in values.items():
             if not torch.isfinite(tensor).all():
                 raise ImportFailed(file, f"`{name}` holds NaN or infinity")
@@ -50,25 +46,3 @@ class State:
             expected = " × ".join("any" if s is None else str(s) for s in shape)
             raise ImportFailed(self.file, f"`{name}` has shape {tuple(tensor.shape)}, not {expected}")
         return tensor.to(torch.float32)
-
-
-def _refuse_unlike_stored(file: Path, values: Mapping[str, Tensor]) -> None:
-    """Tensors that aren't rows of plain numbers, or that claim together more of a storage than there is of it.
-
-    Strides of 0 make a few stored bytes a tensor of any size.
-    """
-    claimed: dict[int, int] = {}
-    for name, tensor in values.items():
-        if not _is_plain(tensor):
-            raise ImportFailed(file, f"`{name}` isn't a dense tensor of plain numbers")
-        storage = tensor.untyped_storage()
-        claimed.setdefault(storage.data_ptr(), 0)
-        claimed[storage.data_ptr()] += tensor.numel() * tensor.element_size()
-        if claimed[storage.data_ptr()] > storage.nbytes():
-            problem = f"of shape {tuple(tensor.shape)} isn't stored in full: it shares {storage.nbytes():,} bytes"
-            raise ImportFailed(file, f"`{name}` {problem}")
-
-
-def _is_plain(tensor: Tensor) -> bool:
-    plain = type(tensor) in (Tensor, nn.Parameter) and tensor.layout is torch.strided and not tensor.is_nested
-    return plain and tensor.device.type == "cpu" and tensor.dtype in PLAIN
