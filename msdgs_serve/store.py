@@ -180,10 +180,13 @@ class SceneStore:
         return self.folder
 
     def _file(self, name: str) -> Path:
-        files = self._files()
-        if name not in files:
-            raise SceneNotFound(name, sorted(files))
-        return files[name]
+        """Looked for by its name alone: every request does this, and a folder may hold any number of scenes."""
+        if is_servable_name(name) and "/" not in name:
+            for path in self._paths:
+                file = path / f"{name}{SUFFIX}" if path.is_dir() else path
+                if file.stem == name and file.is_file():
+                    return file
+        raise SceneNotFound(name, self.names())
 
     def _update(self, entry: _Entry, file: Path) -> None:
         """Load `file` where it isn't what was tried last; one thread does, those that have a scene don't wait."""

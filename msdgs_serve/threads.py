@@ -23,6 +23,7 @@ takes without, or less; with 5 the gain is smaller."""
 _check: ContextVar[Callable[[], object] | None] = ContextVar("check", default=None)
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
+_callers = 0  # of `run_parallel` at this moment
 
 
 def thread_count() -> int:
@@ -56,9 +57,10 @@ def give_way() -> None:
 
 
 def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
-    """Call `function(*item)` for every item on the pool; results in the order of the items.
+    """Call `function(*item)` for every item; results in the order of the items.
 
-    The first exception is raised after all calls have ended. Must not be called from inside the pool.
+    On the pool, or where others are calling too, on the caller's thread: cores that have a frame each needn't share.
+    The first exception is raised after all calls that began have ended. Must not be called from inside the pool.
     """
     check = _check.get()
 
@@ -67,13 +69,28 @@ def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[A
             check()
         return function(*item)
 
-    if len(items) <= 1 or thread_count() == 1:
-        return [call(*item) for item in items]
-    futures = [_shared_pool().submit(call, *item) for item in items]
-    errors = [error for future in futures if (error := future.exception()) is not None]
+    with _counted() as callers:
+        if len(items) <= 1 or thread_count() == 1 or callers > 1:
+            return [call(*item) for item in items]
+        futures = [_shared_pool().submit(call, *item) for item in items]
+        errors = [error for future in futures if (error := future.exception()) is not None]
     if errors:
         raise errors[0]
     return [future.result() for future in futures]
+
+
+@contextmanager
+def _counted() -> Iterator[int]:
+    """How many are within it, this one included."""
+    global _callers
+    with _lock:
+        _callers += 1
+        callers = _callers
+    try:
+        yield callers
+    finally:
+        with _lock:
+            _callers -= 1
 
 
 def split_evenly(count: int, parts: int) -> list[tuple[int, int]]:
@@ -93,8 +110,8 @@ def _shared_pool() -> ThreadPoolExecutor:
 
 def _forget_pool() -> None:
     """A forked child has none of its parent's threads, and perhaps a lock that nobody will release."""
-    global _pool, _lock
-    _pool, _lock = None, threading.Lock()
+    global _pool, _lock, _callers
+    _pool, _lock, _callers = None, threading.Lock(), 0
 
 
 if hasattr(os, "register_at_fork"):

@@ -1,13 +1,19 @@
 """Images and composition: what can be seen without a daemon, and with one the whole check of docker/check.py."""
 
+import contextlib
 import json
 import re
+import shutil
+import socket
 import subprocess
 import sys
+import time
 import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import yaml
 from packaging.requirements import Requirement
@@ -19,6 +25,8 @@ from msdgs_serve.api.work import WorkQueue
 from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.store import SceneStore
 from tests.processes import ROOT
+from tests.scene_files import write_scene
+from tests.service import in_this_process, serving
 
 DOCKER = ROOT / "docker"
 SKIPPED = 77
@@ -85,17 +93,66 @@ def test_the_service_is_told_nothing_that_it_doesn_t_know():
     assert set(in_image) <= known
 
 
+def queries_of_the_dashboard() -> list[str]:
+    dashboard = json.loads((DOCKER / "grafana" / "dashboards" / "msdgs.json").read_text())
+    return [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+
+
 def test_the_dashboard_asks_for_metrics_that_there_are():
     metrics = Metrics(SceneStore([]), PoseCache(0), WorkQueue(1, 1, 1.0))
     metrics.count_request("POST", "/render", 200, 0.1, 100)
     metrics.count_problem("invalid")
     metrics.count_stages({"draw": 0.1})
     exposed = set(re.findall(r"^(\w+)[{ ]", metrics.page().decode(), re.MULTILINE))
-    dashboard = json.loads((DOCKER / "grafana" / "dashboards" / "msdgs.json").read_text())
-    asked = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
-    named = set(re.findall(r"\b(?:msdgs|process)_\w+", " ".join(asked)))
+    named = set(re.findall(r"\b(?:msdgs|process)_\w+", " ".join(queries_of_the_dashboard())))
     assert named
     assert named <= exposed
+
+
+@pytest.mark.slow
+@in_this_process
+@pytest.mark.skipif(shutil.which("prometheus") is None, reason="there is no prometheus to run")
+def test_prometheus_answers_every_query_of_the_dashboard(tmp_path: Path):
+    scene = write_scene(tmp_path / "balls.onnx")
+    with serving(scene) as client, prometheus(tmp_path, client.base_url.netloc.decode()) as answer:
+        unanswered = queries_of_the_dashboard()
+        assert unanswered
+        deadline = time.monotonic() + 60
+        while unanswered and time.monotonic() < deadline:
+            for camera, status in (({"type": "orbit", "azimuth": 0, "elevation": 0}, 200), (None, 422)):
+                body = {"camera": camera, "t": 0.5, "width": 16, "height": 16}
+                assert client.post("/render", json=body).status_code == status
+            time.sleep(0.2)
+            unanswered = [query for query in unanswered if not answer(query)]
+        assert not unanswered
+
+
+@contextlib.contextmanager
+def prometheus(folder: Path, target: str) -> Iterator[Callable[[str], list[Any]]]:
+    """The composition's, which looks at `target` every second instead; a function that asks it."""
+    settings = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yaml").read_text())
+    settings["global"]["scrape_interval"] = "1s"
+    (job,) = settings["scrape_configs"]
+    del job["dns_sd_configs"]
+    job["static_configs"] = [{"targets": [target]}]
+    (folder / "prometheus.yaml").write_text(yaml.safe_dump(settings))
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    options = [f"--config.file={folder}/prometheus.yaml", f"--storage.tsdb.path={folder}/data"]
+    command = ["prometheus", *options, f"--web.listen-address={address}"]
+
+    def answer(query: str) -> list[Any]:
+        with contextlib.suppress(httpx.TransportError):  # it isn't up yet
+            found = httpx.get(f"http://{address}/api/v1/query", params={"query": query})
+            return found.json()["data"]["result"] if found.status_code == 200 else []
+        return []
+
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield answer
+        finally:
+            process.terminate()
 
 
 @pytest.mark.slow
