@@ -28,12 +28,13 @@ from benchmarks import service_promises as promises
 from benchmarks.service_load import Tally, at_rate, overload, saturate
 from benchmarks.service_process import Connection, Running, make_scenes, service
 from benchmarks.service_requests import Offline, Wanted, digest, mixed, pictures
+from msdgs_serve.threads import thread_count
 
 ROOT = Path(__file__).resolve().parents[1]
 CLIENTS = 32
 CATALOGUE = 96  # different requests of the mixed load
 FIRST = "first"  # of the scenes, the one that single measurements are made with
-PLACES = 20  # that the service has by default for work, in line and being done
+PLACES = 16 + thread_count()  # that the service has by default for work, in line and being done
 TOO_MUCH = 4
 KILLS = 5
 PACE = 0.5  # of the peak: below saturation

@@ -1,26 +1,34 @@
 """Calls that take a place in the queue of renders."""
 
-from collections.abc import Callable, Coroutine
-from typing import Any
+from collections.abc import Mapping
 
-from fastapi import Request, Response
-from fastapi.routing import APIRoute
+from starlette.routing import BaseRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from msdgs_serve.api.service import Service
+from msdgs_serve.api.errors import KIND, Refused, refusal
+from msdgs_serve.api.prefix import route_path
+from msdgs_serve.api.work import WorkQueue
 
 
-class QueuedRoute(APIRoute):
-    """Refuses before a body is parsed: what is refused must cost nearly nothing. Who may have the answer already, by
-    `If-None-Match`, needs no place."""
+class Admission:
+    """ASGI middleware: refuses while the queue is full, before a body is parsed and a route is looked for.
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """That of the route, once the queue has a place."""
-        handle = super().get_route_handler()
+    Under too much load that is most of the work. Who may have the answer already, by `If-None-Match`, needs no place.
+    """
 
-        async def unless_full(request: Request) -> Response:
-            service: Service = request.app.state.service
-            if "if-none-match" not in request.headers:
-                service.queue.check_open()
-            return await handle(request)
+    def __init__(self, app: ASGIApp, queue: WorkQueue, routes: Mapping[tuple[str, str], BaseRoute]) -> None:
+        """`routes`: those that take a place, by method and path."""
+        self._app = app
+        self._queue = queue
+        self._routes = routes
 
-        return unless_full
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        route = self._routes.get((scope["method"], route_path(scope))) if scope["type"] == "http" else None
+        if route is not None and all(name != b"if-none-match" for name, _ in scope["headers"]):
+            try:
+                self._queue.check_open()
+            except Refused as refused:
+                scope["route"], scope[KIND] = route, refused.kind
+                await refusal(refused)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)

@@ -1,10 +1,12 @@
 """The application: routes, error handlers and what they share, put together."""
 
 from fastapi import FastAPI
+from fastapi.routing import APIRoute
 from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
 
 from msdgs_serve import __version__
+from msdgs_serve.api.admission import Admission
 from msdgs_serve.api.body_limit import BodyLimit
 from msdgs_serve.api.errors import install_error_handlers
 from msdgs_serve.api.keys import KeyCheck, read_keys
@@ -40,7 +42,15 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
         app.include_router(calls.router)
     install_error_handlers(app)
     install_openapi(app, store, keys=keys is not None)
+    queued = {
+        (method, route.path): route
+        for calls in (render, batch, video)
+        for route in calls.router.routes
+        if isinstance(route, APIRoute)
+        for method in route.methods or ()
+    }
     # the last is the outermost
+    app.add_middleware(Admission, service.queue, queued)
     app.add_middleware(BodyLimit, settings.max_body_bytes, settings.body_seconds, STREAMED)
     if keys is not None:
         app.add_middleware(KeyCheck, keys)

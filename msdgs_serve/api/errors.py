@@ -122,6 +122,12 @@ def problem_of(error: Exception) -> tuple[int, bytes]:
     return response.status_code, bytes(response.body)
 
 
+def refusal(error: Refused) -> Response:
+    """The answer to what is refused."""
+    errors = [FieldError(field=error.field, message=str(error))] if error.field else []
+    return problem_response(error.status, str(error), errors, error.headers)
+
+
 async def _on_domain_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, MsdgsError)
     request.scope[KIND] = error.kind if isinstance(error, Refused) else KINDS.get(type(error), "internal")
@@ -132,8 +138,7 @@ def _domain_problem(error: MsdgsError) -> Response:
     if isinstance(error, ClientGone):
         return Response(status_code=CLIENT_CLOSED_REQUEST)  # nobody reads it; the metrics and the log do
     if isinstance(error, Refused):
-        errors = [FieldError(field=error.field, message=str(error))] if error.field else []
-        return problem_response(error.status, str(error), errors, error.headers)
+        return refusal(error)
     status = next((status for kind, status in STATUS_OF.items() if isinstance(error, kind)), None)
     if status is None:
         logger.error("unexpected domain error", exc_info=error)

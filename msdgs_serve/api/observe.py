@@ -3,9 +3,9 @@
 import contextvars
 import json
 import logging
+import random
 import re
 import time
-import uuid
 from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -107,4 +107,4 @@ class JsonLines(logging.Formatter):
 
 def _id_of(scope: Scope) -> str:
     given = dict(scope["headers"]).get(REQUEST_ID.lower().encode(), b"").decode("latin-1")
-    return given if USABLE_ID.fullmatch(given) else uuid.uuid4().hex
+    return given if USABLE_ID.fullmatch(given) else f"{random.getrandbits(128):032x}"

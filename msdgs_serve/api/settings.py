@@ -15,7 +15,14 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
+from msdgs_serve.threads import thread_count
+
 PROGRAM = "msdgs-serve"
+
+
+def cores() -> int:
+    """Frames that are drawn at once where nothing else is said: more get in each other's way."""
+    return min(thread_count(), 64)
 
 
 class Settings(BaseSettings):
@@ -43,7 +50,9 @@ class Settings(BaseSettings):
         default=4096 * 2160, ge=1, description="largest width × height of a frame; × times, where there are several"
     )
     max_body_bytes: int = Field(default=1 << 20, ge=1024, description="largest request body")
-    concurrent_renders: int = Field(default=4, ge=1, le=64, description="frames in work at once; others wait")
+    concurrent_renders: int = Field(
+        default_factory=cores, ge=1, le=64, description="frames in work at once; others wait"
+    )
     queued_renders: int = Field(default=16, ge=0, le=10_000, description="frames that may wait; others get a 503")
     render_seconds: float = Field(default=30.0, gt=0, le=3600, description="time limit of a frame, waiting included")
     cache_megabytes: int = Field(default=256, ge=0, description="memory for Gaussians posed before")

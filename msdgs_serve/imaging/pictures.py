@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.imaging.formats import Channel
-from msdgs_serve.imaging.image import Image, to_8_bits
+from msdgs_serve.imaging.image import Image
 from msdgs_serve.scene import InvalidInput
 
 FARTHEST_GREY = 0.15
@@ -20,7 +20,8 @@ class DepthRange(NamedTuple):
 
 
 def picture(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
-    """8 bits: [H, W, 3], [H, W, 4] with straight alpha for transparent colour, or [H, W, 1] for all of one number.
+    """0 to 1, where it isn't beyond what can be shown: [H, W, 3], [H, W, 4] with straight alpha for transparent colour,
+    or [H, W, 1] for all of one number.
 
     Motion is black where nothing moves; the hue is its direction, and the brightest is the fastest of this very image.
 
@@ -32,18 +33,18 @@ def picture(image: Image, channel: Channel, depth_range: DepthRange | None = Non
     Numbers of Gaussians are white where they are highest in this very image.
     """
     if channel == "rgb":
-        return image.display_pixels()
+        return image.as_shown()
     if channel == "alpha":
-        return to_8_bits(image.alpha)[..., None]
+        return image.alpha[..., None]
     if channel == "motion":
         return _motion_colors(channel_of(image, "motion") * image.alpha[..., None])
     if channel == "gaussians":
         counts = channel_of(image, "gaussians")
-        return to_8_bits(counts / max(float(counts.max(initial=0.0)), 1.0))[..., None]
+        return (counts / max(float(counts.max(initial=0.0)), 1.0))[..., None]
     near, far = depth_range or depths_of(image)
     seen = np.isfinite(image.depth)
     place = np.clip((np.where(seen, image.depth, far) - near) / max(far - near, 1e-12), 0, 1)
-    return to_8_bits(np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0) * image.alpha)[..., None]
+    return (np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0) * image.alpha)[..., None]
 
 
 def channel_of(image: Image, channel: Channel) -> np.ndarray:
@@ -58,7 +59,7 @@ def _motion_colors(motion: np.ndarray) -> np.ndarray:
     speed = np.hypot(motion[..., 0], motion[..., 1])
     brightness = speed / max(float(speed.max(initial=0.0)), 1e-12)
     angles = np.arctan2(motion[..., 1], motion[..., 0])[..., None] + np.radians([0, 240, 120])
-    return to_8_bits(brightness[..., None] * (0.5 + 0.5 * np.cos(angles)))
+    return brightness[..., None] * (0.5 + 0.5 * np.cos(angles))
 
 
 def depths_of(image: Image) -> DepthRange:

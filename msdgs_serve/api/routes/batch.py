@@ -12,7 +12,6 @@ from fastapi import APIRouter, Header
 from fastapi.responses import StreamingResponse
 from pydantic import ValidationError
 
-from msdgs_serve.api.admission import QueuedRoute
 from msdgs_serve.api.errors import problem_of
 from msdgs_serve.api.frames import FramePlan, draw_frame, plan_frame, server_timing
 from msdgs_serve.api.openapi import BATCH_RESPONSE, problems
@@ -25,7 +24,7 @@ BOUNDARY = "msdgs-frame"
 NDJSON = "application/x-ndjson"
 MULTIPART = "multipart/mixed"
 
-router = APIRouter(tags=["frames"], route_class=QueuedRoute)
+router = APIRouter(tags=["frames"])
 
 
 class Item:

@@ -8,7 +8,6 @@ import anyio.to_thread
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 
-from msdgs_serve.api.admission import QueuedRoute
 from msdgs_serve.api.frames import FramePlan, draw_frame, is_unchanged, plan_frame, server_timing
 from msdgs_serve.api.openapi import IMAGE_RESPONSE, NOT_MODIFIED, problems
 from msdgs_serve.api.queries import request_of
@@ -34,7 +33,7 @@ RESPONSES = {
     ),
 }
 
-router = APIRouter(tags=["frames"], route_class=QueuedRoute)
+router = APIRouter(tags=["frames"])
 
 
 @router.post("/render", summary="A frame, for any camera and any time", response_class=Response, responses=RESPONSES)

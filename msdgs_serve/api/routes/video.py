@@ -8,7 +8,6 @@ import numpy as np
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from msdgs_serve.api.admission import QueuedRoute
 from msdgs_serve.api.cameras import resolve_camera
 from msdgs_serve.api.frames import check_pixels
 from msdgs_serve.api.openapi import VIDEO_RESPONSE, problems
@@ -22,7 +21,7 @@ from msdgs_serve.store import ServedScene
 from msdgs_serve.video import VIDEO_FORMATS, check_video, write_video
 from msdgs_serve.watch import Watch
 
-router = APIRouter(tags=["frames"], route_class=QueuedRoute)
+router = APIRouter(tags=["frames"])
 
 
 @router.post(
