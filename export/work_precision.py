@@ -35,7 +35,8 @@ WORTH_DB, WORST_DB = 25.0, 20.0
 """Trimming isn't tried under the first, and a candidate under the second is no longer a picture of the scene."""
 
 HEADROOM = (2.0, -3.0)
-"""With trimming to so many dB goes the fastest plan that alone is better by the first, and the one by the second."""
+"""With trimming to so many dB goes the fastest plan that alone is better by the first, and the one by the second; of
+those that are about as fast, the smallest."""
 
 EVERY, LOOKS = 6, 3
 """A quick look compares every 6th frame and takes the least of 3 times."""
@@ -149,8 +150,10 @@ class Sweep:
         pairs = set()
         for headroom in HEADROOM:
             enough = [look for look in alone if look.worst_db >= level + headroom]
-            if enough:
-                pairs.add((min(enough, key=lambda look: look.cpu_deformation).candidate.plan, level))
+            least = min((look.cpu_deformation for look in enough), default=0.0)
+            fast = [look for look in enough if look.cpu_deformation <= TIME_MARGIN * least]
+            if fast:
+                pairs.add((min(fast, key=lambda look: look.candidate.size).candidate.plan, level))
         return pairs
 
     def _degrees(self) -> list[tuple[str, float | None, int]]:

@@ -129,6 +129,22 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
     assert sweep._dear("network", None) is None
 
 
+def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: tuple[Job, SweepResult]):
+    def look(plan: str, cpu: float, size: int, db: float = 60.0) -> Look:
+        return Look(cast(Any, SimpleNamespace(plan=plan, size=size)), DEFAULT_RASTERIZER, cpu + 30, cpu, db)
+
+    sweep = Sweep(swept[0], 45.0)
+    fine, coarse = look("keyframes:0.03", 10.0, 600), look("keyframes:0.1", 11.0, 400)
+    assert sweep._pairs([fine, coarse, look("prefix:1", 30.0, 2), look("int8", 1.0, 1, db=20.0)], 50.0) == {
+        ("keyframes:0.1", 50.0)
+    }
+    assert sweep._pairs([fine, replace(coarse, worst_db=51.0)], 50.0) == {
+        ("keyframes:0.03", 50.0),
+        ("keyframes:0.1", 50.0),
+    }
+    assert sweep._pairs([], 50.0) == set()
+
+
 def test_the_report_says_what_was_gained(swept: tuple[Job, SweepResult]):
     contents = report(*swept)
     whole = next(p for p in contents["points"] if p["plan"] == "network" and p["trim_db"] is None)
