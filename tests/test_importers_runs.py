@@ -141,6 +141,15 @@ def test_what_differs_is_named(tmp_path: Path):
         write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
 
 
+def test_rotations_so_long_that_shapes_overflow_are_refused_by_the_runs_name(tmp_path: Path):
+    state = their_state(True)
+    state["gaussian_rotation.bias"] = torch.full((4,), 1e18)  # poses are sound: rotations are made unit
+    state["gaussian_scaling.bias"] = torch.full((3,), 1e5)
+    with pytest.raises(ImportFailed, match=r"run.*its network gives Gaussians that can't be used: `gaussians.scales`"):
+        write_model(write_run(tmp_path / "run", state), "deformgs", tmp_path / "model.pt", QUIET)
+    assert not (tmp_path / "model.pt").exists()
+
+
 def test_two_layers_whose_heads_read_the_input_again_are_refused(tmp_path: Path):
     run = write_run(tmp_path / "run", their_state(True, depth=2))
     with pytest.raises(ImportFailed, match=r"has 2 hidden layers; from 3 to 64"):

@@ -3,7 +3,8 @@
 import ast
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,12 +69,12 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> list[di
     console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
     lost = []
     if model.config.opacity_head or model.config.sh_head:
-        with console.status("holding opacities and colours"):
+        with console.status("holding opacities and colours"), _usable(run):
             held = frozen(model, info)
         model, lost = held.model, [held.left_out()]
         notes.append(held.note())
     if kind == "deformgs":
-        with console.status("comparing shapes"):
+        with console.status("comparing shapes"), _usable(run):
             shapes = unbent(model, info)
         lost.append(shapes.left_out())
         notes.append(shapes.note())
@@ -84,12 +85,19 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> list[di
 
 
 def _check_poses(run: Path, model: DynamicGaussians) -> None:
-    """Raise `ImportFailed` where a network sends Gaussians to where none can be: finite weights may be wild ones."""
+    """Raise `ImportFailed` where a network sends Gaussians to where none can be."""
     for t in np.linspace(0, 1, CHECKED_TIMES).tolist():
-        try:
+        with _usable(run):
             posed(model, t).validate()
-        except InvalidInput as error:
-            raise ImportFailed(run, f"its network gives Gaussians that can't be used at t = {t:g}: {error}") from error
+
+
+@contextmanager
+def _usable(run: Path) -> Iterator[None]:
+    """Say of what can't be drawn that it comes from a run: finite weights may be wild ones, at some times only."""
+    try:
+        yield
+    except InvalidInput as error:
+        raise ImportFailed(run, f"its network gives Gaussians that can't be used: {error}") from error
 
 
 def canonical(source: Splats) -> CanonicalGaussians:
