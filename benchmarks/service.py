@@ -28,13 +28,14 @@ from benchmarks import service_promises as promises
 from benchmarks.service_load import Tally, at_rate, overload, saturate
 from benchmarks.service_process import Connection, Running, make_scenes, service
 from benchmarks.service_requests import Offline, Wanted, digest, mixed, pictures
-from msdgs_serve.threads import thread_count
+from msdgs_serve.api.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 CLIENTS = 32
 CATALOGUE = 96  # different requests of the mixed load
 FIRST = "first"  # of the scenes, the one that single measurements are made with
-PLACES = 16 + thread_count()  # that the service has by default for work, in line and being done
+DEFAULTS = Settings()
+PLACES = DEFAULTS.concurrent_renders + DEFAULTS.queued_renders  # for work, being done and in line
 TOO_MUCH = 4
 KILLS = 5
 PACE = 0.5  # of the peak: below saturation

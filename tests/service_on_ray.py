@@ -5,12 +5,12 @@ import contextlib
 import functools
 import itertools
 import os
-import socket
 import warnings
 from collections.abc import Iterator
 
 import httpx
 
+from benchmarks.service_process import free_port
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.cluster import deployment
 from tests.processes import ROOT
@@ -41,9 +41,7 @@ def _cluster() -> int:
     import ray  # pyright: ignore[reportMissingImports]
     from ray import serve  # pyright: ignore[reportMissingImports]
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     os.environ["PYTHONPATH"] = str(ROOT)
     os.environ.setdefault("RAY_agent_register_timeout_ms", "300000")  # Ray gives up early where others compute
     os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")

@@ -163,7 +163,7 @@ def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
         "sh0.webp": np.column_stack([np.round((g.sh[:, 0] + 2) / 4 * 255), np.round(255 * g.opacities)]),
     }
     for name, values in textures.items():
-        write_webp(folder / name, values)
+        _write_webp(folder / name, values)
     meta = {
         "version": 2,
         "count": len(g),
@@ -175,8 +175,8 @@ def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
     if g.sh.shape[1] > 1:
         entries, files = palette or len(g), ["shN_centroids.webp", "shN_labels.webp"]
         labels, wide = np.arange(len(g)) % entries, 64 * (g.sh.shape[1] - 1)  # 64 entries side by side
-        write_webp(folder / files[0], np.round((g.sh[:entries, 1:].reshape(-1, 3) + 2) / 4 * 255), wide)
-        write_webp(folder / files[1], np.column_stack([labels & 255, labels >> 8]))
+        _write_webp(folder / files[0], np.round((g.sh[:entries, 1:].reshape(-1, 3) + 2) / 4 * 255), wide)
+        _write_webp(folder / files[1], np.column_stack([labels & 255, labels >> 8]))
         bands = int(np.sqrt(g.sh.shape[1])) - 1
         meta["shN"] = {"bands": bands, "count": entries, "codebook": colors.tolist(), "files": files}
     (folder / "meta.json").write_text(json.dumps(meta))
@@ -192,7 +192,7 @@ def zipped(folder: Path) -> bytes:
     return contents.getvalue()
 
 
-def write_webp(file: Path, values: np.ndarray, width: int | None = None) -> None:
+def _write_webp(file: Path, values: np.ndarray, width: int | None = None) -> None:
     """Lossless, a row of values a pixel; square where no width is given."""
     width = width or int(np.ceil(np.sqrt(len(values))))
     height = -(-len(values) // width)

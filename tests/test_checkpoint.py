@@ -136,11 +136,6 @@ def test_configurations_of_others_are_refused(model_file: Path, config: dict[str
         load_model(model_file)
 
 
-class Unsavable:
-    def __reduce__(self) -> tuple:
-        raise KeyboardInterrupt
-
-
 @pytest.mark.parametrize(
     ("config", "message"),
     [({"width": 10_000_000}, r"size mismatch"), ({"depth": 10_000_000}, r"`model.depth` must be at most \d+")],
@@ -158,6 +153,11 @@ def test_tensors_that_are_not_stored_in_full_are_named(model_file: Path):
     rewritten(model_file, state=state)
     with pytest.raises(CheckpointInvalid, match=r"`gaussians.means` of shape .* isn't stored in full"):
         load_model(model_file)
+
+
+class Unsavable:
+    def __reduce__(self) -> tuple:
+        raise KeyboardInterrupt
 
 
 def test_an_interrupted_save_leaves_the_old_file_alone(model_file: Path):

@@ -4,7 +4,6 @@ import contextlib
 import json
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from benchmarks.service_process import free_port
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.work import WorkQueue
@@ -136,9 +136,7 @@ def prometheus(folder: Path, target: str) -> Iterator[Callable[[str], list[Any]]
     del job["dns_sd_configs"]
     job["static_configs"] = [{"targets": [target]}]
     (folder / "prometheus.yaml").write_text(yaml.safe_dump(settings))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    address = f"127.0.0.1:{free_port()}"
     options = [f"--config.file={folder}/prometheus.yaml", f"--storage.tsdb.path={folder}/data"]
     command = ["prometheus", *options, f"--web.listen-address={address}"]
 

@@ -19,6 +19,7 @@ from export.exporters.visionary_rules import (
     GAUSSIANS,
     MULTIPLE,
     OPSET,
+    QUANTISED,
     check_visionary,
 )
 from export.graph import GraphBuilder
@@ -37,7 +38,7 @@ def visionary_model(scene_file: Path) -> onnx.ModelProto:
     """The model of a scene file. Raises `InvalidInput` for the plan `int8`, whose graph no browser runs on its GPU."""
     scene = DeformationSession(scene_file).scene
     source = onnx.load(scene_file)
-    if any(node.op_type in ("QuantizeLinear", "DequantizeLinear") for node in source.graph.node):
+    if any(node.op_type in QUANTISED for node in source.graph.node):
         raise InvalidInput("scene", "of another plan than int8, as lowrank: to_onnx.py --plan lowrank", "int8")
     graph = GraphBuilder()
     rows = []

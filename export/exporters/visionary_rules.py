@@ -17,6 +17,7 @@ GAUSSIAN_TYPES = {GAUSSIANS: TensorProto.FLOAT, "gaussian_f16": TensorProto.FLOA
 """Either is allowed; float32 is what is written here."""
 
 CONTROL_FLOW = {"If", "Loop", "Scan", "SequenceMap"}
+QUANTISED = {"QuantizeLinear", "DequantizeLinear"}
 INSIDE = {TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL}
 """Types of values that aren't outputs."""
 
@@ -66,6 +67,8 @@ def _graph_problems(model: onnx.ModelProto) -> list[str]:
     for node in graph.node:
         if node.op_type in CONTROL_FLOW or any(attribute.HasField("g") for attribute in node.attribute):
             problems.append(f"{node.op_type} is control flow")
+        if node.op_type in QUANTISED:
+            problems.append(f"{node.op_type} isn't float32")
         for attribute in node.attribute:
             if node.op_type == "Cast" and attribute.name == "to" and not outputs & set(node.output):
                 problems += _type_problems(f"Cast to `{node.output[0]}`", attribute.i)

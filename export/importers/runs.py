@@ -87,17 +87,17 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> list[di
 def _check_poses(run: Path, model: DynamicGaussians) -> None:
     """Raise `ImportFailed` where a network sends Gaussians to where none can be."""
     for t in np.linspace(0, 1, CHECKED_TIMES).tolist():
-        with _usable(run):
+        with _usable(run, f" at t = {t:g}"):
             posed(model, t).validate()
 
 
 @contextmanager
-def _usable(run: Path) -> Iterator[None]:
+def _usable(run: Path, when: str = "") -> Iterator[None]:
     """Say of what can't be drawn that it comes from a run: finite weights may be wild ones, at some times only."""
     try:
         yield
     except InvalidInput as error:
-        raise ImportFailed(run, f"its network gives Gaussians that can't be used: {error}") from error
+        raise ImportFailed(run, f"its network gives Gaussians that can't be used{when}: {error}") from error
 
 
 def canonical(source: Splats) -> CanonicalGaussians:
