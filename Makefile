@@ -68,7 +68,7 @@ $(FULL)/.installed-dev: $(FULL)/.installed-train
 	$(PINS) $(FULL)/bin/python $(INSTALL) --editable '.[train,export,dev]'
 	@touch $@
 
-# Ray brings uvloop, on which the service would run in all tests, and 350 MB: it has an environment of its own.
+# Ray has 350 MB: an environment of its own, so that the tests' doesn't grow by them.
 $(CLUSTER)/.installed: pyproject.toml constraints.txt
 	$(call make_environment,$(CLUSTER))
 	$(PINS) $(CLUSTER)/bin/python $(INSTALL) $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) \

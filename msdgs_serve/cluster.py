@@ -59,6 +59,7 @@ def deployment(settings: "Settings", replicas: int = 1, cores: int = 1) -> Any:
 def _service(settings: "Settings", cores: int) -> Any:
     """The FastAPI application of `msdgs-serve`, which has begun when its scenes are loaded."""
     from msdgs_serve.api.app import create_app
+    from msdgs_serve.api.observe import REQUEST_ID
     from msdgs_serve.api.service import Phase
     from msdgs_serve.renderer import Renderer
     from msdgs_serve.store import SceneStore
@@ -77,20 +78,21 @@ def _service(settings: "Settings", cores: int) -> Any:
             yield state
 
     app.router.lifespan_context = loaded
-    app.add_middleware(_WithoutRequestId)
+    app.add_middleware(_Without, REQUEST_ID)
     return app
 
 
-class _WithoutRequestId:
-    """Leaves the header out of answers: Ray's proxy, which has given the request its id, adds it too."""
+class _Without:
+    """Leaves a header out of answers: Ray's proxy, which has given the request its id, adds it too."""
 
-    def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]]) -> None:
+    def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]], header: str) -> None:
         self._app = app
+        self._name = header.lower().encode()
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         async def shorter(message: Message) -> None:
             if message["type"] == "http.response.start":
-                headers = [each for each in message["headers"] if each[0].lower() != b"x-request-id"]
+                headers = [each for each in message["headers"] if each[0].lower() != self._name]
                 message = {**message, "headers": headers}
             await send(message)
 
