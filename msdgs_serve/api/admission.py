@@ -11,9 +11,10 @@ from msdgs_serve.api.work import WorkQueue
 
 
 class Admission:
-    """ASGI middleware: refuses while the queue is full, before a body is parsed and a route is looked for.
+    """ASGI middleware: gives a call its place, or refuses it, before its body is parsed and a route is looked for.
 
-    Under too much load that is most of the work. Who may have the answer already, by `If-None-Match`, needs no place.
+    Under too much load refusals are most of the work. Who may have the answer already, by `If-None-Match`, needs no
+    place.
     """
 
     def __init__(self, app: ASGIApp, queue: WorkQueue, routes: Mapping[tuple[str, str], BaseRoute]) -> None:
@@ -24,11 +25,12 @@ class Admission:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         route = self._routes.get((scope["method"], route_path(scope))) if scope["type"] == "http" else None
-        if route is not None and all(name != b"if-none-match" for name, _ in scope["headers"]):
-            try:
-                self._queue.check_open()
-            except Refused as refused:
-                scope["route"], scope[KIND] = route, refused.kind
-                await refusal(refused)(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+        if route is None or any(name == b"if-none-match" for name, _ in scope["headers"]):
+            await self._app(scope, receive, send)
+            return
+        try:
+            with self._queue.admitted():
+                await self._app(scope, receive, send)
+        except Refused as refused:
+            scope["route"], scope[KIND] = route, refused.kind
+            await refusal(refused)(scope, receive, send)

@@ -4,8 +4,11 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 from http import HTTPStatus
 from typing import TypeVar
 
@@ -22,8 +25,18 @@ FIRST_GUESS = 0.5  # seconds a piece of work takes, until one was measured
 SMOOTHING = 0.1
 
 
+@dataclass
+class _Call:
+    """One that was admitted."""
+
+    has_place: bool = True  # which goes over to its first piece of work
+
+
+_admitted: ContextVar[_Call | None] = ContextVar("admitted", default=None)
+
+
 class WorkQueue:
-    """`workers` pieces of work at once and `waiting` more in line; what comes on top is refused."""
+    """`workers` pieces of work at once and places for `waiting` more in line; what comes on top is refused."""
 
     def __init__(self, workers: int, waiting: int, seconds: float) -> None:
         self._workers = workers
@@ -38,7 +51,7 @@ class WorkQueue:
 
     @property
     def waiting(self) -> int:
-        """Pieces of work in line."""
+        """Places that are taken, and whose work isn't being done yet."""
         return max(0, self._taken - self._running)
 
     @property
@@ -46,10 +59,23 @@ class WorkQueue:
         """Pieces of work being done."""
         return self._running
 
-    def check_open(self) -> None:
-        """Raises `Refused` where new work would be refused now."""
+    @contextmanager
+    def admitted(self) -> Iterator[None]:
+        """Around a call: it has a place from now until its first work is done, and later work of it is never refused.
+
+        Raises `Refused` where all places are taken.
+        """
         with self._lock:
             self._refuse_if_full()
+            self._taken += 1
+        call = _Call()
+        token = _admitted.set(call)
+        try:
+            yield
+        finally:
+            _admitted.reset(token)
+            if call.has_place:
+                self._leave()
 
     def close(self) -> None:
         """Refuse new work; what is there is finished."""
@@ -60,15 +86,15 @@ class WorkQueue:
         self.close()
         self._executor.shutdown(wait=False, cancel_futures=True)
 
-    async def run(self, work: Callable[[], Result], watch: Watch, *, admitted: bool = False) -> Result:
-        """Do `work` when its turn comes. `admitted`: part of something that has its place already.
+    async def run(self, work: Callable[[], Result], watch: Watch) -> Result:
+        """Do `work` when its turn comes; where the call wasn't admitted before, it may be refused here.
 
         Whoever awaits this may be cancelled: work that waits is dropped, and work that runs is ended by its watch.
 
         Raises:
             Refused: with 503 where the queue is full or closed, with 504 when the time is over.
         """
-        future = self._submit(work, watch, admitted)
+        future = self._submit(work, watch)
         waiter = asyncio.wrap_future(future)
         waiter.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody may be left to look
         try:
@@ -82,7 +108,7 @@ class WorkQueue:
                 watch.stop()
                 future.cancel()
 
-    def _submit(self, work: Callable[[], Result], watch: Watch, admitted: bool) -> Future[Result]:
+    def _submit(self, work: Callable[[], Result], watch: Watch) -> Future[Result]:
         submitted = time.perf_counter()
 
         def timed() -> Result:
@@ -98,13 +124,23 @@ class WorkQueue:
                     self._running -= 1
                     self._mean_seconds += SMOOTHING * (time.perf_counter() - started - self._mean_seconds)
 
+        self._take_place(_admitted.get())
+        future = self._executor.submit(timed)
+        future.add_done_callback(lambda _: self._leave())
+        return future
+
+    def _take_place(self, call: _Call | None) -> None:
         with self._lock:
-            if not admitted:
+            if call is not None and call.has_place:
+                call.has_place = False
+                return
+            if call is None:
                 self._refuse_if_full()
             self._taken += 1
-        future = self._executor.submit(timed)
-        future.add_done_callback(self._leave)
-        return future
+
+    def _leave(self) -> None:
+        with self._lock:
+            self._taken -= 1
 
     def _refuse_if_full(self) -> None:
         if self._closed:
@@ -115,10 +151,6 @@ class WorkQueue:
             detail = f"All {self._places} places for work and in the queue are taken; try again later."
             retry_after = min(max(1, seconds), LONGEST_RETRY)
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
-
-    def _leave(self, _: Future) -> None:
-        with self._lock:
-            self._taken -= 1
 
 
 async def unless_gone(request: Request, call: Awaitable[Result]) -> Result:

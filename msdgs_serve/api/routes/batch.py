@@ -89,7 +89,7 @@ async def _items(service: Service, frames: list[dict[str, Any]]) -> AsyncGenerat
     for same in sorted(planned.values(), key=lambda plans: (plans[0][1].scene.name, plans[0][1].times[0])):
         plan, watch = same[0][1], Watch()
         try:
-            image = await service.queue.run(lambda p=plan, w=watch: draw_frame(service, p, w), watch, admitted=True)
+            image = await service.queue.run(lambda p=plan, w=watch: draw_frame(service, p, w), watch)
         except Exception as error:
             for index, _ in same:
                 yield _failed(index, error)

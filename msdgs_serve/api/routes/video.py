@@ -62,10 +62,10 @@ async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: 
         def draw(camera=camera, t=t) -> np.ndarray:  # noqa: ANN001  # of this turn of the loop
             return service.renderer.render(scene.session, camera, t, options, watch).display_pixels()
 
-        pictures.append(await service.queue.run(draw, watch, admitted=True))
+        pictures.append(await service.queue.run(draw, watch))
     file = io.BytesIO()
     fps = body.fps or path.fps
-    await service.queue.run(lambda: write_video(pictures, fps, body.format, file), watch, admitted=True)
+    await service.queue.run(lambda: write_video(pictures, fps, body.format, file), watch)
     service.metrics.count_stages(watch.seconds)
     return file.getvalue()
 
