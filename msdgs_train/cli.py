@@ -52,6 +52,9 @@ class Fit:
     msdgs-plane are the paper's, deformgs and 4dgs what it compares with; static has no motion. docs/training.md"""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the run in RUN, with the settings it was begun with."""
+    tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Also write what metrics.jsonl gets, and held-out renderings, to RUN/tensorboard; look at many runs with
+    `tensorboard --logdir runs`. Needs: pip install 'msdgs[tensorboard]'"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
 
@@ -222,7 +225,14 @@ def _fit(command: Fit) -> int:
     from msdgs_train.progress import FitProgress
 
     with FitProgress(console, command.config.steps) as progress:
-        outcome = fit(command.config, command.data, command.run, resume=command.resume, observer=progress)
+        outcome = fit(
+            command.config,
+            command.data,
+            command.run,
+            resume=command.resume,
+            observer=progress,
+            tensorboard=command.tensorboard,
+        )
     console.print(
         f"{outcome.status} at step {outcome.step:,}, {outcome.gaussians:,} Gaussians, {outcome.seconds:.0f} s"
     )

@@ -13,6 +13,7 @@ from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.metrics import Quality, mean_quality
 from msdgs_train.report import MetricsLog, draw_curve, write_side_by_side
 from msdgs_train.run_record import Best, RunRecord, read_record, write_record
+from msdgs_train.tensorboard_events import require_tensorboard
 from msdgs_train.trainer import StepResult, Trainer, TrainingDiverged
 
 CONFIG = "config.json"
@@ -65,13 +66,23 @@ def stored_config(run: Path) -> TrainConfig:
 
 
 def fit(
-    config: TrainConfig, data: Path, run: Path, *, resume: bool = False, observer: Observer | None = None
+    config: TrainConfig,
+    data: Path,
+    run: Path,
+    *,
+    resume: bool = False,
+    observer: Observer | None = None,
+    tensorboard: bool = False,
 ) -> Outcome:
     """Train on the photographs in `data` and leave everything in the folder `run`.
 
+    With `tensorboard`, `run/tensorboard` gets the metrics as events, and held-out renderings at every evaluation.
+
     Raises `InvalidInput` where `run` holds another run and `resume` is false, or where a resumed run would change
-    settings that have shaped it.
+    settings that have shaped it, and `ExtraMissing` where tensorboard isn't installed.
     """
+    if tensorboard:
+        require_tensorboard()
     if resume:
         check_resumable(stored_config(run), config)
     elif (run / CHECKPOINT).exists():
@@ -86,7 +97,11 @@ def fit(
         (run / BEST).unlink(missing_ok=True)
     record = RunRecord(data.absolute(), best)
     write_record(run, record)
-    return _Run(config, scene, run, trainer, observer or Observer(), seconds, record).execute()
+    going = _Run(config, scene, run, trainer, observer or Observer(), seconds, record, tensorboard)
+    try:
+        return going.execute()
+    finally:
+        going.log.close()
 
 
 def _choosing_split(scene: SceneData) -> str | None:
@@ -109,6 +124,7 @@ class _Run:
         observer: Observer,
         seconds: float,
         record: RunRecord,
+        tensorboard: bool,
     ) -> None:
         self.config = config
         self.scene = scene
@@ -118,7 +134,8 @@ class _Run:
         self.record = record
         self.splits = [split for split in EVALUATED_SPLITS if scene.splits.get(split)]
         self.choosing_split = _choosing_split(scene)
-        self.log = MetricsLog(folder, keep_until=trainer.step_count)
+        self.tensorboard = tensorboard
+        self.log = self._open_log()
         self.started = time.perf_counter() - seconds
 
     def execute(self) -> Outcome:
@@ -142,6 +159,9 @@ class _Run:
         count = len(self.trainer.model.gaussians)
         return Outcome(status, self.trainer.step_count, qualities, count, self._seconds(), self.record.best)
 
+    def _open_log(self) -> MetricsLog:
+        return MetricsLog(self.folder, keep_until=self.trainer.step_count, tensorboard=self.tensorboard)
+
     def _roll_back(self, error: TrainingDiverged) -> None:
         """Go on from the last checkpoint, or anew where there is none yet, with lower learning rates."""
         diverged = self.trainer
@@ -154,7 +174,8 @@ class _Run:
         if (self.folder / CHECKPOINT).exists():
             self.trainer.load_checkpoint(self.folder / CHECKPOINT)
         self.trainer.retry_after(diverged)
-        self.log = MetricsLog(self.folder, keep_until=self.trainer.step_count)
+        self.log.close()
+        self.log = self._open_log()
         self._save()
         self.observer.rolled_back(str(error), self.trainer.step_count, self.trainer.rate_factor)
 
@@ -183,6 +204,8 @@ class _Run:
             qualities.append(evaluated.quality)
             if renders is None or index < renders:
                 write_side_by_side(self.folder, split, evaluated)
+            if index < RENDERS_WHILE_TRAINING:
+                self.log.picture(self.trainer.step_count, split, evaluated)
         quality = mean_quality(qualities)
         self.log.evaluation(self.trainer.step_count, split, quality)
         self.observer.evaluation(self.trainer.step_count, split, quality)
@@ -198,6 +221,7 @@ class _Run:
             write_record(self.folder, self.record)
 
     def _save(self) -> None:
+        self.log.flush()  # a run that goes on from this checkpoint doesn't log again what came before it
         self.trainer.save_checkpoint(self.folder / CHECKPOINT, self._seconds())
         self.trainer.save_model(self.folder / MODEL)
 

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from msdgs_train.datasets.images import write_png
 from msdgs_train.metrics import Quality
+from msdgs_train.tensorboard_events import FOLDER, TensorBoardEvents
 from msdgs_train.trainer import Evaluated, StepResult
 
 METRICS = "metrics.jsonl"
@@ -17,13 +18,17 @@ RENDERS = "renders"
 
 
 class MetricsLog:
-    """Lines of `metrics.jsonl`: {"kind": "train", "step", "loss", "psnr", …} and {"kind": "eval", "split", …}."""
+    """Lines of `metrics.jsonl`: {"kind": "train", "step", "loss", "psnr", …} and {"kind": "eval", "split", …}.
 
-    def __init__(self, run: Path, *, keep_until: int = 0) -> None:
+    With `tensorboard` the same numbers also go to event files in `tensorboard/`, and so do pictures.
+    """
+
+    def __init__(self, run: Path, *, keep_until: int = 0, tensorboard: bool = False) -> None:
         """Goes on after the lines up to step `keep_until`; those of steps after the last checkpoint are dropped."""
         self.path = run / METRICS
         kept = [line for line in read_metrics(run) if line["step"] <= keep_until]
         self.path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        self._events = TensorBoardEvents(run / FOLDER, kept, keep_until) if tensorboard else None
 
     def train(self, result: StepResult, seconds: float) -> None:
         """One line about the steps so far."""
@@ -33,9 +38,26 @@ class MetricsLog:
         """One line about a split of held-out photographs."""
         self._append({"kind": "eval", "step": step, "split": split, **quality._asdict()})
 
+    def picture(self, step: int, split: str, evaluated: Evaluated) -> None:
+        """A held-out photograph at the left and its rendering at the right, for TensorBoard only."""
+        if self._events is not None:
+            self._events.image(step, f"{split}/{_stem(evaluated)}", side_by_side(evaluated))
+
+    def flush(self) -> None:
+        """What was logged outlives this process."""
+        if self._events is not None:
+            self._events.flush()
+
+    def close(self) -> None:
+        """Nothing is logged after this."""
+        if self._events is not None:
+            self._events.close()
+
     def _append(self, line: dict[str, Any]) -> None:
         with self.path.open("a") as file:
             file.write(json.dumps(line) + "\n")
+        if self._events is not None:
+            self._events.add(line)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
@@ -76,10 +98,18 @@ def write_side_by_side(run: Path, split: str, evaluated: Evaluated) -> Path:
     """The photograph at the left, the rendering at the right, in `renders/`; returns the PNG's path."""
     folder = run / RENDERS
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{split}_{Path(evaluated.frame.name).name}.png"
-    pair = np.concatenate([evaluated.truth.numpy(), evaluated.rgb.numpy()], axis=1)
-    write_png(path, to_bytes(pair))
+    path = folder / f"{split}_{_stem(evaluated)}.png"
+    write_png(path, side_by_side(evaluated))
     return path
+
+
+def side_by_side(evaluated: Evaluated) -> np.ndarray:
+    """The photograph at the left, the rendering at the right, [H, 2 W, 3] uint8."""
+    return to_bytes(np.concatenate([evaluated.truth.numpy(), evaluated.rgb.numpy()], axis=1))
+
+
+def _stem(evaluated: Evaluated) -> str:
+    return Path(evaluated.frame.name).name
 
 
 def to_bytes(rgb: np.ndarray) -> np.ndarray:
