@@ -11,6 +11,7 @@ ARGS ?=
 SERVE := .venv-serve
 FULL := .venv
 CLUSTER := .venv-cluster
+VIEWER := .venv-viewer
 HTTP_TESTS := $(addprefix tests/test_,$(addsuffix .py,api api_poison batch client motion openapi service_answers \
 	service_load slow_clients uploads video fuzz))
 INSTALL := -m pip --disable-pip-version-check install --no-compile
@@ -20,7 +21,7 @@ DEMO_FLAGS = --port $(PORT) $(if $(filter-out 0,$(ONCE)),--once)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-train test test-cluster lint format clean
+.PHONY: help demo demo-train test test-cluster test-viewer lint format clean
 
 help:  ## show this list
 	@awk -F ':.*## +' '/^[a-z-]+:.*##/ { printf "  make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -41,6 +42,9 @@ test-cluster: $(CLUSTER)/.installed  ## Ray beside everything: the tests on a cl
 	$(CLUSTER)/bin/python -m pytest -n 0 tests/test_ray.py $(ARGS)
 	MSDGS_TEST_SERVICE=ray $(CLUSTER)/bin/python -m pytest -n 0 -p no:randomly $(HTTP_TESTS) $(ARGS)
 
+test-viewer: $(VIEWER)/.installed  ## the live view of a training in a browser, with viser
+	$(VIEWER)/bin/python -m pytest -n 0 tests/test_live_view.py tests/test_live_view_browser.py $(ARGS)
+
 lint: $(FULL)/.installed-dev  ## ruff, pyright and the import contracts
 	$(FULL)/bin/ruff check
 	$(FULL)/bin/ruff format --check
@@ -52,7 +56,7 @@ format: $(FULL)/.installed-dev  ## write the sources as ruff likes them
 	$(FULL)/bin/ruff format
 
 clean:  ## remove the environments and what the demos wrote
-	rm -rf $(SERVE) $(FULL) $(CLUSTER) out
+	rm -rf $(SERVE) $(FULL) $(CLUSTER) $(VIEWER) out
 
 $(SERVE)/.installed: pyproject.toml constraints.txt
 	$(call make_environment,$(SERVE))
@@ -73,6 +77,14 @@ $(CLUSTER)/.installed: pyproject.toml constraints.txt
 	$(call make_environment,$(CLUSTER))
 	$(PINS) $(CLUSTER)/bin/python $(INSTALL) $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) \
 		--editable '.[cluster,train,export,dev]'
+	@touch $@
+
+# viser 1.1 doesn't take the rich and the websockets that all else is tested with.
+$(VIEWER)/.installed: pyproject.toml constraints.txt
+	$(call make_environment,$(VIEWER))
+	sed -e 's/^rich==.*/rich==14.3.4/' -e 's/^websockets==.*/websockets==16.1.1/' constraints.txt > $(VIEWER)/constraints.txt
+	PIP_CONSTRAINT=$(VIEWER)/constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt $(VIEWER)/bin/python $(INSTALL) \
+		$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) --editable '.[train,export,dev,viewer]'
 	@touch $@
 
 define make_environment

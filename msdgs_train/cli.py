@@ -1,8 +1,9 @@
 """`msdgs-train`: fit a moving scene to photographs, judge and look at what came out, or make a scene to try it on."""
 
 import argparse
+import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from msdgs_train.evaluation import Evaluation
+    from msdgs_train.training_view import TrainingView
+    from msdgs_train.viewer import Viewer
 
 PresetName = Literal["msdgs-small", "msdgs-mlp", "msdgs-plane", "deformgs", "4dgs", "static"]
 """Written out, so that `--help` and shells know them."""
@@ -55,6 +58,13 @@ class Fit:
     tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Also write what metrics.jsonl gets, and held-out renderings, to RUN/tensorboard; look at many runs with
     `tensorboard --logdir runs`. Needs: pip install 'msdgs[tensorboard]'"""
+    viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Open a page on which the model is seen while it is trained, from all around, at any time, after each layer; it
+    stays when the run is over, until Ctrl-C. Needs: pip install 'msdgs[viewer]'"""
+    viewer_port: int = 8080
+    """Port of that page; where it is taken, one of the next. 0 takes a free one."""
+    viewer_host: str = "127.0.0.1"
+    """Address that it listens on; 0.0.0.0 for all networks, where anybody may then pause the run."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
 
@@ -117,6 +127,22 @@ class Steps:
 
 
 @dataclass(frozen=True)
+class View:
+    """Open a page on which a trained model is seen from all around, at any time, after each layer of the deformation.
+    It stays until Ctrl-C. Needs: pip install 'msdgs[viewer]'
+
+    Example:  msdgs-train view runs/first/model.pt
+    """
+
+    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
+    """The model.pt or best.pt of a run."""
+    port: int = 8080
+    """Where it is taken, one of the next. 0 takes a free one."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 for all networks."""
+
+
+@dataclass(frozen=True)
 class Compare:
     """Train every system on every scene with every seed under one budget, and put them side by side: a table
     (comparison.md), all numbers (comparison.json), error against training time (time.png) and against the number of
@@ -165,6 +191,7 @@ Command = (
     | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Steps, tyro.conf.subcommand("steps")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
 )
 
@@ -182,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INVALID
 
 
-def _run(command: Fit | Synthetic | Evaluate | Steps | Compare) -> int:
+def _run(command: Fit | Synthetic | Evaluate | Steps | View | Compare) -> int:
     match command:
         case Fit():
             return _fit(command)
@@ -192,6 +219,8 @@ def _run(command: Fit | Synthetic | Evaluate | Steps | Compare) -> int:
             return _evaluate(command)
         case Steps():
             return _steps(command)
+        case View():
+            return _view(command)
         case Compare():
             return _compare(command)
 
@@ -221,31 +250,42 @@ def _parse_fit(arguments: Sequence[str]) -> Fit:
 
 
 def _fit(command: Fit) -> int:
-    from msdgs_train.fit import fit
-    from msdgs_train.progress import FitProgress
+    from msdgs_train.fit import Observer, Observers, fit
+    from msdgs_train.progress import FitProgress, print_outcome
 
-    with FitProgress(console, command.config.steps) as progress:
-        outcome = fit(
-            command.config,
-            command.data,
-            command.run,
-            resume=command.resume,
-            observer=progress,
-            tensorboard=command.tensorboard,
-        )
-    console.print(
-        f"{outcome.status} at step {outcome.step:,}, {outcome.gaussians:,} Gaussians, {outcome.seconds:.0f} s"
-    )
-    for split, quality in outcome.qualities.items():
-        console.print(f"{split:>5}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
-    console.print(f"model: {command.run / 'model.pt'}", soft_wrap=True)
-    if outcome.best is not None:
-        best = outcome.best
-        console.print(f"best:  {command.run / 'best.pt'}, {best.split} {best.psnr:.2f} dB, step {best.step:,}")
-    if outcome.status != "finished":
-        more = " --max-minutes None" if outcome.status == "out of time" else ""
-        console.print(f"go on with: msdgs-train fit {command.data} {command.run} --resume{more}", soft_wrap=True)
+    with contextlib.ExitStack() as stack:
+        view = stack.enter_context(_training_view(command)) if command.viewer else None
+        with FitProgress(console, command.config.steps) as progress:
+            observers: list[Observer] = [progress, view] if view else [progress]
+            outcome = fit(
+                command.config,
+                command.data,
+                command.run,
+                resume=command.resume,
+                observer=Observers(*observers),
+                tensorboard=command.tensorboard,
+            )
+        print_outcome(console, outcome, command.data, command.run)
+        if view is not None and outcome.status != "interrupted":
+            console.print("the page stays, with the last model; Ctrl-C ends it")
+            view.stay()
     return EXIT_INTERRUPTED if outcome.status == "interrupted" else 0
+
+
+@contextlib.contextmanager
+def _training_view(command: Fit) -> Iterator["TrainingView"]:
+    from msdgs_train.training_view import TrainingView
+
+    with _viewer(command.viewer_host, command.viewer_port) as viewer:
+        yield TrainingView(viewer, command.config.steps)
+
+
+def _viewer(host: str, port: int) -> "Viewer":
+    from msdgs_train.viewer import Viewer
+
+    viewer = Viewer(host, port)
+    console.print(f"look at {viewer.url}", soft_wrap=True)
+    return viewer
 
 
 def _synthetic(command: Synthetic) -> int:
@@ -307,6 +347,17 @@ def _steps(command: Steps) -> int:
 
     pictures = write_steps(command.model, command.out, t=command.t, size=command.size, camera=command.camera)
     console.print(f"wrote {command.out}: k = 0 to {len(pictures) - 1}", soft_wrap=True)
+    return 0
+
+
+def _view(command: View) -> int:
+    from msdgs_train.checkpoint import load_model
+    from msdgs_train.viewer import show_model
+
+    loaded = load_model(command.model)
+    with _viewer(command.host, command.port) as viewer:
+        show_model(viewer, loaded, str(command.model))
+        viewer.stay()
     return 0
 
 

@@ -25,6 +25,7 @@ EVALUATED_SPLITS = ("test", "val")
 CHOOSING_SPLITS = ("val", "test")  # the first that the dataset has decides which model is the best
 RENDERS_WHILE_TRAINING = 4
 MAX_ROLLBACKS = 3
+PAUSE_SECONDS = 0.05  # between questions whether to go on
 
 Status = Literal["finished", "interrupted", "out of time"]
 
@@ -43,6 +44,9 @@ class Outcome(NamedTuple):
 class Observer:
     """Hears of what a run does. This one does nothing; the command line shows a progress bar."""
 
+    def begins(self, trainer: Trainer) -> None:
+        """Before the first step, and again where a rollback has made a new trainer."""
+
     def step(self, result: StepResult, seconds: float) -> None:
         """After every step."""
 
@@ -55,6 +59,39 @@ class Observer:
     def should_stop(self) -> bool:
         """Asked after every step; the run then saves a checkpoint and returns."""
         return False
+
+    def is_paused(self) -> bool:
+        """Asked after every step, and while it is true again and again; the run goes on when it isn't."""
+        return False
+
+
+class Observers(Observer):
+    """Several, told one after the other; each may pause or stop the run."""
+
+    def __init__(self, *observers: Observer) -> None:
+        self.observers = observers
+
+    def begins(self, trainer: Trainer) -> None:
+        for observer in self.observers:
+            observer.begins(trainer)
+
+    def step(self, result: StepResult, seconds: float) -> None:
+        for observer in self.observers:
+            observer.step(result, seconds)
+
+    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+        for observer in self.observers:
+            observer.evaluation(step, split, quality)
+
+    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+        for observer in self.observers:
+            observer.rolled_back(reason, step, rate_factor)
+
+    def should_stop(self) -> bool:
+        return any(observer.should_stop() for observer in self.observers)
+
+    def is_paused(self) -> bool:
+        return any(observer.is_paused() for observer in self.observers)
 
 
 def stored_config(run: Path) -> TrainConfig:
@@ -140,6 +177,7 @@ class _Run:
 
     def execute(self) -> Outcome:
         status: Status = "finished"
+        self.observer.begins(self.trainer)
         while self.trainer.step_count < self.config.steps and status == "finished":
             try:
                 result = self.trainer.step()
@@ -177,13 +215,22 @@ class _Run:
         self.log.close()
         self.log = self._open_log()
         self._save()
+        self.observer.begins(self.trainer)
         self.observer.rolled_back(str(error), self.trainer.step_count, self.trainer.rate_factor)
 
     def _reason_to_stop(self) -> Status:
+        self._wait_while_paused()
         if self.observer.should_stop():
             return "interrupted"
         budget = self.config.max_minutes
         return "out of time" if budget is not None and self._seconds() >= 60 * budget else "finished"
+
+    def _wait_while_paused(self) -> None:
+        """Time that doesn't count as training."""
+        since = time.perf_counter()
+        while self.observer.is_paused() and not self.observer.should_stop():
+            time.sleep(PAUSE_SECONDS)
+        self.started += time.perf_counter() - since
 
     def _after_step(self, result: StepResult) -> None:
         if result.step % self.config.log_every == 0 or result.step == self.config.steps:

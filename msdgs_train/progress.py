@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -13,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import Ended
-from msdgs_train.fit import Observer
+from msdgs_train.fit import Observer, Outcome
 from msdgs_train.metrics import Quality
 from msdgs_train.trainer import StepResult
 
@@ -92,6 +93,22 @@ class FitProgress(Observer):
         if self._stop.is_set():
             raise KeyboardInterrupt
         self._stop.set()
+
+
+def print_outcome(console: Console, outcome: Outcome, data: Path, run: Path) -> None:
+    """How a run has ended, what it has left, and how to go on with it."""
+    console.print(
+        f"{outcome.status} at step {outcome.step:,}, {outcome.gaussians:,} Gaussians, {outcome.seconds:.0f} s"
+    )
+    for split, quality in outcome.qualities.items():
+        console.print(f"{split:>5}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
+    console.print(f"model: {run / 'model.pt'}", soft_wrap=True)
+    if outcome.best is not None:
+        best = outcome.best
+        console.print(f"best:  {run / 'best.pt'}, {best.split} {best.psnr:.2f} dB, step {best.step:,}")
+    if outcome.status != "finished":
+        more = " --max-minutes None" if outcome.status == "out of time" else ""
+        console.print(f"go on with: msdgs-train fit {data} {run} --resume{more}", soft_wrap=True)
 
 
 class ComparisonProgress:

@@ -241,8 +241,13 @@ class Trainer:
         return int((posed.scales <= SMALLEST_SCALE).any(dim=1).sum())
 
     def _pose(self, t: float) -> PosedGaussians:
-        degree = min(self.step_count // self.config.sh_interval, self.config.model.sh_degree)
-        return self.model.pose(t, deform=self._deforms(), sh_degree=degree)
+        deform, sh_degree = self.parts_in_use
+        return self.model.pose(t, deform=deform, sh_degree=sh_degree)
+
+    @property
+    def parts_in_use(self) -> tuple[bool, int]:
+        """Whether Gaussians are deformed yet, and the degree of their spherical harmonics up to now."""
+        return self._deforms(), min(self.step_count // self.config.sh_interval, self.config.model.sh_degree)
 
     def _deforms(self) -> bool:
         return self.step_count >= self.config.warmup_steps and len(self.model.deformation) > 0

@@ -16,15 +16,21 @@ def find_chromium() -> str | None:
     return os.environ.get("MSDGS_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 
+WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Drawn by the processor: for pages that show nothing without WebGL."""
+
+
 @contextlib.contextmanager
-def chromium() -> Iterator[Browser]:
+def chromium(*arguments: str) -> Iterator[Browser]:
     """Ended on leaving. Skips the test that asks where there is none."""
     program = find_chromium()
     if program is None:
         pytest.skip("no Chromium on this machine; `apt-get install chromium`, or name one in MSDGS_CHROMIUM")
     with sync_playwright() as playwright:
         # it runs as root in containers, and shows nothing but our own page
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        browser = playwright.chromium.launch(
+            executable_path=program, args=["--no-sandbox", "--disable-gpu", *arguments]
+        )
         yield browser
         browser.close()
 

@@ -84,6 +84,7 @@ TABLE = (
     Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),
     Row("cubic_between", 1e-5, "fourth derivative 1,296 · h⁴ · 3/128 with h = 1/64, more at the ends"),
     Row("spline_fit", 1e-9, "a pseudo-inverse of a well-conditioned band of up to 129 rows, float64"),
+    Row("browser_camera", 1e-5, "entries of a pose near 4; through orbit controls and messages of a page in float32"),
     Row("served_frame", 1e-3, "of a float pixel; onnxruntime's exponentials and products are not torch's to the bit"),
     # stability: made cases, docs/stability.md
     Row(
