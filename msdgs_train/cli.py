@@ -267,8 +267,9 @@ def _fit(command: Fit) -> int:
             )
         print_outcome(console, outcome, command.data, command.run)
         if view is not None and outcome.status != "interrupted":
-            console.print("the page stays, with the last model; Ctrl-C ends it")
-            view.stay()
+            with contextlib.suppress(KeyboardInterrupt):
+                console.print("the page stays, with the last model; Ctrl-C ends it")
+                view.stay()
     return EXIT_INTERRUPTED if outcome.status == "interrupted" else 0
 
 
@@ -355,7 +356,7 @@ def _view(command: View) -> int:
     from msdgs_train.viewer import show_model
 
     loaded = load_model(command.model)
-    with _viewer(command.host, command.port) as viewer:
+    with _viewer(command.host, command.port) as viewer, contextlib.suppress(KeyboardInterrupt):
         show_model(viewer, loaded, str(command.model))
         viewer.stay()
     return 0

@@ -62,7 +62,7 @@ class TrainingView(Observer):
         return paused
 
     def stay(self) -> None:
-        """Show what came out of the run until Ctrl-C."""
+        """Show what came out of the run until Ctrl-C, which is raised."""
         self._folder.visible = False
         self._viewer.share = 1.0
         self._hand_over()

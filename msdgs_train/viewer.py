@@ -125,9 +125,8 @@ class Viewer:
         self._status.content = markdown
 
     def stay(self) -> None:
-        """Until Ctrl-C."""
-        with contextlib.suppress(KeyboardInterrupt):
-            self._closing.wait()
+        """Until Ctrl-C, which is raised."""
+        self._closing.wait()
 
     def close(self) -> None:
         """The page is gone."""
@@ -175,7 +174,8 @@ class Viewer:
         except MsdgsError as error:
             self._problem.content = f"can't be drawn: {error}"
             return True
-        client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=JPEG_QUALITY)
+        if client.client_id in self.server.get_clients():  # it may have gone meanwhile
+            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=JPEG_QUALITY)
         if self._problem.content:
             self._problem.content = ""
         return True

@@ -72,7 +72,7 @@ def test_a_browsers_camera_is_ours() -> None:
     right = pose[:3, 3] + pose[:3, :3] @ [1.5 * np.tan(np.radians(25.0)), 0.0, 1.0]
     pixels, depths = camera.project(np.stack([top, right]))
     assert_close(pixels, [[150, 0], [300, 100]], "pixel")
-    assert_close(depths, 1, "rotation")
+    assert_close(depths, np.ones(2), "rotation")
 
 
 def test_small_while_it_moves_and_large_when_it_is_still(page: PageServer, loaded: LoadedModel) -> None:
@@ -167,7 +167,7 @@ def test_the_first_view_is_that_of_a_photograph(data: Path) -> None:
     pose = look_at(stage.eye, stage.target, stage.up)
     assert_close(pose, first.camera_to_world, "rotation")
     assert_close(np.degrees(stage.fov_y), FOV, "rotation")
-    assert_close(stage.target, 0, "rotation")
+    assert_close(stage.target, np.zeros(3), "rotation")
     assert stage_of_file(LoadedModel(random_model(), SCENE, 7)).layers == 2
 
 

@@ -20,6 +20,7 @@ class PageClient:
     """A browser with a camera; `pictures` are all that it was sent, [H, W, 3] uint8."""
 
     def __init__(self, camera: Camera) -> None:
+        self.client_id = -1
         self.pictures: list[np.ndarray] = []
         self.scene = SimpleNamespace(set_background_image=self._receive)
         self.camera = SimpleNamespace(look_at=np.zeros(3), up_direction=np.zeros(3))
@@ -57,6 +58,8 @@ class PageServer:
         return 8080
 
     def get_clients(self) -> dict[int, PageClient]:
+        for number, client in self.clients.items():
+            client.client_id = number
         return dict(self.clients)
 
     def stop(self) -> None:
