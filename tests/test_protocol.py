@@ -1,0 +1,76 @@
+"""How answers are written to connections."""
+
+import asyncio
+
+import uvicorn
+from starlette.responses import Response, StreamingResponse
+from starlette.types import ASGIApp
+from uvicorn.server import ServerState
+
+from msdgs_serve.api.protocol import LimitedProtocol
+
+
+class Recorded(asyncio.Transport):
+    """A connection that is never slow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.writes: list[bytes] = []
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        if data:
+            self.writes.append(bytes(data))
+
+    def close(self) -> None:
+        pass
+
+    def is_closing(self) -> bool:
+        return False
+
+    def get_write_buffer_size(self) -> int:
+        return 0
+
+
+def writes_of(app: ASGIApp, request: bytes) -> list[bytes]:
+    """What an application's answer is written as."""
+
+    async def ask() -> list[bytes]:
+        config, state, transport = uvicorn.Config(app, log_config=None, lifespan="off"), ServerState(), Recorded()
+        config.load()
+        protocol = LimitedProtocol(config=config, server_state=state, app_state={}, header_seconds=9, read_seconds=9)
+        protocol.connection_made(transport)
+        protocol.data_received(request)
+        while state.tasks:
+            await asyncio.sleep(0)
+        protocol.connection_lost(None)
+        return transport.writes
+
+    return asyncio.run(ask())
+
+
+GET = b"GET / HTTP/1.1\r\nHost: here\r\n\r\n"
+
+
+def test_an_answer_is_written_at_once():
+    (answer,) = writes_of(Response(b"body"), GET)
+    assert answer.startswith(b"HTTP/1.1 200 OK\r\n")
+    assert answer.endswith(b"\r\n\r\nbody")
+
+
+def test_an_answer_without_a_body_has_its_head():
+    for app, request in ((Response(status_code=304), GET), (Response(b"body"), GET.replace(b"GET", b"HEAD"))):
+        (answer,) = writes_of(app, request)
+        assert answer.startswith(b"HTTP/1.1 ")
+        assert answer.endswith(b"\r\n\r\n")
+
+
+def test_parts_of_a_stream_are_written_as_they_come():
+    async def parts():  # noqa: ANN202
+        yield b"one"
+        yield b"two"
+
+    first, second, end = writes_of(StreamingResponse(parts()), GET)
+    assert first.startswith(b"HTTP/1.1 200 OK\r\n")
+    assert b"one" in first
+    assert b"two" in second
+    assert end == b"0\r\n\r\n"
