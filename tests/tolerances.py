@@ -38,6 +38,7 @@ TABLE = (
     Row("rgb.float32_8192", 5e-4, "a mean near pixel 8192 is rounded to 2e-4 px in float32; slopes are up to 1 / px"),
     Row("alpha.float32_8192", 5e-4, "as rgb"),
     Row("depth.float32_8192.relative", 3e-5, "as in smaller pictures: a splat's depth doesn't depend on its place"),
+    Row("avx512_renderer_db", 70, "the hand-written one takes some decisions at thresholds the other way"),
     Row("rgb.float64", 1e-10, "the same in float64, sigma of needles loses six digits"),
     Row("alpha.float64", 1e-10, "as rgb"),
     Row("depth.float64.relative", 1e-10, "as rgb"),
