@@ -67,14 +67,13 @@ def test_operations_are_what_numpy_says(dtype: type):
 
 @kernel
 def rows_and_columns(
-    matrix: np.ndarray, out: np.ndarray, squares: np.ndarray, triples: np.ndarray, columns: np.ndarray
+    matrix: np.ndarray, out: np.ndarray, squares: np.ndarray, triples: np.ndarray, picked: np.ndarray, rows: np.ndarray
 ) -> None:
     block = lanes.load_columns(matrix, 3, 2)
     lanes.store_columns(out, 5, 3, block)
     lanes.store_square(squares, 2, 7, block[0])
     lanes.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
-    for k in range(16):
-        lanes.mark(columns, np.uint64(k), block[0] > block[1])
+    lanes.store_columns(picked, 0, 0, lanes.load_columns_of(picked, rows, 1))
     lanes.prefetch(squares, 3)
 
 
@@ -82,12 +81,15 @@ def rows_and_columns(
 def test_memory(dtype: type):
     """Loads stop at the end of an array, stores leave what is beside them."""
     matrix = np.arange(70, dtype=dtype).reshape(10, 7)
-    got = [np.full((9, 16), -1, dtype), np.full(40, -1, dtype), np.full(60, -1, dtype), np.zeros(16, np.uint64)]
+    got = [np.full((9, 16), -1, dtype), np.full(40, -1, dtype), np.full(60, -1, dtype)]
+    got.append(np.arange(256, dtype=dtype).reshape(16, 16))
     want = [array.copy() for array in got]
-    rows_and_columns(matrix, *got)
-    plain(rows_and_columns)(matrix, *want)
+    rows = np.array([1, 15, 4], np.uint32)
+    rows_and_columns(matrix, *got, rows)
+    plain(rows_and_columns)(matrix, *want, rows)
     for array, expected in zip(got, want, strict=True):
         np.testing.assert_array_equal(array, expected)
+    np.testing.assert_array_equal(got[3][:, 5], [16 * 15 + 5, *[16 * 4 + 5] * 15])
     np.testing.assert_array_equal(got[0][5:, 3:8], matrix[3:7, 2:])
     np.testing.assert_array_equal(got[0][:5], -1)
     np.testing.assert_array_equal(got[0][:, :3], -1)

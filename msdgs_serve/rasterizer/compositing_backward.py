@@ -15,7 +15,7 @@ from msdgs_serve.rasterizer.compositing import (
     Frame,
     PixelLimits,
     grid_of_a_tile,
-    log2_alpha,
+    log2_alpha_of,
     pixel_limits,
     place_in_tile,
     touched_blocks,
@@ -137,7 +137,7 @@ def _tiles_backward(
                 ahead = min(pair + AHEAD, past - np.uint64(1))
                 prefetch(flat, np.uint64(tiles.splat_ids[ahead]) * np.uint64(RECORD))
                 store(record, 0, load(flat, np.uint64(tiles.splat_ids[pair]) * np.uint64(RECORD)) - load(origin, 0))
-                bits = alive & bits_of(touched_blocks(record, np.uint64(0), grid, limits.log2_alpha_min))
+                bits = alive & bits_of(touched_blocks(record, grid, limits.log2_alpha_min))
                 alive &= ~_splat_backward(bits, record, grid, limits, state, flat_sums, pair * np.uint64(SUMS))
                 pair += np.uint64(1)
             seen[tile] = pair - first_pair
@@ -165,7 +165,7 @@ def _splat_backward(
         pixel_x, pixel_y = load(grid, 32) + grid[block], load(grid, 48) + grid[np.uint64(16) + block]
         dx, dy = pixel_x - record[X], pixel_y - record[Y]
         left = load(state, LEFT + lane)
-        exponent = log2_alpha(record, np.uint64(0), pixel_x, pixel_y)
+        exponent = log2_alpha_of(record, pixel_x, pixel_y)
         raw_alpha = exp2(exponent, limits.exp2)
         uncut = raw_alpha < limits.alpha_max
         alpha = minimum(raw_alpha, filled(limits.alpha_max, raw_alpha))

@@ -411,6 +411,13 @@ def load_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tu
     return tuple(block.T.copy())
 
 
+def load_columns_of(array: np.ndarray, rows: np.ndarray, start: Index) -> tuple[Lanes, ...]:
+    """The 16 columns of an array [n, 16], at the rows that 16 numbers of `rows` [m] name from `start`; past the end of
+    `rows` its last number counts again."""
+    found = rows[np.minimum(np.arange(int(start), int(start) + LANES), len(rows) - 1)]
+    return tuple(array[found].T.copy())
+
+
 def store_columns(array: np.ndarray, first_row: Index, first_column: Index, columns: tuple[Lanes, ...]) -> None:
     """Write up to 16 columns, and 0 for those that lack, into 16 rows of an array [n, m]; what is past its rows and
     columns is dropped."""
@@ -470,6 +477,11 @@ def _type_load_or(_context: Any) -> Callable:
 @type_callable(load_columns)
 def _type_load_columns(_context: Any) -> Callable:
     return lambda array, row, column: types.UniTuple(LanesType(array.dtype), LANES) if _is_array(array, 2) else None
+
+
+@type_callable(load_columns_of)
+def _type_load_columns_of(_context: Any) -> Callable:
+    return lambda array, rows, start: types.UniTuple(LanesType(array.dtype), LANES) if _is_array(array, 2) else None
 
 
 @type_callable(store_columns)
@@ -553,6 +565,42 @@ def _lower_load_columns(context: Any, builder: Any, signature: Any, values: Any)
     return context.make_tuple(builder, signature.return_type, _transposed(builder, rows))
 
 
+@lower_builtin(load_columns_of, types.Array, types.Array, types.Integer)
+def _lower_load_columns_of(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    kind, row_kind = signature.args[:2]
+    data = context.make_array(kind)(context, builder, values[0]).data
+    rows = context.make_array(row_kind)(context, builder, values[1])
+    start = context.cast(builder, values[2], signature.args[2], types.intp)
+    last = builder.sub(builder.extract_value(rows.shape, 0), ir.Constant(ir.IntType(64), 1))
+    places = []
+    for k in range(LANES):
+        entry = builder.add(start, ir.Constant(ir.IntType(64), k))
+        entry = builder.select(builder.icmp_signed("<", entry, last), entry, last)
+        row = context.cast(builder, builder.load(builder.gep(rows.data, [entry])), row_kind.dtype, types.intp)
+        places.append(builder.gep(data, [builder.mul(row, ir.Constant(ir.IntType(64), LANES))]))
+    real = context.get_data_type(kind.dtype)
+    columns = [column for first in range(0, LANES, 4) for column in _four_columns(builder, places, real, first)]
+    return context.make_tuple(builder, signature.return_type, columns)
+
+
+def _four_columns(builder: Any, places: list[Any], real: ir.Type, first: int) -> list[Any]:
+    """Columns `first` to `first` + 3 of the 16 rows that begin at `places`. Groups of four rows lie side by side, so
+    that only the four by four within a group are turned round."""
+    quarter, size = ir.VectorType(real, 4), 4 if real == ir.FloatType() else 8
+    pieces = []
+    for place in places:
+        piece = builder.gep(place, [ir.Constant(ir.IntType(64), first)])
+        pieces.append(builder.load(builder.bitcast(piece, quarter.as_pointer()), align=size))
+    v = []
+    for k in range(4):
+        low, high = (_shuffled(builder, pieces[k + j], pieces[k + j + 4], range(8)) for j in (0, 8))
+        v.append(_shuffled(builder, low, high, range(16)))
+    low, high = ([lane for q in range(k, LANES, 4) for lane in (q, LANES + q, q + 1, LANES + q + 1)] for k in (0, 2))
+    v = [_shuffled(builder, a, b, lanes) for lanes in (low, high) for a, b in (v[:2], v[2:])]
+    low, high = ([lane for q in range(k, LANES, 4) for lane in (q, q + 1, LANES + q, LANES + q + 1)] for k in (0, 2))
+    return [_shuffled(builder, a, b, lanes) for a, b in (v[:2], v[2:]) for lanes in (low, high)]
+
+
 @lower_builtin(store_columns, types.Array, types.Integer, types.Integer, types.UniTuple)
 def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     kind = signature.args[0]
@@ -565,29 +613,6 @@ def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any
     for k, (place, lanes) in enumerate(zip(places, rows, strict=True)):
         with builder.if_then(builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)):
             _masked_store(builder, place, kind.dtype.bitwidth // 8, some, lanes)
-    return context.get_dummy_value()
-
-
-def mark(columns: np.ndarray, place: Index, mask: Mask) -> None:
-    """Set bit `place` of those of 16 uint64 `columns` that the mask says: a row of a matrix of bits, by columns."""
-    columns[:] |= np.where(mask, np.uint64(1) << np.uint64(place), np.uint64(0))
-
-
-@type_callable(mark)
-def _type_mark(_context: Any) -> Callable:
-    return lambda columns, place, mask: types.none if mask == MASK else None
-
-
-@lower_builtin(mark, types.Array, types.Integer, MASK)
-def _lower_mark(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    columns, place, mask = values
-    integers = ir.VectorType(ir.IntType(64), LANES)
-    data = context.make_array(signature.args[0])(context, builder, columns).data
-    pointer = builder.bitcast(data, integers.as_pointer())
-    bit = builder.shl(ir.Constant(ir.IntType(64), 1), context.cast(builder, place, signature.args[1], types.uint64))
-    old = builder.load(pointer, align=8)
-    marked = builder.or_(old, _broadcast(builder, bit))
-    builder.store(builder.select(mask, marked, old), pointer, align=8)
     return context.get_dummy_value()
 
 

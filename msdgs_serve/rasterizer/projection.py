@@ -41,9 +41,11 @@ from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
 RECORD = LANES
 """Numbers that a splat's record has: one load. Their places:"""
-(X, Y, ROOT_A, ROOT_B, ROOT_C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, EXTENT_X, EXTENT_Y) = (
-    np.uint64(place) for place in range(14)
+(X, Y, ROOT_A, ROOT_B, ROOT_C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, EXTENT_X, EXTENT_Y) = (
+    np.uint64(place) for place in range(12)
 )
+CACHE_LINE = 64
+"""Bytes."""
 ROOT_SCALE = math.sqrt(0.5 / math.log(2))
 """alpha = 2^(LOG2_OPACITY - |root @ d|²): the root is that of the inverse covariance times this."""
 
@@ -53,8 +55,7 @@ class Splats(NamedTuple):
 
     A record: the mean X, Y in pixels; the root [[A, B], [0, C]] of the inverse 2D covariance times `ROOT_SCALE`²,
     1/px; log2 of the opacity; the colour seen from the camera, 0 or more; the depth along the camera's axis, scene
-    units; where the ellipse's extreme points lie (`SLOPE_X`: dx of the least distance a unit of dy, and the other way
-    round); half the size of the box outside of which alpha < alpha_min, pixels.
+    units; half the size of the box outside of which alpha < alpha_min, pixels.
     """
 
     records: np.ndarray  # [N, RECORD]
@@ -73,7 +74,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     gaussians = _kernel_arrays(gaussians)
     count, dtype = len(gaussians), gaussians.means.dtype
     view = view_of(camera, options)
-    records = np.empty((count, RECORD), dtype)
+    records = empty_records(count, dtype)
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
     ranges = ranges_of_lanes(count)
@@ -85,6 +86,14 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     )
     parts = [keys[start : start + found] for (start, _), (found, _) in zip(ranges, visible, strict=True)]
     return Splats(records, rectangles, np.concatenate(parts), all(sound for _, sound in visible))
+
+
+def empty_records(count: int, dtype: np.dtype) -> np.ndarray:
+    """[count, RECORD] from a multiple of 64 bytes on, so that a record of float32 is one cache line and not two."""
+    size = count * RECORD * dtype.itemsize
+    raw = np.empty(size + CACHE_LINE, np.uint8)
+    start = -raw.ctypes.data % CACHE_LINE
+    return raw[start : start + size].view(dtype).reshape(count, RECORD)
 
 
 def ranges_of_lanes(count: int) -> list[tuple[int, int]]:
@@ -153,7 +162,6 @@ def _project_range(
             drawn = drawn & (opacity >= view.alpha_min)
         # from here on in the records' dtype: ratios, roots and sums of the above lose nothing in float32
         u, v = converted(u, records), converted(v, records)
-        slope_h, slope_v = converted(xy / yy, records), converted(xy / xx, records)
         # alpha_min <= 2^(log2_opacity - |root @ d|²) bounds the distance; that ellipse has this bounding box
         log2_opacity = log2(maximum(converted(opacity, records), spread(real(view.alpha_min))))
         reach = (log2_opacity - view.log2_alpha_min) * (2 * math.log(2))
@@ -168,7 +176,7 @@ def _project_range(
             continue
         # a sum of two squares, |root @ d|², keeps its digits along a needle where the quadratic form cancels
         root_a = square_root(converted(yy / det, records))
-        root_b = -slope_h * root_a
+        root_b = -converted(xy / yy, records) * root_a
         root_c = 1 / square_root(converted(yy, records))
         dx, dy, dz = direction(view, wx, wy, wz)
         red, green, blue = raw_colors(
@@ -190,8 +198,6 @@ def _project_range(
                 select(drawn, maximum(green, zero), zero),
                 select(drawn, maximum(blue, zero), zero),
                 select(drawn, converted(z, records), zero),
-                select(drawn, slope_h, zero),
-                select(drawn, slope_v, zero),
                 select(drawn, extent_x, zero),
                 select(drawn, extent_y, zero),
             ),
