@@ -19,6 +19,8 @@ from scipy.optimize import nnls
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.avx512.comparison import Comparison
+from benchmarks.avx512.renderer import why_not
 from benchmarks.drawers import AS_DRAWN_BY, Drawer, psnr
 from benchmarks.frame_times import Gradient, Subject, Times, draw_in_stages, memory_of, row_of, work_of
 from benchmarks.rasterizer_knobs import KnobRuns, oracle_agreement
@@ -47,6 +49,7 @@ class Benchmark:
     python benchmarks/rasterizer.py --counts 100000 --sizes 800x800 --repeats 5
     python benchmarks/rasterizer.py --knobs --gradient --json out/rasterizer.json --plot out/rasterizer.png
     python benchmarks/rasterizer.py --f3d-python .venv-f3d/bin/python --open3d-python .venv-open3d/bin/python
+    python benchmarks/rasterizer.py --avx512
     python benchmarks/rasterizer.py --against ../msdgs-before
     python benchmarks/rasterizer.py --splats bonsai.ply guitar.splat
 
@@ -64,6 +67,8 @@ class Benchmark:
     """Time the backward pass too, as training does it; needs torch."""
     knobs: bool = False
     """Error against time for thresholds, degrees and bounds, at 100,000 Gaussians and 800x800."""
+    avx512: bool = False
+    """The same frames in turns with a renderer written by hand for AVX-512; needs g++ and such a processor."""
     splats: tuple[Path, ...] = ()
     """Files of real splats, .splat or INRIA's .ply, to draw at 800x800 beside the seeded scenes."""
     pictures: Path | None = None
@@ -100,6 +105,8 @@ class Run:
             for width, height in sizes
         ]
         self._time_stages("frames", subjects)
+        if options.avx512:
+            self._time_avx512(subjects)
         if options.splats:
             real = [Subject(path.name, gaussians := read_gaussians(path), around(gaussians)) for path in options.splats]
             self._time_stages("real", real)
@@ -154,6 +161,15 @@ class Run:
         for _ in self._turns("knobs", 3 * self.options.repeats):
             runs.draw_all()
             self.result["knobs"] = runs.rows()
+
+    def _time_avx512(self, subjects: list[Subject]) -> None:
+        if reason := why_not():
+            self.result["no_avx512"] = reason
+            return
+        with Comparison(subjects) as comparison:
+            for _ in self._turns("AVX-512", self.options.repeats):
+                comparison.draw_all()
+                self.result["avx512"] = comparison.rows()
 
     def _time_others(self, pythons: dict[str, Path]) -> None:
         self.result["others"] = []

@@ -15,13 +15,15 @@ from benchmarks.splat_scenes import object_camera, object_scene
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, compositing, rasterize
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.exponential import exp2_polynomial
-from msdgs_serve.rasterizer.projection import ROOT_A, ROOT_B, ROOT_C, ROOT_SCALE, Splats, X, Y, project
+from msdgs_serve.rasterizer.projection import RED, ROOT_A, ROOT_B, ROOT_C, ROOT_SCALE, Splats, X, Y, project
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.scene import Camera, Gaussians
 from tests.reference import render
 
 WITHOUT_THRESHOLDS = GSPLAT._replace(alpha_min=1e-6, transmittance_min=0.0)
+FLOAT16 = {"all numbers": int(X), "all but the place": int(ROOT_A), "colour and depth": int(RED)}
+"""The first column of a record that is rounded."""
 BLACK = np.zeros(3, np.float32)
 
 
@@ -47,6 +49,7 @@ def knobs() -> list[Knob]:
     found += [Knob("degree of 2^x", str(degree), _with_degree(degree)) for degree in (3, 4, 6, 7)]
     found += [Knob("degree of harmonics", str(degree), _with_harmonics(degree)) for degree in (2, 1, 0)]
     found.append(Knob("bounds", "3σ square", _with_3_sigma))
+    found += [Knob("records in float16", name, _with_float16(first)) for name, first in FLOAT16.items()]
     return found
 
 
@@ -79,6 +82,23 @@ def _with_harmonics(degree: int) -> Callable:
 def shorter(gaussians: Gaussians, degree: int) -> Gaussians:
     """Without harmonics above a degree."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
+
+
+def _with_float16(first: int) -> Callable:
+    def draw(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+        splats = project(gaussians, camera, GSPLAT)
+        drawn = with_float16_records(splats, first)
+        tiles = bin_into_tiles(splats, camera.width, camera.height)
+        return composite(drawn, tiles, camera.width, camera.height, BLACK, GSPLAT).rgb
+
+    return draw
+
+
+def with_float16_records(splats: Splats, first: int) -> Splats:
+    """Records as float16 would hold them, from a column on."""
+    records = splats.records.copy()
+    records[:, first:] = records[:, first:].astype(np.float16)
+    return splats._replace(records=records)
 
 
 def _with_3_sigma(gaussians: Gaussians, camera: Camera) -> np.ndarray:

@@ -23,9 +23,11 @@ def print_tables(result: Row, console: Console) -> None:
     for section, title in (("frames", "Seeded scenes"), ("real", "Real splats")):
         if section in result:
             console.print(_stages(result[section], title), _floors(result[section]))
-    for section, table in (("knobs", _knobs), ("others", _others), ("checkouts", _checkouts)):
+    for section, table in (("avx512", _avx512), ("knobs", _knobs), ("others", _others), ("checkouts", _checkouts)):
         if result.get(section):
             console.print(table(result[section]))
+    if "no_avx512" in result:
+        console.print(f"no renderer written by hand for AVX-512: {result['no_avx512']}")
     if "oracle_agreement" in result:
         console.print(f"float64 against tests/reference.py on a small scene: {result['oracle_agreement']:.1e} at most")
     for line in summary(result):
@@ -102,6 +104,20 @@ def _floors(rows: list[Row]) -> Table:
             f"{row['memory_bytes'] / 1e6:.1f}",
             f"{row['bytes_per_splat']:.0f}",
         )
+    return table
+
+
+def _avx512(rows: list[Row]) -> Table:
+    table = _table(
+        "Beside a renderer written by hand for AVX-512, in turns: milliseconds, ours / by hand",
+        *("Gaussians", "size", "project", "sort, bin", "composite", "total", "ours / by hand", "PSNR"),
+    )
+    for row in rows:
+        ours, other = row["ours"], row["by_hand"]
+        cells = [
+            f"{ours[name]['min']:.1f} / {other[name]['min']:.1f}" for name in ("project", "bin", "composite", "total")
+        ]
+        table.add_row(f"{row['count']:,}", _size(row["size"]), *cells, f"{row['ratio']:.2f}", f"{row['psnr']:.1f} dB")
     return table
 
 

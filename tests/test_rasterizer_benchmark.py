@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.avx512.renderer import why_not
 from benchmarks.rasterizer_knobs import with_3_sigma_squares
 from benchmarks.splat_files import gaussians_of, records_of
 from benchmarks.splat_scenes import object_scene
@@ -39,7 +40,14 @@ def test_the_command(tmp_path: Path):
     """Small, on one seeded scene, one file of splats and this checkout against itself."""
     records_of(object_scene(50, 1)).tofile(tmp_path / "some.splat")
     command = [sys.executable, "benchmarks/rasterizer.py", "--counts", "300", "--sizes", "64x48", "--repeats", "2"]
-    command += ["--splats", str(tmp_path / "some.splat"), "--pictures", str(tmp_path / "pictures"), "--gradient"]
+    command += [
+        "--splats",
+        str(tmp_path / "some.splat"),
+        "--pictures",
+        str(tmp_path / "pictures"),
+        "--gradient",
+        "--avx512",
+    ]
     command += ["--against", ".", "--json", str(tmp_path / "all.json"), "--plot", str(tmp_path / "all.png")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
@@ -48,5 +56,6 @@ def test_the_command(tmp_path: Path):
     assert (row["count"], row["size"], row["repeats"], real["count"]) == (300, [64, 48], 2, 50)
     assert 0 < row["milliseconds"]["total"]["min"] <= row["milliseconds"]["total"]["median"]
     assert checkouts["psnr"] is None  # the same bytes
+    assert ("avx512" in result) == (why_not() is None)
     assert (tmp_path / "all.png").stat().st_size > 1000
     assert (tmp_path / "pictures" / "some.splat.png").exists()

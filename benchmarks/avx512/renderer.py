@@ -71,6 +71,10 @@ class Avx512Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give its memory back."""
         self._library.delete_renderer(self._renderer)
 
     def draw(self, gaussians: Gaussians, camera: Camera, options: RasterizerOptions) -> Drawn:

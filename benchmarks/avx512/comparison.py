@@ -1,0 +1,47 @@
+"""Our frames and the hand-written renderer's in turns, stage by stage."""
+
+from typing import Any
+
+from benchmarks.avx512.renderer import Avx512Renderer
+from benchmarks.drawers import psnr
+from benchmarks.frame_times import Subject, Times, draw_in_stages
+from msdgs_serve.rasterizer import GSPLAT, rasterize
+
+
+class Comparison:
+    """Draws all subjects, each with both; a context, which gives the other's memory back."""
+
+    def __init__(self, subjects: list[Subject]) -> None:
+        self._subjects, self._renderer = subjects, Avx512Renderer()
+        self._psnr = [
+            psnr(rasterize(*scene).rgb, self._renderer.draw(*scene, GSPLAT).rgb)
+            for scene in ((subject.gaussians, subject.camera) for subject in subjects)
+        ]
+        self._ours, self._by_hand = [[Times() for _ in subjects] for _ in range(2)]
+
+    def __enter__(self) -> "Comparison":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._renderer.close()
+
+    def draw_all(self) -> None:
+        """One turn."""
+        for subject, ours, by_hand in zip(self._subjects, self._ours, self._by_hand, strict=True):
+            draw_in_stages(subject, ours)
+            drawn = by_hand.time("total", self._renderer.draw, subject.gaussians, subject.camera, GSPLAT)
+            stages = drawn.seconds
+            by_hand.add("project", stages["project"])
+            by_hand.add("bin", stages["sort"] + stages["bin"])
+            by_hand.add("composite", stages["composite"])
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Milliseconds of both, and the ratio of their shortest frames."""
+        rows = []
+        for k, subject in enumerate(self._subjects):
+            ours, by_hand = self._ours[k].milliseconds(), self._by_hand[k].milliseconds()
+            size = [subject.camera.width, subject.camera.height]
+            row = {"count": len(subject.gaussians), "size": size, "ours": ours, "by_hand": by_hand}
+            ratio = ours["total"]["min"] / by_hand["total"]["min"]
+            rows.append(row | {"ratio": ratio, "psnr": self._psnr[k]})
+        return rows
