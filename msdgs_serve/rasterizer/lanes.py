@@ -557,10 +557,11 @@ def _lower_load_columns(context: Any, builder: Any, signature: Any, values: Any)
     row, column = (context.cast(builder, v, t, types.intp) for v, t in zip(values[1:], signature.args[1:], strict=True))
     places, count, width = _rows(context, builder, kind, values[0], row, column)
     zeros = ir.Constant(ir.VectorType(context.get_data_type(kind.dtype), LANES), [0.0] * LANES)
+    inside, nothing = _first(builder, width), ir.Constant(ir.VectorType(ir.IntType(1), LANES), [0] * LANES)
     rows = []
     for k, place in enumerate(places):
         exists = builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)
-        some = _first(builder, builder.select(exists, width, ir.Constant(ir.IntType(64), 0)))
+        some = builder.select(exists, inside, nothing)
         rows.append(_masked_load(builder, place, kind.dtype.bitwidth // 8, some, zeros))
     return context.make_tuple(builder, signature.return_type, _transposed(builder, rows))
 

@@ -27,6 +27,7 @@ from msdgs_serve.rasterizer.lanes import (
     maximum,
     minimum,
     negative,
+    prefetch,
     select,
     spread,
     square_root,
@@ -46,6 +47,8 @@ RECORD = LANES
 )
 CACHE_LINE = 64
 """Bytes."""
+AHEAD = 2 * LANES
+"""Gaussians between asking for harmonics and needing them."""
 ROOT_SCALE = math.sqrt(0.5 / math.log(2))
 """alpha = 2^(LOG2_OPACITY - |root @ d|²): the root is that of the inverse covariance times this."""
 
@@ -131,8 +134,12 @@ def _project_range(
     boxes = np.empty(5 * LANES, records.dtype)
     scratch = np.empty(48 * LANES, sh.dtype)
     r, t = view.rotation, view.translation
+    flat_sh, numbers = sh.reshape(-1), np.uint64(sh.shape[1] * LANES)
     found, sound = start, True
     for first in range(start, stop, LANES):
+        ahead = np.uint64(first + AHEAD) * np.uint64(sh.shape[1])
+        for place in range(ahead, ahead + numbers, np.uint64(LANES)):
+            prefetch(flat_sh, place)
         columns = load_columns(means, first, 0)
         wx, wy, wz = converted(columns[0], double), converted(columns[1], double), converted(columns[2], double)
         opacity = converted(load_or(opacities, first, spread(opacities.dtype.type(0))), double)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.lanes import prefetch
 from msdgs_serve.rasterizer.projection import Splats
 from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
@@ -118,7 +119,10 @@ def _gather_rectangles(
 ) -> None:
     """The rectangles of the splats in their order, and where these begin and end: second differences of the number
     of splats on each tile, four additions however large a rectangle is."""
+    flat = rectangles.reshape(-1)
     for k in range(np.uint64(start), np.uint64(stop)):
+        ahead = min(k + AHEAD, np.uint64(stop) - np.uint64(1))
+        prefetch(flat, np.uint64(order[ahead]) * np.uint64(4))
         i = np.uint64(order[k])
         left, right, top, bottom = (
             np.uint64(rectangles[i, 0]),
