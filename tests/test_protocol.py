@@ -1,6 +1,7 @@
 """How answers are written to connections."""
 
 import asyncio
+from collections.abc import AsyncIterator
 
 import uvicorn
 from starlette.responses import Response, StreamingResponse
@@ -65,7 +66,7 @@ def test_an_answer_without_a_body_has_its_head():
 
 
 def test_parts_of_a_stream_are_written_as_they_come():
-    async def parts():  # noqa: ANN202
+    async def parts() -> AsyncIterator[bytes]:
         yield b"one"
         yield b"two"
 
