@@ -17,7 +17,6 @@
 #include <cstdint>
 #include <cstring>
 #include <numeric>
-#include <numeric>
 #include <span>
 #include <thread>
 #include <vector>
