@@ -10,7 +10,7 @@ import numpy as np
 
 from msdgs_serve.rasterizer.atomic import fetch_add
 from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial
-from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.lanes import (
     LANES,
     Lanes,
@@ -268,7 +268,7 @@ def _offsets(x: Lanes, y: Lanes, a: Lanes, b: Lanes, c: Lanes) -> tuple[Lanes, L
     return -fma(a, x, b * y), -(c * y)
 
 
-@kernel
+@inlined_kernel
 def _blend_block(
     block: np.uint64,
     bits: np.uint64,

@@ -20,10 +20,12 @@ SCENE = RASTERIZER.parent / "scene"
 STORED = use_writable_folder(RASTERIZER.parent)
 
 
-def kernel(function: Callable) -> Any:
+def kernel(function: Callable, *, inlined: bool = False) -> Any:
     """Decorate a function that numba compiles; it may use kernels and constants of the rasterizer, of
-    `msdgs_serve.scene` and of the function's own folder."""
-    compiled: Any = numba.njit(nogil=True, cache=STORED, fastmath=FAST_MATH, error_model="numpy")(function)
+    `msdgs_serve.scene` and of the function's own folder. `inlined`: into its callers, whatever its size."""
+    compiled: Any = numba.njit(nogil=True, cache=STORED, fastmath=FAST_MATH, error_model="numpy", forceinline=inlined)(
+        function
+    )
     if STORED and not config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
         # numba's index carries a stamp of the function's own file and is void when that changes. Kernels and constants
         # of other files are compiled in too, and numba has no public way to say so: their digest joins the stamp.
@@ -31,6 +33,11 @@ def kernel(function: Callable) -> Any:
         index.__class__ = CheckedFiles
         index._source_stamp = (index._source_stamp, digest_of_sources(Path(function.__code__.co_filename).parent))
     return compiled
+
+
+def inlined_kernel(function: Callable) -> Any:
+    """`kernel`, where a call would cost too much."""
+    return kernel(function, inlined=True)
 
 
 @cache
