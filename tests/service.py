@@ -24,6 +24,7 @@ WATCH_SECONDS = 0.05
 SERVICE_VARIABLE = "MSDGS_TEST_SERVICE"
 ON_RAY = os.environ.get(SERVICE_VARIABLE) == "ray"
 in_this_process = pytest.mark.skipif(ON_RAY, reason="reaches into the process of the service: not on Ray Serve")
+own_connection = pytest.mark.skipif(ON_RAY, reason="slow connections end at the proxy of Ray Serve")
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ import pytest
 
 from tests.images import decode
 from tests.scene_files import write_scene
-from tests.service import serving
+from tests.service import own_connection, serving
 from tests.test_api import eventually
 from tests.test_api_poison import check_problem
 
@@ -128,6 +128,7 @@ def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path)
     assert files(folder) == []
 
 
+@own_connection
 def test_a_file_that_stops_coming_is_given_up(client: httpx.Client, folder: Path):
     assert client.base_url.port
     with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
@@ -137,6 +138,7 @@ def test_a_file_that_stops_coming_is_given_up(client: httpx.Client, folder: Path
     eventually(lambda: files(folder) == [])
 
 
+@own_connection
 def test_a_client_that_leaves_in_the_middle_leaves_nothing(client: httpx.Client, folder: Path):
     assert client.base_url.port
     with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
