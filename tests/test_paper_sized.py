@@ -16,7 +16,8 @@ COUNT = 40
 def test_the_large_model_moves_parts_as_the_small_one_does():
     small = random_model(COUNT, layers=("mlp", "mlp"))
     parts = split(small, 100, torch.Generator().manual_seed(0))
-    large = grown(parts)
+    large = grown(parts).double()
+    parts.double()
     assert len(large.deformation) == 10
     for t in (0.0, 0.37, 1.0):
         with torch.no_grad():

@@ -143,7 +143,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
     monkeypatch.setattr("export.plans.own_poses.fitted", counted)
     again, errors_again = own_poses(SomeTrajectories(trajectories, some), np.arange(len(some)), 0.05)
     assert len(tried) == len(some)
-    assert np.array_equal(errors_again, errors[some])
+    assert_close(errors_again, errors[some], "fitted_beside_others")
     sizes = {int(i): stored.points.shape[1] for rows, stored in poses.grids for i in rows}
     assert all(sizes[int(some[i])] == stored.points.shape[1] for rows, stored in again.grids for i in rows)
 

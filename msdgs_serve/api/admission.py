@@ -1,6 +1,7 @@
 """Calls that take a place in the queue of renders."""
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -28,9 +29,11 @@ class Admission:
         if route is None or any(name == b"if-none-match" for name, _ in scope["headers"]):
             await self._app(scope, receive, send)
             return
-        try:
-            with self._queue.admitted():
-                await self._app(scope, receive, send)
-        except Refused as refused:
-            scope["route"], scope[KIND] = route, refused.kind
-            await refusal(refused)(scope, receive, send)
+        with ExitStack() as place:
+            try:
+                place.enter_context(self._queue.admitted())
+            except Refused as refused:
+                scope["route"], scope[KIND] = route, refused.kind
+                await refusal(refused)(scope, receive, send)
+                return
+            await self._app(scope, receive, send)

@@ -330,9 +330,9 @@ def _without_lowest(bits: np.uint64) -> np.uint64:
 @kernel
 def _without_three(bits: np.uint64) -> tuple[np.uint64, np.uint64, np.uint64]:
     """The bits without the lowest one, without the lowest two, without the lowest three."""
-    second = bits & (bits - np.uint64(1))
-    third = second & (second - np.uint64(1))
-    return second, third, third & (third - np.uint64(1))
+    second = _without_lowest(bits)
+    third = _without_lowest(second)
+    return second, third, _without_lowest(third)
 
 
 @kernel
