@@ -20,4 +20,4 @@ class PairCounts(NamedTuple):
 def count_pairs(splats: Splats, tiles: TileLists, width: int, height: int, options: RasterizerOptions) -> PairCounts:
     """Take the decisions of the compositing, and count instead of blending."""
     counts = count_splats(splats, tiles, width, height, options)
-    return PairCounts(len(splats.visible), len(tiles.splat_ids), counts.lanes, int(counts.blended.sum(dtype=float)))
+    return PairCounts(splats.visible, len(tiles.splat_ids), counts.lanes, int(counts.blended.sum(dtype=float)))

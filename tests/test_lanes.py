@@ -96,6 +96,25 @@ def test_memory(dtype: type):
 
 
 @kernel
+def whole_numbers(columns: np.ndarray, row: int, out: np.ndarray) -> None:
+    a, b, c, d = (lanes.load(columns, 0), lanes.load(columns, 16), lanes.load(columns, 32), lanes.load(columns, 48))
+    lanes.store_whole_numbers(out, row, (a, b, c, d))
+
+
+@DTYPES
+def test_whole_numbers(dtype: type):
+    """Cut off at the point, up to the largest that fits; rows before and past the end stay as they are."""
+    columns = np.linspace(0, 65535.9, 64).astype(dtype)
+    expected = columns.reshape(4, 16).T.astype(np.uint16)
+    for rows in (19, 18, 3):
+        out = np.full((rows, 4), 7, np.uint16)
+        whole_numbers(columns, 2, out)
+        np.testing.assert_array_equal(out[2:18], expected[: rows - 2])
+        assert (out[:2] == 7).all()
+        assert (out[18:] == 7).all()
+
+
+@kernel
 def powers(x: np.ndarray, polynomial: tuple, out: np.ndarray, logarithms: np.ndarray) -> None:
     for k in range(0, len(x), 16):
         power = exp2(lanes.load(x, k), polynomial)

@@ -91,7 +91,8 @@ def _llvm(builder: Any, name: str, result: ir.Type, *values: Any) -> Any:
 
 def _suffix(vector: ir.VectorType) -> str:
     """How LLVM spells a vector type in the name of a function."""
-    return f"v{vector.count}{'f32' if vector.element == ir.FloatType() else 'f64'}"
+    kinds = {ir.FloatType(): "f32", ir.DoubleType(): "f64", ir.IntType(64): "i64"}
+    return f"v{vector.count}{kinds[vector.element]}"
 
 
 def _broadcast(builder: Any, value: Any, count: int = LANES) -> Any:
@@ -425,6 +426,13 @@ def store_columns(array: np.ndarray, first_row: Index, first_column: Index, colu
     block[:] = _sixteen(columns).T[: block.shape[0], : block.shape[1]]
 
 
+def store_whole_numbers(array: np.ndarray, first_row: Index, columns: tuple[Lanes, ...]) -> None:
+    """Write 4 columns of numbers in [0, 65535], cut off at the point, into 16 rows of an array [n, 4] of uint16; rows
+    past its end are dropped."""
+    rows = array[int(first_row) :][:LANES]
+    rows[:] = np.stack(columns, axis=1)[: len(rows)]
+
+
 def sums_of(columns: tuple[Lanes, ...]) -> Lanes:
     """The sum of each of up to 16 `Lanes`, in the lane of its number; 0 in the others."""
     return _sixteen(columns).sum(axis=1)
@@ -614,6 +622,28 @@ def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any
     for k, (place, lanes) in enumerate(zip(places, rows, strict=True)):
         with builder.if_then(builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)):
             _masked_store(builder, place, kind.dtype.bitwidth // 8, some, lanes)
+    return context.get_dummy_value()
+
+
+@type_callable(store_whole_numbers)
+def _type_store_whole_numbers(_context: Any) -> Callable:
+    kind = types.Array(types.uint16, 2, "C")
+    return lambda array, row, columns: types.none if array == kind and len(columns) == 4 else None
+
+
+@lower_builtin(store_whole_numbers, types.Array, types.Integer, types.UniTuple)
+def _lower_store_whole_numbers(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """A row is one number of 64 bits, its first column the lowest: what numba runs on stores those first."""
+    array = context.make_array(signature.args[0])(context, builder, values[0])
+    row = context.cast(builder, values[1], signature.args[1], types.intp)
+    half, whole = (ir.VectorType(ir.IntType(bits), LANES) for bits in (32, 64))
+    columns = [builder.zext(builder.fptosi(v, half), whole) for v in cgutils.unpack_tuple(builder, values[2])]
+    rows = columns[0]
+    for k, column in enumerate(columns[1:], start=1):
+        rows = builder.or_(rows, builder.shl(column, ir.Constant(whole, [16 * k] * LANES)))
+    place = builder.gep(array.data, [builder.mul(row, ir.Constant(ir.IntType(64), len(columns)))])
+    exists = _first(builder, builder.sub(builder.extract_value(array.shape, 0), row))
+    _masked_store(builder, builder.bitcast(place, whole.as_pointer()), 2, exists, rows)
     return context.get_dummy_value()
 
 

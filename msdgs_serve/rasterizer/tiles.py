@@ -12,7 +12,7 @@ from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.lanes import prefetch
 from msdgs_serve.rasterizer.projection import Splats
 from msdgs_serve.rasterizer.view import TILE
-from msdgs_serve.threads import run_parallel, split_evenly, thread_count
+from msdgs_serve.threads import run_parallel, run_serially, split_evenly, thread_count
 
 DIGIT_BITS = 12
 """Of the sort: counters of 16 kB, half of a level-1 cache."""
@@ -36,7 +36,7 @@ class TileLists(NamedTuple):
 def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
     """Sort the visible splats by float32 depth, equal depths by index, and deal them out to the tiles."""
     columns, rows = -(-width // TILE), -(-height // TILE)
-    order = sorted_by_depth(splats.visible)
+    order = sorted_by_depth(splats)
     parts = _parts(len(order))
     rectangles = np.empty((len(order), 4), np.uint16)
     corners = np.zeros((len(parts), rows + 1, columns + 1), np.int32)
@@ -56,38 +56,28 @@ def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
     return TileLists(offsets, splat_ids, columns, rows)
 
 
-def sorted_by_depth(keys: np.ndarray) -> np.ndarray:
-    """Indices [V] uint32 of splats, from keys [V] of depth bits above the index, given in the order of the indices."""
-    if len(keys) == 0:
-        return np.empty(0, np.uint32)
-    parts = _parts(len(keys))
-    lows, highs = zip(*run_parallel(_extremes, [(*part, keys) for part in parts]), strict=True)
-    base, bits = np.uint64(min(lows)), int(max(highs) - min(lows)).bit_length()
-    passes = -(-bits // DIGIT_BITS)
+def sorted_by_depth(splats: Splats) -> np.ndarray:
+    """Indices [V] uint32 of the splats that are drawn."""
+    count, keys, parts = splats.visible, splats.keys, splats.drawn
+    nearest, farthest = splats.depth_range
+    base, bits = np.uint64(nearest), max(farthest - nearest, 0).bit_length()
+    passes = max(1, -(-bits // DIGIT_BITS))
+    run = run_parallel if count >= SPLATS_A_PART else run_serially
     for k in range(passes):
         first, past = (bits * k // passes, bits * (k + 1) // passes)
         shift, buckets = np.uint64(first), 1 << (past - first)
         counts = np.zeros((len(parts), buckets), np.int64)
-        run_parallel(_count_digits, [(*part, keys, base, shift, counts[j]) for j, part in enumerate(parts)])
+        run(_count_digits, [(*part, keys, base, shift, counts[j]) for j, part in enumerate(parts)])
         ends = counts.T.ravel().cumsum().reshape(buckets, -1)
         cursors = np.ascontiguousarray(ends.T - counts)
-        out = np.empty_like(keys)
-        run_parallel(_scatter_by_digit, [(*part, keys, base, shift, cursors[j], out) for j, part in enumerate(parts)])
-        keys = out
-    return keys.astype(np.uint32)
+        out = np.empty(count, np.uint32 if k == passes - 1 else np.uint64)  # in the end without the depths
+        run(_scatter_by_digit, [(*part, keys, base, shift, cursors[j], out) for j, part in enumerate(parts)])
+        keys, parts = out, _parts(count)
+    return keys
 
 
 def _parts(count: int) -> list[tuple[int, int]]:
     return split_evenly(count, min(thread_count(), 1 + count // SPLATS_A_PART)) or [(0, 0)]
-
-
-@kernel
-def _extremes(start: int, stop: int, keys: np.ndarray) -> tuple[np.uint64, np.uint64]:
-    """The least and the largest depth bits."""
-    least, largest = keys[start], keys[start]
-    for k in range(np.uint64(start), np.uint64(stop)):
-        least, largest = min(least, keys[k]), max(largest, keys[k])
-    return least >> np.uint64(32), largest >> np.uint64(32)
 
 
 @kernel
