@@ -8,12 +8,14 @@ Times mean something on a machine that does nothing else. Clients run on the sam
 """
 
 import argparse
+import itertools
 import re
 import signal
 import statistics
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +27,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import service_promises as promises
-from benchmarks.service_load import Tally, at_rate, overload, saturate
+from benchmarks.service_load import Health, Tally, at_rate, overload, saturate
 from benchmarks.service_process import Connection, Running, make_scenes, service
 from benchmarks.service_requests import Offline, Wanted, digest, mixed, pictures
 from msdgs_serve.api.settings import Settings
@@ -36,7 +38,7 @@ CATALOGUE = 96  # different requests of the mixed load
 FIRST = "first"  # of the scenes, the one that single measurements are made with
 DEFAULTS = Settings()
 PLACES = DEFAULTS.concurrent_renders + DEFAULTS.queued_renders  # for work, being done and in line
-TOO_MUCH = 4
+TOO_MUCH, OVERLOAD_TURNS = 4, 3
 KILLS = 5
 PACE = 0.5  # of the peak: below saturation
 
@@ -175,25 +177,39 @@ def _memory(tally: Tally) -> Row:
 
 
 def too_much(setting: Setting) -> Iterator[Row]:
-    """Half of what the service can do, all, and four times as much, of 400 × 400 JPEGs."""
+    """Half of what the service can do, all, and four times as much, of 400 × 400 JPEGs.
+
+    All and too much in turns: a machine's speed may change by a half within a minute.
+    """
     requests = pictures(1000, FIRST)
+    seconds = setting.overload_seconds / OVERLOAD_TURNS
     with service(setting.folder) as running:
-        peak = saturate(running, requests, 8, 10).frames_a_second
-        paced = at_rate(running, requests, CLIENTS, 15, PACE * peak)
-        tally, health = overload(running, requests, 64, setting.overload_seconds, TOO_MUCH * peak)
-        again = saturate(running, requests, 8, 10).frames_a_second
-    yield Row("8 clients, 400×400 JPEG", "", f"{peak:.1f} frames/s, after the overload {again:.1f}", None)
+        peaks, tallies, health = [saturate(running, requests, 8, 5).frames_a_second], list[Tally](), list[Health]()
+        paced = at_rate(running, requests, CLIENTS, 15, PACE * peaks[0])
+        for _ in range(OVERLOAD_TURNS):
+            tally, looked = overload(running, requests, 64, seconds, TOO_MUCH * peaks[-1])
+            tallies.append(tally)
+            health.append(looked)
+            peaks.append(saturate(running, requests, 8, 5).frames_a_second)
+    yield Row("8 clients, 400×400 JPEG", "", f"{', '.join(f'{peak:.0f}' for peak in peaks)} frames/s", None)
     ratio = paced.milliseconds(0.99) / paced.milliseconds(0.5)
     measured = f"{ratio:.1f} ({paced.milliseconds(0.5):.0f} and {paced.milliseconds(0.99):.0f} ms)"
     yield Row(f"at {PACE:.0%} of that: p99 / p50", "< 3", measured, ratio < 3)
-    title = f"{TOO_MUCH}× overload for {setting.overload_seconds:.0f} s"
-    bound = 1000 * PLACES / tally.frames_a_second
-    p99 = tally.milliseconds(0.99)
-    yield Row(f"{title}: p99 of accepted / queue bound", "<= 2", f"{p99 / bound:.2f} ({p99:.0f} ms)", p99 <= 2 * bound)
-    goodput = tally.frames_a_second / max(peak, again)
-    yield Row(f"{title}: goodput of peak", ">= 80 %", f"{goodput:.0%}; {dict(tally.statuses)}", goodput >= 0.8)
-    fine = health.p99 < 250 and set(health.statuses) == {200}
-    yield Row(f"{title}: p99 of /live and /ready", "< 250 ms, all 200", f"{health.p99:.0f} ms, {health.statuses}", fine)
+    title = f"{TOO_MUCH}× overload, {OVERLOAD_TURNS} × {seconds:.0f} s"
+    late = [tally.milliseconds(0.99) / (1000 * PLACES / tally.frames_a_second) for tally in tallies]
+    measured = f"{max(late):.2f} ({max(tally.milliseconds(0.99) for tally in tallies):.0f} ms)"
+    yield Row(f"{title}: p99 of accepted / queue bound, the worst turn", "<= 2", measured, max(late) <= 2)
+    before_and_after = [(before + after) / 2 for before, after in itertools.pairwise(peaks)]
+    possible = sum(peak * tally.lasted for peak, tally in zip(before_and_after, tallies, strict=True))
+    statuses = sum((tally.statuses for tally in tallies), Counter[int]())
+    goodput = statuses[200] / possible
+    measured = f"{goodput:.0%}; {dict(statuses)}"
+    yield Row(f"{title}: goodput of the peaks before and after", ">= 80 %", measured, goodput >= 0.8)
+    worst = max(looked.p99 for looked in health)
+    seen = sum((Counter(looked.statuses) for looked in health), Counter[int]())
+    measured = f"{worst:.0f} ms, {dict(seen)}"
+    fine = worst < 250 and set(seen) == {200}
+    yield Row(f"{title}: p99 of /live and /ready, the worst turn", "< 250 ms, all 200", measured, fine)
 
 
 def unkind(setting: Setting) -> Iterator[Row]:

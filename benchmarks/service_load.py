@@ -1,17 +1,22 @@
-"""Many clients at once, and what they saw."""
+"""Many clients at once, and what they saw.
 
+All in one thread, with hardly any HTTP of their own: they are on the service's machine, and what they take it lacks.
+"""
+
+import asyncio
 import multiprocessing
 import random
-import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import uvloop
 
+from benchmarks.service_line import Line, connected
 from benchmarks.service_process import Connection, Running
 from benchmarks.service_requests import Wanted, digest
 
@@ -28,7 +33,6 @@ class Tally:
     bodies: Counter[tuple[Wanted, str]] = field(default_factory=Counter)  # what was asked for, and the answer's digest
     resident: list[tuple[float, int]] = field(default_factory=list)  # seconds from the start, bytes of the service
     lasted: float = 0.0
-    lock: threading.Lock = field(default_factory=threading.Lock)
 
     @property
     def frames_a_second(self) -> float:
@@ -40,12 +44,10 @@ class Tally:
 
     def add(self, wanted: Wanted, status: int, body: bytes, seconds: float) -> None:
         """One answer."""
-        found = digest(body) if status == 200 else ""
-        with self.lock:
-            self.statuses[status] += 1
-            if status == 200:
-                self.seconds.append(seconds)
-                self.bodies[wanted, found] += 1
+        self.statuses[status] += 1
+        if status == 200:
+            self.seconds.append(seconds)
+            self.bodies[wanted, digest(body)] += 1
 
 
 class Health(NamedTuple):
@@ -59,43 +61,38 @@ def saturate(running: Running, requests: Sequence[Wanted], clients: int, seconds
     """Clients that ask again as soon as they are answered; those refused wait as long as they are told."""
     tally, stop = Tally(), time.monotonic() + seconds
 
-    def ask(seed: int) -> None:
-        chance, connection = random.Random(seed), Connection(running.port)
-        while time.monotonic() < stop:
-            wanted = chance.choice(requests)
-            started = time.perf_counter()
-            answer = connection.ask("POST", "/render", wanted.body())
-            tally.add(wanted, answer.status, answer.body, time.perf_counter() - started)
-            if answer.status == 503:
-                time.sleep(float(answer.headers["retry-after"]))
-        connection.close()
+    async def client(seed: int) -> None:
+        chance = random.Random(seed)
+        async with connected(running.port) as line:
+            while time.monotonic() < stop:
+                wait = await _ask(line, chance.choice(requests), tally)
+                await asyncio.sleep(wait)
 
-    _together(running, tally, [threading.Thread(target=ask, args=(seed,)) for seed in range(clients)])
+    uvloop.run(_together(running, tally, [client(seed) for seed in range(clients)]))
     return tally
 
 
 def at_rate(running: Running, requests: Sequence[Wanted], clients: int, seconds: float, rate: float) -> Tally:
     """Requests at evenly spread moments, whatever becomes of those before, as long as one of `clients` is free."""
-    tally, lock = Tally(), threading.Lock()
-    moments = iter(enumerate(np.arange(0, seconds, 1 / rate)))
-    begun = time.monotonic()
+    tally, begun = Tally(), time.monotonic()
+    moments = iter(enumerate(np.arange(0, seconds, 1 / rate).tolist()))
 
-    def ask() -> None:
-        connection = Connection(running.port)
-        while True:
-            with lock:
-                number, moment = next(moments, (0, None))
-            if moment is None:
-                break
-            time.sleep(max(0.0, begun + moment - time.monotonic()))
-            wanted = requests[number % len(requests)]
-            started = time.perf_counter()
-            answer = connection.ask("POST", "/render", wanted.body())
-            tally.add(wanted, answer.status, answer.body, time.perf_counter() - started)
-        connection.close()
+    async def client() -> None:
+        async with connected(running.port) as line:
+            for number, moment in moments:
+                await asyncio.sleep(max(0.0, begun + moment - time.monotonic()))
+                await _ask(line, requests[number % len(requests)], tally)
 
-    _together(running, tally, [threading.Thread(target=ask) for _ in range(clients)])
+    uvloop.run(_together(running, tally, [client() for _ in range(clients)]))
     return tally
+
+
+async def _ask(line: Line, wanted: Wanted, tally: Tally) -> float:
+    """One request; the seconds that its client is told to wait."""
+    started = time.perf_counter()
+    answer = await line.post("/render", wanted.body())
+    tally.add(wanted, answer.status, answer.body, time.perf_counter() - started)
+    return float(answer.header("retry-after")) if answer.status == 503 else 0.0
 
 
 def overload(
@@ -124,12 +121,12 @@ def watch_health(port: int, seconds: float) -> Health:
     return Health(1000 * float(np.quantile(took, 0.99)), dict(statuses))
 
 
-def _together(running: Running, tally: Tally, threads: Sequence[threading.Thread]) -> None:
+async def _together(running: Running, tally: Tally, clients: Sequence[Coroutine[None, None, None]]) -> None:
     """Start all, note the service's memory until they end."""
     begun = time.monotonic()
-    for thread in threads:
-        thread.start()
-    while any(thread.is_alive() for thread in threads):
+    everyone = asyncio.gather(*clients)
+    while not everyone.done():
         tally.resident.append((time.monotonic() - begun, running.resident_bytes()))
-        time.sleep(MEMORY_PAUSE)
+        await asyncio.wait([everyone], timeout=MEMORY_PAUSE)
     tally.lasted = time.monotonic() - begun
+    await everyone
