@@ -17,7 +17,7 @@ from msdgs_serve.scene.baked import (
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.onnx_constants import Malformed, read_constants
-from msdgs_serve.threads import run_parallel, thread_count
+from msdgs_serve.threads import run_parallel, sharing_cores, thread_count
 
 CHUNK = 2048
 """Gaussians a call where layers run. The widest activation of a call is CHUNK × width, whatever the scene's size."""
@@ -99,7 +99,8 @@ class DeformationSession:
                 expected[:] = output
 
         chunk = self._chunk or (CHUNK if self._has_steps else max(len(every), 1))
-        run_parallel(run, [(i, min(i + chunk, len(every))) for i in range(0, len(every), chunk)])
+        with sharing_cores():
+            run_parallel(run, [(i, min(i + chunk, len(every))) for i in range(0, len(every), chunk)])
         self._check_finite(t, posed)
         return posed["means"], posed["quats"], posed["scales"]
 

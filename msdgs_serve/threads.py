@@ -23,7 +23,7 @@ takes without, or less; with 5 the gain is smaller."""
 _check: ContextVar[Callable[[], object] | None] = ContextVar("check", default=None)
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
-_callers = 0  # of `run_parallel` at this moment
+_callers = 0  # within `sharing_cores` at this moment
 
 
 def thread_count() -> int:
@@ -56,19 +56,33 @@ def give_way() -> None:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), GIVING_WAY)
 
 
+@contextmanager
+def sharing_cores() -> Iterator[None]:
+    """Around what one caller computes. Where several do at once, each stays on its own thread: cores that have a frame
+    each needn't share, and every part is one more wait for Python's interpreter."""
+    _count_callers(1)
+    try:
+        yield
+    finally:
+        _count_callers(-1)
+
+
+def threads_to_use() -> int:
+    """How many parts of work are worth while now: `thread_count()`, or 1 where several callers share the cores."""
+    return thread_count() if _callers <= 1 else 1
+
+
 def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
     """Call `function(*item)` for every item; results in the order of the items.
 
-    On the pool, or where others are calling too, on the caller's thread: cores that have a frame each needn't share
-    (1.04 times as many frames a second from 8 clients).
+    On the pool, or on the caller's thread where several callers share the cores.
     The first exception is raised after all calls that began have ended. Must not be called from inside the pool.
     """
-    with _counted() as callers:
-        if len(items) <= 1 or thread_count() == 1 or callers > 1:
-            return run_serially(function, items)
-        call = _checked(function)
-        futures = [_shared_pool().submit(call, *item) for item in items]
-        errors = [error for future in futures if (error := future.exception()) is not None]
+    if len(items) <= 1 or threads_to_use() == 1:
+        return run_serially(function, items)
+    call = _checked(function)
+    futures = [_shared_pool().submit(call, *item) for item in items]
+    errors = [error for future in futures if (error := future.exception()) is not None]
     if errors:
         raise errors[0]
     return [future.result() for future in futures]
@@ -92,18 +106,10 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-@contextmanager
-def _counted() -> Iterator[int]:
-    """How many are within it, this one included."""
+def _count_callers(more: int) -> None:
     global _callers
     with _lock:
-        _callers += 1
-        callers = _callers
-    try:
-        yield callers
-    finally:
-        with _lock:
-            _callers -= 1
+        _callers += more
 
 
 def split_evenly(count: int, parts: int) -> list[tuple[int, int]]:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_, get_total_norm
 
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.threads import sharing_cores
 from msdgs_train import checkpoint
 from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import Frame, SceneData, composite
@@ -137,6 +138,7 @@ class Trainer:
         """Each runs torch on one core: small matrices shared among cores leave most of them waiting."""
         return ThreadPoolExecutor(self.config.threads, "photograph", torch.set_num_threads, (1,))
 
+    @sharing_cores()
     def _shoot(self, frame: Frame, background: Tensor, pairs: torch.Generator) -> _Shot:
         truth = self._photograph(frame, background)
         posed = self._pose(frame.t)

@@ -51,7 +51,7 @@ from msdgs_serve.rasterizer.projection import (
 )
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
-from msdgs_serve.threads import run_parallel, thread_count
+from msdgs_serve.threads import run_parallel, threads_to_use
 
 BLOCKS = TILE * TILE // LANES
 BLOCK_SIDE = 4
@@ -117,7 +117,7 @@ def composite(
         turn = np.array([first])
         past = min(first + TILES_A_ROUND, count)
         arguments = (turn, past, splats.records, tiles, limits, background, wanted, frame)
-        run_parallel(_composite_tiles, [arguments] * thread_count())
+        run_parallel(_composite_tiles, [arguments] * threads_to_use())
     return frame
 
 

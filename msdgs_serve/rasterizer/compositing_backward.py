@@ -48,7 +48,7 @@ from msdgs_serve.rasterizer.projection import (
 )
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
-from msdgs_serve.threads import run_parallel, thread_count
+from msdgs_serve.threads import run_parallel, threads_to_use
 
 # places in a tile's scratch: what is left of the light (with a minus sign where a pixel is done), the pixel's gradient,
 # and what is still behind
@@ -82,7 +82,7 @@ def composite_backward(
     turn = np.zeros(1, np.int64)
     limits = pixel_limits(options, records.dtype)
     arguments = (turn, records, tiles, limits, frame.rgb, frame.alpha, grad_rgb, grad_alpha, pair_sums, seen)
-    run_parallel(_tiles_backward, [arguments] * thread_count())
+    run_parallel(_tiles_backward, [arguments] * threads_to_use())
     sums = np.zeros((len(records), SUMS), records.dtype)
     _add_up(tiles, seen, pair_sums, sums)
     return sums

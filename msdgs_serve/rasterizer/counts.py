@@ -33,7 +33,7 @@ from msdgs_serve.rasterizer.lanes import (
 from msdgs_serve.rasterizer.projection import RECORD, Splats
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
-from msdgs_serve.threads import run_parallel, split_evenly, thread_count
+from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
 
 
 class Counts(NamedTuple):
@@ -47,7 +47,7 @@ def count_splats(splats: Splats, tiles: TileLists, width: int, height: int, opti
     """Take the decisions of the compositing, and count instead of blending."""
     limits = pixel_limits(options, splats.records.dtype)
     blended = np.empty((height, width), splats.records.dtype)
-    ranges = split_evenly(len(tiles.offsets) - 1, 8 * thread_count())
+    ranges = split_evenly(len(tiles.offsets) - 1, 8 * threads_to_use())
     lanes = run_parallel(_count_tiles, [(*part, splats.records, tiles, limits, blended) for part in ranges])
     return Counts(blended, sum(lanes))
 

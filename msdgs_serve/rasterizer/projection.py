@@ -39,7 +39,7 @@ from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, TILE, RasterizerO
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_serve.threads import run_parallel, split_evenly, thread_count
+from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
 
 RECORD = LANES
 """Numbers that a splat's record has: one load. Their places:"""
@@ -110,7 +110,8 @@ def empty_records(count: int, dtype: np.dtype) -> np.ndarray:
 
 def ranges_of_lanes(count: int) -> list[tuple[int, int]]:
     """(start, stop) of parts of `range(count)` for the threads; each but the last has whole groups of 16."""
-    groups = split_evenly(-(-count // LANES), 2 * thread_count()) or [(0, 0)]
+    threads = threads_to_use()
+    groups = split_evenly(-(-count // LANES), 2 * threads if threads > 1 else 1) or [(0, 0)]
     return [(first * LANES, min(past * LANES, count)) for first, past in groups]
 
 

@@ -13,6 +13,7 @@ from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.threads import sharing_cores
 
 
 class Rendering(NamedTuple):
@@ -26,6 +27,7 @@ class Rendering(NamedTuple):
     counts: np.ndarray  # [H, W] Gaussians that add to each pixel; [0, 0] unasked
 
 
+@sharing_cores()
 def rasterize(
     gaussians: Gaussians,
     camera: Camera,

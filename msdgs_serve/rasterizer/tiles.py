@@ -12,7 +12,7 @@ from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.lanes import prefetch
 from msdgs_serve.rasterizer.projection import Splats
 from msdgs_serve.rasterizer.view import TILE
-from msdgs_serve.threads import run_parallel, run_serially, split_evenly, thread_count
+from msdgs_serve.threads import run_parallel, run_serially, split_evenly, threads_to_use
 
 DIGIT_BITS = 12
 """Of the sort: counters of 16 kB, half of a level-1 cache."""
@@ -77,7 +77,7 @@ def sorted_by_depth(splats: Splats) -> np.ndarray:
 
 
 def _parts(count: int) -> list[tuple[int, int]]:
-    return split_evenly(count, min(thread_count(), 1 + count // SPLATS_A_PART)) or [(0, 0)]
+    return split_evenly(count, min(threads_to_use(), 1 + count // SPLATS_A_PART)) or [(0, 0)]
 
 
 @kernel
