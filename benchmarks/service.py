@@ -196,9 +196,10 @@ def too_much(setting: Setting) -> Iterator[Row]:
     measured = f"{ratio:.1f} ({paced.milliseconds(0.5):.0f} and {paced.milliseconds(0.99):.0f} ms)"
     yield Row(f"at {PACE:.0%} of that: p99 / p50", "< 3", measured, ratio < 3)
     title = f"{TOO_MUCH}× overload, {OVERLOAD_TURNS} × {seconds:.0f} s"
-    late = [tally.milliseconds(0.99) / (1000 * PLACES / tally.frames_a_second) for tally in tallies]
-    measured = f"{max(late):.2f} ({max(tally.milliseconds(0.99) for tally in tallies):.0f} ms)"
-    yield Row(f"{title}: p99 of accepted / queue bound, the worst turn", "<= 2", measured, max(late) <= 2)
+    late = np.concatenate([np.array(tally.seconds) * tally.frames_a_second / PLACES for tally in tallies])
+    p99 = float(np.quantile(late, 0.99))
+    measured = f"{p99:.2f} ({', '.join(f'{tally.milliseconds(0.99):.0f}' for tally in tallies)} ms)"
+    yield Row(f"{title}: p99 of accepted / queue bound", "<= 2", measured, p99 <= 2)
     before_and_after = [(before + after) / 2 for before, after in itertools.pairwise(peaks)]
     possible = sum(peak * tally.lasted for peak, tally in zip(before_and_after, tallies, strict=True))
     statuses = sum((tally.statuses for tally in tallies), Counter[int]())

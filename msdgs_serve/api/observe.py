@@ -6,7 +6,7 @@ import logging
 import random
 import re
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -35,7 +35,7 @@ class Observe:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        token = request_id.set(_id_of(scope))
+        token = request_id.set(usable_id(dict(scope["headers"]).get(REQUEST_ID.lower().encode(), b"")))
         answer = _Answer(send)
         started = time.perf_counter()
         try:
@@ -51,21 +51,40 @@ class Observe:
             request_id.reset(token)
 
     def _record(self, scope: Scope, answer: "_Answer", seconds: float) -> None:
-        status = answer.status or 0
-        method = scope["method"] if scope["method"] in METHODS else UNKNOWN_METHOD
         route = getattr(scope.get("route"), "path", "unmatched")
-        self._metrics.count_request(method, route, status, seconds, answer.sent)
-        if status >= FIRST_ERROR:
-            self._metrics.count_problem(scope.get(KIND) or f"status_{status}")
-        facts = {
-            "method": method,
-            "path": scope["path"],
-            "status": status,
-            "milliseconds": round(1000 * seconds, 2),
-            "bytes": answer.sent,
-            "client": (scope.get("client") or ("unknown",))[0],
-        }
-        access_log.info("%s %s %d", method, scope["path"], status, extra={"facts": facts})
+        answered = Answered(
+            scope["method"], scope["path"], route, answer.status or 0, scope.get(KIND), seconds, answer.sent
+        )
+        record(self._metrics, answered, scope.get("client"))
+
+
+class Answered(NamedTuple):
+    """What is known of a request in the end."""
+
+    method: str
+    path: str
+    route: str
+    status: int  # 0 where there was none
+    kind: str | None  # of problem, where one is known
+    seconds: float
+    sent: int  # bytes of the body
+
+
+def record(metrics: Metrics, request: Answered, client: tuple[str, int] | None) -> None:
+    """Count a request, and log it."""
+    method = request.method if request.method in METHODS else UNKNOWN_METHOD
+    metrics.count_request(method, request.route, request.status, request.seconds, request.sent)
+    if request.status >= FIRST_ERROR:
+        metrics.count_problem(request.kind or f"status_{request.status}")
+    facts = {
+        "method": method,
+        "path": request.path,
+        "status": request.status,
+        "milliseconds": round(1000 * request.seconds, 2),
+        "bytes": request.sent,
+        "client": (client or ("unknown",))[0],
+    }
+    access_log.info("%s %s %d", method, request.path, request.status, extra={"facts": facts})
 
 
 class _Answer:
@@ -105,6 +124,7 @@ class JsonLines(logging.Formatter):
         return json.dumps(line)
 
 
-def _id_of(scope: Scope) -> str:
-    given = dict(scope["headers"]).get(REQUEST_ID.lower().encode(), b"").decode("latin-1")
-    return given if USABLE_ID.fullmatch(given) else f"{random.getrandbits(128):032x}"
+def usable_id(given: bytes) -> str:
+    """A client's own id, or a new one where that isn't short and plain."""
+    text = given.decode("latin-1")
+    return text if USABLE_ID.fullmatch(text) else f"{random.getrandbits(128):032x}"

@@ -14,17 +14,28 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from msdgs_serve.api.doorman import Doorman
 from msdgs_serve.api.errors import MEDIA_TYPE, problem_response
+
+NOTHING_BUFFERED = (b"", False)  # nor an end of the connection
 
 
 class LimitedProtocol(H11Protocol):
     """Closes connections whose headers don't come within `header_seconds`, or that take no bytes for `read_seconds`."""
 
-    def __init__(self, *arguments: Any, header_seconds: float, read_seconds: float, **keywords: Any) -> None:
+    def __init__(
+        self,
+        *arguments: Any,
+        header_seconds: float,
+        read_seconds: float,
+        doorman: Doorman | None = None,
+        **keywords: Any,
+    ) -> None:
         super().__init__(*arguments, **keywords)
         self.conn = _HeadWithBody(h11.SERVER)
         self._header_seconds = header_seconds
         self._read_seconds = read_seconds
+        self._doorman = doorman
         self._header_timer: asyncio.TimerHandle | None = None
         self._read_timer: asyncio.TimerHandle | None = None
         self._unsent = 0
@@ -36,6 +47,8 @@ class LimitedProtocol(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Headers are complete once h11 has left its idle state; what comes after the answer may begin new ones."""
+        if self._is_turned_away(data):
+            return
         super().data_received(data)
         if self.conn.their_state is not h11.IDLE:
             self._header_timer = _cancelled(self._header_timer)
@@ -66,6 +79,20 @@ class LimitedProtocol(H11Protocol):
     def send_400_response(self, msg: str) -> None:
         """A problem like any other, for what is no HTTP."""
         self._send_problem(http.HTTPStatus.BAD_REQUEST, "That is no HTTP/1.1 request, or its headers are too long.")
+
+    def _is_turned_away(self, data: bytes) -> bool:
+        """Whether this was a call, and the doorman has answered it: h11 then knows nothing of it."""
+        between = self.conn.their_state is h11.IDLE and self.conn.our_state is h11.IDLE
+        if self._doorman is None or not between or self.conn.trailing_data != NOTHING_BUFFERED:
+            return False
+        answer = self._doorman.answer(data, self.client, self.server_state.default_headers)
+        if answer is None:
+            return False
+        self._header_timer = _cancelled(self._header_timer)
+        self._unset_keepalive_if_required()
+        self.transport.write(answer)
+        self.timeout_keep_alive_task = self.loop.call_later(self.timeout_keep_alive, self.timeout_keep_alive_handler)
+        return True
 
     def _watch_headers(self) -> None:
         self._header_timer = self.loop.call_later(self._header_seconds, self._headers_late)
@@ -114,9 +141,11 @@ class _HeadWithBody(h11.Connection):
         return head + data
 
 
-def limited_protocol(header_seconds: float, read_seconds: float) -> Callable[..., LimitedProtocol]:
+def limited_protocol(
+    header_seconds: float, read_seconds: float, doorman: Doorman | None
+) -> Callable[..., LimitedProtocol]:
     """What uvicorn makes a connection's protocol with."""
-    return partial(LimitedProtocol, header_seconds=header_seconds, read_seconds=read_seconds)
+    return partial(LimitedProtocol, header_seconds=header_seconds, read_seconds=read_seconds, doorman=doorman)
 
 
 def _cancelled(timer: asyncio.TimerHandle | None) -> None:

@@ -8,6 +8,7 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
+from msdgs_serve.api.doorman import Doorman
 from msdgs_serve.api.protocol import limited_protocol
 from msdgs_serve.api.service import Phase, Service
 from msdgs_serve.api.settings import Settings
@@ -23,16 +24,20 @@ class Server(uvicorn.Server):
     """
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
+        self.service: Service = app.state.service
+        # with keys or other origins a refusal depends on headers, which the application looks at
+        is_plain = settings.api_keys_file is None and not settings.cors_origins
+        doorman = Doorman(self.service.queue, self.service.metrics) if is_plain else None
+        protocol = limited_protocol(settings.header_seconds, settings.read_seconds, doorman)
         config = uvicorn.Config(
             app,
-            http=limited_protocol(settings.header_seconds, settings.read_seconds),  # pyright: ignore[reportArgumentType]
+            http=protocol,  # pyright: ignore[reportArgumentType]
             log_config=None,
             access_log=False,
             timeout_graceful_shutdown=CLOSING_SECONDS,
             server_header=False,
         )
         super().__init__(config)
-        self.service: Service = app.state.service
         self._drain_seconds = settings.drain_seconds
         self._drained_by = 0.0
 

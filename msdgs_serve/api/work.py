@@ -77,6 +77,11 @@ class WorkQueue:
             if call.has_place:
                 self._leave()
 
+    def refuse_if_full(self) -> None:
+        """Raise `Refused` where a call would not be admitted now."""
+        with self._lock:
+            self._refuse_if_full()
+
     def close(self) -> None:
         """Refuse new work; what is there is finished."""
         self._closed = True
