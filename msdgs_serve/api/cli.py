@@ -86,7 +86,10 @@ def _serve(settings: Settings) -> None:
     with bind(settings.host, settings.port) as listener:
         print("Loading; the very first start compiles, which takes up to a minute …", flush=True)
         server = _AnnouncedServer(app, settings, store, listener)
-        server.run(sockets=[listener])
+        try:
+            server.run(sockets=[listener])
+        finally:
+            gc.unfreeze()  # or OpenImageIO's bindings complain in the end of what was not let go
     if server.service.failure is not None:
         raise server.service.failure
 
