@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -75,17 +75,27 @@ def threads_to_use() -> int:
 def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
     """Call `function(*item)` for every item; results in the order of the items.
 
-    On the pool, or on the caller's thread where several callers share the cores.
+    On the caller's thread and the pool's, or where several callers share the cores on the caller's alone.
     The first exception is raised after all calls that began have ended. Must not be called from inside the pool.
     """
-    if len(items) <= 1 or threads_to_use() == 1:
+    threads = min(threads_to_use(), len(items))
+    if threads <= 1:
         return run_serially(function, items)
-    call = _checked(function)
-    futures = [_shared_pool().submit(call, *item) for item in items]
-    errors = [error for future in futures if (error := future.exception()) is not None]
-    if errors:
-        raise errors[0]
-    return [future.result() for future in futures]
+    call, turn, results = _checked(function), itertools.count(), [None] * len(items)
+
+    def work() -> None:
+        while (k := next(turn)) < len(items):
+            results[k] = call(*items[k])
+
+    helpers = [_shared_pool().submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
+    return results
 
 
 def run_serially(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
