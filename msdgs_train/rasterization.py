@@ -59,6 +59,10 @@ def rasterize(
     return rgb, alpha, info
 
 
+BACKGROUND = 5
+"""Its place among the arguments; summing its gradient takes as long as half of the rest where a picture is large."""
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -97,9 +101,11 @@ class _Rasterize(torch.autograd.Function):
         sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
         grads = project_backward(gaussians, splats, sums, *ctx.view)
         ctx.info.means2d_grads = torch.from_numpy(grads.means2d)
-        grad_background = np.einsum("hw,hwc->c", 1 - alpha, grad_rgb)
-        arrays = (grads.means, grads.quats, grads.scales, grads.opacities, grads.sh, grad_background)
-        return *(torch.from_numpy(array) for array in arrays), None, None, None
+        arrays = (grads.means, grads.quats, grads.scales, grads.opacities, grads.sh)
+        grad_background = None
+        if ctx.needs_input_grad[BACKGROUND]:
+            grad_background = torch.from_numpy(np.einsum("hw,hwc->c", 1 - alpha, grad_rgb))
+        return *(torch.from_numpy(array) for array in arrays), grad_background, None, None, None
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -48,7 +48,7 @@ from msdgs_serve.rasterizer.projection import (
 )
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
-from msdgs_serve.threads import run_parallel, threads_to_use
+from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
 
 # places in a tile's scratch: what is left of the light (with a minus sign where a pixel is done), the pixel's gradient,
 # and what is still behind
@@ -84,7 +84,7 @@ def composite_backward(
     arguments = (turn, records, tiles, limits, frame.rgb, frame.alpha, grad_rgb, grad_alpha, pair_sums, seen)
     run_parallel(_tiles_backward, [arguments] * threads_to_use())
     sums = np.zeros((len(records), SUMS), records.dtype)
-    _add_up(tiles, seen, pair_sums, sums)
+    run_parallel(_add_up, [(*part, tiles, seen, pair_sums, sums) for part in split_evenly(len(sums), threads_to_use())])
     return sums
 
 
@@ -110,6 +110,8 @@ def _tiles_backward(
     grid = grid_of_a_tile(records)
     height, width = alpha.shape
     flat, flat_sums = records.reshape(-1), pair_sums.reshape(-1)
+    flat_rgb, flat_alpha = rgb.reshape(-1), alpha.reshape(-1)
+    flat_grad_rgb, flat_grad_alpha = grad_rgb.reshape(-1), grad_alpha.reshape(-1)
     while True:
         first = fetch_add(turn, TILES_A_TURN)
         if first >= count:
@@ -119,16 +121,18 @@ def _tiles_backward(
             origin[0], origin[1] = x0, y0
             state[:] = 0
             state[:PIXELS] = 1
-            for row in range(min(TILE, height - y0)):
-                for column in range(min(TILE, width - x0)):
-                    pixel = np.uint64(place_in_tile(row, column))
-                    y, x = y0 + row, x0 + column
-                    behind = alpha[y, x] * grad_alpha[y, x]
-                    for channel in range(3):
-                        grad = grad_rgb[y, x, channel]
-                        behind += rgb[y, x, channel] * grad
-                        state[GRAD_RED + np.uint64(PIXELS * channel) + pixel] = grad
-                    state[GRAD_ALPHA + pixel] = grad_alpha[y, x]
+            rows, columns = np.uint64(min(TILE, height - y0)), np.uint64(min(TILE, width - x0))
+            for row in range(rows):
+                line = np.uint64(y0 + row) * np.uint64(width) + np.uint64(x0)
+                _prefetch_line(line + np.uint64(TILE), flat_rgb, flat_alpha, flat_grad_rgb, flat_grad_alpha)
+                for column in range(columns):
+                    pixel, there = place_in_tile(row, column), line + column
+                    behind = flat_alpha[there] * flat_grad_alpha[there]
+                    for channel in range(np.uint64(3)):
+                        grad = flat_grad_rgb[np.uint64(3) * there + channel]
+                        behind += flat_rgb[np.uint64(3) * there + channel] * grad
+                        state[GRAD_RED + np.uint64(PIXELS) * channel + pixel] = grad
+                    state[GRAD_ALPHA + pixel] = flat_grad_alpha[there]
                     state[BEHIND + pixel] = behind
             alive = np.uint64((1 << BLOCKS) - 1)
             first_pair, past = np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])
@@ -141,6 +145,18 @@ def _tiles_backward(
                 alive &= ~_splat_backward(bits, record, grid, limits, state, flat_sums, pair * np.uint64(SUMS))
                 pair += np.uint64(1)
             seen[tile] = pair - first_pair
+
+
+@kernel
+def _prefetch_line(
+    start: np.uint64, rgb: np.ndarray, alpha: np.ndarray, grad_rgb: np.ndarray, grad_alpha: np.ndarray
+) -> None:
+    """Fetch a row of the next tile while this one is worked on: the rows are a page away from each other."""
+    for place in range(np.uint64(3) * start, np.uint64(3) * (start + np.uint64(TILE)), np.uint64(LANES)):
+        prefetch(rgb, place)
+        prefetch(grad_rgb, place)
+    prefetch(alpha, start)
+    prefetch(grad_alpha, start)
 
 
 @kernel
@@ -197,13 +213,15 @@ def _splat_backward(
 
 
 @kernel
-def _add_up(tiles: TileLists, seen: np.ndarray, pair_sums: np.ndarray, sums: np.ndarray) -> None:
-    """Add up each splat's tiles, always in the same order."""
+def _add_up(start: int, stop: int, tiles: TileLists, seen: np.ndarray, pair_sums: np.ndarray, sums: np.ndarray) -> None:
+    """Add up the tiles of splats `start` to `stop`, always in the same order."""
     flat_pairs, flat = pair_sums.reshape(-1), sums.reshape(-1)
-    for tile in range(len(seen)):
+    last = np.uint64(max(len(tiles.splat_ids), 1) - 1)
+    for tile in range(np.uint64(len(seen))):
         first = np.uint64(tiles.offsets[tile])
         for pair in range(first, first + np.uint64(seen[tile])):
-            ahead = min(pair + AHEAD, np.uint64(len(tiles.splat_ids) - 1))
-            prefetch(flat, np.uint64(tiles.splat_ids[ahead]) * np.uint64(SUMS))
-            place = np.uint64(tiles.splat_ids[pair]) * np.uint64(SUMS)
-            store(flat, place, load(flat, place) + load(flat_pairs, pair * np.uint64(SUMS)))
+            prefetch(flat, np.uint64(tiles.splat_ids[min(pair + AHEAD, last)]) * np.uint64(SUMS))
+            splat = np.uint64(tiles.splat_ids[pair])
+            if np.uint64(start) <= splat and splat < np.uint64(stop):
+                place = splat * np.uint64(SUMS)
+                store(flat, place, load(flat, place) + load(flat_pairs, pair * np.uint64(SUMS)))
