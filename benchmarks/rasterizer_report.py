@@ -159,6 +159,10 @@ def _checkouts(rows: list[Row]) -> Table:
     return table
 
 
+ABOVE: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 3, "fontsize": 8}
+"""Where a legend hides nothing."""
+
+
 def draw_plot(result: Row, path: Path) -> None:
     """Times over the number of Gaussians, and, where knobs were turned, error over time."""
     knobs = result.get("knobs")
@@ -192,7 +196,7 @@ def _draw_growth(axes: Any, result: Row) -> None:
         )
     axes.set(xscale="log", yscale="log", xlabel="Gaussians", ylabel="milliseconds a frame, least of all turns")
     axes.grid(which="both", alpha=0.2)
-    axes.legend()
+    axes.legend(**ABOVE)
 
 
 def _draw_knobs(axes: Any, rows: list[Row]) -> None:
@@ -202,9 +206,11 @@ def _draw_knobs(axes: Any, rows: list[Row]) -> None:
         axes.plot([row["milliseconds"]["min"] for row in some], errors, marker="o", linestyle="", label=name)
         for row, error in zip(some, errors, strict=True):
             place = (row["milliseconds"]["min"], error)
-            axes.annotate(row["value"], place, xytext=(5, 3), textcoords="offset points", fontsize=7)
+            # many values change time alone, so their labels would lie on each other
+            axes.annotate(row["value"], place, xytext=(3, 3), textcoords="offset points", fontsize=7, rotation=50)
     axes.set(xscale="log", yscale="log", xlabel="processor milliseconds a frame, least of all turns")
     axes.xaxis.set_minor_formatter(ScalarFormatter())
     axes.set_ylabel("RMS error to float64 without thresholds")
     axes.grid(which="both", alpha=0.2)
-    axes.legend(fontsize=8)
+    axes.margins(x=0.08)
+    axes.legend(**ABOVE)
