@@ -1,4 +1,4 @@
-"""A client of a few lines, for loads: half the processor time of `http.client`, and no thread for each connection."""
+"""A client of a few lines, for loads: less work than `http.client` has, and no thread for each connection."""
 
 import asyncio
 import json

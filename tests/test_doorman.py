@@ -45,7 +45,7 @@ def queue() -> Iterator[WorkQueue]:
 def doorman(queue: WorkQueue) -> Doorman:
     """Of that queue."""
     renderer = Renderer()
-    return Doorman(queue, Metrics(SceneStore([]), renderer.cache, queue))
+    return Doorman(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
 
 
 def test_only_a_full_queue_has_calls_turned_away(doorman: Doorman, queue: WorkQueue):
@@ -66,6 +66,8 @@ def test_only_a_full_queue_has_calls_turned_away(doorman: Doorman, queue: WorkQu
         CALL[:-1],
         CALL + b"P",
         CALL + CALL,
+        CALL.replace(b"Length: 8", b"Length: 9") + b" ",
+        CALL.replace(b"here", b"he\x00re"),
         CALL.replace(b"POST", b"GET"),
         CALL.replace(b"/render", b"/render/batch"),
         CALL.replace(b"/render", b"/render?t=1"),
@@ -125,9 +127,7 @@ def test_nobody_can_tell_the_difference(tmp_path: Path, caplog: pytest.LogCaptur
                 assert headers.keys() == answers[0][1].keys()
                 assert all(value == answers[0][1][name] for name, value in headers.items() if name not in CHANGES)
             assert len({headers["x-request-id"] for _, headers, _ in answers}) == 3
-            assert sent(connection, CALL)[0] == b"HTTP/1.1 422 Unprocessable Entity", (
-                "a frame of no size, once there is room"
-            )
+            assert sent(connection, CALL)[0] == b"HTTP/1.1 422 Unprocessable Entity", "there is room, and no camera"
         counted = client.get("/metrics").text.splitlines()
         assert [line.split()[-1] for name in REFUSED for line in counted if line.startswith(name)] == ["4.0", "4.0"]
     lines = [vars(record)["facts"] for record in caplog.records if vars(record)["facts"]["status"] == 503]

@@ -14,6 +14,7 @@ from msdgs_serve.api.errors import KIND, server_error
 from msdgs_serve.api.metrics import Metrics
 
 REQUEST_ID = "X-Request-ID"
+IDENTITY = REQUEST_ID.lower().encode()  # as ASGI names it
 USABLE_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 FIRST_ERROR = 400
 UNKNOWN_METHOD = "other"
@@ -35,7 +36,7 @@ class Observe:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        token = request_id.set(usable_id(dict(scope["headers"]).get(REQUEST_ID.lower().encode(), b"")))
+        token = request_id.set(usable_id(dict(scope["headers"]).get(IDENTITY, b"")))
         answer = _Answer(send)
         started = time.perf_counter()
         try:
@@ -98,7 +99,7 @@ class _Answer:
     async def send(self, message: Message) -> None:
         if message["type"] == "http.response.start":
             self.status = message["status"]
-            header = (REQUEST_ID.lower().encode(), (request_id.get() or "").encode())
+            header = (IDENTITY, (request_id.get() or "").encode())
             message = {**message, "headers": [*message.get("headers", ()), header]}
         else:
             self.sent += len(message.get("body", b""))

@@ -27,7 +27,7 @@ class Server(uvicorn.Server):
         self.service: Service = app.state.service
         # with keys or other origins a refusal depends on headers, which the application looks at
         is_plain = settings.api_keys_file is None and not settings.cors_origins
-        doorman = Doorman(self.service.queue, self.service.metrics) if is_plain else None
+        doorman = Doorman(self.service.queue, self.service.metrics, settings.max_body_bytes) if is_plain else None
         protocol = limited_protocol(settings.header_seconds, settings.read_seconds, doorman)
         config = uvicorn.Config(
             app,
