@@ -67,30 +67,45 @@ def test_operations_are_what_numpy_says(dtype: type):
 
 @kernel
 def rows_and_columns(
-    matrix: np.ndarray, out: np.ndarray, squares: np.ndarray, triples: np.ndarray, picked: np.ndarray, rows: np.ndarray
+    matrix: np.ndarray,
+    out: np.ndarray,
+    squares: np.ndarray,
+    triples: np.ndarray,
+    picked: np.ndarray,
+    loaded: np.ndarray,
+    points: np.ndarray,
+    rows: np.ndarray,
 ) -> None:
-    block = lanes.load_columns(matrix, 3, 2)
+    block = lanes.load_columns(matrix, 3)
     lanes.store_columns(out, 5, 3, block)
     lanes.store_square(squares, 2, 7, block[0])
     lanes.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
     lanes.store_columns(picked, 0, 0, lanes.load_columns_of(picked, rows, 1))
+    lanes.store_rows(loaded, 1, lanes.load_four_columns(matrix, 2, 7))
+    lanes.store_rows(loaded, 17, lanes.load_triples(points, 2))
+    lanes.store_rows(loaded, 33, lanes.load_triples(points, 1))
     lanes.prefetch(squares, 3)
 
 
 @DTYPES
 def test_memory(dtype: type):
     """Loads stop at the end of an array, stores leave what is beside them."""
-    matrix = np.arange(70, dtype=dtype).reshape(10, 7)
+    matrix = np.arange(160, dtype=dtype).reshape(10, 16)
+    points = np.arange(54, dtype=dtype).reshape(18, 3)
     got = [np.full((9, 16), -1, dtype), np.full(40, -1, dtype), np.full(60, -1, dtype)]
-    got.append(np.arange(256, dtype=dtype).reshape(16, 16))
+    got += [np.arange(256, dtype=dtype).reshape(16, 16), np.full((50, 16), -1, dtype)]
     want = [array.copy() for array in got]
     rows = np.array([1, 15, 4], np.uint32)
-    rows_and_columns(matrix, *got, rows)
-    plain(rows_and_columns)(matrix, *want, rows)
+    rows_and_columns(matrix, *got, points, rows)
+    plain(rows_and_columns)(matrix, *want, points, rows)
     for array, expected in zip(got, want, strict=True):
         np.testing.assert_array_equal(array, expected)
     np.testing.assert_array_equal(got[3][:, 5], [16 * 15 + 5, *[16 * 4 + 5] * 15])
-    np.testing.assert_array_equal(got[0][5:, 3:8], matrix[3:7, 2:])
+    np.testing.assert_array_equal(got[0][5:, 3:], matrix[3:7, :13])
+    np.testing.assert_array_equal(got[4][1:17, :4], [*matrix[2:, 7:11], *[matrix[9, 7:11]] * 8])
+    np.testing.assert_array_equal(got[4][17:33, :3], points[2:])
+    np.testing.assert_array_equal(got[4][33:49, :3], points[1:17])
+    np.testing.assert_array_equal(got[4][[0, 49]], -1)
     np.testing.assert_array_equal(got[0][:5], -1)
     np.testing.assert_array_equal(got[0][:, :3], -1)
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import Lanes, load
-from msdgs_serve.scene.spherical_harmonics import SH_C1, SH_C2, SH_C3
+from msdgs_serve.rasterizer.lanes import Lanes, filled, load
+from msdgs_serve.scene.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 C20, C21, C22, C23, C24 = SH_C2
 C30, C31, C32, C33, C34, C35, C36 = SH_C3
@@ -33,6 +33,12 @@ def harmonics_above_0(x: Any, y: Any, z: Any) -> tuple:
         C35 * z * (xx - yy),
         C36 * x * (xx - 3 * yy),
     )
+
+
+@kernel
+def harmonics(x: Lanes, y: Lanes, z: Lanes) -> tuple:
+    """The 16 of degree 0 to 3; the first is a constant even where there is no direction and the others are NaN."""
+    return (filled(SH_C0, x),) + harmonics_above_0(x, y, z)  # noqa: RUF005 numba unpacks no tuples
 
 
 @kernel

@@ -404,12 +404,23 @@ def load_or(array: np.ndarray, start: Index, otherwise: Lanes) -> Lanes:
     return np.concatenate([found, otherwise[len(found) :]])
 
 
-def load_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tuple[Lanes, ...]:
-    """16 columns of 16 rows of an array [n, m], as one `Lanes` a column; 0 past its rows and columns."""
-    block = np.zeros((LANES, LANES), array.dtype)
-    found = array[int(first_row) :, int(first_column) :][:LANES, :LANES]
-    block[: found.shape[0], : found.shape[1]] = found
-    return tuple(block.T.copy())
+def load_triples(array: np.ndarray, first_row: Index) -> tuple[Lanes, Lanes, Lanes]:
+    """The columns of 16 rows of an array [n, 3]; 0 past its rows."""
+    found = array[int(first_row) :][:LANES]
+    x, y, z = np.concatenate([found, np.zeros((LANES - len(found), 3), array.dtype)]).T.copy()
+    return x, y, z
+
+
+def load_four_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tuple[Lanes, ...]:
+    """4 of the columns, which must be there, of 16 rows of an array [n, m]; past the end of the rows the last counts
+    again."""
+    rows = np.minimum(np.arange(int(first_row), int(first_row) + LANES), len(array) - 1)
+    return tuple(array[rows, int(first_column) : int(first_column) + 4].T.copy())
+
+
+def load_columns(array: np.ndarray, first_row: Index) -> tuple[Lanes, ...]:
+    """The columns of 16 rows of an array [n, 16]; past the end of the rows the last counts again."""
+    return tuple(column for first in range(0, LANES, 4) for column in load_four_columns(array, first_row, first))
 
 
 def load_columns_of(array: np.ndarray, rows: np.ndarray, start: Index) -> tuple[Lanes, ...]:
@@ -424,6 +435,11 @@ def store_columns(array: np.ndarray, first_row: Index, first_column: Index, colu
     columns is dropped."""
     block = array[int(first_row) :, int(first_column) :][:LANES, :LANES]
     block[:] = _sixteen(columns).T[: block.shape[0], : block.shape[1]]
+
+
+def store_rows(array: np.ndarray, first_row: Index, columns: tuple[Lanes, ...]) -> None:
+    """Write up to 16 columns, and 0 for those that lack, into 16 rows, which must be there, of an array [n, 16]."""
+    array[int(first_row) : int(first_row) + LANES] = _sixteen(columns).T
 
 
 def store_whole_numbers(array: np.ndarray, first_row: Index, columns: tuple[Lanes, ...]) -> None:
@@ -482,9 +498,19 @@ def _type_load_or(_context: Any) -> Callable:
     return lambda array, start, otherwise: otherwise if _is_array(array, 1) else None
 
 
+@type_callable(load_triples)
+def _type_load_triples(_context: Any) -> Callable:
+    return lambda array, row: types.UniTuple(LanesType(array.dtype), 3) if _is_array(array, 2) else None
+
+
+@type_callable(load_four_columns)
+def _type_load_four_columns(_context: Any) -> Callable:
+    return lambda array, row, column: types.UniTuple(LanesType(array.dtype), 4) if _is_array(array, 2) else None
+
+
 @type_callable(load_columns)
 def _type_load_columns(_context: Any) -> Callable:
-    return lambda array, row, column: types.UniTuple(LanesType(array.dtype), LANES) if _is_array(array, 2) else None
+    return lambda array, row: types.UniTuple(LanesType(array.dtype), LANES) if _is_array(array, 2) else None
 
 
 @type_callable(load_columns_of)
@@ -559,19 +585,59 @@ def _rows(context: Any, builder: Any, kind: Any, array: Any, first_row: Any, fir
     return places, builder.sub(count, first_row), builder.sub(width, first_column)
 
 
-@lower_builtin(load_columns, types.Array, types.Integer, types.Integer)
-def _lower_load_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+@lower_builtin(load_triples, types.Array, types.Integer)
+def _lower_load_triples(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """48 numbers in a row; a column takes two shuffles."""
     kind = signature.args[0]
-    row, column = (context.cast(builder, v, t, types.intp) for v, t in zip(values[1:], signature.args[1:], strict=True))
-    places, count, width = _rows(context, builder, kind, values[0], row, column)
-    zeros = ir.Constant(ir.VectorType(context.get_data_type(kind.dtype), LANES), [0.0] * LANES)
-    inside, nothing = _first(builder, width), ir.Constant(ir.VectorType(ir.IntType(1), LANES), [0] * LANES)
-    rows = []
-    for k, place in enumerate(places):
-        exists = builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)
-        some = builder.select(exists, inside, nothing)
-        rows.append(_masked_load(builder, place, kind.dtype.bitwidth // 8, some, zeros))
-    return context.make_tuple(builder, signature.return_type, _transposed(builder, rows))
+    array = context.make_array(kind)(context, builder, values[0])
+    row = context.cast(builder, values[1], signature.args[1], types.intp)
+    three = ir.Constant(ir.IntType(64), 3)
+    left = builder.mul(builder.sub(builder.extract_value(array.shape, 0), row), three)
+    vector = ir.VectorType(context.get_data_type(kind.dtype), LANES)
+    v = []
+    for first in range(0, 3 * LANES, LANES):
+        offset = builder.add(builder.mul(row, three), ir.Constant(ir.IntType(64), first))
+        place = builder.bitcast(builder.gep(array.data, [offset]), vector.as_pointer())
+        some = _first(builder, builder.sub(left, ir.Constant(ir.IntType(64), first)))
+        zeros = ir.Constant(vector, [0.0] * LANES)
+        v.append(_masked_load(builder, place, kind.dtype.bitwidth // 8, some, zeros))
+    columns = []
+    for column in range(3):
+        wanted = range(column, 3 * LANES, 3)
+        two = _shuffled(builder, v[0], v[1], [place % (2 * LANES) for place in wanted])
+        ends = [k if place < 2 * LANES else place - LANES for k, place in enumerate(wanted)]
+        columns.append(_shuffled(builder, two, v[2], ends))
+    return context.make_tuple(builder, signature.return_type, columns)
+
+
+@lower_builtin(load_four_columns, types.Array, types.Integer, types.Integer)
+def _lower_load_four_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    places, real = _clamped_rows(context, builder, signature.args[0], values[0], signature.args[1], values[1])
+    column = context.cast(builder, values[2], signature.args[2], types.intp)
+    columns = _four_columns(builder, places, real, column)
+    return context.make_tuple(builder, signature.return_type, columns)
+
+
+@lower_builtin(load_columns, types.Array, types.Integer)
+def _lower_load_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    places, real = _clamped_rows(context, builder, signature.args[0], values[0], signature.args[1], values[1])
+    return context.make_tuple(builder, signature.return_type, _sixteen_columns(builder, places, real))
+
+
+def _clamped_rows(
+    context: Any, builder: Any, kind: Any, array: Any, row_kind: Any, first_row: Any
+) -> tuple[list[Any], ir.Type]:
+    """Pointers to 16 rows of an array [n, m], to the last one where there are no more; what they point to."""
+    array = context.make_array(kind)(context, builder, array)
+    count, width = (builder.extract_value(array.shape, axis) for axis in (0, 1))
+    last = builder.sub(count, ir.Constant(ir.IntType(64), 1))
+    first = context.cast(builder, first_row, row_kind, types.intp)
+    places = []
+    for k in range(LANES):
+        row = builder.add(first, ir.Constant(ir.IntType(64), k))
+        row = builder.select(builder.icmp_signed("<", row, last), row, last)
+        places.append(builder.gep(array.data, [builder.mul(row, width)]))
+    return places, context.get_data_type(kind.dtype)
 
 
 @lower_builtin(load_columns_of, types.Array, types.Array, types.Integer)
@@ -588,17 +654,21 @@ def _lower_load_columns_of(context: Any, builder: Any, signature: Any, values: A
         row = context.cast(builder, builder.load(builder.gep(rows.data, [entry])), row_kind.dtype, types.intp)
         places.append(builder.gep(data, [builder.mul(row, ir.Constant(ir.IntType(64), LANES))]))
     real = context.get_data_type(kind.dtype)
-    columns = [column for first in range(0, LANES, 4) for column in _four_columns(builder, places, real, first)]
-    return context.make_tuple(builder, signature.return_type, columns)
+    return context.make_tuple(builder, signature.return_type, _sixteen_columns(builder, places, real))
 
 
-def _four_columns(builder: Any, places: list[Any], real: ir.Type, first: int) -> list[Any]:
+def _sixteen_columns(builder: Any, places: list[Any], real: ir.Type) -> list[Any]:
+    firsts = [ir.Constant(ir.IntType(64), first) for first in range(0, LANES, 4)]
+    return [column for first in firsts for column in _four_columns(builder, places, real, first)]
+
+
+def _four_columns(builder: Any, places: list[Any], real: ir.Type, first: Any) -> list[Any]:
     """Columns `first` to `first` + 3 of the 16 rows that begin at `places`. Groups of four rows lie side by side, so
     that only the four by four within a group are turned round."""
     quarter, size = ir.VectorType(real, 4), 4 if real == ir.FloatType() else 8
     pieces = []
     for place in places:
-        piece = builder.gep(place, [ir.Constant(ir.IntType(64), first)])
+        piece = builder.gep(place, [first])
         pieces.append(builder.load(builder.bitcast(piece, quarter.as_pointer()), align=size))
     v = []
     for k in range(4):
@@ -622,6 +692,24 @@ def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any
     for k, (place, lanes) in enumerate(zip(places, rows, strict=True)):
         with builder.if_then(builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)):
             _masked_store(builder, place, kind.dtype.bitwidth // 8, some, lanes)
+    return context.get_dummy_value()
+
+
+@type_callable(store_rows)
+def _type_store_rows(_context: Any) -> Callable:
+    return lambda array, row, columns: types.none if _is_array(array, 2) else None
+
+
+@lower_builtin(store_rows, types.Array, types.Integer, types.UniTuple)
+def _lower_store_rows(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    kind = signature.args[0]
+    array = context.make_array(kind)(context, builder, values[0])
+    row = context.cast(builder, values[1], signature.args[1], types.intp)
+    place = builder.gep(array.data, [builder.mul(row, ir.Constant(ir.IntType(64), LANES))])
+    vector = ir.VectorType(context.get_data_type(kind.dtype), LANES).as_pointer()
+    for k, lanes in enumerate(_transposed(builder, _filled_up(builder, values[2]))):
+        there = builder.gep(place, [ir.Constant(ir.IntType(64), LANES * k)])
+        builder.store(lanes, builder.bitcast(there, vector), align=kind.dtype.bitwidth // 8)
     return context.get_dummy_value()
 
 

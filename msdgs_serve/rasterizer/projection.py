@@ -10,19 +10,20 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.exponential import arctangent, log2
-from msdgs_serve.rasterizer.harmonics import harmonics_above_0
+from msdgs_serve.rasterizer.harmonics import harmonics
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.lanes import (
     LANES,
+    Index,
     Lanes,
     Mask,
     bits_of,
     converted,
     filled,
     fma,
-    load,
-    load_columns,
+    load_four_columns,
     load_or,
+    load_triples,
     lowest_bit,
     maximum,
     minimum,
@@ -32,13 +33,12 @@ from msdgs_serve.rasterizer.lanes import (
     spread,
     square_root,
     store,
-    store_columns,
+    store_rows,
     store_whole_numbers,
 )
 from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
 
 RECORD = LANES
@@ -85,7 +85,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     gaussians = _kernel_arrays(gaussians)
     count, dtype = len(gaussians), gaussians.means.dtype
     view = view_of(camera, options)
-    records = empty_records(count, dtype)
+    records = empty_records(-(-count // LANES) * LANES, dtype)
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
     ranges = ranges_of_lanes(count)
@@ -97,7 +97,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     )
     ends, nearest, farthest, sound = zip(*parts, strict=True)
     drawn = [(start, end) for (start, _), end in zip(ranges, ends, strict=True)]
-    return Splats(records, rectangles, keys, drawn, (min(nearest), max(farthest)), all(sound))
+    return Splats(records[:count], rectangles, keys, drawn, (min(nearest), max(farthest)), all(sound))
 
 
 def empty_records(count: int, dtype: np.dtype) -> np.ndarray:
@@ -142,7 +142,6 @@ def _project_range(
     zero = spread(real(0))
     double = np.empty(1, np.float64)
     depths = np.empty(LANES, records.dtype)
-    scratch = np.empty(48 * LANES, sh.dtype)
     r, t = view.rotation, view.translation
     arrays = (
         (means.reshape(-1), np.uint64(3)),
@@ -156,11 +155,11 @@ def _project_range(
             ahead = np.uint64(first + AHEAD) * numbers
             for place in range(ahead, ahead + np.uint64(LANES) * numbers, np.uint64(LANES)):
                 prefetch(array, place)
-        columns = load_columns(means, first, 0)
-        wx, wy, wz = converted(columns[0], double), converted(columns[1], double), converted(columns[2], double)
+        mean = load_triples(means, first)
+        wx, wy, wz = converted(mean[0], double), converted(mean[1], double), converted(mean[2], double)
         opacity = converted(load_or(opacities, first, spread(opacities.dtype.type(0))), double)
-        qs, ss = load_columns(quats, first, 0), load_columns(scales, first, 0)
-        usable = _usable(columns, qs, ss, opacity)
+        qs, ss = load_four_columns(quats, first, 0), load_triples(scales, first)
+        usable = _usable(mean, qs, ss, opacity)
         x = fma(spread(r[0, 0]), wx, fma(spread(r[0, 1]), wy, fma(spread(r[0, 2]), wz, spread(t[0]))))
         y = fma(spread(r[1, 0]), wx, fma(spread(r[1, 1]), wy, fma(spread(r[1, 2]), wz, spread(t[1]))))
         z = fma(spread(r[2, 0]), wx, fma(spread(r[2, 1]), wy, fma(spread(r[2, 2]), wz, spread(t[2]))))
@@ -202,14 +201,11 @@ def _project_range(
         root_b = -converted(xy / yy, records) * root_a
         root_c = 1 / square_root(converted(yy, records))
         dx, dy, dz = direction(view, wx, wy, wz)
-        red, green, blue = raw_colors(
-            sh, first, scratch, converted(dx, records), converted(dy, records), converted(dz, records)
-        )
+        red, green, blue = raw_colors(sh, first, converted(dx, records), converted(dy, records), converted(dz, records))
         sound = sound and bits_of(drawn & (abs_sum(red, green, blue) < np.inf)) == bits
-        store_columns(
+        store_rows(
             records,
             first,
-            0,
             (
                 select(drawn, u, zero),
                 select(drawn, v, zero),
@@ -270,7 +266,7 @@ def depth_bits(depth: float) -> np.uint64:
 @kernel
 def _store_nothing(records: np.ndarray, first: int) -> None:
     zero = spread(records.dtype.type(0))
-    store_columns(records, first, 0, (zero,))
+    store_rows(records, first, (zero,))
 
 
 @kernel
@@ -365,26 +361,41 @@ def direction(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, L
 
 
 @kernel
-def raw_colors(
-    sh: np.ndarray, first: int, scratch: np.ndarray, x: Lanes, y: Lanes, z: Lanes
-) -> tuple[Lanes, Lanes, Lanes]:
-    """SH + 0.5 towards the unit directions (x, y, z), before the cut at 0; `sh` is [N, 3 coefficients].
+def raw_colors(sh: np.ndarray, first: int, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """SH + 0.5 towards the unit directions (x, y, z), before the cut at 0; `sh` is [N, 3 coefficients]."""
+    functions = sh.shape[1] // 3
+    basis = harmonics(x, y, z)
+    color = filled(0.5, x), filled(0.5, x), filled(0.5, x)
+    for k in range(np.uint64(0), np.uint64(functions & ~3), np.uint64(4)):
+        c = four_coefficients(sh, first, k)
+        color = _added(color, c[0], basis[k])
+        color = _added(color, c[1], basis[k + np.uint64(1)])
+        color = _added(color, c[2], basis[k + np.uint64(2)])
+        color = _added(color, c[3], basis[k + np.uint64(3)])
+    if functions % 4:
+        color = _added(color, last_coefficient(sh, first), basis[functions - 1])
+    return color
 
-    `scratch` then has the coefficients, 16 lanes each.
-    """
-    width = sh.shape[1]
-    for window in range(0, width, LANES):
-        columns = load_columns(sh, first, window)
-        for k in range(LANES):
-            store(scratch, np.uint64((window + k) * LANES), columns[k])
-    red = SH_C0 * load(scratch, 0) + 0.5
-    green = SH_C0 * load(scratch, 16) + 0.5
-    blue = SH_C0 * load(scratch, 32) + 0.5
-    if width > 3:
-        basis = harmonics_above_0(x, y, z)
-        for k in range(1, width // 3):
-            place = np.uint64(48 * k)
-            red = fma(load(scratch, place), basis[k - 1], red)
-            green = fma(load(scratch, place + np.uint64(16)), basis[k - 1], green)
-            blue = fma(load(scratch, place + np.uint64(32)), basis[k - 1], blue)
-    return red, green, blue
+
+@kernel
+def _added(color: tuple, coefficient: tuple, value: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    r, g, b = coefficient
+    return fma(r, value, color[0]), fma(g, value, color[1]), fma(b, value, color[2])
+
+
+@kernel
+def four_coefficients(sh: np.ndarray, first: int, k: Index) -> tuple:
+    """Of 16 Gaussians from `first` the coefficients of functions `k` to `k` + 3, red, green and blue, [4][3]."""
+    place = np.uint64(3) * k
+    a = load_four_columns(sh, first, place)
+    b, c = load_four_columns(sh, first, place + np.uint64(4)), load_four_columns(sh, first, place + np.uint64(8))
+    return (a[0], a[1], a[2]), (a[3], b[0], b[1]), (b[2], b[3], c[0]), (c[1], c[2], c[3])
+
+
+@kernel
+def last_coefficient(sh: np.ndarray, first: int) -> tuple[Lanes, Lanes, Lanes]:
+    """Of 16 Gaussians from `first` the coefficient of the last function, red, green and blue."""
+    if sh.shape[1] == 3:
+        return load_triples(sh, first)
+    _, r, g, b = load_four_columns(sh, first, sh.shape[1] - 4)
+    return r, g, b

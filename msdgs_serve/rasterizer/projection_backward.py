@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.harmonics import harmonics_above_0, harmonics_slope
+from msdgs_serve.rasterizer.harmonics import harmonics, harmonics_slope
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.lanes import (
     LANES,
@@ -18,7 +18,9 @@ from msdgs_serve.rasterizer.lanes import (
     filled,
     load,
     load_columns,
+    load_four_columns,
     load_or,
+    load_triples,
     select,
     square_root,
     store,
@@ -32,7 +34,9 @@ from msdgs_serve.rasterizer.projection import (
     ROOT_SCALE,
     Splats,
     covariance2d,
+    four_coefficients,
     half_axis,
+    last_coefficient,
     ranges_of_lanes,
     raw_colors,
     rotation_columns,
@@ -43,7 +47,6 @@ from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_serve.threads import run_parallel
 
 # numbers of the columns of a record: a tuple is indexed by a plain int
@@ -103,16 +106,16 @@ def _backward_range(
     scratch, pulls = np.empty(48 * LANES, sh.dtype), np.zeros(LANES * LANES, sh.dtype)
     w, t = view.rotation, view.translation
     for first in range(start, stop, LANES):
-        record, moments = load_columns(records, first, 0), load_columns(sums, first, 0)
+        record, moments = load_columns(records, first), load_columns(sums, first)
         drawn = record[_EXTENT] > 0
-        mean = load_columns(means, first, 0)
+        mean = load_triples(means, first)
         wx, wy, wz = converted(mean[0], double), converted(mean[1], double), converted(mean[2], double)
         x = w[0, 0] * wx + w[0, 1] * wy + w[0, 2] * wz + t[0]
         y = w[1, 0] * wx + w[1, 1] * wy + w[1, 2] * wz + t[1]
         z = w[2, 0] * wx + w[2, 1] * wy + w[2, 2] * wz + t[2]
         _, _, jacobian = seen_at(view, x, y, z)
         (j00, _, j02), (_, j11, j12) = jacobian
-        qs, ss = load_columns(quats, first, 0), load_columns(scales, first, 0)
+        qs, ss = load_four_columns(quats, first, 0), load_triples(scales, first)
         qw, qx = converted(qs[0], double), converted(qs[1], double)
         qy, qz = converted(qs[2], double), converted(qs[3], double)
         axes = rotation_columns(qw, qx, qy, qz)
@@ -254,31 +257,36 @@ def _color_gradient(
     per_distance = 1 / square_root(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx * per_distance, dy * per_distance, dz * per_distance
     x, y, z = converted(dx, sh), converted(dy, sh), converted(dz, sh)
-    red, green, blue = raw_colors(sh, first, scratch, x, y, z)
+    red, green, blue = raw_colors(sh, first, x, y, z)
     zero = filled(0, red)
     red = select(drawn & (red > 0), moments[0], zero)
     green = select(drawn & (green > 0), moments[1], zero)
     blue = select(drawn & (blue > 0), moments[2], zero)
-    width = sh.shape[1]
-    if width > 3:
-        basis = harmonics_above_0(x, y, z)
-        for k in range(1, width // 3):
-            place = np.uint64(48 * k)
-            pull = load(scratch, place) * red + load(scratch, place + np.uint64(16)) * green
-            pull += load(scratch, place + np.uint64(32)) * blue
-            store(scratch, place, basis[k - 1] * red)
-            store(scratch, place + np.uint64(16), basis[k - 1] * green)
-            store(scratch, place + np.uint64(32), basis[k - 1] * blue)
-            store(pulls, np.uint64(LANES * k), pull)
-    store(scratch, 0, SH_C0 * red)
-    store(scratch, 16, SH_C0 * green)
-    store(scratch, 32, SH_C0 * blue)
-    for window in range(0, width, LANES):
+    functions = sh.shape[1] // 3
+    basis = harmonics(x, y, z)
+    for k in range(functions):
+        place = np.uint64(3 * LANES * k)
+        store(scratch, place, basis[k] * red)
+        store(scratch, place + np.uint64(LANES), basis[k] * green)
+        store(scratch, place + np.uint64(2 * LANES), basis[k] * blue)
+    pull = (red, green, blue)
+    for k in range(np.uint64(0), np.uint64(functions & ~3), np.uint64(4)):
+        c = four_coefficients(sh, first, k)
+        for j in range(4):
+            store(pulls, (k + np.uint64(j)) * np.uint64(LANES), _dot(c[j], pull))
+    if functions % 4:
+        store(pulls, np.uint64(LANES * (functions - 1)), _dot(last_coefficient(sh, first), pull))
+    for window in range(0, sh.shape[1], LANES):
         store_columns(grad_sh, first, window, _sixteen(scratch, np.uint64(LANES * window)))
     gx, gy, gz = harmonics_slope(pulls, x, y, z)
     px, py, pz = converted(gx, double), converted(gy, double), converted(gz, double)
     along = px * dx + py * dy + pz * dz
     return (px - along * dx) * per_distance, (py - along * dy) * per_distance, (pz - along * dz) * per_distance
+
+
+@kernel
+def _dot(a: tuple, b: tuple) -> Lanes:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel
