@@ -6,7 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import LANES, fma, load, spread, store
+from msdgs_serve.rasterizer.lane_types import LANES
+from msdgs_serve.rasterizer.lanes import fma, spread
+from msdgs_serve.rasterizer.lanes_memory import load, store
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
 FLOPS_A_PAIR = 37

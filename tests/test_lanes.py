@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import lanes
+from msdgs_serve.rasterizer import lanes_memory as memory
 from msdgs_serve.rasterizer.atomic import fetch_add
 from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial, log2
 from msdgs_serve.rasterizer.jit import kernel
@@ -23,7 +24,7 @@ def plain(compiled: Callable) -> Callable:
 @kernel
 def operations(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> tuple[int, int]:
     """One row of `out` for each operation."""
-    x, y = lanes.load(a, 0), lanes.load(b, np.uint64(1))
+    x, y = memory.load(a, 0), memory.load(b, np.uint64(1))
     two = lanes.pair(x, y)
     both = lanes.minimum(two * 2 + 1, lanes.filled(0.5, two))
     mask = (x < y) | (x >= 1.5) & ~(y <= -1)
@@ -47,10 +48,10 @@ def operations(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> tuple[int, int]
         lanes.mantissa_of(x * x + 0.125),
     )
     for k in range(16):
-        lanes.store(out, 16 * k, rows[k])
-    lanes.store(out, 256, lanes.times_power_of_two(x, y + lanes.rounder(y)))
-    lanes.store(out, 272, lanes.load_or(a, 40, x))
-    lanes.store(out, 288, lanes.sums_of(rows))
+        memory.store(out, 16 * k, rows[k])
+    memory.store(out, 256, lanes.times_power_of_two(x, y + lanes.rounder(y)))
+    memory.store(out, 272, memory.load_or(a, 40, x))
+    memory.store(out, 288, memory.sums_of(rows))
     bits = lanes.bits_of(mask)
     return bits, lanes.lowest_bit(bits)
 
@@ -76,15 +77,15 @@ def rows_and_columns(
     points: np.ndarray,
     rows: np.ndarray,
 ) -> None:
-    block = lanes.load_columns(matrix, 3)
-    lanes.store_columns(out, 5, 3, block)
-    lanes.store_square(squares, 2, 7, block[0])
-    lanes.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
-    lanes.store_columns(picked, 0, 0, lanes.load_columns_of(picked, rows, 1))
-    lanes.store_rows(loaded, 1, lanes.load_four_columns(matrix, 2, 7))
-    lanes.store_rows(loaded, 17, lanes.load_triples(points, 2))
-    lanes.store_rows(loaded, 33, lanes.load_triples(points, 1))
-    lanes.prefetch(squares, 3)
+    block = memory.load_columns(matrix, 3)
+    memory.store_columns(out, 5, 3, block)
+    memory.store_square(squares, 2, 7, block[0])
+    memory.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
+    memory.store_columns(picked, 0, 0, memory.load_columns_of(picked, rows, 1))
+    memory.store_rows(loaded, 1, memory.load_four_columns(matrix, 2, 7))
+    memory.store_rows(loaded, 17, memory.load_triples(points, 2))
+    memory.store_rows(loaded, 33, memory.load_triples(points, 1))
+    memory.prefetch(squares, 3)
 
 
 @DTYPES
@@ -112,8 +113,8 @@ def test_memory(dtype: type):
 
 @kernel
 def whole_numbers(columns: np.ndarray, row: int, out: np.ndarray) -> None:
-    a, b, c, d = (lanes.load(columns, 0), lanes.load(columns, 16), lanes.load(columns, 32), lanes.load(columns, 48))
-    lanes.store_whole_numbers(out, row, (a, b, c, d))
+    a, b, c, d = (memory.load(columns, 0), memory.load(columns, 16), memory.load(columns, 32), memory.load(columns, 48))
+    memory.store_whole_numbers(out, row, (a, b, c, d))
 
 
 @DTYPES
@@ -132,9 +133,9 @@ def test_whole_numbers(dtype: type):
 @kernel
 def powers(x: np.ndarray, polynomial: tuple, out: np.ndarray, logarithms: np.ndarray) -> None:
     for k in range(0, len(x), 16):
-        power = exp2(lanes.load(x, k), polynomial)
-        lanes.store(out, k, power)
-        lanes.store(logarithms, k, log2(power))
+        power = exp2(memory.load(x, k), polynomial)
+        memory.store(out, k, power)
+        memory.store(logarithms, k, log2(power))
 
 
 @pytest.mark.parametrize(("dtype", "degree"), [(np.float32, 5), (np.float64, 12)])

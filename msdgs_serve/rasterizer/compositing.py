@@ -11,25 +11,25 @@ import numpy as np
 from msdgs_serve.rasterizer.atomic import fetch_add
 from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
+from msdgs_serve.rasterizer.lane_types import LANES, Lanes, Mask
 from msdgs_serve.rasterizer.lanes import (
-    LANES,
-    Lanes,
-    Mask,
     bits_of,
     filled,
     first_of,
     fma,
-    load,
-    load_columns_of,
     lowest_bit,
     maximum,
     minimum,
     negative,
     pair,
-    prefetch,
     second_of,
     select,
     spread,
+)
+from msdgs_serve.rasterizer.lanes_memory import (
+    load,
+    load_columns_of,
+    prefetch,
     store,
     store_square,
     store_square_of_triples,

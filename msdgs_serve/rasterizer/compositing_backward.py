@@ -22,21 +22,9 @@ from msdgs_serve.rasterizer.compositing import (
 )
 from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import (
-    LANES,
-    bits_of,
-    filled,
-    fma,
-    load,
-    lowest_bit,
-    minimum,
-    negative,
-    prefetch,
-    select,
-    spread,
-    store,
-    sums_of,
-)
+from msdgs_serve.rasterizer.lane_types import LANES
+from msdgs_serve.rasterizer.lanes import bits_of, filled, fma, lowest_bit, minimum, negative, select, spread
+from msdgs_serve.rasterizer.lanes_memory import load, prefetch, store, sums_of
 from msdgs_serve.rasterizer.projection import (
     BLUE,
     GREEN,

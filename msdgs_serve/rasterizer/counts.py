@@ -16,20 +16,9 @@ from msdgs_serve.rasterizer.compositing import (
 )
 from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import (
-    LANES,
-    bits_of,
-    filled,
-    first_of,
-    fma,
-    load,
-    minimum,
-    negative,
-    pair,
-    select,
-    spread,
-    store,
-)
+from msdgs_serve.rasterizer.lane_types import LANES
+from msdgs_serve.rasterizer.lanes import bits_of, filled, first_of, fma, minimum, negative, pair, select, spread
+from msdgs_serve.rasterizer.lanes_memory import load, store
 from msdgs_serve.rasterizer.projection import RECORD, Splats
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions

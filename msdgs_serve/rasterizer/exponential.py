@@ -6,15 +6,8 @@ from functools import cache
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import (
-    Lanes,
-    exponent_of,
-    filled,
-    mantissa_of,
-    rounder,
-    select,
-    times_power_of_two,
-)
+from msdgs_serve.rasterizer.lane_types import Lanes
+from msdgs_serve.rasterizer.lanes import exponent_of, filled, mantissa_of, rounder, select, times_power_of_two
 
 ATANH_SERIES = tuple(2 / math.log(2) / n for n in range(21, 0, -2))
 """Of 2 atanh(s) / ln 2 over s, highest power of s² first."""

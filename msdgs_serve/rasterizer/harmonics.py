@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import Lanes, filled, load
+from msdgs_serve.rasterizer.lane_types import Lanes
+from msdgs_serve.rasterizer.lanes import filled
+from msdgs_serve.rasterizer.lanes_memory import load
 from msdgs_serve.scene.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 C20, C21, C22, C23, C24 = SH_C2

@@ -12,26 +12,25 @@ import numpy as np
 from msdgs_serve.rasterizer.exponential import arctangent, log2
 from msdgs_serve.rasterizer.harmonics import harmonics
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.lane_types import LANES, Index, Lanes, Mask
 from msdgs_serve.rasterizer.lanes import (
-    LANES,
-    Index,
-    Lanes,
-    Mask,
     bits_of,
     converted,
     filled,
     fma,
-    load_four_columns,
-    load_or,
-    load_triples,
     lowest_bit,
     maximum,
     minimum,
     negative,
-    prefetch,
     select,
     spread,
     square_root,
+)
+from msdgs_serve.rasterizer.lanes_memory import (
+    load_four_columns,
+    load_or,
+    load_triples,
+    prefetch,
     store,
     store_rows,
     store_whole_numbers,

@@ -9,20 +9,14 @@ import numpy as np
 
 from msdgs_serve.rasterizer.harmonics import harmonics, harmonics_slope
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes import (
-    LANES,
-    Index,
-    Lanes,
-    Mask,
-    converted,
-    filled,
+from msdgs_serve.rasterizer.lane_types import LANES, Index, Lanes, Mask
+from msdgs_serve.rasterizer.lanes import converted, filled, select, square_root
+from msdgs_serve.rasterizer.lanes_memory import (
     load,
     load_columns,
     load_four_columns,
     load_or,
     load_triples,
-    select,
-    square_root,
     store,
     store_columns,
 )

@@ -1,0 +1,441 @@
+"""`Lanes` from memory and back: rows of arrays become columns on the way, and columns rows.
+
+As in `lanes.py` the body of each function is what it does without the compiler.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import lower_builtin, type_callable
+
+from msdgs_serve.rasterizer.lane_types import (
+    FREEDOMS,
+    LANES,
+    REALS,
+    Index,
+    Lanes,
+    LanesType,
+    broadcast,
+    llvm,
+    same,
+    shuffled,
+    suffix,
+    typed,
+)
+
+
+def _is_array(array: Any, ndim: int) -> bool:
+    shaped = isinstance(array, types.Array) and array.ndim == ndim and array.layout == "C"
+    return shaped and array.dtype in REALS
+
+
+def _columns_of(array: Any, count: int) -> types.Type | None:
+    return types.UniTuple(LanesType(array.dtype), count) if _is_array(array, 2) else None
+
+
+def _none_if(fits: Any) -> types.Type | None:
+    """What a function that returns nothing returns, for arguments that it takes."""
+    return types.none if fits else None
+
+
+def _vector_at(context: Any, builder: Any, signature: Any, values: Any) -> tuple[Any, int]:
+    """Pointer to 16 numbers of the first argument, an array, at the index that is the second; its alignment."""
+    kind = signature.args[0]
+    data = context.make_array(kind)(context, builder, values[0]).data
+    place = builder.gep(data, [context.cast(builder, values[1], signature.args[1], types.intp)])
+    vector = ir.VectorType(context.get_data_type(kind.dtype), LANES)
+    return builder.bitcast(place, vector.as_pointer()), kind.dtype.bitwidth // 8
+
+
+def load(array: np.ndarray, start: Index) -> Lanes:
+    """16 consecutive numbers of an array [n]."""
+    return array[int(start) : int(start) + LANES].copy()
+
+
+def store(array: np.ndarray, start: Index, lanes: Lanes) -> None:
+    """Write 16 consecutive numbers of an array [n]."""
+    array[int(start) : int(start) + LANES] = lanes
+
+
+def load_or(array: np.ndarray, start: Index, otherwise: Lanes) -> Lanes:
+    """The numbers of an array [n] from `start`; `otherwise` past its end."""
+    found = array[int(start) : int(start) + LANES]
+    return np.concatenate([found, otherwise[len(found) :]])
+
+
+def load_triples(array: np.ndarray, first_row: Index) -> tuple[Lanes, Lanes, Lanes]:
+    """The columns of 16 rows of an array [n, 3]; 0 past its rows."""
+    found = array[int(first_row) :][:LANES]
+    x, y, z = np.concatenate([found, np.zeros((LANES - len(found), 3), array.dtype)]).T.copy()
+    return x, y, z
+
+
+def load_four_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tuple[Lanes, ...]:
+    """4 of the columns, which must be there, of 16 rows of an array [n, m]; past the end of the rows the last counts
+    again."""
+    rows = np.minimum(np.arange(int(first_row), int(first_row) + LANES), len(array) - 1)
+    return tuple(array[rows, int(first_column) : int(first_column) + 4].T.copy())
+
+
+def load_columns(array: np.ndarray, first_row: Index) -> tuple[Lanes, ...]:
+    """The columns of 16 rows of an array [n, 16]; past the end of the rows the last counts again."""
+    return tuple(column for first in range(0, LANES, 4) for column in load_four_columns(array, first_row, first))
+
+
+def load_columns_of(array: np.ndarray, rows: np.ndarray, start: Index) -> tuple[Lanes, ...]:
+    """The 16 columns of an array [n, 16], at the rows that 16 numbers of `rows` [m] name from `start`; past the end of
+    `rows` its last number counts again."""
+    found = rows[np.minimum(np.arange(int(start), int(start) + LANES), len(rows) - 1)]
+    return tuple(array[found].T.copy())
+
+
+def store_columns(array: np.ndarray, first_row: Index, first_column: Index, columns: tuple[Lanes, ...]) -> None:
+    """Write up to 16 columns, and 0 for those that lack, into 16 rows of an array [n, m]; what is past its rows and
+    columns is dropped."""
+    block = array[int(first_row) :, int(first_column) :][:LANES, :LANES]
+    block[:] = _sixteen(columns).T[: block.shape[0], : block.shape[1]]
+
+
+def store_rows(array: np.ndarray, first_row: Index, columns: tuple[Lanes, ...]) -> None:
+    """Write up to 16 columns, and 0 for those that lack, into 16 rows, which must be there, of an array [n, 16]."""
+    array[int(first_row) : int(first_row) + LANES] = _sixteen(columns).T
+
+
+def store_whole_numbers(array: np.ndarray, first_row: Index, columns: tuple[Lanes, ...]) -> None:
+    """Write 4 columns of numbers in [0, 65535], cut off at the point, into 16 rows of an array [n, 4] of uint16; rows
+    past its end are dropped."""
+    rows = array[int(first_row) :][:LANES]
+    rows[:] = np.stack(columns, axis=1)[: len(rows)]
+
+
+def sums_of(columns: tuple[Lanes, ...]) -> Lanes:
+    """The sum of each of up to 16 `Lanes`, in the lane of its number; 0 in the others."""
+    return _sixteen(columns).sum(axis=1)
+
+
+def _sixteen(columns: tuple[Lanes, ...]) -> np.ndarray:
+    """[16, 16] columns as rows, filled up with zeros."""
+    return np.stack([*columns, *[np.zeros_like(columns[0])] * (LANES - len(columns))])
+
+
+def _filled_up(builder: Any, columns: Any) -> list[Any]:
+    """The vectors of a tuple, and vectors of zeros up to 16."""
+    vectors = [builder.extract_value(columns, k) for k in range(len(columns.type))]
+    return vectors + [ir.Constant(vectors[0].type, [0.0] * LANES)] * (LANES - len(vectors))
+
+
+typed(sums_of, lambda columns: columns.dtype if isinstance(columns, types.UniTuple) else None)
+
+
+@lower_builtin(sums_of, types.UniTuple)
+def _lower_sums_of(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    vectors = _filled_up(builder, values[0])
+    lower, upper = ([lane for k in range(start, start + 8) for lane in (k, LANES + k)] for start in (0, 8))
+    while len(vectors) > 1:  # two vectors of partial sums become one, whose neighbours belong to one and the other
+        pairs = [(vectors[k], vectors[k + len(vectors) // 2]) for k in range(len(vectors) // 2)]
+        vectors = [
+            builder.fadd(shuffled(builder, a, b, lower), shuffled(builder, a, b, upper), flags=FREEDOMS)
+            for a, b in pairs
+        ]
+    return vectors[0]
+
+
+typed(load, lambda array, start: LanesType(array.dtype) if _is_array(array, 1) else None)
+typed(store, lambda array, start, lanes: _none_if(_is_array(array, 1) and LanesType(array.dtype) == lanes))
+typed(load_or, lambda array, start, otherwise: otherwise if _is_array(array, 1) else None)
+typed(load_triples, lambda array, row: _columns_of(array, 3))
+typed(load_four_columns, lambda array, row, column: _columns_of(array, 4))
+typed(load_columns, lambda array, row: _columns_of(array, LANES))
+typed(load_columns_of, lambda array, rows, start: _columns_of(array, LANES))
+typed(store_columns, lambda array, row, column, columns: _none_if(_is_array(array, 2)))
+
+
+@lower_builtin(load, types.Array, types.Integer)
+def _lower_load(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    place, alignment = _vector_at(context, builder, signature, values)
+    return builder.load(place, align=alignment)
+
+
+@lower_builtin(store, types.Array, types.Integer, LanesType)
+def _lower_store(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    place, alignment = _vector_at(context, builder, signature, values)
+    builder.store(values[2], place, align=alignment)
+    return context.get_dummy_value()
+
+
+def _first(builder: Any, count: Any) -> Any:
+    """The mask of the first `count` lanes, an i64 that may be negative or above 16."""
+    integers = ir.VectorType(ir.IntType(64), LANES)
+    return builder.icmp_signed("<", ir.Constant(integers, list(range(LANES))), broadcast(builder, count))
+
+
+def _masked_load(builder: Any, place: Any, alignment: int, mask: Any, otherwise: Any) -> Any:
+    name = f"llvm.masked.load.{suffix(otherwise.type)}.p0"
+    return llvm(builder, name, otherwise.type, place, ir.Constant(ir.IntType(32), alignment), mask, otherwise)
+
+
+def _masked_store(builder: Any, place: Any, alignment: int, mask: Any, lanes: Any) -> None:
+    name = f"llvm.masked.store.{suffix(lanes.type)}.p0"
+    llvm(builder, name, ir.VoidType(), lanes, place, ir.Constant(ir.IntType(32), alignment), mask)
+
+
+@lower_builtin(load_or, types.Array, types.Integer, LanesType)
+def _lower_load_or(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    place, alignment = _vector_at(context, builder, signature, values)
+    array = context.make_array(signature.args[0])(context, builder, values[0])
+    start = context.cast(builder, values[1], signature.args[1], types.intp)
+    count = builder.sub(builder.extract_value(array.shape, 0), start)
+    return _masked_load(builder, place, alignment, _first(builder, count), values[2])
+
+
+def _transposed(builder: Any, vectors: list[Any]) -> list[Any]:
+    """16 vectors as the columns of a matrix to those that are its rows: four rounds of interleaving."""
+    lower = [lane for k in range(LANES // 2) for lane in (k, LANES + k)]
+    upper = [lane for k in range(LANES // 2, LANES) for lane in (k, LANES + k)]
+    low, high = (ir.Constant(ir.VectorType(ir.IntType(32), LANES), lanes) for lanes in (lower, upper))
+    for _ in range(4):
+        pairs = [(vectors[k], vectors[k + LANES // 2]) for k in range(LANES // 2)]
+        vectors = [builder.shuffle_vector(a, b, mask) for a, b in pairs for mask in (low, high)]
+    return vectors
+
+
+def _rows(context: Any, builder: Any, kind: Any, array: Any, first_row: Any, first_column: Any) -> tuple[Any, Any, Any]:
+    """Of an array [n, m]: pointers to the 16 rows, the number of rows and that of columns from there."""
+    array = context.make_array(kind)(context, builder, array)
+    count, width = (builder.extract_value(array.shape, axis) for axis in (0, 1))
+    start = builder.add(builder.mul(first_row, width), first_column)
+    vector = ir.VectorType(context.get_data_type(kind.dtype), LANES).as_pointer()
+    places = []
+    for row in range(LANES):
+        offset = builder.add(start, builder.mul(width, ir.Constant(ir.IntType(64), row)))
+        places.append(builder.bitcast(builder.gep(array.data, [offset]), vector))
+    return places, builder.sub(count, first_row), builder.sub(width, first_column)
+
+
+@lower_builtin(load_triples, types.Array, types.Integer)
+def _lower_load_triples(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """48 numbers in a row; a column takes two shuffles."""
+    kind = signature.args[0]
+    array = context.make_array(kind)(context, builder, values[0])
+    row = context.cast(builder, values[1], signature.args[1], types.intp)
+    three = ir.Constant(ir.IntType(64), 3)
+    left = builder.mul(builder.sub(builder.extract_value(array.shape, 0), row), three)
+    vector = ir.VectorType(context.get_data_type(kind.dtype), LANES)
+    v = []
+    for first in range(0, 3 * LANES, LANES):
+        offset = builder.add(builder.mul(row, three), ir.Constant(ir.IntType(64), first))
+        place = builder.bitcast(builder.gep(array.data, [offset]), vector.as_pointer())
+        some = _first(builder, builder.sub(left, ir.Constant(ir.IntType(64), first)))
+        zeros = ir.Constant(vector, [0.0] * LANES)
+        v.append(_masked_load(builder, place, kind.dtype.bitwidth // 8, some, zeros))
+    columns = []
+    for column in range(3):
+        wanted = range(column, 3 * LANES, 3)
+        two = shuffled(builder, v[0], v[1], [place % (2 * LANES) for place in wanted])
+        ends = [k if place < 2 * LANES else place - LANES for k, place in enumerate(wanted)]
+        columns.append(shuffled(builder, two, v[2], ends))
+    return context.make_tuple(builder, signature.return_type, columns)
+
+
+@lower_builtin(load_four_columns, types.Array, types.Integer, types.Integer)
+def _lower_load_four_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    places, real = _clamped_rows(context, builder, signature.args[0], values[0], signature.args[1], values[1])
+    column = context.cast(builder, values[2], signature.args[2], types.intp)
+    columns = _four_columns(builder, places, real, column)
+    return context.make_tuple(builder, signature.return_type, columns)
+
+
+@lower_builtin(load_columns, types.Array, types.Integer)
+def _lower_load_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    places, real = _clamped_rows(context, builder, signature.args[0], values[0], signature.args[1], values[1])
+    return context.make_tuple(builder, signature.return_type, _sixteen_columns(builder, places, real))
+
+
+def _clamped_rows(
+    context: Any, builder: Any, kind: Any, array: Any, row_kind: Any, first_row: Any
+) -> tuple[list[Any], ir.Type]:
+    """Pointers to 16 rows of an array [n, m], to the last one where there are no more; what they point to."""
+    array = context.make_array(kind)(context, builder, array)
+    count, width = (builder.extract_value(array.shape, axis) for axis in (0, 1))
+    last = builder.sub(count, ir.Constant(ir.IntType(64), 1))
+    first = context.cast(builder, first_row, row_kind, types.intp)
+    places = []
+    for k in range(LANES):
+        row = builder.add(first, ir.Constant(ir.IntType(64), k))
+        row = builder.select(builder.icmp_signed("<", row, last), row, last)
+        places.append(builder.gep(array.data, [builder.mul(row, width)]))
+    return places, context.get_data_type(kind.dtype)
+
+
+@lower_builtin(load_columns_of, types.Array, types.Array, types.Integer)
+def _lower_load_columns_of(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    kind, row_kind = signature.args[:2]
+    data = context.make_array(kind)(context, builder, values[0]).data
+    rows = context.make_array(row_kind)(context, builder, values[1])
+    start = context.cast(builder, values[2], signature.args[2], types.intp)
+    last = builder.sub(builder.extract_value(rows.shape, 0), ir.Constant(ir.IntType(64), 1))
+    places = []
+    for k in range(LANES):
+        entry = builder.add(start, ir.Constant(ir.IntType(64), k))
+        entry = builder.select(builder.icmp_signed("<", entry, last), entry, last)
+        row = context.cast(builder, builder.load(builder.gep(rows.data, [entry])), row_kind.dtype, types.intp)
+        places.append(builder.gep(data, [builder.mul(row, ir.Constant(ir.IntType(64), LANES))]))
+    real = context.get_data_type(kind.dtype)
+    return context.make_tuple(builder, signature.return_type, _sixteen_columns(builder, places, real))
+
+
+def _sixteen_columns(builder: Any, places: list[Any], real: ir.Type) -> list[Any]:
+    firsts = [ir.Constant(ir.IntType(64), first) for first in range(0, LANES, 4)]
+    return [column for first in firsts for column in _four_columns(builder, places, real, first)]
+
+
+def _four_columns(builder: Any, places: list[Any], real: ir.Type, first: Any) -> list[Any]:
+    """Columns `first` to `first` + 3 of the 16 rows that begin at `places`. Groups of four rows lie side by side, so
+    that only the four by four within a group are turned round."""
+    quarter, size = ir.VectorType(real, 4), 4 if real == ir.FloatType() else 8
+    pieces = []
+    for place in places:
+        piece = builder.gep(place, [first])
+        pieces.append(builder.load(builder.bitcast(piece, quarter.as_pointer()), align=size))
+    v = []
+    for k in range(4):
+        low, high = (shuffled(builder, pieces[k + j], pieces[k + j + 4], range(8)) for j in (0, 8))
+        v.append(shuffled(builder, low, high, range(16)))
+    low, high = ([lane for q in range(k, LANES, 4) for lane in (q, LANES + q, q + 1, LANES + q + 1)] for k in (0, 2))
+    v = [shuffled(builder, a, b, lanes) for lanes in (low, high) for a, b in (v[:2], v[2:])]
+    low, high = ([lane for q in range(k, LANES, 4) for lane in (q, q + 1, LANES + q, LANES + q + 1)] for k in (0, 2))
+    return [shuffled(builder, a, b, lanes) for a, b in (v[:2], v[2:]) for lanes in (low, high)]
+
+
+@lower_builtin(store_columns, types.Array, types.Integer, types.Integer, types.UniTuple)
+def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    kind = signature.args[0]
+    row, column = (
+        context.cast(builder, v, t, types.intp) for v, t in zip(values[1:3], signature.args[1:3], strict=True)
+    )
+    places, count, width = _rows(context, builder, kind, values[0], row, column)
+    rows = _transposed(builder, _filled_up(builder, values[3]))
+    some = _first(builder, width)
+    for k, (place, lanes) in enumerate(zip(places, rows, strict=True)):
+        with builder.if_then(builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)):
+            _masked_store(builder, place, kind.dtype.bitwidth // 8, some, lanes)
+    return context.get_dummy_value()
+
+
+typed(store_rows, lambda array, row, columns: _none_if(_is_array(array, 2)))
+
+
+@lower_builtin(store_rows, types.Array, types.Integer, types.UniTuple)
+def _lower_store_rows(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    kind = signature.args[0]
+    array = context.make_array(kind)(context, builder, values[0])
+    row = context.cast(builder, values[1], signature.args[1], types.intp)
+    place = builder.gep(array.data, [builder.mul(row, ir.Constant(ir.IntType(64), LANES))])
+    vector = ir.VectorType(context.get_data_type(kind.dtype), LANES).as_pointer()
+    for k, lanes in enumerate(_transposed(builder, _filled_up(builder, values[2]))):
+        there = builder.gep(place, [ir.Constant(ir.IntType(64), LANES * k)])
+        builder.store(lanes, builder.bitcast(there, vector), align=kind.dtype.bitwidth // 8)
+    return context.get_dummy_value()
+
+
+@type_callable(store_whole_numbers)
+def _type_store_whole_numbers(_context: Any) -> Callable:
+    kind = types.Array(types.uint16, 2, "C")
+    return lambda array, row, columns: types.none if array == kind and len(columns) == 4 else None
+
+
+@lower_builtin(store_whole_numbers, types.Array, types.Integer, types.UniTuple)
+def _lower_store_whole_numbers(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """A row is one number of 64 bits, its first column the lowest: what numba runs on stores those first."""
+    array = context.make_array(signature.args[0])(context, builder, values[0])
+    row = context.cast(builder, values[1], signature.args[1], types.intp)
+    half, whole = (ir.VectorType(ir.IntType(bits), LANES) for bits in (32, 64))
+    columns = [builder.zext(builder.fptosi(v, half), whole) for v in cgutils.unpack_tuple(builder, values[2])]
+    rows = columns[0]
+    for k, column in enumerate(columns[1:], start=1):
+        rows = builder.or_(rows, builder.shl(column, ir.Constant(whole, [16 * k] * LANES)))
+    place = builder.gep(array.data, [builder.mul(row, ir.Constant(ir.IntType(64), len(columns)))])
+    exists = _first(builder, builder.sub(builder.extract_value(array.shape, 0), row))
+    _masked_store(builder, builder.bitcast(place, whole.as_pointer()), 2, exists, rows)
+    return context.get_dummy_value()
+
+
+def store_square(array: np.ndarray, start: Index, stride: Index, lanes: Lanes) -> None:
+    """Write 4 × 4 numbers into an array [n]: 4 from `start`, the next 4 `stride` further, and so on."""
+    for row, numbers in enumerate(np.reshape(lanes, (4, 4))):
+        array[int(start) + row * int(stride) :][:4] = numbers
+
+
+def store_square_of_triples(array: np.ndarray, start: Index, stride: Index, a: Lanes, b: Lanes, c: Lanes) -> None:
+    """Write 4 × 4 triples (a, b, c) into an array [n], 4 of them from `start`, the next 4 `stride` further."""
+    for row, triples in enumerate(np.stack([a, b, c], axis=1).reshape(4, 12)):
+        array[int(start) + row * int(stride) :][:12] = triples
+
+
+typed(store_square, lambda array, start, stride, lanes: _none_if(_is_array(array, 1)))
+typed(store_square_of_triples, lambda array, start, stride, a, b, c: _none_if(_is_array(array, 1) and same(a, b, c)))
+
+
+def _store_pieces(
+    context: Any, builder: Any, signature: Any, values: Any, pieces: list[Any], write: Callable | None = None
+) -> Any:
+    """Write vectors into the array, the first argument, at the second, each the third further than the one before."""
+    kind = signature.args[0]
+    data = context.make_array(kind)(context, builder, values[0]).data
+    start, stride = (
+        context.cast(builder, v, t, types.intp) for v, t in zip(values[1:3], signature.args[1:3], strict=True)
+    )
+    for piece in pieces:
+        place = builder.bitcast(builder.gep(data, [start]), piece.type.as_pointer())
+        if write:
+            write(place, piece)
+        else:
+            builder.store(piece, place, align=kind.dtype.bitwidth // 8)
+        start = builder.add(start, stride)
+    return context.get_dummy_value()
+
+
+@lower_builtin(store_square, types.Array, types.Integer, types.Integer, LanesType)
+def _lower_store_square(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    lanes = values[3]
+    rows = [shuffled(builder, lanes, lanes, range(4 * row, 4 * row + 4)) for row in range(4)]
+    return _store_pieces(context, builder, signature, values, rows)
+
+
+@lower_builtin(store_square_of_triples, types.Array, types.Integer, types.Integer, LanesType, LanesType, LanesType)
+def _lower_store_square_of_triples(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    kind = signature.args[0]
+    mask = _first(builder, ir.Constant(ir.IntType(64), 12))
+    rows = []
+    for row in range(4):
+        wanted = [(pixel, channel) for pixel in range(4 * row, 4 * row + 4) for channel in range(3)]
+        # two sources a shuffle: first and second value, then those and the third; the last 4 lanes are not written
+        two = [channel * LANES + pixel if channel < 2 else 0 for pixel, channel in wanted]
+        three = [place if channel < 2 else LANES + pixel for place, (pixel, channel) in enumerate(wanted)]
+        some = shuffled(builder, values[3], values[4], [*two, 0, 0, 0, 0])
+        rows.append(shuffled(builder, some, values[5], [*three, 0, 0, 0, 0]))
+
+    def write(place: Any, row: Any) -> None:
+        _masked_store(builder, place, kind.dtype.bitwidth // 8, mask, row)
+
+    return _store_pieces(context, builder, signature, values, rows, write)
+
+
+def prefetch(array: np.ndarray, place: Index) -> None:
+    """Have the cache line of an element of an array [n] fetched meanwhile; nothing without the compiler."""
+
+
+typed(prefetch, lambda array, place: types.none)
+
+
+@lower_builtin(prefetch, types.Array, types.Integer)
+def _lower_prefetch(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    data = context.make_array(signature.args[0])(context, builder, values[0]).data
+    place = builder.gep(data, [context.cast(builder, values[1], signature.args[1], types.intp)])
+    byte = builder.bitcast(place, ir.IntType(8).as_pointer())
+    read, everywhere, data_cache = (ir.Constant(ir.IntType(32), value) for value in (0, 3, 1))
+    llvm(builder, "llvm.prefetch.p0", ir.VoidType(), byte, read, everywhere, data_cache)
+    return context.get_dummy_value()
