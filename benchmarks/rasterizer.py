@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import platform
 import sys
 import tempfile
@@ -31,6 +30,7 @@ from benchmarks.splat_scenes import around, object_camera, object_scene
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera
 from msdgs_serve.threads import thread_count
+from msdgs_train.files import write_text
 
 KNOB_COUNT, OTHERS_COUNTS, SQUARE = 100_000, (100_000, 300_000), "800x800"
 
@@ -251,14 +251,6 @@ def cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def write_whole(path: Path, text: str) -> None:
-    """A file that is there is replaced at once, or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    os.replace(part, path)
-
-
 def main(options: Benchmark) -> int:
     """Measure, print, write."""
     console = Console(highlight=False)
@@ -272,7 +264,8 @@ def main(options: Benchmark) -> int:
             stopped = True
     print_tables(run.result, console)
     if options.json:
-        write_whole(options.json, json.dumps(run.result, indent=1) + "\n")
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        write_text(options.json, json.dumps(run.result, indent=1) + "\n")
     if options.plot and "frames" in run.result:
         draw_plot(run.result, options.plot)
     if stopped:

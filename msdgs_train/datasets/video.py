@@ -11,7 +11,6 @@ training runs: 1.2 GB for 300 frames of 1352×1014. Their names hang on the vide
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from msdgs_train.datasets.scene_data import DatasetInvalid, Frame
+from msdgs_train.files import replacing
 
 
 class VideoInfo(NamedTuple):
@@ -102,13 +102,8 @@ def _cache_file(video: Path, wanted: VideoInfo) -> Path:
 def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.stem}.", suffix=".tmp")
-        try:
-            with os.fdopen(handle, "wb") as output:
-                _write(output, video, wanted)
-            os.replace(name, file)
-        finally:
-            Path(name).unlink(missing_ok=True)
+        with replacing(file) as temporary, temporary.open("wb") as output:
+            _write(output, video, wanted)
     except OSError as error:
         gigabytes = 3e-9 * wanted.count * wanted.width * wanted.height
         raise _invalid(
