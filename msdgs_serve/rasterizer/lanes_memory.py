@@ -1,6 +1,7 @@
 """`Lanes` from memory and back: rows of arrays become columns on the way, and columns rows.
 
-As in `lanes.py` the body of each function is what it does without the compiler.
+As in `lanes.py` the body of each function is what it does without the compiler. Rows of 3 and 4 numbers have loads of
+their own: with masked ones of 16 columns for any width projecting takes 1.2 to 1.5 times as long.
 """
 
 from collections.abc import Callable
