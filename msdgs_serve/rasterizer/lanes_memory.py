@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import lower_builtin, type_callable
+from numba.extending import lower_builtin
 
 from msdgs_serve.rasterizer.lane_types import (
     FREEDOMS,
@@ -261,14 +261,16 @@ def _clamped_rows(
     """Pointers to 16 rows of an array [n, m], to the last one where there are no more; what they point to."""
     array = context.make_array(kind)(context, builder, array)
     count, width = (builder.extract_value(array.shape, axis) for axis in (0, 1))
-    last = builder.sub(count, ir.Constant(ir.IntType(64), 1))
-    first = context.cast(builder, first_row, row_kind, types.intp)
-    places = []
-    for k in range(LANES):
-        row = builder.add(first, ir.Constant(ir.IntType(64), k))
-        row = builder.select(builder.icmp_signed("<", row, last), row, last)
-        places.append(builder.gep(array.data, [builder.mul(row, width)]))
+    rows = _up_to_last(builder, context.cast(builder, first_row, row_kind, types.intp), count)
+    places = [builder.gep(array.data, [builder.mul(row, width)]) for row in rows]
     return places, context.get_data_type(kind.dtype)
+
+
+def _up_to_last(builder: Any, start: Any, count: Any) -> list[Any]:
+    """16 numbers from `start`, i64; from `count` on the last below it again."""
+    last = builder.sub(count, ir.Constant(ir.IntType(64), 1))
+    numbers = [builder.add(start, ir.Constant(ir.IntType(64), k)) for k in range(LANES)]
+    return [builder.select(builder.icmp_signed("<", number, last), number, last) for number in numbers]
 
 
 @lower_builtin(load_columns_of, types.Array, types.Array, types.Integer)
@@ -277,11 +279,8 @@ def _lower_load_columns_of(context: Any, builder: Any, signature: Any, values: A
     data = context.make_array(kind)(context, builder, values[0]).data
     rows = context.make_array(row_kind)(context, builder, values[1])
     start = context.cast(builder, values[2], signature.args[2], types.intp)
-    last = builder.sub(builder.extract_value(rows.shape, 0), ir.Constant(ir.IntType(64), 1))
     places = []
-    for k in range(LANES):
-        entry = builder.add(start, ir.Constant(ir.IntType(64), k))
-        entry = builder.select(builder.icmp_signed("<", entry, last), entry, last)
+    for entry in _up_to_last(builder, start, builder.extract_value(rows.shape, 0)):
         row = context.cast(builder, builder.load(builder.gep(rows.data, [entry])), row_kind.dtype, types.intp)
         places.append(builder.gep(data, [builder.mul(row, ir.Constant(ir.IntType(64), LANES))]))
     real = context.get_data_type(kind.dtype)
@@ -342,10 +341,8 @@ def _lower_store_rows(context: Any, builder: Any, signature: Any, values: Any) -
     return context.get_dummy_value()
 
 
-@type_callable(store_whole_numbers)
-def _type_store_whole_numbers(_context: Any) -> Callable:
-    kind = types.Array(types.uint16, 2, "C")
-    return lambda array, row, columns: types.none if array == kind and len(columns) == 4 else None
+WHOLE_NUMBERS = types.Array(types.uint16, 2, "C")
+typed(store_whole_numbers, lambda array, row, columns: _none_if(array == WHOLE_NUMBERS and len(columns) == 4))
 
 
 @lower_builtin(store_whole_numbers, types.Array, types.Integer, types.UniTuple)

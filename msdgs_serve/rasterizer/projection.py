@@ -84,7 +84,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     gaussians = _kernel_arrays(gaussians)
     count, dtype = len(gaussians), gaussians.means.dtype
     view = view_of(camera, options)
-    records = empty_records(-(-count // LANES) * LANES, dtype)
+    records = empty_records(-(-count // LANES) * LANES, dtype)  # whole groups: stored without a look at the end
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
     ranges = ranges_of_lanes(count)
