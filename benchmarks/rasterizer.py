@@ -167,8 +167,8 @@ class Run:
             self.result["no_avx512"] = reason
             return
         with Comparison(subjects) as comparison:
-            for _ in self._turns("AVX-512", self.options.repeats):
-                comparison.draw_all()
+            for turn in self._turns("AVX-512", self.options.repeats):
+                comparison.draw_all(turn)
                 self.result["avx512"] = comparison.rows()
 
     def _time_others(self, pythons: dict[str, Path]) -> None:

@@ -44,12 +44,10 @@ def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
         _gather_rectangles,
         [(*part, order, splats.rectangles, rectangles, corners[k]) for k, part in enumerate(parts)],
     )
-    counts = np.zeros((columns * rows + 1, len(parts)), np.int64)
-    counts[1:] = corners.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(len(parts), -1).T
-    ends = counts.ravel().cumsum().reshape(counts.shape)
-    offsets = np.ascontiguousarray(ends[:, -1])
+    offsets = np.empty(columns * rows + 1, np.int64)
+    cursors = np.empty((len(parts), columns * rows), np.int64)
+    _place_parts(corners, offsets, cursors)
     splat_ids = np.empty(offsets[-1], np.uint32)
-    cursors = np.ascontiguousarray((ends - counts)[1:].T)
     run_parallel(
         _deal_out, [(*part, order, rectangles, cursors[k], columns, splat_ids) for k, part in enumerate(parts)]
     )
@@ -68,16 +66,16 @@ def sorted_by_depth(splats: Splats) -> np.ndarray:
         shift, buckets = np.uint64(first), 1 << (past - first)
         counts = np.zeros((len(parts), buckets), np.int64)
         run(_count_digits, [(*part, keys, base, shift, counts[j]) for j, part in enumerate(parts)])
-        ends = counts.T.ravel().cumsum().reshape(buckets, -1)
-        cursors = np.ascontiguousarray(ends.T - counts)
+        _to_cursors(counts)
         out = np.empty(count, np.uint32 if k == passes - 1 else np.uint64)  # in the end without the depths
-        run(_scatter_by_digit, [(*part, keys, base, shift, cursors[j], out) for j, part in enumerate(parts)])
+        run(_scatter_by_digit, [(*part, keys, base, shift, counts[j], out) for j, part in enumerate(parts)])
         keys, parts = out, _parts(count)
     return keys
 
 
 def _parts(count: int) -> list[tuple[int, int]]:
-    return split_evenly(count, min(threads_to_use(), 1 + count // SPLATS_A_PART)) or [(0, 0)]
+    most = 1 + count // SPLATS_A_PART
+    return split_evenly(count, min(threads_to_use(), most) if most > 1 else 1) or [(0, 0)]
 
 
 @kernel
@@ -91,6 +89,17 @@ def _count_digits(
 ) -> None:
     for k in range(np.uint64(start), np.uint64(stop)):
         counts[_digit(keys[k], base, shift, len(counts))] += 1
+
+
+@kernel
+def _to_cursors(counts: np.ndarray) -> None:
+    """In place of how many numbers a part [P] has of each digit [D], where it writes the first of them."""
+    start = np.int64(0)
+    for digit in range(np.uint64(counts.shape[1])):
+        for part in range(np.uint64(counts.shape[0])):
+            count = counts[part, digit]
+            counts[part, digit] = start
+            start += count
 
 
 @kernel
@@ -125,6 +134,26 @@ def _gather_rectangles(
         corners[top, right] -= 1
         corners[bottom, left] -= 1
         corners[bottom, right] += 1
+
+
+@kernel
+def _place_parts(corners: np.ndarray, offsets: np.ndarray, cursors: np.ndarray) -> None:
+    """Where each part [P] writes its first splat of each tile, and where tiles begin, from second differences of the
+    parts' counts [P, rows + 1, columns + 1], which become sums along each row."""
+    parts, rows, columns = np.uint64(corners.shape[0]), corners.shape[1] - 1, corners.shape[2] - 1
+    above = np.zeros((corners.shape[0], columns), np.int32)
+    start, tile = np.int64(0), np.uint64(0)
+    offsets[0] = 0
+    for row in range(np.uint64(rows)):
+        for column in range(np.uint64(columns)):
+            for part in range(parts):
+                if column > np.uint64(0):
+                    corners[part, row, column] += corners[part, row, column - np.uint64(1)]
+                above[part, column] += corners[part, row, column]
+                cursors[part, tile] = start
+                start += above[part, column]
+            tile += np.uint64(1)
+            offsets[tile] = start
 
 
 @kernel

@@ -98,5 +98,5 @@ def _check(options: RasterizerOptions) -> None:
         "transmittance_min": (0 <= options.transmittance_min < 1, "in [0, 1)"),
     }
     for name, (holds, expected) in bounds.items():
-        if not holds or not np.isfinite(getattr(options, name)):
+        if not holds or not math.isfinite(getattr(options, name)):
             raise InvalidInput(f"options.{name}", expected, getattr(options, name))
