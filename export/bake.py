@@ -9,6 +9,7 @@ from msdgs_serve import __version__
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.gaussians import FloatArray
+from msdgs_train.basis_layer import BasisLayer
 from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.layers import MLPLayer
 from msdgs_train.model import DynamicGaussians, unit_quats
@@ -22,7 +23,7 @@ class ModelNotExportable(MsdgsError):
     """A model has values or parts that a scene file can't hold."""
 
 
-Layer = MLPLayer | PlaneLayer
+Layer = MLPLayer | PlaneLayer | BasisLayer
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Moving:
     scale_modulation: FloatArray | None  # [M, 3] factors of equation 12; None where the model has none
     mean_modulation: FloatArray | None = None  # [M, 3]
     quat_modulation: FloatArray | None = None  # [M, 4]
+    basis_weights: FloatArray | None = None  # [M, B] of shared motions, rows sum to 1; None where there are none
 
     def __len__(self) -> int:
         return len(self.means)
@@ -85,6 +87,7 @@ def _moving(model: DynamicGaussians) -> Moving:
         scale_modulation=factors["scales"],
         mean_modulation=factors["means"],
         quat_modulation=factors["quats"],
+        basis_weights=None if g.basis_logits is None else _array(g.basis_logits.softmax(dim=1)),
     )
 
 

@@ -41,12 +41,18 @@ class TrainConfig:
     """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
     half_extent: float | None = None
     """Half the side of that cube in scene units; what the dataset suggests if not given."""
-    warmup_fraction: float = 0.03
-    """The first part of the run is trained without deformation, so that it starts from a blurred static scene."""
+    warmup_fraction: float = 0.05
+    """The first part of the run is trained on all photographs without deformation: what stands still is in place."""
+    sown_fraction: float = 0.25
+    """After that, Gaussians are added at random, this part of `max_gaussians`: where something only passes, none are
+    left. Until then there are at most `max_gaussians` less twice as many."""
+    settling_fraction: float = 0.025
+    """The next part of the run is still without deformation, but on photographs of the middle of the scene's time, in
+    which what moves takes shape."""
     window_start: float = 0.03
-    """Training begins with photographs of the middle of the scene's time, up to this part of it away on either side.
-    What moves is sharp there, and is then followed outwards, photograph by photograph."""
-    window_until_fraction: float = 0.5
+    """These are up to this part of the scene's time away from its middle. What moves is sharp there, and is then
+    followed outwards, photograph by photograph."""
+    window_until_fraction: float = 0.75
     """The part of the run after which all times take part; 0: they do from the start."""
     sh_interval: int = 2000
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
@@ -70,6 +76,15 @@ class TrainConfig:
     field_rate_start: float = 2e-3
     """Learning rate of the deformation layers."""
     field_rate_end: float = 2e-5
+    """At the last step."""
+    bases_rate_start: float = 6e-4
+    """Learning rate of shared motions, their shifts and turns alike; as long as all times don't take part it stays, and
+    is four times as much where photographs teach motion alone."""
+    bases_rate_end: float = 6e-5
+    """At the last step."""
+    basis_logits_rate_start: float = 2e-2
+    """Learning rate of how much each Gaussian follows each motion; it stays and falls as that of the motions."""
+    basis_logits_rate_end: float = 2e-3
     """At the last step."""
     grids_rate_start: float = 1e-2
     """Learning rate of the grids of plane layers; it falls as that of the other parts of the layers."""
@@ -131,12 +146,13 @@ class TrainConfig:
             self._require(name, "a whole number above 0", lambda v: v >= 1)
         for name in ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed"):
             self._require(name, "0 or above", lambda v: v >= 0)
-        parts = ("warmup_fraction", "window_until_fraction", "densify_until_fraction")
+        parts = ("warmup_fraction", "settling_fraction", "window_until_fraction", "densify_until_fraction")
         for name in ("l1_weight", "prune_opacity", *parts):
             self._require(name, "in [0, 1]", lambda v: 0 <= v <= 1)
         for item in dataclasses.fields(self):
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
+        self._require("sown_fraction", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         more = (
             "plane_space_bends_weight",
@@ -162,8 +178,22 @@ class TrainConfig:
 
     @property
     def warmup_steps(self) -> int:
-        """Steps before the deformation takes part."""
+        """Steps on all photographs, without deformation."""
         return round(self.warmup_fraction * self.steps)
+
+    @property
+    def still_steps(self) -> int:
+        """Steps before the deformation takes part."""
+        return round((self.warmup_fraction + self.settling_fraction) * self.steps)
+
+    @property
+    def sown(self) -> int:
+        """Gaussians that are added at random after the warm-up."""
+        return int(self.sown_fraction * self.max_gaussians) if self.warmup_steps else 0
+
+    def most_gaussians(self, step: int) -> int:
+        """How many there may be after this step, counted from 1."""
+        return self.max_gaussians - 2 * self.sown if step <= self.warmup_steps else self.max_gaussians
 
     @property
     def densify_until(self) -> int:

@@ -76,7 +76,7 @@ class DensityControl:
         """Clone small and split large Gaussians under strong gradients, remove faint and huge ones, start anew."""
         with torch.no_grad():
             pruned = self._to_prune(gaussians, step)
-            chosen = self._to_densify(pruned)
+            chosen = self._to_densify(pruned, step)
             large = gaussians.log_scales.exp().amax(dim=1) > self.config.split_scale * self.extent
             cloned, split = (torch.nonzero(m)[:, 0] for m in (chosen & ~large, chosen & large))
             halves = self._halves(gaussians, split.repeat(2))
@@ -103,11 +103,11 @@ class DensityControl:
             return torch.zeros_like(pruned)
         return pruned
 
-    def _to_densify(self, pruned: Tensor) -> Tensor:
-        """[N] bool: strong gradients, the strongest first while there is room under `max_gaussians`."""
+    def _to_densify(self, pruned: Tensor, step: int) -> Tensor:
+        """[N] bool: strong gradients, the strongest first while there is room."""
         mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
         chosen = mean >= self.config.densify_gradient
-        room = self.config.max_gaussians - int((~pruned).sum())
+        room = self.config.most_gaussians(step) - int((~pruned).sum())
         if int(chosen.sum()) > room:
             strongest = torch.sort(mean, descending=True, stable=True).indices[: max(room, 0)]
             chosen = torch.zeros_like(chosen).index_fill_(0, strongest, True)

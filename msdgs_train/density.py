@@ -1,4 +1,4 @@
-"""What a strategy of density control is to the trainer, and which one the settings ask for."""
+"""What a strategy of density control is to the trainer, which one the settings ask for, and Gaussians to begin with."""
 
 from typing import Protocol
 
@@ -8,7 +8,11 @@ from torch import Tensor
 from msdgs_train.config import TrainConfig
 from msdgs_train.densification import DensityControl
 from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.optimizers import replace_rows
 from msdgs_train.relocation import Relocation
+
+SOWING_SEED = 7
+"""Added to that of the settings: not the very places at which training began."""
 
 
 class DensityStrategy(Protocol):
@@ -21,6 +25,10 @@ class DensityStrategy(Protocol):
 
     def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Hear of one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
+        ...
+
+    def forget(self, count: int) -> None:
+        """Drop what was gathered; there are `count` Gaussians now."""
         ...
 
     def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
@@ -41,3 +49,18 @@ def start_density_control(config: TrainConfig, extent: float, count: int) -> Den
     if config.densify_strategy == "mcmc":
         return Relocation.start(config)
     return DensityControl.start(config, extent, count)
+
+
+@torch.no_grad()
+def sow(
+    gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, config: TrainConfig, half_extent: float
+) -> None:
+    """Add `config.sown` faint Gaussians, or as many as there is room for, anywhere in [-half_extent, half_extent]³."""
+    model, count = config.model, min(config.sown, config.max_gaussians - len(gaussians))
+    if count <= 0:
+        return
+    new = CanonicalGaussians.random_in_cube(
+        count, half_extent, model.sh_degree, model.embedding_size, config.seed + SOWING_SEED, model.motions
+    )
+    kept = torch.arange(len(gaussians))
+    replace_rows(optimizer, gaussians, kept, {name: values.detach() for name, values in new.named_parameters()})

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.scene.errors import InvalidInput
@@ -19,6 +20,8 @@ RADIUS = 5  # of the window, 11 pixels wide
 SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
+ELSEWHERE = 0.25
+"""Mean difference of a pixel's colours where something has moved away, or come."""
 
 
 def _gaussian_window() -> np.ndarray:
@@ -43,6 +46,14 @@ def photometric_loss(rgb: Tensor, truth: Tensor, l1_weight: float) -> Tensor:
     if l1_weight == 1.0:
         return l1
     return l1_weight * l1 + (1 - l1_weight) * (1 - ssim(rgb, truth))
+
+
+def still_loss(rgb: Tensor, truth: Tensor, l1_weight: float) -> Tensor:
+    """λ L1 where two pictures, [H, W, 3], show the same: none of the pixels two apart is off by `ELSEWHERE` or more."""
+    _check_pair(rgb, truth)
+    off = (rgb - truth).abs()
+    worst = max_pool2d(off.detach().mean(dim=2)[None], kernel_size=5, stride=1, padding=2)[0]
+    return l1_weight * (off * (worst < ELSEWHERE)[:, :, None]).mean()
 
 
 def ssim(rgb: Tensor, truth: Tensor) -> Tensor:

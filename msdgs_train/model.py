@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
+from msdgs_train.basis_layer import BasisLayer, Carried
 from msdgs_train.deformation import Deltas, MultiStepDeformation
-from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.gaussians import CanonicalGaussians, StoredGaussians
 from msdgs_train.layers import MLPLayer
 from msdgs_train.model_config import LayerKind, ModelConfig
 from msdgs_train.modulation import Factors, Modulation
@@ -61,6 +62,11 @@ class DynamicGaussians(nn.Module):
         layers = [layer for layer in self.deformation.layers if isinstance(layer, PlaneLayer)]
         return [grid for layer in layers for grid in layer.plane_grids()]
 
+    @property
+    def bases(self) -> BasisLayer | None:
+        """The layer of shared motions, if there is one."""
+        return next((layer for layer in self.deformation.layers if isinstance(layer, BasisLayer)), None)
+
     def pose(
         self,
         t: float | Tensor,
@@ -81,7 +87,8 @@ class DynamicGaussians(nn.Module):
         if not (deform and len(self.deformation) and steps != 0):
             return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)
         time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
-        deltas = self.deformation(means.detach() if self.config.detach_means else means, time, steps)
+        places = means.detach() if self.config.detach_means else means
+        deltas = self.deformation(places, time, steps, carried(g))
         deltas = self._modulated(deltas, g.embeddings)
         if deltas.opacities is not None:
             raw_opacities = raw_opacities + deltas.opacities
@@ -108,12 +115,20 @@ class DynamicGaussians(nn.Module):
         return (activated_scales(log_scales) + deltas).clamp_min(SMALLEST_SCALE)
 
 
+def carried(gaussians: CanonicalGaussians | StoredGaussians) -> Carried | None:
+    """Gaussians as a layer of kind `bases` wants them, None where there is none."""
+    logits = gaussians.basis_logits
+    return None if logits is None else Carried(gaussians.means, unit_quats(gaussians.raw_quats), logits.softmax(dim=1))
+
+
 def activated_scales(log_scales: Tensor) -> Tensor:
     """Standard deviations of their logarithms, within e^±20."""
     return log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
 
 
-def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer | PlaneLayer:
+def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer | PlaneLayer | BasisLayer:
+    if kind == "bases":
+        return BasisLayer(config.basis_count, config.basis_knots, domain.time_range)
     if kind == "mlp":
         return MLPLayer(
             config.width,
@@ -153,6 +168,7 @@ def _check_shapes(config: ModelConfig, gaussians: CanonicalGaussians) -> None:
         "sh_dc": (n, 1, 3),
         "sh_rest": (n, sh_coefficients(config.sh_degree) - 1, 3),
         "embeddings": (n, config.embedding_size) if config.embedding_size else None,
+        "basis_logits": (n, config.motions) if config.motions else None,
     }
     for name, shape in expected.items():
         tensor = getattr(gaussians, name)

@@ -7,7 +7,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.heads import Heads
 
-LayerKind = Literal["mlp", "plane"]
+LayerKind = Literal["mlp", "plane", "bases"]
 ModulationTarget = Literal["means", "scales", "quats"]
 DeltaSpace = Literal["raw", "activated"]
 LEAST = {
@@ -19,6 +19,8 @@ LEAST = {
     "plane_space_nodes": 2,
     "plane_time_nodes": 2,
     "plane_width": 1,
+    "basis_count": 1,
+    "basis_knots": 1,
 }
 """The smallest sizes that make sense; the others may be 0."""
 
@@ -45,6 +47,10 @@ class ModelConfig:
     plane_width: int = 32
     plane_scales: tuple[int, ...] = (1,)
     """Grids a layer, with so many times `plane_space_nodes`; their features are put side by side. 4DGS has 1 2."""
+    basis_count: int = 128
+    """Motions of a layer of kind `bases`, each of which many Gaussians follow. Such a layer is the first."""
+    basis_knots: int = 60
+    """Of their splines, over the time range of the scene."""
     weights: bool = True
     """Each layer predicts how much its step counts (equation 8); without, all steps count in full."""
     embedding_size: int = 32
@@ -78,6 +84,8 @@ class ModelConfig:
             raise InvalidInput("model.plane_scales", "one grid or more", self.plane_scales)
         if self.skip >= self.depth:
             raise InvalidInput("model.skip", f"fewer than the {self.depth} hidden layers of `depth`", self.skip)
+        if "bases" in self.layers[1:]:
+            raise InvalidInput("model.layers", "with `bases`, which moves canonical Gaussians, first", self.layers)
         if self.delta_space not in get_args(DeltaSpace):
             raise InvalidInput("model.delta_space", f"one of {list(get_args(DeltaSpace))}", self.delta_space)
 
@@ -91,6 +99,11 @@ class ModelConfig:
         for value in values:
             if not (type(value) is int and value > 0 if known is None else value in known):
                 raise InvalidInput(f"model.{name}", expected, value)
+
+    @property
+    def motions(self) -> int:
+        """Weights of shared motions that each Gaussian has."""
+        return self.basis_count if "bases" in self.layers else 0
 
     @property
     def heads(self) -> Heads:

@@ -33,8 +33,10 @@ _DECAYING_RATES = {
     "modulation": "modulation",
     "deformation": "field",
     "grids": "grids",
+    "bases": "bases",
+    "basis_logits": "basis_logits",
 }
-_HELD_RATES = ("field", "grids")  # as they begin until all times take part
+_HELD_RATES = ("field", "grids", "bases", "basis_logits")  # as they begin until all times take part
 
 
 def exponential(start: float, end: float, step: float, steps: float) -> float:
@@ -56,8 +58,9 @@ def make_optimizer(model: DynamicGaussians, config: TrainConfig) -> torch.optim.
     """One Adam; a group for each attribute of the Gaussians, one for the deformation, one for the modulation."""
     named: dict[str, list[nn.Parameter]] = {name: [p] for name, p in model.gaussians.named_parameters()}
     named["grids"] = [planes for grid in model.plane_grids() for planes in (grid.space, grid.time)]
-    grids = {id(planes) for planes in named["grids"]}
-    named["deformation"] = [p for p in model.deformation.parameters() if id(p) not in grids]
+    named["bases"] = list(model.bases.parameters()) if model.bases is not None else []
+    own = {id(p) for name in ("grids", "bases") for p in named[name]}
+    named["deformation"] = [p for p in model.deformation.parameters() if id(p) not in own]
     if model.modulation is not None:
         named["modulation"] = list(model.modulation.parameters())
     rates = learning_rates(config, 0)

@@ -72,6 +72,13 @@ PRESETS: dict[str, TrainConfig] = {
         plane_space_bends_weight=1e-4 * _4DGS_PLANES,
         plane_time_l1_weight=1e-4 * _4DGS_PLANES,
     ),
+    "msdgs-bases": TrainConfig(
+        model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
+        steps=60_000,
+        max_gaussians=18_000,
+        densify_gradient=8e-4,
+        densify_until_fraction=0.75,
+    ),
     "static": TrainConfig(
         model=replace(TrainConfig().model, layers=(), embedding_size=0),
         warmup_fraction=0.0,

@@ -48,6 +48,9 @@ class Relocation:
     def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Gradients don't matter here."""
 
+    def forget(self, count: int) -> None:
+        """Nothing was gathered."""
+
     def state(self) -> tuple[Tensor, ...]:
         """Nothing but the generator."""
         return ()
@@ -58,17 +61,17 @@ class Relocation:
     def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
         """A round where one is due; and the faint wander by a part of the learning rate of the means."""
         if self.config.densifies_after(step):
-            self.relocate(gaussians, optimizer)
+            self.relocate(gaussians, optimizer, step)
         rate = next(group["lr"] for group in optimizer.param_groups if group["name"] == "means")
         self.wander(gaussians, rate)
 
     @torch.no_grad()
-    def relocate(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer) -> Relocated:
+    def relocate(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> Relocated:
         """Put the faint, and what the budget has room for, beside others, drawn by their opacity."""
         opacities = gaussians.raw_opacities.double().sigmoid()
         alive = torch.nonzero(opacities > self.config.prune_opacity)[:, 0]
         count = len(opacities)
-        added = max(0, min(self.config.max_gaussians, int(GROWTH * count)) - count)
+        added = max(0, min(self.config.most_gaussians(step), int(GROWTH * count)) - count)
         moved = count - len(alive)
         if moved + added == 0 or len(alive) == 0:  # a scene that has faded altogether may recover
             return Relocated(0, 0)

@@ -15,13 +15,14 @@ from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.threads import sharing_cores
 from msdgs_train import checkpoint
 from msdgs_train.config import TrainConfig
+from msdgs_train.curriculum import Curriculum, Lesson
 from msdgs_train.datasets import Frame, SceneData, composite
-from msdgs_train.density import start_density_control
+from msdgs_train.density import sow, start_density_control
 from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.losses import photometric_loss
+from msdgs_train.losses import photometric_loss, still_loss
 from msdgs_train.metrics import Quality, mean_quality, psnr_from_mse, quality
 from msdgs_train.model import SMALLEST_SCALE, Domain, DynamicGaussians, PosedGaussians
-from msdgs_train.optimizers import learning_rates, make_optimizer, set_learning_rates
+from msdgs_train.optimizers import learning_rates, make_optimizer, replace_values, set_learning_rates
 from msdgs_train.rasterization import RasterizationInfo, rasterize
 from msdgs_train.rigidity import stretch
 
@@ -32,7 +33,7 @@ MAX_FIELD_GRADIENT = 1.0  # norm; 0.05 to 0.6 is usual
 SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 50 steps
 BOUNDS_TIMES = 9
 KEPT_PHOTOGRAPHS = 2 << 30  # bytes
-OUTERMOST = 0.8  # of the time window: from there on a photograph counts as new
+AHEAD = 8.0  # times the way of motions, where only they learn: what is fast has far to go before the next photograph
 VISIBLE_OPACITY = 0.05
 OUTSIDE_BOUNDS = 0.01
 
@@ -55,7 +56,7 @@ class StepResult(NamedTuple):
 class _Shot(NamedTuple):
     """What one photograph has to say about the model."""
 
-    frame: Frame
+    lesson: Lesson
     loss: float
     squared_error: float
     gradients: tuple[Tensor | None, ...]  # of the model's parameters, in their order
@@ -86,8 +87,7 @@ class Trainer:
         self._skipped_in_a_row = 0
         self._averages: tuple[float, float] | None = None  # loss, squared error
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._order = torch.empty(0, dtype=torch.int64)
-        self._distances = _distances_from_middle(scene.time_range, self.frames)
+        self._curriculum = Curriculum(config, self.frames, scene.time_range)
         self._half_extent = config.half_extent or scene.half_extent
         self.model = _new_model(config, scene, Domain(self._half_extent, scene.time_range))
         self.optimizer = make_optimizer(self.model, config)
@@ -96,21 +96,23 @@ class Trainer:
 
     def step(self) -> StepResult:
         """Render the next photographs' views, pull the model towards them, and control density."""
-        self._widen_window()
+        self._prepare()
         set_learning_rates(self.optimizer, self._learning_rates())
         shots = self._shots()
         self._set_gradients(shots)
         loss = sum(shot.loss for shot in shots) / len(shots)
         self.step_count += 1
         if self._is_finite(loss):
-            if len(self.model.deformation):
-                # one outlier would stay in Adam's second moment, and slow the field down, for a thousand steps
-                clip_grad_norm_(self.model.deformation.parameters(), MAX_FIELD_GRADIENT)
-            self.optimizer.step()
-            self._average(loss, sum(shot.squared_error for shot in shots) / len(shots))
-            for shot in shots:
+            # one outlier would stay in Adam's second moment, and slow the field down, for a thousand steps
+            clip_grad_norm_(self._field_parameters(), MAX_FIELD_GRADIENT)
+            self._move(shots)
+            whole = [shot for shot in shots if shot.lesson.subject == "everything"]
+            if whole:
+                losses, errors = ([getattr(s, name) for s in whole] for name in ("loss", "squared_error"))
+                self._average(sum(losses) / len(whole), sum(errors) / len(whole))
+            for shot in whole:
                 if shot.info.means2d_grads is not None:
-                    camera = shot.frame.camera
+                    camera = shot.lesson.frame.camera
                     self.density.gather(shot.info.means2d_grads, shot.info.radii, camera.width, camera.height)
         self.density.after_step(self.model.gaussians, self.optimizer, self.step_count)
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
@@ -126,7 +128,11 @@ class Trainer:
     def _shots(self) -> list[_Shot]:
         """Render the next photographs' views and differentiate the loss of each, side by side."""
         drawn = [
-            (self._next_frame(), self._next_background(), _offspring(self._pairs_generator))
+            (
+                self._curriculum.next(self.step_count, self._generator),
+                self._next_background(),
+                _offspring(self._pairs_generator),
+            )
             for _ in range(self.config.photographs)
         ]
         if len(drawn) == 1:
@@ -139,14 +145,30 @@ class Trainer:
         return ThreadPoolExecutor(self.config.threads, "photograph", torch.set_num_threads, (1,))
 
     @sharing_cores()
-    def _shoot(self, frame: Frame, background: Tensor, pairs: torch.Generator) -> _Shot:
-        truth = self._photograph(frame, background)
-        posed = self._pose(frame.t)
-        rgb, _, info = rasterize(*posed, frame.camera, background)
-        loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed, pairs)
-        gradients = torch.autograd.grad(loss, self._parameters(), allow_unused=True)
+    def _shoot(self, lesson: Lesson, background: Tensor, pairs: torch.Generator) -> _Shot:
+        truth = self._photograph(lesson.frame, background)
+        posed = self._pose(lesson.t)
+        rgb, _, info = rasterize(*posed, lesson.frame.camera, background)
+        if lesson.subject == "stillness":
+            loss = still_loss(rgb, truth, self.config.l1_weight)
+        else:
+            loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed, pairs)
+        gradients = self._gradients(loss, lesson)
         squared_error = float((rgb.detach() - truth).square().mean())
-        return _Shot(frame, loss.item(), squared_error, gradients, info, self._floored(posed))
+        return _Shot(lesson, loss.item(), squared_error, gradients, info, self._floored(posed))
+
+    def _gradients(self, loss: Tensor, lesson: Lesson) -> tuple[Tensor | None, ...]:
+        """Of all parameters, in their order; None of those that the lesson doesn't teach."""
+        motion = {id(parameter) for parameter in self.model.deformation.parameters()}
+        if lesson.subject == "stillness" and self.model.gaussians.basis_logits is not None:
+            motion.add(id(self.model.gaussians.basis_logits))
+        taught = [
+            lesson.subject == "everything" or (id(p) in motion) == (lesson.subject == "motion")
+            for p in self._parameters()
+        ]
+        learning = [p for p, learns in zip(self._parameters(), taught, strict=True) if learns]
+        found = iter(torch.autograd.grad(loss, learning, allow_unused=True))
+        return tuple(next(found) if learns else None for learns in taught)
 
     def _set_gradients(self, shots: list[_Shot]) -> None:
         """The mean over the photographs, added up in their order, so that the same seed gives the same bits."""
@@ -180,7 +202,7 @@ class Trainer:
             "rollbacks": self.rollbacks,
             "averages": self._averages,
             "generators": [generator.get_state() for generator in self._generators],
-            "order": self._order,
+            "order": self._curriculum.order,
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state(),
@@ -194,7 +216,8 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self.optimizer = make_optimizer(self.model, self.config)
         self.optimizer.load_state_dict(state["optimizer"])
-        self.step_count, self._order, self._averages = state["step_count"], state["order"], state["averages"]
+        self.step_count, self._averages = state["step_count"], state["averages"]
+        self._curriculum.order = state["order"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self.rollbacks = state.get("rollbacks", 0)
         for generator, stored in zip(self._generators, state["generators"], strict=True):
@@ -212,7 +235,7 @@ class Trainer:
         self.skipped, self._skipped_in_a_row = diverged.skipped, 0
         self.rollbacks = diverged.rollbacks + 1
         self._generator.manual_seed(self.config.seed + ROLLBACK_SEED * self.rollbacks)
-        self._order = torch.empty(0, dtype=torch.int64)
+        self._curriculum.order = torch.empty(0, dtype=torch.int64)
 
     @property
     def rate_factor(self) -> float:
@@ -233,9 +256,29 @@ class Trainer:
     def _generators(self) -> tuple[torch.Generator, ...]:
         return self._generator, self.density.generator, self._pairs_generator
 
+    @torch.no_grad()
+    def _move(self, shots: list[_Shot]) -> None:
+        """A step of the optimiser; shared motions go `AHEAD` times as far at the times that teach motion alone."""
+        bases, ahead = self.model.bases, [shot.lesson.t for shot in shots if shot.lesson.subject == "motion"]
+        if bases is None or not ahead:
+            self.optimizer.step()
+            return
+        curves, read = list(bases.parameters()), torch.zeros(len(bases.shifts), dtype=torch.bool)
+        for t in ahead:
+            read[bases.knots_at(torch.tensor(t))[0]] = True
+        before = [curve[read] for curve in curves]
+        self.optimizer.step()
+        for curve, old in zip(curves, before, strict=True):
+            curve[read] = torch.lerp(old, curve[read], AHEAD)
+
     def _learning_rates(self) -> dict[str, float]:
         rates = learning_rates(self.config, self.step_count)
         return {group: self.rate_factor * rate for group, rate in rates.items()}
+
+    def _field_parameters(self) -> list[nn.Parameter]:
+        """Of layers that are networks or grids, where one weight serves many Gaussians at many times."""
+        bases = set() if self.model.bases is None else set(self.model.bases.parameters())
+        return [p for p in self.model.deformation.parameters() if p not in bases]
 
     def _floored(self, posed: PosedGaussians) -> int:
         if self.config.model.delta_space == "raw":
@@ -252,7 +295,7 @@ class Trainer:
         return self._deforms(), min(self.step_count // self.config.sh_interval, self.config.model.sh_degree)
 
     def _deforms(self) -> bool:
-        return self.step_count >= self.config.warmup_steps and len(self.model.deformation) > 0
+        return self.step_count >= self.config.still_steps and len(self.model.deformation) > 0
 
     def _priors(self, posed: PosedGaussians, pairs: torch.Generator) -> Tensor | float:
         """What is asked besides likeness to the photographs: few and small Gaussians, rigid motion, smooth grids."""
@@ -275,35 +318,20 @@ class Trainer:
                 total = total + weight * roughness() if weight else total
         return total
 
-    def _widen_window(self) -> None:
-        before, after = self._window(self.step_count - 1), self._window(self.step_count)
+    def _prepare(self) -> None:
+        """What is due before this step: sowing, placing motions, widening what layers know of time."""
+        step, gaussians = self.step_count, self.model.gaussians
+        if step == self.config.warmup_steps and self.config.sown and len(self.model.deformation):
+            sow(gaussians, self.optimizer, self.config, self._half_extent)
+            self.density.forget(len(gaussians))
+        bases = self.model.bases
+        if bases is not None and step == self.config.still_steps:
+            logits = bases.place(gaussians.means.detach(), gaussians.raw_opacities.detach().sigmoid())
+            replace_values(self.optimizer, gaussians, "basis_logits", logits)
+        before, after = (self._curriculum.window(k) for k in (step - 1, step))
         if before < after:
-            for grid in self.model.plane_grids():
-                grid.carry_outwards(before, after)
-
-    def _next_frame(self) -> Frame:
-        """From a shuffled pass over the photographs of the time window, one pass after the other.
-
-        While the window grows, half of a pass are its outermost photographs, over and over.
-        """
-        if not len(self._order):
-            window = self._window(self.step_count)
-            inside = torch.nonzero(self._distances <= window)[:, 0]
-            if window < 0.5:
-                outermost = inside[self._distances[inside] >= OUTERMOST * window]
-                inside = torch.cat([inside, outermost.repeat(len(inside) // max(len(outermost), 1))])
-            self._order = inside[torch.randperm(len(inside), generator=self._generator)]
-        chosen, self._order = self._order[0], self._order[1:]
-        return self.frames[int(chosen)]
-
-    def _window(self, step: int) -> float:
-        """How far from the middle of the scene's time photographs are taken in: 0.5 is all of it."""
-        c = self.config
-        if c.window_until_fraction == 0:
-            return 0.5
-        done = step / c.steps - c.warmup_fraction
-        growth = done / max(c.window_until_fraction - c.warmup_fraction, 1e-9)
-        return min(c.window_start + (0.5 - c.window_start) * max(growth, 0.0), 0.5)
+            for part in [*self.model.plane_grids(), *([bases] if bases is not None else [])]:
+                part.carry_outwards(before, after)
 
     def _next_background(self) -> Tensor:
         if self.config.background == "random":
@@ -374,18 +402,9 @@ def _offspring(generator: torch.Generator) -> torch.Generator:
     return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))
 
 
-def _distances_from_middle(time_range: tuple[float, float], frames: list[Frame]) -> Tensor:
-    """[F] in [0, 0.5], as parts of the time range; the nearest is set to 0 so that no window is empty."""
-    first, last = time_range
-    middle, length = (first + last) / 2, (last - first) or 1.0
-    distances = torch.tensor([min(abs(frame.t - middle) / length, 0.5) for frame in frames], dtype=torch.float64)
-    distances[distances.argmin()] = 0
-    return distances
-
-
 def _new_model(config: TrainConfig, scene: SceneData, domain: Domain) -> DynamicGaussians:
     sizes = config.model
-    rest = (sizes.sh_degree, sizes.embedding_size, config.seed)
+    rest = (sizes.sh_degree, sizes.embedding_size, config.seed, sizes.motions)
     if scene.points is not None and len(scene.points):
         points = (scene.points, scene.point_colors)
         gaussians = CanonicalGaussians.from_sparse_points(*points, config.init_count, *rest)

@@ -44,7 +44,9 @@ def small_config(**changes: Any) -> ModelConfig:
 def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config: Any) -> DynamicGaussians:
     """A model whose Gaussians and networks all differ from their start by normal noise."""
     settings = small_config(**config)
-    gaussians = CanonicalGaussians.random_in_cube(count, 1.3, settings.sh_degree, settings.embedding_size, seed)
+    gaussians = CanonicalGaussians.random_in_cube(
+        count, 1.3, settings.sh_degree, settings.embedding_size, seed, settings.motions
+    )
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(seed)
         model = DynamicGaussians(settings, gaussians)

@@ -61,6 +61,8 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
         (300, {"depth": 4, "skip": 3}, 300),
         (300, {"layers": ("plane", "plane"), "plane_scales": (1, 2), "plane_space_nodes": 6}, 300),
         (300, {"sh_degree": 0}, 300),
+        (300, {"layers": ("bases",), "basis_count": 12, "basis_knots": 5}, 300),
+        (300, {"layers": ("bases", "plane", "mlp"), "basis_count": 3, "embedding_size": 0}, 300),
         (300, {"layers": ()}, 0),
         (1, {}, 1),
         (1, {"layers": ()}, 0),

@@ -89,7 +89,7 @@ def setup(count: int = 100, **changes: Any) -> tuple[CanonicalGaussians, torch.o
 def test_the_faint_move_beside_others_and_share_with_them() -> None:
     gaussians, optimizer, control = setup()
     before = {name: p.detach().clone() for name, p in gaussians.named_parameters()}
-    assert control.relocate(gaussians, optimizer) == (10, 5)
+    assert control.relocate(gaussians, optimizer, 1_000) == (10, 5)
     assert len(gaussians) == 105
     places = {tuple(mean.tolist()): i for i, mean in enumerate(before["means"])}
     origins = torch.tensor([places[tuple(mean.tolist())] for mean in gaussians.means.detach()])
@@ -116,7 +116,7 @@ def test_opaque_ones_are_drawn_more_often() -> None:
         gaussians.raw_opacities[:900] = math.log(0.01 / 0.99)
         gaussians.raw_opacities[900:] = math.log(0.9 / 0.1)
     means = gaussians.means.detach()[900:].clone()
-    control.relocate(gaussians, optimizer)
+    control.relocate(gaussians, optimizer, 1_000)
     added = gaussians.means.detach()[1000:]
     assert len(added) == 50
     near_opaque = sum(bool((means == mean).all(dim=1).any()) for mean in added)
@@ -128,7 +128,7 @@ def test_never_more_than_the_budget_and_all_of_it_in_the_end(budget: int, rounds
     gaussians, optimizer, control = setup(max_gaussians=budget)
     counts = []
     for _ in range(rounds):
-        control.relocate(gaussians, optimizer)
+        control.relocate(gaussians, optimizer, 1_000)
         counts.append(len(gaussians))
     assert counts == sorted(counts)
     assert max(counts) <= budget
@@ -139,7 +139,7 @@ def test_a_scene_that_has_faded_is_left_alone() -> None:
     gaussians, optimizer, control = setup()
     with torch.no_grad():
         gaussians.raw_opacities.fill_(-9.0)
-    assert control.relocate(gaussians, optimizer) == (0, 0)
+    assert control.relocate(gaussians, optimizer, 1_000) == (0, 0)
     assert len(gaussians) == 100
 
 

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import torch
 
 from export.bake import Baked
+from msdgs_train.basis_layer import Carried
 from msdgs_train.deformation import MultiStepDeformation, operations
 from msdgs_train.model import SMALLEST_SCALE, activated_scales, unit_quats
 
@@ -27,6 +28,8 @@ class ExactPoses:
         self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
         factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
         self._factors = [None if f is None else _double(f) for f in factors]
+        weights = m.basis_weights
+        self._carried = None if weights is None else Carried(self._means, self._quats, _double(weights))
         self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
 
     @property
@@ -41,7 +44,8 @@ class ExactPoses:
     @torch.no_grad()
     def _posed(self, t: float, ids: torch.Tensor) -> Poses:
         means, log_scales = self._means[ids], self._log_scales[ids]
-        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64))
+        carried = self._carried.rows(ids) if self._carried else None
+        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64), carried=carried)
         of_means, of_scales, of_quats = (
             delta if factors is None else factors[ids] * delta  # equation 12
             for factors, delta in zip(self._factors, (deltas.means, deltas.scales, deltas.quats), strict=True)

@@ -5,11 +5,14 @@ import onnx
 import torch
 
 from export.bake import Baked, Layer, Moving
+from export.basis_graph import basis_deltas
 from export.graph import GraphBuilder, to_numpy
 from export.plane_graph import plane_heads
 from export.plans.scene_graph import finished, new_graph, unit_quats
+from msdgs_train.basis_layer import BasisLayer
 from msdgs_train.layers import MLPLayer
 from msdgs_train.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
+from msdgs_train.plane_layer import PlaneLayer
 
 DELTAS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
 """Columns of the heads, in the order of `Heads.sizes`, whose last column, if there is one, is the weight."""
@@ -38,7 +41,10 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...], delt
     for k, layer in enumerate(layers, start=1):
         name = f"layer{k}"
         share = _share(graph, name, steps, k)
-        step = _layer(graph, name, layer, moved, time, used, share)  # equation 7
+        if isinstance(layer, BasisLayer):
+            step = basis_deltas(graph, name, layer, moving.basis_weights, means, quats, time, used, share)
+        else:
+            step = _layer(graph, name, layer, moved, time, used, share)  # equation 7
         deltas = graph.node("Add", [deltas, step], f"{name}.deltas") if deltas else step  # equation 9
         parts = dict(zip(used, graph.split(deltas, [f"{name}.{part}" for part in used], sizes), strict=True))
         if k < len(layers) and "means" in parts:
@@ -58,12 +64,14 @@ def used_heads(layers: tuple[Layer, ...]) -> list[str]:
 
 
 def _changes(layer: Layer, columns: slice) -> bool:
+    if isinstance(layer, BasisLayer):
+        return columns != DELTAS["scales"]
     if isinstance(layer, MLPLayer):
         return bool(layer.heads.weight[columns].any() or layer.heads.bias[columns].any())
     return any(bool(p.any()) for p in layer.heads[list(DELTAS.values()).index(columns)].parameters())
 
 
-def _rows(layer: Layer, used: list[str]) -> np.ndarray:
+def _rows(layer: MLPLayer | PlaneLayer, used: list[str]) -> np.ndarray:
     """Columns of the heads' output that are computed."""
     deltas = [np.arange(10)[DELTAS[part]] for part in used]
     return np.concatenate([*deltas, [10]] if layer.outputs.weight else deltas)
@@ -102,7 +110,9 @@ def _share(graph: GraphBuilder, name: str, steps: str, k: int) -> str:
     return graph.node("Clip", [graph.node("Sub", [steps, before], f"{name}.steps"), *limits], f"{name}.share")
 
 
-def _layer(graph: GraphBuilder, name: str, layer: Layer, means: str, time: str, used: list[str], share: str) -> str:
+def _layer(
+    graph: GraphBuilder, name: str, layer: MLPLayer | PlaneLayer, means: str, time: str, used: list[str], share: str
+) -> str:
     """One layer at the means [M, 3]: the deltas of the heads that are used, times its share, and its weight if it
     predicts one."""
     rows = _rows(layer, used)

@@ -16,7 +16,7 @@ from export.precision.stability_report import FormatGap, Samples, StabilityRepor
 from export.verify import times_to_verify
 from msdgs_serve.scene.camera import Camera
 from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.model import DynamicGaussians, carried
 
 MAX_ERROR = 50.0
 """dB. Errors above it are invisible: the export's own default."""
@@ -97,8 +97,10 @@ class _Assessment:
         exact = pose_arrays(self.double, t, ids)
         poses = {name: pose_arrays(model, t, ids) for name, model in self.models.items()}
         errors = {name: largest_error(pose_errors(pose, exact, self.size)) for name, pose in poses.items()}
-        means = self.double.gaussians.means.detach()[torch.from_numpy(ids)]
-        found = growth(self.double.deformation, self.single.deformation, means, float(np.float32(t)))
+        with torch.no_grad():
+            rows = self.double.gaussians.rows(torch.from_numpy(ids))
+            followed = carried(rows)
+        found = growth(self.double.deformation, self.single.deformation, rows.means, float(np.float32(t)), followed)
         found = found._replace(predicted=found.predicted * self.mean_factors[ids])
         return _Moment(t, ids, found, exact, poses[FLOAT32.name]["means"], errors)
 

@@ -111,6 +111,8 @@ def _model(model: DynamicGaussians, network: Network, which: slice | torch.Tenso
     tensors["sh_rest"] = tensors["sh_rest"][:, : sh_coefficients(sh_degree) - 1]
     if not network.modulated:
         tensors.pop("embeddings", None)
+    if not any(model.config.layers[k] == "bases" for k in network.layers):
+        tensors.pop("basis_logits", None)
     layers = [model.deformation.layers[k] for k in network.layers]
     config = replace(
         model.config,

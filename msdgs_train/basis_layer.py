@@ -1,0 +1,162 @@
+"""One step of deformation by rigid motions that many Gaussians share: a time-free weight of each, splines over time.
+
+What moves as one does so by construction, and what is learned of one moment leaves the others as they are, where an
+MLP's weights serve all places and times. Motion bases are those of Shape of Motion (Wang et al. 2024), but on splines.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_train.layers import LayerStep
+
+OPAQUE = 0.3
+"""Opacity from which a Gaussian may be the pivot of a motion."""
+REACH = 0.5
+"""Standard deviation of a motion's first weights, in distances between pivots."""
+FOLLOWED = 8
+"""Motions nearest to a Gaussian, that it may ever follow: a file stores so many of its weights."""
+NEVER = -1e4
+"""Logit of the others: their weights are 0 in float64 too, and so are gradients."""
+LEAST_LOGIT = -12.0
+"""Of the others of these at first: little enough, and still enough of a gradient to come back."""
+LEAST_REACH = 1e-3  # scene units
+MOTION = 16
+"""Numbers of a motion at one time: a rotation matrix row by row, what is added to rotated means, a quaternion."""
+
+
+class Carried(NamedTuple):
+    """N canonical Gaussians as motions carry them."""
+
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4] wxyz, unit
+    basis_weights: Tensor  # [N, B] of each motion; rows sum to 1
+
+    def rows(self, ids: Tensor | slice) -> "Carried":
+        """Some of them."""
+        return Carried(*(tensor[ids] for tensor in self))
+
+
+class BasisLayer(nn.Module):
+    """B motions, each a shift and a turn about a pivot: cubic B-splines of evenly spread knots.
+
+    It moves canonical Gaussians, so it is the first of a chain. Gradients reach the means as they are turned, whatever
+    `detach_means` says, which is for layers that read means as places in a field.
+    """
+
+    kind = "bases"
+    pivots: Tensor
+    first_time: Tensor
+    time_knots: Tensor
+
+    def __init__(self, count: int = 128, knots: int = 60, time_range: tuple[float, float] = (0.0, 1.0)) -> None:
+        super().__init__()
+        first, last = time_range
+        self.shifts = nn.Parameter(torch.zeros(knots + 3, count, 3))  # scene units
+        self.turns = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(knots + 3, count, 1))  # wxyz, any length
+        self.register_buffer("pivots", torch.zeros(count, 3))
+        self.register_buffer("first_time", torch.tensor(first))
+        self.register_buffer("time_knots", torch.tensor(knots / ((last - first) or 1.0)))  # a unit of time
+
+    def forward(self, carried: Carried, t: Tensor) -> LayerStep:
+        """The step of N Gaussians at time `t`, a scalar tensor of the same dtype and device."""
+        means = carried.means
+        blended = carried.basis_weights @ self.motions(t)
+        matrices, offsets, turns = blended[:, :9].view(-1, 3, 3), blended[:, 9:12], blended[:, 12:]
+        moved = torch.einsum("nij,nj->ni", matrices, means) + offsets
+        turned = product(_unit(turns), carried.quats)
+        still = torch.zeros_like(means)
+        return LayerStep(moved - means, still, turned - carried.quats, means.new_ones(len(means), 1))
+
+    def motions(self, t: Tensor) -> Tensor:
+        """[B, MOTION] at time `t`."""
+        read, part = self.knots_at(t)
+        weights = cubic_weights(part)
+        shifts, turns = (torch.einsum("k,kbc->bc", weights, curve[read]) for curve in (self.shifts, self.turns))
+        turns = _unit(turns)
+        matrices = rotation_matrices(turns)
+        offsets = self.pivots + shifts - torch.einsum("bij,bj->bi", matrices, self.pivots)
+        return torch.cat([matrices.flatten(1), offsets, turns], dim=1)
+
+    def knots_at(self, t: Tensor) -> tuple[slice, Tensor]:
+        """The four knots that a time reads, and how far it is, in [0, 1], from the second to the third of them."""
+        knots = len(self.shifts) - 3
+        place = ((t - self.first_time) * self.time_knots).clamp(0, knots)
+        first = min(int(place), knots - 1)
+        return slice(first, first + 4), place - first
+
+    @torch.no_grad()
+    def place(self, means: Tensor, opacities: Tensor) -> Tensor:
+        """Put the pivots among opaque Gaussians, as far apart as can be; returns weights to begin with, [N, B] logits.
+
+        Args:
+            means: [N, 3].
+            opacities: [N] in (0, 1).
+        """
+        opaque = means[opacities > OPAQUE] if bool((opacities > OPAQUE).any()) else means
+        chosen = int((opaque - opaque.mean(dim=0)).norm(dim=1).argmin())
+        distances = torch.full((len(opaque),), torch.inf)
+        for k in range(len(self.pivots)):
+            self.pivots[k] = opaque[chosen]
+            distances = torch.minimum(distances, (opaque - opaque[chosen]).norm(dim=1))
+            chosen = int(distances.argmax())
+        reach = max(REACH * float(distances.max()), LEAST_REACH)
+        logits = -0.5 * (torch.cdist(means, self.pivots) / reach).square()
+        nearest = logits.topk(min(FOLLOWED, logits.shape[1]), dim=1)
+        near = (nearest.values - nearest.values[:, :1]).clamp_min(LEAST_LOGIT)
+        return torch.full_like(logits, NEVER).scatter_(1, nearest.indices, near)
+
+    @torch.no_grad()
+    def carry_outwards(self, before: float, after: float) -> None:
+        """Go on with what is known when training's time window, around the middle of the range, widens from half a
+        width of `before` to `after`, parts of the range.
+
+        Beyond it motions stay where they are and turn on as they turn: a turn has inertia, and what falls will bounce;
+        were it expected to fall on, it would be lost under the ground.
+        """
+        knots = len(self.shifts) - 3
+        known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
+        for last, outwards in ((known[0], -1), (known[-1], 1)):
+            turn, inner = (_unit(self.turns[k]) for k in (last, last - outwards))
+            step = product(turn, inner * turn.new_tensor([1.0, -1.0, -1.0, -1.0]))
+            for k in range(last + outwards, knots + 3 if outwards > 0 else -1, outwards):
+                if abs(k - last) <= 3:  # as many as a time within the window reads
+                    turn = _unit(product(step, turn))
+                self.shifts[k], self.turns[k] = self.shifts[last], turn
+
+    def bends(self) -> Tensor:
+        """Mean size of second differences along time."""
+        return self.shifts.diff(n=2, dim=0).abs().mean() + self.turns.diff(n=2, dim=0).abs().mean()
+
+    def extra_repr(self) -> str:
+        return f"{sum(p.numel() for p in self.parameters()):,} parameters"
+
+
+def cubic_weights(part: Tensor) -> Tensor:
+    """[4] of the knots around a time, `part` of the way from the second to the third: a uniform cubic B-spline."""
+    u, v = part, 1 - part
+    return torch.stack([v**3, 3 * u**3 - 6 * u**2 + 4, 3 * v**3 - 6 * v**2 + 4, u**3]) / 6
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton products of quaternions [N, 4], wxyz: first b turns, then a."""
+    (aw, av), (bw, bv) = (q.split((1, 3), dim=1) for q in (a, b))
+    vector = aw * bv + bw * av + torch.linalg.cross(av, bv)
+    return torch.cat([aw * bw - (av * bv).sum(dim=1, keepdim=True), vector], dim=1)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """[N, 3, 3] of unit quaternions [N, 4], wxyz."""
+    w, x, y, z = quats.unbind(dim=1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def _unit(quats: Tensor) -> Tensor:
+    return quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(MIN_NORM)

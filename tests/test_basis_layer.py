@@ -1,0 +1,146 @@
+"""Shared motions: splines, turns, blends, where they begin, and how they go on where nothing is known yet."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.basis_layer import FOLLOWED, BasisLayer, Carried, cubic_weights, product, rotation_matrices
+from msdgs_train.model_config import ModelConfig
+from tests.models import random_model
+from tests.tolerances import tolerance
+
+EXACT = tolerance("rotation")
+
+
+def layer_of(count: int = 3, knots: int = 5, time_range: tuple[float, float] = (0.0, 1.0)) -> BasisLayer:
+    generator = torch.Generator().manual_seed(1)
+    layer = BasisLayer(count, knots, time_range).double()
+    with torch.no_grad():
+        layer.shifts += 0.3 * torch.randn(layer.shifts.shape, generator=generator, dtype=torch.float64)
+        layer.turns += 0.5 * torch.randn(layer.turns.shape, generator=generator, dtype=torch.float64)
+        layer.pivots += torch.randn(layer.pivots.shape, generator=generator, dtype=torch.float64)
+    return layer
+
+
+def carried_of(count: int, motions: int) -> Carried:
+    generator = torch.Generator().manual_seed(2)
+    means, quats, logits = (
+        torch.randn(count, columns, generator=generator, dtype=torch.float64) for columns in (3, 4, motions)
+    )
+    return Carried(means, quats / quats.norm(dim=1, keepdim=True), logits.softmax(dim=1))
+
+
+def time(t: float) -> torch.Tensor:
+    return torch.tensor(t, dtype=torch.float64)
+
+
+def as_rotation(quat: torch.Tensor) -> Rotation:
+    return Rotation.from_quat(quat.detach().numpy()[..., [1, 2, 3, 0]])
+
+
+@pytest.mark.parametrize("t", [2.0, 2.013, 3.1, 4.49, 4.5])
+def test_motions_are_rigid_and_on_splines(t: float) -> None:
+    layer = layer_of(time_range=(2.0, 4.5))
+    knots = np.arange(-3, 9) / 5 * 2.5 + 2
+    curves = torch.cat([layer.shifts, layer.turns], dim=2).detach().numpy()
+    shift, turn = np.split(BSpline(knots, curves, 3)(t), [3], axis=1)
+    for k in range(3):
+        quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
+        point, weights = torch.randn(1, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)[k : k + 1]
+        step = layer(Carried(point, quats, weights), time(t))
+        rotation, pivot = as_rotation(torch.from_numpy(turn[k])), layer.pivots[k].numpy()
+        expected = rotation.apply(point[0].numpy() - pivot) + pivot + shift[k]
+        assert np.abs((point + step.delta_means).detach().numpy()[0] - expected).max() <= EXACT
+        assert (as_rotation((quats + step.delta_quats)[0]) * rotation.inv()).magnitude() <= EXACT
+        assert not step.delta_scales.any()
+        assert (step.weight == 1).all()
+
+
+def test_a_gaussian_follows_the_mean_of_its_motions() -> None:
+    layer, carried = layer_of(), carried_of(7, 3)
+    moved = carried.means + layer(carried, time(0.3)).delta_means
+    alone = [layer(carried._replace(basis_weights=torch.eye(3).double()[[k] * 7]), time(0.3)) for k in range(3)]
+    mean = sum(carried.basis_weights[:, k, None] * (carried.means + alone[k].delta_means) for k in range(3))
+    assert float((moved - mean).abs().max()) <= EXACT
+
+
+def test_a_new_layer_moves_nothing() -> None:
+    step = BasisLayer(3, 4).double()(carried_of(5, 3), time(0.7))
+    assert float(step.delta_means.abs().max()) <= EXACT
+    assert float(step.delta_quats.abs().max()) <= EXACT
+
+
+def test_gradients() -> None:
+    layer, carried = layer_of(), carried_of(4, 3)
+    tensors = [tensor.detach().requires_grad_() for tensor in carried]
+
+    def moved(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        step = layer(Carried(*values), time(0.41))
+        return step.delta_means, step.delta_quats
+
+    assert torch.autograd.gradcheck(moved, tensors)
+
+
+def test_quaternions_as_scipy_has_them() -> None:
+    a, b = (carried_of(6, 3).quats.roll(k, dims=0) for k in (0, 1))
+    assert ((as_rotation(product(a, b)) * (as_rotation(a) * as_rotation(b)).inv()).magnitude() <= EXACT).all()
+    assert np.abs(rotation_matrices(a).numpy() - as_rotation(a).as_matrix()).max() <= EXACT
+    assert float(cubic_weights(time(0.37)).sum()) == pytest.approx(1)
+
+
+def test_pivots_are_spread_among_what_is_opaque() -> None:
+    generator = torch.Generator().manual_seed(3)
+    means = torch.rand(400, 3, generator=generator)
+    opacities = torch.where(means[:, 0] < 0.5, 0.9, 0.01)
+    layer = BasisLayer(20, 4)
+    weights = layer.place(means, opacities).softmax(dim=1)
+    assert bool((layer.pivots[:, 0] < 0.5).all())
+    assert len(layer.pivots.unique(dim=0)) == 20
+    assert bool(((weights > 0).sum(dim=1) == FOLLOWED).all())
+    nearest = torch.cdist(means, layer.pivots).argmin(dim=1)
+    assert torch.equal(weights.argmax(dim=1), nearest)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_fewer_gaussians_than_motions(count: int) -> None:
+    layer = BasisLayer(12, 4)
+    weights = layer.place(torch.rand(count, 3), torch.full((count,), 0.1)).softmax(dim=1)
+    assert bool(torch.isfinite(weights).all())
+
+
+def test_beyond_the_window_motions_stay_and_turn_on() -> None:
+    layer = BasisLayer(1, 40)
+    angles = 0.1 * torch.arange(43)
+    with torch.no_grad():
+        layer.shifts[:, 0, 0] = torch.arange(43.0)
+        layer.turns[:, 0] = torch.stack([(angles / 2).cos(), 0 * angles, 0 * angles, (angles / 2).sin()], dim=1)
+    known = layer.turns.detach().clone()
+    layer.carry_outwards(0.1, 0.2)
+    inside = [k for k in range(43) if abs((k - 1) / 40 - 0.5) <= 0.2 + 0.5 / 40]
+    assert torch.equal(layer.shifts[inside, 0, 0].detach(), torch.tensor(inside, dtype=torch.float32))
+    assert (layer.shifts[: inside[0], 0, 0] == inside[0]).all()
+    assert (layer.shifts[inside[-1] :, 0, 0] == inside[-1]).all()
+    near = slice(inside[0] - 3, inside[-1] + 4)
+    assert float((layer.turns.detach()[near] - known[near]).abs().max()) <= tolerance("float32.relative")
+
+
+def test_only_the_first_layer_may_be_of_bases() -> None:
+    with pytest.raises(InvalidInput, match="layers"):
+        ModelConfig(layers=("mlp", "bases"))
+
+
+def test_of_a_model_the_means_get_gradients_as_they_are_turned() -> None:
+    model = random_model(20, layers=("bases",), basis_count=4, basis_knots=3, embedding_size=0).double()
+    weights = torch.randn(20, 3, dtype=torch.float64)
+    (got,) = torch.autograd.grad((model.pose(0.3).means * weights).sum(), [model.gaussians.means])
+    nudged = torch.zeros(20, 3, dtype=torch.float64)
+    for axis in range(3):
+        for sign in (1, -1):
+            with torch.no_grad():
+                model.gaussians.means[:, axis] += sign * 1e-5
+                nudged[:, axis] += sign * (model.pose(0.3).means * weights).sum(dim=1) / 2e-5
+                model.gaussians.means[:, axis] -= sign * 1e-5
+    assert float((got - nudged).abs().max()) <= tolerance("motion_gradient")

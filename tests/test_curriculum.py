@@ -1,0 +1,95 @@
+"""Which photographs come, and what they teach: of passes, the window, and the three kinds of steps."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from msdgs_train.curriculum import MIDDLE, NEW, Curriculum, Lesson
+from msdgs_train.datasets import SceneData, load_scene
+from msdgs_train.trainer import Trainer
+from tests.training_scene import small_config, write_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneData:
+    return load_scene(write_scene(tmp_path_factory.mktemp("scene"), train=41))
+
+
+def lessons(scene: SceneData, steps: range, **changes: Any) -> list[Lesson]:
+    """Those of some steps of a run of 1,000: 100 on all photographs, 100 around the middle, then up to step 600."""
+    settings = {"steps": 1000, "warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6}
+    curriculum = Curriculum(small_config(**{**settings, **changes}), scene.splits["train"], scene.time_range)
+    generator = torch.Generator().manual_seed(0)
+    return [curriculum.next(step, generator) for step in steps]
+
+
+def distance(scene: SceneData, t: float) -> float:
+    first, last = scene.time_range
+    return abs(t - (first + last) / 2) / (last - first)
+
+
+def test_every_photograph_once_a_pass(scene: SceneData) -> None:
+    names = [lesson.frame.name for lesson in lessons(scene, range(82), window_until_fraction=0.0)]
+    assert len(set(names[:41])) == len(set(names[41:])) == 41
+    assert names[:41] != names[41:]
+
+
+def test_first_and_last_all_photographs_teach_everything(scene: SceneData) -> None:
+    drawn = lessons(scene, range(1000))
+    for part in (drawn[:100], drawn[600:]):
+        assert {lesson.frame.name for lesson in part} == {frame.name for frame in scene.splits["train"]}
+        assert {lesson.subject for lesson in part} == {"everything"}
+
+
+def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
+    for step, lesson in enumerate(lessons(scene, range(1000), window_start=0.1)):
+        if 100 <= step < 600:
+            window = 0.1 + 0.4 * max(step - 200, 0) / 400
+            inside = distance(scene, lesson.frame.t) <= window + 1e-9
+            assert inside == (lesson.subject != "stillness")
+            assert distance(scene, lesson.t) <= window + 1e-9
+
+
+def test_of_four_steps_two_teach_motion_and_one_stillness(scene: SceneData) -> None:
+    drawn = lessons(scene, range(200, 560), window_start=0.1)
+    assert Counter(lesson.subject for lesson in drawn) == {"everything": 90, "motion": 180, "stillness": 90}
+
+
+def test_what_is_new_teaches_motion(scene: SceneData) -> None:
+    for step, lesson in enumerate(lessons(scene, range(600), window_start=0.1)):
+        if lesson.subject == "motion":
+            window = 0.1 + 0.4 * (step - 200) / 400
+            assert step >= 200
+            outermost = max(d for f in scene.splits["train"] if (d := distance(scene, f.t)) <= window + 1e-9)
+            assert distance(scene, lesson.frame.t) >= min(outermost, max(window - NEW, MIDDLE * window)) - 1e-9
+
+
+def test_a_single_time_leaves_no_window_empty(tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path, train=1))
+    assert {lesson.frame.name for lesson in lessons(scene, range(1000))} == {scene.splits["train"][0].name}
+
+
+def test_a_lesson_changes_only_what_it_teaches(scene: SceneData) -> None:
+    trainer = Trainer(small_config(warmup_fraction=0.1, settling_fraction=0.1, densify_every=0, steps=100), scene)
+    groups = {"motion": list(trainer.model.deformation.parameters())}
+    while trainer.step_count < 22:
+        trainer.step()
+    seen = set()
+    for _ in range(12):
+        gaussians = list(trainer.model.gaussians.parameters())
+        before = {name: [p.detach().clone() for p in ps] for name, ps in (*groups.items(), ("still", gaussians))}
+        (shot,) = shots = trainer._shots()
+        trainer._set_gradients(shots)
+        trainer.optimizer.step()
+        trainer.step_count += 1
+        changed = {
+            "motion": any(not torch.equal(a, b) for a, b in zip(before["motion"], groups["motion"], strict=True)),
+            "still": any(not torch.equal(a, b) for a, b in zip(before["still"], gaussians, strict=True)),
+        }
+        subject = shot.lesson.subject
+        assert changed == {"motion": subject != "stillness", "still": subject != "motion"}
+        seen.add(subject)
+    assert seen == {"everything", "motion", "stillness"}
