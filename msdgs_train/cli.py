@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from msdgs_train.training_view import TrainingView
     from msdgs_train.viewer import Viewer
 
-PresetName = Literal["msdgs-small", "msdgs-mlp", "msdgs-plane", "deformgs", "4dgs", "static"]
+PresetName = Literal["msdgs-small", "msdgs-mlp", "msdgs-plane", "deformgs", "4dgs", "msdgs-bases", "static"]
 """Written out, so that `--help` and shells know them."""
 
 EXIT_INVALID = 2

@@ -54,6 +54,10 @@ class TrainConfig:
     followed outwards, photograph by photograph."""
     window_until_fraction: float = 0.75
     """The part of the run after which all times take part; 0: they do from the start."""
+    teach_motion: bool = True
+    """Half of the steps while the window grows, of its outermost photographs, teach motion alone; else everything."""
+    teach_stillness: bool = True
+    """A quarter of the steps while it grows, of photographs outside, teach what stands still; else there are none."""
     sh_interval: int = 2000
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
@@ -189,7 +193,7 @@ class TrainConfig:
     @property
     def sown(self) -> int:
         """Gaussians that are added at random after the warm-up."""
-        return int(self.sown_fraction * self.max_gaussians) if self.warmup_steps else 0
+        return int(self.sown_fraction * self.max_gaussians) if self.warmup_steps and self.model.layers else 0
 
     def most_gaussians(self, step: int) -> int:
         """How many there may be after this step, counted from 1."""

@@ -46,7 +46,7 @@ class Curriculum:
     def window(self, step: int) -> float:
         """How far from the middle of the scene's time photographs are taken in: 0.5 is all of it."""
         c = self._config
-        if c.window_until_fraction == 0 or step < c.warmup_steps:
+        if c.window_until_fraction == 0 or not c.model.layers or step < c.warmup_steps:
             return 0.5
         done = step - c.still_steps
         growth = done / max(c.window_until_fraction * c.steps - c.still_steps, 1e-9)
@@ -55,12 +55,18 @@ class Curriculum:
     def next(self, step: int, generator: torch.Generator) -> Lesson:
         """The lesson of this step, counted from 0."""
         window = self.window(step)
-        if window < 0.5 and step % 4 == 0 and len(outside := torch.nonzero(self.distances > window)[:, 0]):
+        if (
+            self._config.teach_stillness
+            and window < 0.5
+            and step % 4 == 0
+            and len(outside := torch.nonzero(self.distances > window)[:, 0])
+        ):
             return self._lesson(self._drawn(outside, generator), window, "stillness")
         if window < 0.5 and step % 2 == 1 and step >= self._config.still_steps:
             border = min(float(self.distances[self.distances <= window].max()), max(window - NEW, MIDDLE * window))
             new = torch.nonzero((self.distances <= window) & (self.distances >= border))[:, 0]
-            return self._lesson(self._drawn(new, generator), window, "motion")
+            subject = "motion" if self._config.teach_motion else "everything"
+            return self._lesson(self._drawn(new, generator), window, subject)
         self.order = self.order[self.distances[self.order] <= window]
         if not len(self.order):
             inside = torch.nonzero(self.distances <= window)[:, 0]

@@ -321,7 +321,7 @@ class Trainer:
     def _prepare(self) -> None:
         """What is due before this step: sowing, placing motions, widening what layers know of time."""
         step, gaussians = self.step_count, self.model.gaussians
-        if step == self.config.warmup_steps and self.config.sown and len(self.model.deformation):
+        if step == self.config.warmup_steps and self.config.sown:
             sow(gaussians, self.optimizer, self.config, self._half_extent)
             self.density.forget(len(gaussians))
         bases = self.model.bases

@@ -58,6 +58,13 @@ def test_of_four_steps_two_teach_motion_and_one_stillness(scene: SceneData) -> N
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 90, "motion": 180, "stillness": 90}
 
 
+def test_switches(scene: SceneData) -> None:
+    drawn = lessons(scene, range(200, 560), window_start=0.1, teach_motion=False)
+    assert Counter(lesson.subject for lesson in drawn) == {"everything": 270, "stillness": 90}
+    drawn = lessons(scene, range(200, 560), window_start=0.1, teach_stillness=False)
+    assert Counter(lesson.subject for lesson in drawn) == {"everything": 180, "motion": 180}
+
+
 def test_what_is_new_teaches_motion(scene: SceneData) -> None:
     for step, lesson in enumerate(lessons(scene, range(600), window_start=0.1)):
         if lesson.subject == "motion":

@@ -104,7 +104,7 @@ def test_a_scene_that_has_faded_is_left_alone() -> None:
 
 def test_strongest_gradients_come_first_under_the_cap() -> None:
     model, optimizer, control = _setup()
-    control.config = small_config(init_count=6, max_gaussians=8, densify_gradient=0.5)
+    control.config = small_config(init_count=6, max_gaussians=8, densify_gradient=0.5, warmup_fraction=0.0)
     _gather(control, [0.6, 0.9, 0.7, 0.8, 0.6, 0.6])
     assert control.densify(model.gaussians, optimizer, 4).cloned == 2
     assert torch.equal(model.gaussians.means[6:], model.gaussians.means[[1, 3]])

@@ -8,7 +8,7 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from msdgs_serve.scene import InvalidInput
-from msdgs_train.losses import RADIUS, photometric_loss, ssim
+from msdgs_train.losses import RADIUS, photometric_loss, ssim, still_loss
 from tests.tolerances import assert_close, tolerance
 
 
@@ -83,3 +83,16 @@ def test_shapes_that_disagree_are_refused() -> None:
         photometric_loss(rgb, truth.float(), 0.8)
     with pytest.raises(InvalidInput, match="`rgb`"):
         ssim(rgb[..., 0], truth[..., 0])
+
+
+def test_what_has_moved_away_teaches_nothing_of_what_stands_still() -> None:
+    truth = torch.full((20, 30, 3), 0.5)
+    rgb = (truth + 0.1).requires_grad_()
+    with torch.no_grad():
+        rgb[4, 5] += 0.3
+    loss = still_loss(rgb, truth, 0.8)
+    (gradient,) = torch.autograd.grad(loss, [rgb])
+    elsewhere = torch.ones(20, 30, dtype=torch.bool)
+    elsewhere[2:7, 3:8] = False
+    assert torch.equal(gradient.any(dim=2), elsewhere)
+    assert float(loss.detach()) == pytest.approx(0.8 * 0.1 * float(elsewhere.double().mean()))

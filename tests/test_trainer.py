@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -221,12 +222,13 @@ class _Rollbacks(Observer):
 
 def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
     """Not finite in those calls, counted over all trainers, and as they are in the others."""
-    calls, whole = iter(range(10**6)), trainer_module.photometric_loss
+    calls = iter(range(10**6))
 
-    def loss(rgb: torch.Tensor, truth: torch.Tensor, weight: float) -> torch.Tensor:
-        return whole(rgb, truth, weight) * (float("nan") if next(calls) in broken else 1.0)
+    def breaking(whole: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
+        return lambda *arguments: whole(*arguments) * (float("nan") if next(calls) in broken else 1.0)
 
-    monkeypatch.setattr(trainer_module, "photometric_loss", loss)
+    for name in ("photometric_loss", "still_loss"):
+        monkeypatch.setattr(trainer_module, name, breaking(getattr(trainer_module, name)))
 
 
 @pytest.mark.usefixtures("_no_curve")

@@ -29,6 +29,7 @@ def small_config(**changes: Any) -> TrainConfig:
     """A run of 24 steps that goes through warm-up, densification, opacity reset and every SH degree."""
     values = {
         "steps": 24, "threads": 1, "model": SMALL_MODEL, "init_count": 60, "max_gaussians": 90, "warmup_fraction": 0.25,
+        "settling_fraction": 0.0,
         "sh_interval": 6, "densify_from": 4, "densify_every": 4, "densify_until_fraction": 0.8,
         "densify_gradient": 1e-5, "opacity_reset_every": 9, "log_every": 1, "eval_every": 10, "checkpoint_every": 0,
     }  # fmt: skip
