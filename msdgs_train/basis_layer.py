@@ -23,6 +23,9 @@ NEVER = -1e4
 LEAST_LOGIT = -12.0
 """Of the others of these at first: little enough, and still enough of a gradient to come back."""
 LEAST_REACH = 1e-3  # scene units
+NEIGHBOURS = 4
+SHORTEST = 0.01  # scene units, added to distances between pivots
+TURNS_COUNT = 0.3  # scene units that a quaternion's unit is worth
 MOTION = 16
 """Numbers of a motion at one time: a rotation matrix row by row, what is added to rotated means, a quaternion."""
 
@@ -51,7 +54,7 @@ class BasisLayer(nn.Module):
     first_time: Tensor
     time_knots: Tensor
 
-    def __init__(self, count: int = 128, knots: int = 60, time_range: tuple[float, float] = (0.0, 1.0)) -> None:
+    def __init__(self, count: int = 96, knots: int = 48, time_range: tuple[float, float] = (0.0, 1.0)) -> None:
         super().__init__()
         first, last = time_range
         self.shifts = nn.Parameter(torch.zeros(knots + 3, count, 3))  # scene units
@@ -126,9 +129,24 @@ class BasisLayer(nn.Module):
                     turn = _unit(product(step, turn))
                 self.shifts[k], self.turns[k] = self.shifts[last], turn
 
-    def bends(self) -> Tensor:
-        """Mean size of second differences along time."""
-        return self.shifts.diff(n=2, dim=0).abs().mean() + self.turns.diff(n=2, dim=0).abs().mean()
+    def bends(self, t: Tensor) -> Tensor:
+        """Mean size of second differences along time of the knots that a time reads, those of turns counting less."""
+        read, _ = self.knots_at(t)
+        shifts, turns = (curve[read].diff(n=2, dim=0).abs().mean() for curve in (self.shifts, self.turns))
+        return shifts + TURNS_COUNT * turns
+
+    def strains(self, t: Tensor) -> Tensor:
+        """Mean distance of where motions and their neighbours carry a pivot, as a part of that between the pivots."""
+        matrices, offsets, _ = self.motions(t).split((9, 3, 4), dim=1)
+        near = (
+            torch.cdist(self.pivots, self.pivots)
+            .topk(min(NEIGHBOURS + 1, len(self.pivots)), largest=False)
+            .indices[:, 1:]
+        )
+        own = torch.einsum("bij,bj->bi", matrices.view(-1, 3, 3), self.pivots) + offsets
+        carried = torch.einsum("bij,bkj->bki", matrices.view(-1, 3, 3), self.pivots[near]) + offsets[:, None]
+        lengths = torch.linalg.vector_norm(self.pivots[near] - self.pivots[:, None], dim=2)
+        return (torch.linalg.vector_norm(carried - own[near], dim=2) / (lengths + SHORTEST)).mean()
 
     def extra_repr(self) -> str:
         return f"{sum(p.numel() for p in self.parameters()):,} parameters"

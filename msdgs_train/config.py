@@ -64,6 +64,10 @@ class TrainConfig:
     """λ in L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
     rigidity_weight: float = 0.0
     """Of the mean relative change of distances between Gaussians, added to the loss; 0: none."""
+    bases_bends_weight: float = 0.1
+    """Of the mean size of second differences along time of shared motions."""
+    bases_strains_weight: float = 0.1
+    """Of how far neighbouring motions are from being one, on average: a part of the distance between them."""
     plane_bends_weight: float = 1e-2
     """Of the mean squared second difference along time of the grids of plane layers."""
     plane_slopes_weight: float = 1e-4
@@ -159,6 +163,8 @@ class TrainConfig:
         self._require("sown_fraction", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         more = (
+            "bases_bends_weight",
+            "bases_strains_weight",
             "plane_space_bends_weight",
             "plane_time_l1_weight",
             "mcmc_noise",

@@ -152,7 +152,7 @@ class Trainer:
         if lesson.subject == "stillness":
             loss = still_loss(rgb, truth, self.config.l1_weight)
         else:
-            loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed, pairs)
+            loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed, lesson.t, pairs)
         gradients = self._gradients(loss, lesson)
         squared_error = float((rgb.detach() - truth).square().mean())
         return _Shot(lesson, loss.item(), squared_error, gradients, info, self._floored(posed))
@@ -297,7 +297,7 @@ class Trainer:
     def _deforms(self) -> bool:
         return self.step_count >= self.config.still_steps and len(self.model.deformation) > 0
 
-    def _priors(self, posed: PosedGaussians, pairs: torch.Generator) -> Tensor | float:
+    def _priors(self, posed: PosedGaussians, t: float, pairs: torch.Generator) -> Tensor | float:
         """What is asked besides likeness to the photographs: few and small Gaussians, rigid motion, smooth grids."""
         c, total = self.config, 0.0
         if c.densify_strategy == "mcmc":
@@ -308,6 +308,10 @@ class Trainer:
             means = self.model.gaussians.means
             stretched = stretch(means, posed.means, self._half_extent, pairs)
             total = total + c.rigidity_weight * stretched
+        bases = self.model.bases
+        if bases is not None:
+            time = torch.tensor(t, dtype=posed.means.dtype)
+            total = total + c.bases_bends_weight * bases.bends(time) + c.bases_strains_weight * bases.strains(time)
         for grid in self.model.plane_grids():
             for weight, roughness in (
                 (c.plane_bends_weight, grid.time_bends),

@@ -127,6 +127,33 @@ def test_beyond_the_window_motions_stay_and_turn_on() -> None:
     assert float((layer.turns.detach()[near] - known[near]).abs().max()) <= tolerance("float32.relative")
 
 
+def test_a_body_that_moves_as_one_has_no_strain() -> None:
+    layer = BasisLayer(6, 4).double()
+    with torch.no_grad():
+        layer.pivots.copy_(torch.rand(6, 3, generator=torch.Generator().manual_seed(4)))
+        turn = torch.tensor([0.8, 0.6, 0.0, 0.0], dtype=torch.float64)
+        layer.turns[:] = turn
+        turned = torch.from_numpy(as_rotation(turn).apply(layer.pivots.numpy()))
+        layer.shifts[:] = turned - layer.pivots + torch.tensor([1.0, 2.0, 3.0])
+        assert float(layer.strains(time(0.4))) <= EXACT
+        layer.shifts[:, 2, 0] += 0.5
+        distances = torch.cdist(layer.pivots, layer.pivots)
+        near = distances.topk(5, largest=False).indices[:, 1:]
+        touched = (near == 2) | (torch.arange(6)[:, None] == 2)
+        expected = torch.where(touched, 0.5 / (distances.gather(1, near) + 0.01), 0.0).mean()
+        assert float(layer.strains(time(0.4))) == pytest.approx(float(expected))
+
+
+def test_straight_motion_does_not_bend() -> None:
+    layer = BasisLayer(2, 6).double()
+    with torch.no_grad():
+        layer.shifts[:] = torch.arange(9.0)[:, None, None]
+        assert float(layer.bends(time(0.5))) <= EXACT
+        layer.shifts[5, 0, 1] += 0.6
+        assert float(layer.bends(time(0.5))) == pytest.approx((0.6 + 1.2) / (2 * 2 * 3))
+        assert float(layer.bends(time(0.1))) <= EXACT
+
+
 def test_only_the_first_layer_may_be_of_bases() -> None:
     with pytest.raises(InvalidInput, match="layers"):
         ModelConfig(layers=("mlp", "bases"))

@@ -306,7 +306,7 @@ def test_what_is_added_to_the_loss(data: Path, mcmc: bool) -> None:
         if mcmc:
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(trainer.model.plane_grids()) == 2
-        assert float(trainer._priors(posed, torch.Generator())) == pytest.approx(
+        assert float(trainer._priors(posed, 0.3, torch.Generator())) == pytest.approx(
             float(expected), rel=tolerance("float32.relative")
         )
 
