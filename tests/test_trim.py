@@ -194,6 +194,8 @@ def test_cameras_are_added_where_too_few_are_stored(count: int):
         (5, {"layers": ()}, SCENE),
         (5, {"layers": (), "embedding_size": 0}, SCENE),
         (40, {"layers": ("plane", "mlp")}, SCENE),
+        (40, {"layers": ("bases",), "basis_count": 5}, SCENE),
+        (40, {"layers": ("bases", "mlp"), "basis_count": 5}, SCENE),
         (40, {"weights": False, "modulate": ("means", "scales", "quats")}, SCENE),
         (40, {"delta_space": "activated"}, SCENE),
         (40, {}, SceneInfo(bounds=SCENE.bounds)),
@@ -209,6 +211,11 @@ def test_unusual_scenes_are_trimmed_and_written(tmp_path: Path, count: int, chan
     exported = write_scene(tmp_path / "s.onnx", contents, candidate.trimmed.moving, rendered=error.to_plain(), times=4)
     assert exported.measured_error["rendered"]["psnr_worst"] == error.psnr_worst
     assert exported.moving_count + exported.static_count == len(candidate.trimmed.ids)
+
+
+def test_shared_motions_have_no_heads_to_leave_out(tmp_path: Path):
+    candidate = job_of(tmp_path, random_model(40, layers=("bases",), basis_count=5), SCENE).candidate("network", 50.0)
+    assert "heads" not in {entry["rule"] for entry in candidate.trimmed.left_out}
 
 
 def with_hidden_one(model: DynamicGaussians) -> DynamicGaussians:

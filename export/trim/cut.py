@@ -27,7 +27,7 @@ class Network:
     """The parts of a deformation that are left."""
 
     layers: tuple[int, ...]  # indices of the model's
-    heads: frozenset[str]  # out of `HEADS`
+    heads: frozenset[str]  # out of `HEADS`, of layers that have heads
     modulated: bool
 
 
@@ -64,7 +64,8 @@ class TrimmedModel:
 def whole(model: DynamicGaussians) -> Cut:
     """The cut that leaves everything in."""
     count = len(model.gaussians)
-    network = Network(tuple(range(len(model.deformation))), frozenset(HEADS), model.modulation is not None)
+    heads = HEADS if any(kind != "bases" for kind in model.config.layers) else ()
+    network = Network(tuple(range(len(model.deformation))), frozenset(heads), model.modulation is not None)
     moves = np.full(count, len(model.deformation) > 0)
     return Cut(network, np.ones(count, bool), moves, model.config.sh_degree)
 

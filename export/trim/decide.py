@@ -8,11 +8,14 @@ from export.trim.cut import Cut, TrimmedModel, trimmed, whole
 from export.trim.evidence import Evidence
 from export.trim.rules import RULES
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
+from msdgs_train.basis_layer import FOLLOWED, BasisLayer
 from msdgs_train.model import DynamicGaussians
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12
-"""Of a Gaussian in a scene file: pose, opacity, an SH coefficient; and where it moves, its id and its modulation."""
+BASIS_BYTES = FOLLOWED * (4 + 1)
+"""Of a Gaussian in a scene file: pose, opacity, an SH coefficient; and where it moves, its id and its modulation, or the
+weights of the motions that it follows, and their numbers."""
 
 
 class LeftOut(NamedTuple):
@@ -81,7 +84,8 @@ def left_out_count(rule: str, cut: Cut, smaller: Cut) -> int:
 def stored_bytes(model: DynamicGaussians, cut: Cut) -> int:
     """About what a cut takes in a file of the plan `network`: Gaussians and layers."""
     gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(cut.sh_degree)
-    moving = MOVING_BYTES + MODULATION_BYTES * cut.network.modulated
     layers = [model.deformation.layers[k] for k in cut.network.layers] if cut.moves.any() else []
+    follows = any(isinstance(layer, BasisLayer) for layer in layers)
+    moving = MOVING_BYTES + MODULATION_BYTES * cut.network.modulated + BASIS_BYTES * follows
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())
     return gaussian * int(cut.kept.sum()) + moving * int(cut.moves.sum()) + weights
