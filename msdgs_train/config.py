@@ -53,7 +53,7 @@ class TrainConfig:
     """These are up to this part of the scene's time away from its middle. What moves is sharp there, and is then
     followed outwards, photograph by photograph."""
     window_until_fraction: float = 0.75
-    """The part of the run after which all times take part; 0: they do from the start."""
+    """The part of the run after which all times take part; 0: they do from the start, and nothing is sown or settles."""
     teach_motion: bool = True
     """Half of the steps while the window grows, of its outermost photographs, teach motion alone; else everything."""
     teach_stillness: bool = True
@@ -194,12 +194,14 @@ class TrainConfig:
     @property
     def still_steps(self) -> int:
         """Steps before the deformation takes part."""
-        return round((self.warmup_fraction + self.settling_fraction) * self.steps)
+        settling = self.settling_fraction if self.window_until_fraction else 0.0
+        return round((self.warmup_fraction + settling) * self.steps)
 
     @property
     def sown(self) -> int:
         """Gaussians that are added at random after the warm-up."""
-        return int(self.sown_fraction * self.max_gaussians) if self.warmup_steps and self.model.layers else 0
+        follows = self.warmup_steps and self.window_until_fraction and self.model.layers
+        return int(self.sown_fraction * self.max_gaussians) if follows else 0
 
     def most_gaussians(self, step: int) -> int:
         """How many there may be after this step, counted from 1."""

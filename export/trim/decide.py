@@ -14,8 +14,8 @@ from msdgs_train.model import DynamicGaussians
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12
 BASIS_BYTES = FOLLOWED * (4 + 1)
-"""Of a Gaussian in a scene file: pose, opacity, an SH coefficient; and where it moves, its id and its modulation, or the
-weights of the motions that it follows, and their numbers."""
+"""Of a Gaussian in a scene file: pose, opacity, an SH coefficient; and where it moves, its id and its modulation, or
+the motions that it follows and their weights."""
 
 
 class LeftOut(NamedTuple):
