@@ -53,7 +53,7 @@ class TrainConfig:
     """These are up to this part of the scene's time away from its middle. What moves is sharp there, and is then
     followed outwards, photograph by photograph."""
     window_until_fraction: float = 0.75
-    """The part of the run after which all times take part; 0: they do from the start, and nothing is sown or settles."""
+    """The part of the run after which all times take part; 0: from the start, and nothing is sown or settles."""
     teach_motion: bool = True
     """Half of the steps while the window grows, of its outermost photographs, teach motion alone; else everything."""
     teach_stillness: bool = True
