@@ -27,7 +27,7 @@ class Comparison:
 
     def draw_all(self, turn: int) -> None:
         """One turn. Each goes through all subjects by itself, and who begins changes: who draws a scene right after the
-        other finds its Gaussians in the caches, which makes the smallest scene's frame 1.4 times as fast."""
+        other finds its Gaussians in the caches, which makes the smallest scene's frame a good deal faster."""
         sides = (self._draw_ours, self._draw_by_hand)
         for draw in sides if turn % 2 else sides[::-1]:
             draw()
