@@ -75,6 +75,7 @@ PRESETS: dict[str, TrainConfig] = {
     "msdgs-bases": TrainConfig(
         model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
         steps=70_000,
+        warmup_fraction=0.05,
         max_gaussians=18_000,
         densify_gradient=8e-4,
         densify_until_fraction=0.75,
