@@ -42,8 +42,8 @@ class TrainConfig:
     half_extent: float | None = None
     """Half the side of that cube in scene units; what the dataset suggests if not given."""
     warmup_fraction: float = 0.1
-    """The first part of the run is trained on all photographs without deformation: what stands still is in place. In the
-    demo's 2,500 steps 0.5 dB better than half of it."""
+    """The first part of the run is trained on all photographs without deformation: what stands still is in place. Half
+    as much costs the demo, of 2,500 steps, 0.5 dB."""
     sown_fraction: float = 0.25
     """After that, Gaussians are added at random, this part of `max_gaussians`: where something only passes, none are
     left. Until then there are at most `max_gaussians` less twice as many."""
