@@ -81,7 +81,7 @@ def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[A
     On the caller's thread and the pool's, or where several callers share the cores on the caller's alone.
     The first exception is raised after all calls that began have ended. Must not be called from inside the pool.
     """
-    threads = min(threads_to_use(), len(items))
+    threads = min(threads_to_use(), len(items)) if len(items) > 1 else 1
     if threads <= 1:
         return run_serially(function, items)
     call, turn, results = _checked(function), itertools.count(), [None] * len(items)
@@ -99,6 +99,26 @@ def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[A
     for helper in begun:
         helper.result()
     return results
+
+
+def run_together(work: Callable[..., bool], arguments: tuple) -> None:
+    """Call `work(*arguments)` on the caller's thread and on the pool's, as `run_parallel` does.
+
+    Each call takes parts of the work until none is left, and returns whether all parts are done. Only if not, because
+    another thread still has one, the caller sleeps until it has: to be woken up takes as long as a small part.
+    """
+    call = _checked(work)
+    helpers = [_shared_pool().submit(call, *arguments) for _ in range(threads_to_use() - 1)]
+    done = False
+    try:
+        done = call(*arguments)
+    finally:
+        begun = [helper for helper in helpers if not helper.cancel()]
+        if not done:
+            wait(begun)
+    if not done:
+        for helper in begun:
+            helper.result()
 
 
 def run_serially(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:

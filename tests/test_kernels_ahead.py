@@ -58,7 +58,7 @@ print(json.dumps([ahead, compiled()]))
 
 def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
     ahead, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
-    assert ahead["msdgs_serve.rasterizer.projection._project_range"]
+    assert ahead["msdgs_serve.rasterizer.projection._project_ranges"]
     assert ahead["msdgs_serve.rasterizer.compositing._composite_tiles"]
     assert after == ahead
 

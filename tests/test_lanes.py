@@ -8,7 +8,7 @@ import pytest
 
 from msdgs_serve.rasterizer import lanes
 from msdgs_serve.rasterizer import lanes_memory as memory
-from msdgs_serve.rasterizer.atomic import fetch_add
+from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial, log2
 from msdgs_serve.rasterizer.jit import kernel
 from tests.tolerances import assert_close
@@ -152,15 +152,24 @@ def test_powers_and_logarithms(dtype: type, degree: int):
 
 
 @kernel
-def draw_numbers(counter: np.ndarray, count: int, drawn: np.ndarray) -> None:
+def draw_numbers(counters: np.ndarray, count: int, drawn: np.ndarray) -> None:
     for _ in range(count):
-        drawn[fetch_add(counter, 2)] += 1
+        drawn[fetch_add(counters, TAKEN, 2)] += 1
+        fetch_add(counters, DONE, 1)
 
 
 def test_every_number_is_drawn_once():
-    counter, drawn = np.zeros(1, np.int64), np.zeros(80_000, np.int64)
+    counters, drawn = np.zeros(2, np.int64), np.zeros(80_000, np.int64)
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: draw_numbers(counter, 10_000, drawn), range(4)))
-    assert counter[0] == len(drawn)
+        list(pool.map(lambda _: draw_numbers(counters, 10_000, drawn), range(4)))
+    assert counters.tolist() == [len(drawn), 40_000]
     assert (drawn[::2] == 1).all()
     assert not drawn[1::2].any()
+
+
+def test_parts_that_another_thread_has_are_not_waited_for_forever():
+    counters = np.array([5, 4])
+    assert not all_done(counters, 5)
+    counters[DONE] = 5
+    assert all_done(counters, 5)
+    assert counters.tolist() == [5, 5]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.atomic import fetch_add
+from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.lane_types import LANES, Lanes, Mask
@@ -51,7 +51,7 @@ from msdgs_serve.rasterizer.projection import (
 )
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
-from msdgs_serve.threads import run_parallel, threads_to_use
+from msdgs_serve.threads import run_together
 
 BLOCKS = TILE * TILE // LANES
 BLOCK_SIDE = 4
@@ -114,16 +114,14 @@ def composite(
     limits = pixel_limits(options, dtype)
     count = len(tiles.offsets) - 1
     for first in range(0, count, TILES_A_ROUND):
-        turn = np.array([first])
-        past = min(first + TILES_A_ROUND, count)
-        arguments = (turn, past, splats.records, tiles, limits, background, wanted, frame)
-        run_parallel(_composite_tiles, [arguments] * threads_to_use())
+        counters, past = np.array([first, first]), min(first + TILES_A_ROUND, count)
+        run_together(_composite_tiles, (counters, past, splats.records, tiles, limits, background, wanted, frame))
     return frame
 
 
 @kernel
 def _composite_tiles(
-    turn: np.ndarray,
+    counters: np.ndarray,
     past: int,
     records: np.ndarray,
     tiles: TileLists,
@@ -131,8 +129,8 @@ def _composite_tiles(
     background: np.ndarray,
     median: tuple,
     frame: Frame,
-) -> None:
-    """Draw tiles, `TILES_A_TURN` of them at each turn, up to the tile `past`.
+) -> bool:
+    """Draw tiles, `TILES_A_TURN` of them at each turn, up to the tile `past`; whether all of them are drawn.
 
     `median` is (True,) or (): whether there is a median depth is known when this is compiled, and costs nothing if not.
     """
@@ -142,17 +140,17 @@ def _composite_tiles(
     alive = np.empty(BLOCKS, np.bool_)
     touching = np.empty(BLOCKS, np.uint64)
     height, width = frame.alpha.shape
+    pixels = (frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1), frame.median_depth.reshape(-1))
     flat, last = records.reshape(-1), np.uint64(max(len(tiles.splat_ids), 1) - 1)
     while True:
-        first = fetch_add(turn, TILES_A_TURN)
+        first = fetch_add(counters, TAKEN, TILES_A_TURN)
         if first >= past:
-            return
-        for tile in range(first, min(first + TILES_A_TURN, past)):
+            return all_done(counters, past)
+        end_of_turn = min(first + TILES_A_TURN, past)
+        for tile in range(first, end_of_turn):
             x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
-            _prefetch_tile(x0, y0, min(TILE, height - y0), frame)
-            state[:PIXELS] = 1
-            state[PIXELS : 5 * PIXELS] = 0
-            state[5 * PIXELS :] = np.inf
+            _prefetch_tile(width, x0, y0, min(TILE, height - y0), pixels)
+            _begin_tile(state, median)
             alive[:] = True
             entry, end = np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])
             some = True
@@ -173,7 +171,12 @@ def _composite_tiles(
                             alive[block] = _blend_block(block, bits, batch, grid, limits, median, state)
                         some |= alive[block]
                 entry += BATCH
-            _write_tile(x0, y0, min(TILE, width - x0), min(TILE, height - y0), state, background, median, frame)
+            columns, rows = min(TILE, width - x0), min(TILE, height - y0)
+            if columns == TILE and rows == TILE:
+                _write_tile(width, x0, y0, state, background, median, pixels)
+            else:
+                _write_cut_tile(width, x0, y0, (columns, rows), state, background, median, pixels)
+        fetch_add(counters, DONE, end_of_turn - first)
 
 
 @kernel
@@ -197,11 +200,23 @@ def place_in_tile(row: int, column: int) -> int:
     return block * LANES + (row % BLOCK_SIDE) * BLOCK_SIDE + column % BLOCK_SIDE
 
 
-@kernel
-def _prefetch_tile(x0: int, y0: int, rows: int, frame: Frame) -> None:
+@inlined_kernel
+def _begin_tile(state: np.ndarray, median: tuple) -> None:
+    """All of the light is left, and nothing has been seen."""
+    real = state.dtype.type
+    for k in range(np.uint64(0), np.uint64(PIXELS), np.uint64(LANES)):
+        store(state, k, spread(real(1)))
+    for k in range(np.uint64(PIXELS), np.uint64(5 * PIXELS), np.uint64(LANES)):
+        store(state, k, spread(real(0)))
+    if len(median) > 0:
+        for k in range(np.uint64(5 * PIXELS), np.uint64(6 * PIXELS), np.uint64(LANES)):
+            store(state, k, spread(real(np.inf)))
+
+
+@inlined_kernel
+def _prefetch_tile(width: int, x0: int, y0: int, rows: int, pixels: tuple) -> None:
     """Fetch what the tile will be written to while it is blended: a row's pixels are a page away from the next's."""
-    width = frame.alpha.shape[1]
-    rgb, alphas, depths = frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1)
+    rgb, alphas, depths, _ = pixels
     for row in range(rows):
         start = (y0 + row) * width + x0
         for third in range(3):
@@ -406,51 +421,52 @@ def _keep_median(open_: Mask, before: Lanes, after: Lanes, depth: float, state: 
     store(state, place, select(open_ & (before > 0.5) & (after <= 0.5), filled(depth, kept), kept))
 
 
-@kernel
+@inlined_kernel
+def _finish_block(block: np.uint64, state: np.ndarray, background: np.ndarray) -> tuple:
+    """Red, green, blue, alpha and depth of a block's pixels when all has been drawn."""
+    lane = block * np.uint64(LANES)
+    left = -negative(load(state, lane))
+    red = load(state, lane + np.uint64(PIXELS)) + left * background[0]
+    green = load(state, lane + np.uint64(2 * PIXELS)) + left * background[1]
+    blue = load(state, lane + np.uint64(3 * PIXELS)) + left * background[2]
+    alpha = 1 - left
+    depth = load(state, lane + np.uint64(4 * PIXELS)) / alpha
+    return red, green, blue, alpha, select(alpha > 0, depth, spread(state.dtype.type(np.inf)))
+
+
+@inlined_kernel
 def _write_tile(
-    x0: int,
-    y0: int,
-    columns: int,
-    rows: int,
-    state: np.ndarray,
-    background: np.ndarray,
-    median: tuple,
-    frame: Frame,
+    width: int, x0: int, y0: int, state: np.ndarray, background: np.ndarray, median: tuple, pixels: tuple
 ) -> None:
-    whole = rows == TILE and columns == TILE
-    width = frame.alpha.shape[1]
-    rgb, alphas, depths = frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1)
-    medians = frame.median_depth.reshape(-1)
-    infinite = spread(state.dtype.type(np.inf))
+    """Into `pixels`, the images of a frame as they lie in memory."""
+    rgb, alphas, depths, medians = pixels
     for block in range(np.uint64(BLOCKS)):
-        lane = block * np.uint64(LANES)
-        left = -negative(load(state, lane))
-        red = load(state, lane + np.uint64(PIXELS)) + left * background[0]
-        green = load(state, lane + np.uint64(2 * PIXELS)) + left * background[1]
-        blue = load(state, lane + np.uint64(3 * PIXELS)) + left * background[2]
-        alpha = 1 - left
-        depth = select(alpha > 0, load(state, lane + np.uint64(4 * PIXELS)) / alpha, infinite)
-        if whole:
-            x, y = x0 + BLOCK_SIDE * (block % np.uint64(4)), y0 + BLOCK_SIDE * (block // np.uint64(4))
-            start = np.int64(y) * width + np.int64(x)
-            store_square_of_triples(rgb, 3 * start, 3 * width, red, green, blue)
-            store_square(alphas, start, width, alpha)
-            store_square(depths, start, width, depth)
+        red, green, blue, alpha, depth = _finish_block(block, state, background)
+        column, row = np.int64(block % np.uint64(BLOCK_SIDE)), np.int64(block // np.uint64(BLOCK_SIDE))
+        start = (y0 + BLOCK_SIDE * row) * width + x0 + BLOCK_SIDE * column
+        store_square_of_triples(rgb, 3 * start, 3 * width, red, green, blue)
+        store_square(alphas, start, width, alpha)
+        store_square(depths, start, width, depth)
+        if len(median) > 0:
+            store_square(medians, start, width, load(state, block * np.uint64(LANES) + np.uint64(5 * PIXELS)))
+
+
+@kernel
+def _write_cut_tile(
+    width: int, x0: int, y0: int, size: tuple, state: np.ndarray, background: np.ndarray, median: tuple, pixels: tuple
+) -> None:
+    """As `_write_tile`, of a tile of which the image has so many columns and rows."""
+    rgb, alphas, depths, medians = pixels
+    columns, rows = size
+    for block in range(np.uint64(BLOCKS)):
+        for k, lanes in enumerate(_finish_block(block, state, background)):
+            store(state, block * np.uint64(LANES) + np.uint64(k * PIXELS), lanes)
+    for row in range(rows):
+        for column in range(columns):
+            place, pixel = place_in_tile(row, column), (y0 + row) * width + x0 + column
+            for channel in range(3):
+                rgb[3 * pixel + channel] = state[place + PIXELS * channel]
+            alphas[pixel] = state[place + 3 * PIXELS]
+            depths[pixel] = state[place + 4 * PIXELS]
             if len(median) > 0:
-                store_square(medians, start, width, load(state, lane + np.uint64(5 * PIXELS)))
-        else:
-            store(state, lane, alpha)
-            store(state, lane + np.uint64(PIXELS), red)
-            store(state, lane + np.uint64(2 * PIXELS), green)
-            store(state, lane + np.uint64(3 * PIXELS), blue)
-            store(state, lane + np.uint64(4 * PIXELS), depth)
-    if not whole:
-        for row in range(rows):
-            for column in range(columns):
-                place = place_in_tile(row, column)
-                frame.alpha[y0 + row, x0 + column] = state[place]
-                for channel in range(3):
-                    frame.rgb[y0 + row, x0 + column, channel] = state[place + PIXELS * (channel + 1)]
-                frame.depth[y0 + row, x0 + column] = state[place + 4 * PIXELS]
-                if len(median) > 0:
-                    frame.median_depth[y0 + row, x0 + column] = state[place + 5 * PIXELS]
+                medians[pixel] = state[place + 5 * PIXELS]

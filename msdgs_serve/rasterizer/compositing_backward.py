@@ -7,7 +7,7 @@ d loss / d alpha_i = T_i s_i - (what all splats behind it and the background add
 
 import numpy as np
 
-from msdgs_serve.rasterizer.atomic import fetch_add
+from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.compositing import (
     BLOCKS,
     PIXELS,
@@ -36,7 +36,7 @@ from msdgs_serve.rasterizer.projection import (
 )
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
-from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
+from msdgs_serve.threads import run_parallel, run_together, split_evenly, threads_to_use
 
 # places in a tile's scratch: what is left of the light (with a minus sign where a pixel is done), the pixel's gradient,
 # and what is still behind
@@ -67,10 +67,11 @@ def composite_backward(
     records = splats.records
     pair_sums = np.empty((len(tiles.splat_ids), SUMS), records.dtype)
     seen = np.empty(len(tiles.offsets) - 1, np.int64)
-    turn = np.zeros(1, np.int64)
-    limits = pixel_limits(options, records.dtype)
-    arguments = (turn, records, tiles, limits, frame.rgb, frame.alpha, grad_rgb, grad_alpha, pair_sums, seen)
-    run_parallel(_tiles_backward, [arguments] * threads_to_use())
+    counters, limits = np.zeros(2, np.int64), pixel_limits(options, records.dtype)
+    run_together(
+        _tiles_backward,
+        (counters, records, tiles, limits, frame.rgb, frame.alpha, grad_rgb, grad_alpha, pair_sums, seen),
+    )
     sums = np.zeros((len(records), SUMS), records.dtype)
     run_parallel(_add_up, [(*part, tiles, seen, pair_sums, sums) for part in split_evenly(len(sums), threads_to_use())])
     return sums
@@ -78,7 +79,7 @@ def composite_backward(
 
 @kernel
 def _tiles_backward(
-    turn: np.ndarray,
+    counters: np.ndarray,
     records: np.ndarray,
     tiles: TileLists,
     limits: PixelLimits,
@@ -88,9 +89,9 @@ def _tiles_backward(
     grad_alpha: np.ndarray,
     pair_sums: np.ndarray,
     seen: np.ndarray,
-) -> None:
+) -> bool:
     """Write the sums of each pair of tile and splat, and how many pairs of a tile have been: those behind what hides
-    them are left out."""
+    them are left out. Whether all tiles are done."""
     count = len(tiles.offsets) - 1
     state = np.empty(6 * PIXELS, records.dtype)
     record = np.empty(RECORD, records.dtype)
@@ -101,10 +102,11 @@ def _tiles_backward(
     flat_rgb, flat_alpha = rgb.reshape(-1), alpha.reshape(-1)
     flat_grad_rgb, flat_grad_alpha = grad_rgb.reshape(-1), grad_alpha.reshape(-1)
     while True:
-        first = fetch_add(turn, TILES_A_TURN)
+        first = fetch_add(counters, TAKEN, TILES_A_TURN)
         if first >= count:
-            return
-        for tile in range(first, min(first + TILES_A_TURN, count)):
+            return all_done(counters, count)
+        end_of_turn = min(first + TILES_A_TURN, count)
+        for tile in range(first, end_of_turn):
             x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
             origin[0], origin[1] = x0, y0
             state[:] = 0
@@ -133,6 +135,7 @@ def _tiles_backward(
                 alive &= ~_splat_backward(bits, record, grid, limits, state, flat_sums, pair * np.uint64(SUMS))
                 pair += np.uint64(1)
             seen[tile] = pair - first_pair
+        fetch_add(counters, DONE, end_of_turn - first)
 
 
 @kernel

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.exponential import arctangent, log2
 from msdgs_serve.rasterizer.harmonics import harmonics
-from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.lane_types import LANES, Index, Lanes, Mask
 from msdgs_serve.rasterizer.lanes import (
     bits_of,
@@ -38,7 +39,7 @@ from msdgs_serve.rasterizer.lanes_memory import (
 from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
+from msdgs_serve.threads import run_together, split_evenly, threads_to_use
 
 RECORD = LANES
 """Numbers that a splat's record has: one load. Their places:"""
@@ -87,15 +88,14 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     records = empty_records(-(-count // LANES) * LANES, dtype)  # whole groups: stored without a look at the end
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
-    ranges = ranges_of_lanes(count)
+    ranges = np.array(ranges_of_lanes(count))
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     sh = gaussians.sh.reshape(count, 3 * gaussians.sh.shape[1])
-    parts = run_parallel(
-        _project_range,
-        [(start, stop, view, *arrays, sh, records, rectangles, keys) for start, stop in ranges],
-    )
-    ends, nearest, farthest, sound = zip(*parts, strict=True)
-    drawn = [(start, end) for (start, _), end in zip(ranges, ends, strict=True)]
+    found = np.empty((len(ranges), 4), np.int64)
+    counters = np.zeros(2, np.int64)
+    run_together(_project_ranges, (counters, ranges, found, view, *arrays, sh, records, rectangles, keys))
+    ends, nearest, farthest, sound = found.T.tolist()
+    drawn = list(zip(ranges[:, 0].tolist(), ends, strict=True))
     return Splats(records[:count], rectangles, keys, drawn, (min(nearest), max(farthest)), all(sound))
 
 
@@ -119,6 +119,34 @@ def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
     dtype = np.float64 if gaussians.means.dtype == np.float64 else np.float32
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     return Gaussians(*(np.require(array, dtype, ("C", "W")) for array in arrays))
+
+
+@kernel
+def _project_ranges(
+    counters: np.ndarray,
+    ranges: np.ndarray,
+    found: np.ndarray,
+    view: View,
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    sh: np.ndarray,
+    records: np.ndarray,
+    rectangles: np.ndarray,
+    keys: np.ndarray,
+) -> bool:
+    """Project `ranges` [P, 2], one at each turn, and write what each has found [P, 4]; whether all of them are done."""
+    while True:
+        k = fetch_add(counters, TAKEN, 1)
+        if k >= len(ranges):
+            return all_done(counters, len(ranges))
+        start, stop = ranges[k, 0], ranges[k, 1]
+        end, nearest, farthest, sound = _project_range(
+            start, stop, view, means, quats, scales, opacities, sh, records, rectangles, keys
+        )
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = end, nearest, farthest, sound
+        fetch_add(counters, DONE, 1)
 
 
 @kernel
@@ -199,8 +227,8 @@ def _project_range(
         root_a = square_root(converted(yy / det, records))
         root_b = -converted(xy / yy, records) * root_a
         root_c = 1 / square_root(converted(yy, records))
-        dx, dy, dz = direction(view, wx, wy, wz)
-        red, green, blue = raw_colors(sh, first, converted(dx, records), converted(dy, records), converted(dz, records))
+        dx, dy, dz = direction(view, wx, wy, wz, z, records)
+        red, green, blue = raw_colors(sh, first, dx, dy, dz)
         sound = sound and bits_of(drawn & (abs_sum(red, green, blue) < np.inf)) == bits
         store_rows(
             records,
@@ -349,17 +377,21 @@ def seen_at(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple:
 
 
 @kernel
-def direction(view: View, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
-    """Unit vectors of the lines of sight to points in the world."""
+def direction(view: View, x: Lanes, y: Lanes, z: Lanes, depth: Lanes, like: np.ndarray) -> tuple[Lanes, Lanes, Lanes]:
+    """Unit vectors of the lines of sight to points in the world, in the dtype of `like`."""
     if view.model == ORTHOGRAPHIC:
         r = view.rotation
-        return filled(r[2, 0], x), filled(r[2, 1], x), filled(r[2, 2], x)
-    dx, dy, dz = x - view.position[0], y - view.position[1], z - view.position[2]
+        return spread(like.dtype.type(r[2, 0])), spread(like.dtype.type(r[2, 1])), spread(like.dtype.type(r[2, 2]))
+    # divided by the depth before anything is squared: its square need not be a float32
+    per_depth, position = 1 / depth, view.position
+    dx = converted((x - position[0]) * per_depth, like)
+    dy = converted((y - position[1]) * per_depth, like)
+    dz = converted((z - position[2]) * per_depth, like)
     per_distance = 1 / square_root(dx * dx + dy * dy + dz * dz)
     return dx * per_distance, dy * per_distance, dz * per_distance
 
 
-@kernel
+@inlined_kernel
 def raw_colors(sh: np.ndarray, first: int, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """SH + 0.5 towards the unit directions (x, y, z), before the cut at 0; `sh` is [N, 3 coefficients]."""
     functions = sh.shape[1] // 3

@@ -166,10 +166,19 @@ def _deal_out(
     columns: int,
     splat_ids: np.ndarray,
 ) -> None:
-    """Append each splat, in order, to the lists of its tiles."""
+    """Append each splat, in order, to the lists of its tiles.
+
+    One loop over a rectangle's tiles, since its end is guessed wrong once a splat, and once more a row with two.
+    """
     for k in range(np.uint64(start), np.uint64(stop)):
-        for row in range(np.uint64(rectangles[k, 2]), np.uint64(rectangles[k, 3])):
-            for column in range(np.uint64(rectangles[k, 0]), np.uint64(rectangles[k, 1])):
-                tile = row * np.uint64(columns) + column
-                splat_ids[np.uint64(cursors[tile])] = order[k]
-                cursors[tile] += 1
+        left, top = np.uint64(rectangles[k, 0]), np.uint64(rectangles[k, 2])
+        across, down = np.uint64(rectangles[k, 1]) - left, np.uint64(rectangles[k, 3]) - top
+        to_next_row = np.uint64(columns) - across
+        tile, column = top * np.uint64(columns) + left, np.uint64(0)
+        for _ in range(across * down):
+            splat_ids[np.uint64(cursors[tile])] = order[k]
+            cursors[tile] += 1
+            column += np.uint64(1)
+            row_ends = column == across
+            tile += np.uint64(1) + (to_next_row if row_ends else np.uint64(0))
+            column = np.uint64(0) if row_ends else column
