@@ -5,7 +5,7 @@ from onnx import TensorProto
 
 from export.graph import GraphBuilder, to_numpy
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.basis_layer import BasisLayer
+from msdgs_train.basis_layer import LEAST_STRETCH, BasisLayer
 
 KNOTS = 4
 """That a time reads."""
@@ -28,9 +28,12 @@ def basis_deltas(
     matrices, offsets, turns = graph.split(
         blended, [f"{name}.{p}" for p in ("matrices", "offsets", "turns")], [9, 3, 4]
     )
-    parts = {"means": _moved(graph, name, matrices, offsets, means), "quats": _turned(graph, name, turns, quats)}
-    like = graph.node("Sub", [means, means], f"{name}.zeros") if "scales" in used else ""
-    columns = [like if part == "scales" else parts[part] for part in used]
+    parts = {
+        "means": lambda: _moved(graph, name, matrices, offsets, means),
+        "scales": lambda: _stretched(graph, name, matrices, quats),
+        "quats": lambda: _turned(graph, name, turns, quats),
+    }
+    columns = [parts[part]() for part in used]
     return graph.node("Mul", [graph.node("Concat", columns, f"{name}.raw", axis=1), share], f"{name}.shared")
 
 
@@ -51,9 +54,9 @@ def _blended(graph: GraphBuilder, name: str, basis_weights: np.ndarray, motions:
 
 def _motions(graph: GraphBuilder, name: str, layer: BasisLayer, time: str) -> str:
     """[B, 16] `BasisLayer.motions` at `time`, [1, 1]."""
-    shifts, turns = _spline(graph, name, layer, time)
+    shifts, turns, stretches = _spline(graph, name, layer, time)
     turns = _unit(graph, f"{name}.turns", turns)
-    matrices = _matrices(graph, f"{name}.matrices", turns)
+    matrices = _stretching(graph, f"{name}.matrices", _matrices(graph, f"{name}.rotations", turns), stretches)
     pivots = to_numpy(layer.pivots)
     tiled = graph.constant(f"{name}.pivots.tiled", np.tile(pivots, 3))
     turned = _row_sums(graph, f"{name}.pivots.turned", graph.node("Mul", [matrices, tiled], f"{name}.pivots.products"))
@@ -62,8 +65,8 @@ def _motions(graph: GraphBuilder, name: str, layer: BasisLayer, time: str) -> st
     return graph.node("Concat", [matrices, offsets, turns], name, axis=1)
 
 
-def _spline(graph: GraphBuilder, name: str, layer: BasisLayer, time: str) -> tuple[str, str]:
-    """Shifts [B, 3] and turns [B, 4] before they are made unit."""
+def _spline(graph: GraphBuilder, name: str, layer: BasisLayer, time: str) -> list[str]:
+    """Shifts [B, 3], turns [B, 4] before they are made unit, and stretches [B, 6]."""
     knots, count = layer.shifts.shape[0] - 3, layer.shifts.shape[1]
 
     def scalar(what: str, value: float) -> str:
@@ -90,14 +93,34 @@ def _spline(graph: GraphBuilder, name: str, layer: BasisLayer, time: str) -> tup
     around = graph.constant(f"{name}.around", np.arange(KNOTS, dtype=np.int64)[None])
     rows = graph.node("Add", [row, around], f"{name}.rows")
     flat = graph.node("Reshape", [rows, graph.constant(f"{name}.flat", np.array([KNOTS], np.int64))], f"{name}.ids")
-    values = np.concatenate([to_numpy(layer.shifts), to_numpy(layer.turns)], axis=2).reshape(knots + 3, -1)
+    curves = [to_numpy(curve) for curve in (layer.shifts, layer.turns, layer.stretches)]
+    values = np.concatenate(curves, axis=2).reshape(knots + 3, -1)
     table = graph.node("Gather", [graph.constant(f"{name}.table", values), flat], f"{name}.read")
     mixed = graph.node("MatMul", [weights, table], f"{name}.mixed")
-    shape = graph.constant(f"{name}.shape", np.array([count, 7], np.int64))
-    shifts, turns = graph.split(
-        graph.node("Reshape", [mixed, shape], f"{name}.curves"), [f"{name}.shifts", f"{name}.raw_turns"], [3, 4]
+    sizes = [curve.shape[2] for curve in curves]
+    shape = graph.constant(f"{name}.shape", np.array([count, sum(sizes)], np.int64))
+    names = [f"{name}.{part}" for part in ("shifts", "raw_turns", "stretches")]
+    return graph.split(graph.node("Reshape", [mixed, shape], f"{name}.curves"), names, sizes)
+
+
+def _stretching(graph: GraphBuilder, name: str, rotations: str, stretches: str) -> str:
+    """[B, 9] matrices that stretch by the identity and xx, yy, zz, xy, xz, yz, [B, 6], and then rotate."""
+    place = np.zeros((6, 9), np.float32)
+    for k, entries in enumerate(((0,), (4,), (8,), (1, 3), (2, 6), (5, 7))):
+        place[k, list(entries)] = 1
+    one = graph.constant(f"{name}.one", np.eye(3, dtype=np.float32).reshape(9))
+    full = graph.node("Gemm", [stretches, graph.constant(f"{name}.place", place), one], f"{name}.stretch")
+    return _products(graph, name, rotations, full)
+
+
+def _products(graph: GraphBuilder, name: str, left: str, right: str) -> str:
+    """[·, 9] products of 3 × 3 matrices, [·, 9] each."""
+    square, flat = (
+        graph.constant(f"{name}.{word}", np.array(shape, np.int64))
+        for word, shape in (("square", (-1, 3, 3)), ("flat", (-1, 9)))
     )
-    return shifts, turns
+    squares = [graph.node("Reshape", [m, square], f"{name}.{k}") for k, m in (("left", left), ("right", right))]
+    return graph.node("Reshape", [graph.node("MatMul", squares, f"{name}.product"), flat], name)
 
 
 def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
@@ -132,6 +155,18 @@ def _moved(graph: GraphBuilder, name: str, matrices: str, offsets: str, means: s
     return graph.node(
         "Sub", [graph.node("Add", [turned, offsets], f"{name}.means.moved"), means], f"{name}.means.delta"
     )
+
+
+def _stretched(graph: GraphBuilder, name: str, matrices: str, quats: str) -> str:
+    """[M, 3] logarithms of how much longer a Gaussian's axes are, columns of its rotation, times its matrix."""
+    axes = _products(graph, f"{name}.axes", matrices, _matrices(graph, f"{name}.axes.canonical", quats))
+    columns = graph.constant(f"{name}.axes.columns", np.tile(np.eye(3, dtype=np.float32), (3, 1)))
+    squares = graph.node("Mul", [axes, axes], f"{name}.axes.squares")
+    lengths = graph.node(
+        "Sqrt", [graph.node("MatMul", [squares, columns], f"{name}.axes.sums")], f"{name}.axes.lengths"
+    )
+    least = graph.constant(f"{name}.axes.least", np.array(LEAST_STRETCH, np.float32))
+    return graph.node("Log", [graph.node("Max", [lengths, least], f"{name}.axes.kept")], f"{name}.scales.delta")
 
 
 def _row_sums(graph: GraphBuilder, name: str, products: str) -> str:

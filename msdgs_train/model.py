@@ -128,7 +128,7 @@ def activated_scales(log_scales: Tensor) -> Tensor:
 
 def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer | PlaneLayer | BasisLayer:
     if kind == "bases":
-        return BasisLayer(config.basis_count, config.basis_knots, domain.time_range)
+        return BasisLayer(config.basis_count, config.basis_knots, domain.time_range, config.basis_stretches)
     if kind == "mlp":
         return MLPLayer(
             config.width,

@@ -49,8 +49,10 @@ class ModelConfig:
     """Grids a layer, with so many times `plane_space_nodes`; their features are put side by side. 4DGS has 1 2."""
     basis_count: int = 96
     """Motions of a layer of kind `bases`, each of which many Gaussians follow. Such a layer is the first."""
-    basis_knots: int = 48
+    basis_knots: int = 24
     """Of their splines, over the time range of the scene."""
+    basis_stretches: bool = True
+    """They stretch what follows them; else they are rigid."""
     weights: bool = True
     """Each layer predicts how much its step counts (equation 8); without, all steps count in full."""
     embedding_size: int = 32
@@ -88,6 +90,8 @@ class ModelConfig:
             raise InvalidInput("model.layers", "with `bases`, which moves canonical Gaussians, first", self.layers)
         if self.delta_space not in get_args(DeltaSpace):
             raise InvalidInput("model.delta_space", f"one of {list(get_args(DeltaSpace))}", self.delta_space)
+        if "bases" in self.layers and self.delta_space != "raw":
+            raise InvalidInput("model.delta_space", "raw with `bases`, whose stretches are factors", self.delta_space)
 
     def _check_list(self, name: str, known: tuple[Any, ...] | None) -> None:
         """Make a list, as JSON has it, a tuple; refuse values that aren't known, or aren't whole numbers above 0."""

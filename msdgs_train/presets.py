@@ -74,7 +74,7 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "msdgs-bases": TrainConfig(
         model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
-        steps=70_000,
+        steps=54_000,
         warmup_fraction=0.05,
         max_gaussians=18_000,
         densify_gradient=8e-4,

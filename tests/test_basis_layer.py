@@ -21,6 +21,7 @@ def layer_of(count: int = 3, knots: int = 5, time_range: tuple[float, float] = (
     with torch.no_grad():
         layer.shifts.add_(0.3 * torch.randn(layer.shifts.shape, generator=generator, dtype=torch.float64))
         layer.turns.add_(0.5 * torch.randn(layer.turns.shape, generator=generator, dtype=torch.float64))
+        layer.stretches.add_(0.2 * torch.randn(layer.stretches.shape, generator=generator, dtype=torch.float64))
         layer.pivots.add_(torch.randn(layer.pivots.shape, generator=generator, dtype=torch.float64))
     return layer
 
@@ -42,21 +43,32 @@ def as_rotation(quat: torch.Tensor) -> Rotation:
 
 
 @pytest.mark.parametrize("t", [2.0, 2.013, 3.1, 4.49, 4.5])
-def test_motions_are_rigid_and_on_splines(t: float) -> None:
+def test_motions_are_on_splines(t: float) -> None:
     layer = layer_of(time_range=(2.0, 4.5))
     knots = np.arange(-3, 9) / 5 * 2.5 + 2
-    curves = torch.cat([layer.shifts, layer.turns], dim=2).detach().numpy()
-    shift, turn = np.split(BSpline(knots, curves, 3)(t), [3], axis=1)
+    curves = torch.cat([layer.shifts, layer.turns, layer.stretches], dim=2).detach().numpy()
+    shift, turn, stretch = np.split(BSpline(knots, curves, 3)(t), [3, 7], axis=1)
     for k in range(3):
         quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
         point, weights = torch.randn(1, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)[k : k + 1]
         step = layer(Carried(point, quats, weights), time(t))
         rotation, pivot = as_rotation(torch.from_numpy(turn[k])), layer.pivots[k].numpy()
-        expected = rotation.apply(point[0].numpy() - pivot) + pivot + shift[k]
+        longer = np.eye(3) + stretch[k][[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+        expected = rotation.apply(longer @ (point[0].numpy() - pivot)) + pivot + shift[k]
         assert np.abs((point + step.delta_means).detach().numpy()[0] - expected).max() <= EXACT
         assert (as_rotation((quats + step.delta_quats)[0]) * rotation.inv()).magnitude() <= EXACT
-        assert not step.delta_scales.any()
+        lengths = np.linalg.norm(rotation.as_matrix() @ longer, axis=0)
+        assert np.abs(step.delta_scales.exp().detach().numpy()[0] - lengths).max() <= EXACT
         assert (step.weight == 1).all()
+
+
+def test_scales_grow_along_a_gaussians_own_axes() -> None:
+    layer, half = BasisLayer(1, 4).double(), 0.5**0.5
+    with torch.no_grad():
+        layer.stretches[:, 0, 0] = 1.0  # twice as long along x
+    quats = torch.tensor([[half, 0.0, 0.0, half]], dtype=torch.float64)  # its second axis is -x
+    step = layer(Carried(torch.zeros(1, 3).double(), quats, torch.ones(1, 1).double()), time(0.5))
+    assert np.abs(step.delta_scales.exp().detach().numpy() - [[1, 2, 1]]).max() <= EXACT
 
 
 def test_a_gaussian_follows_the_mean_of_its_motions() -> None:
@@ -71,15 +83,16 @@ def test_a_new_layer_moves_nothing() -> None:
     step = BasisLayer(3, 4).double()(carried_of(5, 3), time(0.7))
     assert float(step.delta_means.abs().max().detach()) <= EXACT
     assert float(step.delta_quats.abs().max().detach()) <= EXACT
+    assert float(step.delta_scales.abs().max().detach()) <= EXACT
 
 
 def test_gradients() -> None:
     layer, carried = layer_of(), carried_of(4, 3)
     tensors = [tensor.detach().requires_grad_() for tensor in carried]
 
-    def moved(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def moved(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         step = layer(Carried(*values), time(0.41))
-        return step.delta_means, step.delta_quats
+        return step.delta_means, step.delta_scales, step.delta_quats
 
     assert torch.autograd.gradcheck(moved, tensors)
 
@@ -157,6 +170,20 @@ def test_straight_motion_does_not_bend() -> None:
 def test_only_the_first_layer_may_be_of_bases() -> None:
     with pytest.raises(InvalidInput, match="layers"):
         ModelConfig(layers=("mlp", "bases"))
+
+
+def test_rigid_motions_stay_rigid() -> None:
+    model = random_model(20, layers=("bases",), basis_count=4, basis_knots=3, basis_stretches=False, embedding_size=0)
+    bases = model.double().bases
+    assert bases is not None
+    assert not any("stretches" in name for name, _ in bases.named_parameters())
+    turns = bases.motions(time(0.3))[:, :9].view(-1, 3, 3).detach()
+    assert float((turns @ turns.transpose(1, 2) - torch.eye(3)).abs().max()) <= EXACT
+
+
+def test_stretches_are_factors_of_scales() -> None:
+    with pytest.raises(InvalidInput, match="delta_space"):
+        ModelConfig(layers=("bases",), delta_space="activated")
 
 
 def test_of_a_model_the_means_get_gradients_as_they_are_turned() -> None:

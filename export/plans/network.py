@@ -65,7 +65,7 @@ def used_heads(layers: tuple[Layer, ...]) -> list[str]:
 
 def _changes(layer: Layer, columns: slice) -> bool:
     if isinstance(layer, BasisLayer):
-        return columns != DELTAS["scales"]
+        return True
     if isinstance(layer, MLPLayer):
         return bool(layer.heads.weight[columns].any() or layer.heads.bias[columns].any())
     return any(bool(p.any()) for p in layer.heads[list(DELTAS.values()).index(columns)].parameters())
