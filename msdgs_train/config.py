@@ -126,9 +126,6 @@ class TrainConfig:
     densify_gradient: float = 4e-4
     """Mean gradient norm in a projected centre, in normalised device coordinates, from which one is densified. This and
     what follows, but for `max_gaussians` and `prune_opacity`, is of `gradient`."""
-    densify_movers: float = 1.0
-    """Times that the gradient of a Gaussian that moves counts. Above 1 room is kept for these: as many as were sown are
-    added little by little, until density control ends."""
     split_scale: float = 0.01
     """One with a larger standard deviation than this part of the scene's extent is split, a smaller one is cloned."""
     max_gaussians: int = 10_000
@@ -181,7 +178,6 @@ class TrainConfig:
             self._require(name, "finite and above 0", lambda v: 0 < v < math.inf)
         for name in ("size", "half_extent", "max_minutes"):
             self._require(name, "above 0, or left out", lambda v: v is None or 0 < v < math.inf)
-        self._require("densify_movers", "finite and 1 or above", lambda v: 1 <= v < math.inf)
         self._require("max_gaussians", "init_count or more", lambda v: v >= self.init_count)
         self._require("densify_strategy", "gradient or mcmc", lambda v: v in ("gradient", "mcmc"))
         self._require("background", f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
@@ -210,12 +206,7 @@ class TrainConfig:
 
     def most_gaussians(self, step: int) -> int:
         """How many there may be after this step, counted from 1."""
-        if step <= self.warmup_steps:
-            return self.max_gaussians - 2 * self.sown
-        if self.densify_movers == 1:
-            return self.max_gaussians
-        left = (self.densify_until - step) / max(self.densify_until - self.warmup_steps, 1)
-        return self.max_gaussians - round(self.sown * max(left, 0.0))
+        return self.max_gaussians - 2 * self.sown if step <= self.warmup_steps else self.max_gaussians
 
     @property
     def densify_until(self) -> int:

@@ -19,8 +19,6 @@ from msdgs_train.optimizers import replace_rows, replace_values
 SPLIT_SHRINK = 1.6
 """The two halves of a split Gaussian are smaller by this factor."""
 RESET_OPACITY = 0.01
-MOVES = 0.005
-"""Of the scene's extent: a Gaussian that has been so far from its canonical place moves."""
 
 
 class DensityChange(NamedTuple):
@@ -39,23 +37,20 @@ class DensityControl:
     extent: float  # radius of the cameras' positions, scene units
     gradients: Tensor  # [N] sums of norms
     counts: Tensor  # [N] photographs in which each was drawn
-    moved: Tensor  # [N] farthest from its canonical place, scene units
     generator: torch.Generator
 
     @classmethod
     def start(cls, config: TrainConfig, extent: float, count: int) -> "DensityControl":
         """With nothing gathered yet, for `count` Gaussians."""
         generator = torch.Generator().manual_seed(config.seed + 1)
-        return cls(config, extent, torch.zeros(count), torch.zeros(count), torch.zeros(count), generator)
+        return cls(config, extent, torch.zeros(count), torch.zeros(count), generator)
 
-    def gather(self, means2d_grads: Tensor, radii: Tensor, moved: Tensor, width: int, height: int) -> None:
-        """Add one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn, how far
-        it has moved [N]."""
+    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Add one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
         drawn = radii > 0
         norms = torch.hypot(means2d_grads[:, 0] * (0.5 * width), means2d_grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
-        self.moved = torch.maximum(self.moved, moved)
 
     def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
         """`densify` and `reset_opacities` where they are due."""
@@ -66,11 +61,11 @@ class DensityControl:
 
     def state(self) -> tuple[Tensor, ...]:
         """What has been gathered."""
-        return self.gradients, self.counts, self.moved
+        return self.gradients, self.counts
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:
         """Go on from it."""
-        self.gradients, self.counts, self.moved = state
+        self.gradients, self.counts = state
 
     def is_reset_due(self, step: int) -> bool:
         """Whether `reset_opacities` is to run after this step (counted from 1)."""
@@ -98,7 +93,7 @@ class DensityControl:
 
     def forget(self, count: int) -> None:
         """Drop what was gathered; there are `count` Gaussians now."""
-        self.gradients, self.counts, self.moved = (torch.zeros(count) for _ in range(3))
+        self.gradients, self.counts = torch.zeros(count), torch.zeros(count)
 
     def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
         pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opacity
@@ -110,8 +105,7 @@ class DensityControl:
 
     def _to_densify(self, pruned: Tensor, step: int) -> Tensor:
         """[N] bool: strong gradients, the strongest first while there is room."""
-        counted = torch.where(self.moved > MOVES * self.extent, self.config.densify_movers, 1.0)
-        mean = (counted * self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
+        mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
         chosen = mean >= self.config.densify_gradient
         room = self.config.most_gaussians(step) - int((~pruned).sum())
         if int(chosen.sum()) > room:

@@ -23,9 +23,8 @@ class DensityStrategy(Protocol):
         """All of its randomness."""
         ...
 
-    def gather(self, means2d_grads: Tensor, radii: Tensor, moved: Tensor, width: int, height: int) -> None:
-        """Hear of one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn, and
-        how far from its canonical place it is then, [N] scene units."""
+    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Hear of one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
         ...
 
     def forget(self, count: int) -> None:

@@ -74,14 +74,11 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "msdgs-bases": TrainConfig(
         model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
-        steps=52_000,
+        steps=54_000,
         warmup_fraction=0.05,
-        sown_fraction=0.3125,
-        max_gaussians=24_000,
+        max_gaussians=18_000,
         densify_gradient=8e-4,
-        densify_movers=20.0,
         densify_until_fraction=0.75,
-        prune_opacity=0.02,
     ),
     "static": TrainConfig(
         model=replace(TrainConfig().model, layers=(), embedding_size=0),

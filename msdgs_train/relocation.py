@@ -45,7 +45,7 @@ class Relocation:
         """With its own randomness, of the settings' seed."""
         return cls(config, torch.Generator().manual_seed(config.seed + 1))
 
-    def gather(self, means2d_grads: Tensor, radii: Tensor, moved: Tensor, width: int, height: int) -> None:
+    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Gradients don't matter here."""
 
     def forget(self, count: int) -> None:

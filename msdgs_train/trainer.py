@@ -61,7 +61,6 @@ class _Shot(NamedTuple):
     squared_error: float
     gradients: tuple[Tensor | None, ...]  # of the model's parameters, in their order
     info: RasterizationInfo
-    moved: Tensor  # [N] from canonical places, scene units
     floored: int
 
 
@@ -112,9 +111,9 @@ class Trainer:
                 losses, errors = ([getattr(s, name) for s in whole] for name in ("loss", "squared_error"))
                 self._average(sum(losses) / len(whole), sum(errors) / len(whole))
             for shot in whole:
-                camera, info = shot.lesson.frame.camera, shot.info
-                if info.means2d_grads is not None:
-                    self.density.gather(info.means2d_grads, info.radii, shot.moved, camera.width, camera.height)
+                if shot.info.means2d_grads is not None:
+                    camera = shot.lesson.frame.camera
+                    self.density.gather(shot.info.means2d_grads, shot.info.radii, camera.width, camera.height)
         self.density.after_step(self.model.gaussians, self.optimizer, self.step_count)
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         return StepResult(
@@ -156,8 +155,7 @@ class Trainer:
             loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed, lesson.t, pairs)
         gradients = self._gradients(loss, lesson)
         squared_error = float((rgb.detach() - truth).square().mean())
-        moved = (posed.means - self.model.gaussians.means).detach().norm(dim=1)
-        return _Shot(lesson, loss.item(), squared_error, gradients, info, moved, self._floored(posed))
+        return _Shot(lesson, loss.item(), squared_error, gradients, info, self._floored(posed))
 
     def _gradients(self, loss: Tensor, lesson: Lesson) -> tuple[Tensor | None, ...]:
         """Of all parameters, in their order; None of those that the lesson doesn't teach."""

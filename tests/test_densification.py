@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from msdgs_train.config import TrainConfig
-from msdgs_train.densification import MOVES, SPLIT_SHRINK, DensityControl, rotate
+from msdgs_train.densification import SPLIT_SHRINK, DensityControl, rotate
 from msdgs_train.model import DynamicGaussians
 from msdgs_train.optimizers import make_optimizer
 from tests.training_scene import small_config
@@ -35,10 +35,10 @@ def _setup(count: int = 6, **changes: Any) -> tuple[DynamicGaussians, torch.opti
     return model, optimizer, DensityControl.start(config, EXTENT, count)
 
 
-def _gather(control: DensityControl, pixels: list[float], moved: list[float] | None = None) -> None:
-    """A gradient for each, in NDC units at 2 × 2 pixels, and how far it has moved."""
-    grads, ways = torch.tensor(pixels), torch.tensor(moved or [0.0] * len(pixels))
-    control.gather(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), ways, 2, 2)
+def _gather(control: DensityControl, pixels: list[float]) -> None:
+    """A gradient for each, in NDC units at 2 × 2 pixels."""
+    grads = torch.tensor(pixels)
+    control.gather(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), 2, 2)
 
 
 def _moment_rows(model: DynamicGaussians, optimizer: torch.optim.Adam, name: str) -> list[float]:
@@ -51,8 +51,8 @@ def _moment_rows(model: DynamicGaussians, optimizer: torch.optim.Adam, name: str
 def test_gradients_are_scaled_to_ndc_and_averaged_over_where_drawn() -> None:
     _, _, control = _setup(2)
     grads = torch.tensor([[0.3, 0.4], [1.0, 1.0]])
-    control.gather(grads, torch.tensor([1.0, 0.0]), torch.zeros(2), 20, 20)
-    control.gather(grads, torch.tensor([1.0, 0.0]), torch.zeros(2), 20, 20)
+    control.gather(grads, torch.tensor([1.0, 0.0]), 20, 20)
+    control.gather(grads, torch.tensor([1.0, 0.0]), 20, 20)
     assert torch.allclose(control.gradients, torch.tensor([10.0, 0.0]))
     assert control.counts.tolist() == [2.0, 0.0]
 
@@ -66,24 +66,6 @@ def test_small_ones_are_cloned_as_they_are() -> None:
         assert torch.equal(p, before[name][[0, 1, 2, 3, 4, 5, 1, 4]]), name
         if p.numel():
             assert _moment_rows(model, optimizer, name) == [1, 2, 3, 4, 5, 6, 0, 0]
-
-
-def test_what_moves_counts_more() -> None:
-    model, optimizer, control = _setup(densify_movers=4.0)
-    far = 2 * MOVES * EXTENT
-    _gather(control, [0, 0.2, 0.2, 0.4, 0.1, 0], [far, far, far / 4, 0, far, far])
-    _gather(control, [0, 0.2, 0.2, 0.4, 0.1, 0])
-    assert control.densify(model.gaussians, optimizer, 4) == (1, 0, 0)
-    assert _moment_rows(model, optimizer, "means") == [1, 2, 3, 4, 5, 6, 0]
-    assert torch.equal(model.gaussians.means[6], model.gaussians.means[1])
-
-
-def test_room_for_what_moves_grows_until_density_control_ends() -> None:
-    settings = {"steps": 100, "warmup_fraction": 0.2, "densify_until_fraction": 0.7, "sown_fraction": 0.25}
-    config: TrainConfig = small_config(init_count=6, max_gaussians=100, densify_movers=2.0, **settings)
-    assert [config.most_gaussians(step) for step in (20, 21, 45, 70, 90)] == [50, 76, 88, 100, 100]
-    at_once: TrainConfig = small_config(init_count=6, max_gaussians=100, **settings)
-    assert [at_once.most_gaussians(step) for step in (20, 21, 70)] == [50, 100, 100]
 
 
 def test_large_ones_are_split_inside_themselves() -> None:
