@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 from typing import Any
 
 THREADS_VARIABLE = "MSDGS_THREADS"
@@ -27,13 +28,18 @@ _callers = 0  # within `sharing_cores` at this moment
 
 
 def thread_count() -> int:
-    """Threads in the pool: `MSDGS_THREADS`, or the cores this process may use."""
+    """Threads in the pool: `MSDGS_THREADS`, or the cores this process could use when this was first asked."""
     setting = os.environ.get(THREADS_VARIABLE)
     if setting is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return _cores()
     if not setting.isdecimal() or int(setting) < 1:
         raise ValueError(f"{THREADS_VARIABLE} must be a whole number above 0, got {setting!r}")
     return int(setting)
+
+
+@cache
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

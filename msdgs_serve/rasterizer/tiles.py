@@ -60,15 +60,17 @@ def sorted_by_depth(splats: Splats) -> np.ndarray:
     nearest, farthest = splats.depth_range
     base, bits = np.uint64(nearest), max(farthest - nearest, 0).bit_length()
     passes = max(1, -(-bits // DIGIT_BITS))
-    run = run_parallel if count >= SPLATS_A_PART else run_serially
+    together = count < SPLATS_A_PART  # one after the other, in order: they count and write as one part would
+    run = run_serially if together else run_parallel
     for k in range(passes):
         first, past = (bits * k // passes, bits * (k + 1) // passes)
         shift, buckets = np.uint64(first), 1 << (past - first)
-        counts = np.zeros((len(parts), buckets), np.int64)
-        run(_count_digits, [(*part, keys, base, shift, counts[j]) for j, part in enumerate(parts)])
+        counts = np.zeros((1 if together else len(parts), buckets), np.int64)
+        rows = [counts[0]] * len(parts) if together else list(counts)
+        run(_count_digits, [(*part, keys, base, shift, row) for part, row in zip(parts, rows, strict=True)])
         _to_cursors(counts)
         out = np.empty(count, np.uint32 if k == passes - 1 else np.uint64)  # in the end without the depths
-        run(_scatter_by_digit, [(*part, keys, base, shift, counts[j], out) for j, part in enumerate(parts)])
+        run(_scatter_by_digit, [(*part, keys, base, shift, row, out) for part, row in zip(parts, rows, strict=True)])
         keys, parts = out, _parts(count)
     return keys
 
