@@ -50,8 +50,8 @@ CACHE_LINE = 64
 """Bytes."""
 AHEAD = 2 * LANES
 """Gaussians between asking for their numbers and needing them; of 1,000,000 a frame takes 0.95 of the time for it."""
-PARTS_A_THREAD = 4
-"""Of the Gaussians: another thread is late by the time that it takes to wake up, and takes fewer of them."""
+LEAST_PARTS = 8
+"""Of the Gaussians, for two threads and more: another is late by the time it takes to wake up, and takes fewer."""
 ROOT_SCALE = math.sqrt(0.5 / math.log(2))
 """alpha = 2^(LOG2_OPACITY - |root @ d|²): the root is that of the inverse covariance times this."""
 
@@ -112,7 +112,7 @@ def empty_records(count: int, dtype: np.dtype) -> np.ndarray:
 def ranges_of_lanes(count: int) -> list[tuple[int, int]]:
     """(start, stop) of parts of `range(count)` for the threads; each but the last has whole groups of 16."""
     threads = threads_to_use()
-    groups = split_evenly(-(-count // LANES), PARTS_A_THREAD * threads if threads > 1 else 1) or [(0, 0)]
+    groups = split_evenly(-(-count // LANES), max(2 * threads, LEAST_PARTS) if threads > 1 else 1) or [(0, 0)]
     return [(first * LANES, min(past * LANES, count)) for first, past in groups]
 
 
