@@ -92,18 +92,12 @@ def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[A
         return run_serially(function, items)
     call, turn, results = _checked(function), itertools.count(), [None] * len(items)
 
-    def work() -> None:
+    def work() -> bool:
         while (k := next(turn)) < len(items):
             results[k] = call(*items[k])
+        return False  # what the others have begun is not known
 
-    helpers = [_shared_pool().submit(work) for _ in range(threads - 1)]
-    try:
-        work()
-    finally:
-        begun = [helper for helper in helpers if not helper.cancel()]
-        wait(begun)
-    for helper in begun:
-        helper.result()
+    _on_threads(threads, work, ())
     return results
 
 
@@ -113,11 +107,15 @@ def run_together(work: Callable[..., bool], arguments: tuple) -> None:
     Each call takes parts of the work until none is left, and returns whether all parts are done. Only if not, because
     another thread still has one, the caller sleeps until it has: to be woken up takes as long as a small part.
     """
-    call = _checked(work)
-    helpers = [_shared_pool().submit(call, *arguments) for _ in range(threads_to_use() - 1)]
+    _on_threads(threads_to_use(), _checked(work), arguments)
+
+
+def _on_threads(threads: int, work: Callable[..., bool], arguments: tuple) -> None:
+    """`work(*arguments)` on so many; where the caller's doesn't say that all is done, what has begun is waited for."""
+    helpers = [_shared_pool().submit(work, *arguments) for _ in range(threads - 1)]
     done = False
     try:
-        done = call(*arguments)
+        done = work(*arguments)
     finally:
         begun = [helper for helper in helpers if not helper.cancel()]
         if not done:

@@ -91,11 +91,11 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
     ranges = np.array(ranges_of_lanes(count))
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    sh = gaussians.sh.reshape(count, 3 * gaussians.sh.shape[1])
+    g = gaussians
+    arrays = (g.means, g.quats, g.scales, g.opacities, g.sh.reshape(count, 3 * g.sh.shape[1]))
     found = np.empty((len(ranges), 4), np.int64)
     counters = np.zeros(2, np.int64)
-    run_together(_project_ranges, (counters, ranges, found, view, *arrays, sh, records, rectangles, keys))
+    run_together(_project_ranges, (counters, ranges, found, view, arrays, (records, rectangles, keys)))
     ends, nearest, farthest, sound = found.T.tolist()
     drawn = list(zip(ranges[:, 0].tolist(), ends, strict=True))
     return Splats(records[:count], rectangles, keys, drawn, (min(nearest), max(farthest)), all(sound))
@@ -129,44 +129,28 @@ def _project_ranges(
     ranges: np.ndarray,
     found: np.ndarray,
     view: View,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    sh: np.ndarray,
-    records: np.ndarray,
-    rectangles: np.ndarray,
-    keys: np.ndarray,
+    gaussians: tuple,
+    splats: tuple,
 ) -> bool:
-    """Project `ranges` [P, 2], one at each turn, and write what each has found [P, 4]; whether all of them are done."""
+    """Project `ranges` [P, 2], one at each turn, and write what each has found [P, 4]; whether all of them are done.
+
+    `gaussians` are the arrays of `Gaussians`, harmonics flat; `splats` the records, rectangles and keys of `Splats`.
+    """
     while True:
         k = fetch_add(counters, TAKEN, 1)
         if k >= len(ranges):
             return all_done(counters, len(ranges))
-        start, stop = ranges[k, 0], ranges[k, 1]
-        end, nearest, farthest, sound = _project_range(
-            start, stop, view, means, quats, scales, opacities, sh, records, rectangles, keys
-        )
+        end, nearest, farthest, sound = _project_range(ranges[k, 0], ranges[k, 1], view, gaussians, splats)
         found[k, 0], found[k, 1], found[k, 2], found[k, 3] = end, nearest, farthest, sound
         fetch_add(counters, DONE, 1)
 
 
 @kernel
-def _project_range(
-    start: int,
-    stop: int,
-    view: View,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    sh: np.ndarray,
-    records: np.ndarray,
-    rectangles: np.ndarray,
-    keys: np.ndarray,
-) -> tuple[int, int, int, bool]:
+def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: tuple) -> tuple[int, int, int, bool]:
     """Splats `start` to `stop`. Keys are written from `start`; where they end, bits of the least and the largest depth
     that is drawn, and whether all that was read is what a Gaussian may have."""
+    means, quats, scales, opacities, sh = gaussians
+    records, rectangles, keys = splats
     real = records.dtype.type
     zero = spread(real(0))
     double = np.empty(1, np.float64)
