@@ -64,7 +64,8 @@ class Offline:
         view = framing(session.scene.metadata)
         pose = orbit(view.target, view.distance, wanted.azimuth, ELEVATION, view.up)
         camera = Camera.from_fov(pose, wanted.size, wanted.size, view.fov_y)
-        options = RenderOptions("transparent" if FORMATS[wanted.image_format].holds_float else "scene")
+        depth = FORMATS[wanted.image_format].holds_float
+        options = RenderOptions("transparent" if depth else "scene", depth=depth)
         image = self._renderer.render(session, camera, wanted.t, options)
         return encode(image, wanted.image_format) if encoded else b""
 

@@ -25,6 +25,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
+from msdgs_serve.imaging.formats import default_channels
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions
@@ -100,7 +101,8 @@ def _run(options: argparse.Namespace) -> None:
     _claim(folder, _record(options, views, image_format, transparent))
     files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(views))]
     background = "transparent" if transparent else "scene"
-    _draw(views, files, Look(image_format, options.quality, RenderOptions(background)), options.ray)
+    drawn = RenderOptions(background, depth="depth" in default_channels(image_format))
+    _draw(views, files, Look(image_format, options.quality, drawn), options.ray)
     if is_film:
         unfinished = options.out.with_name(f".{options.out.name}.part")
         with unfinished.open("wb") as file:

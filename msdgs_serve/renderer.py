@@ -46,6 +46,7 @@ class RenderOptions:
     background: Background = "scene"  # an sRGB-encoded colour, what the scene was trained on, or none
     shutter: Shutter | None = None  # motion blur; None: one moment
     motion_dt: float | None = None  # draw motion vectors too, to this much later; not together with a shutter
+    depth: bool = False  # draw how far what is seen is too
     counts: bool = False  # count the Gaussians that add to each pixel too
     steps: float | None = None  # after so many of the scene's layers; None: all
     rasterizer: RasterizerOptions = GSPLAT
@@ -104,12 +105,18 @@ class Renderer:
             constants = options.rasterizer._replace(mip=session.scene.metadata.antialiasing == "mip")
             extra = None if later is None else displacements(gaussians, later, camera)
             drawn = rasterize(
-                gaussians, camera, background=background, extra=extra, counts=options.counts, options=constants
+                gaussians,
+                camera,
+                background=background,
+                depth=options.depth,
+                extra=extra,
+                counts=options.counts,
+                options=constants,
             )
             transparent = options.background == "transparent"
             motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]
-            counts = drawn.counts if options.counts else None
-            return Image(drawn.rgb, drawn.alpha, drawn.depth, transparent, camera, t, motion, counts)
+            depth, counts = drawn.depth if options.depth else None, drawn.counts if options.counts else None
+            return Image(drawn.rgb, drawn.alpha, depth, transparent, camera, t, motion, counts)
 
 
 def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarray:

@@ -1,13 +1,17 @@
 """Gaussians and cameras for the tests: random ones by seed, and adversarial ones by name."""
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 
+from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.camera import look_at
 
 Scene = tuple[Gaussians, Camera]
+
+draw = functools.partial(rasterize, depth=True)
 
 IDENTITY_ROTATION = (1.0, 0.0, 0.0, 0.0)
 

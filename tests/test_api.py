@@ -15,12 +15,12 @@ import pytest
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import FORMATS
-from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
 from tests.images import decode, linear_to_srgb, psnr
 from tests.scene_files import UP, metadata, write_scene
+from tests.scenes import draw
 from tests.service import serving
 
 SIZE = 64
@@ -57,7 +57,7 @@ def render(client: httpx.Client, **changes: Any) -> np.ndarray:
 @pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
 def test_the_frame_is_what_the_rasterizer_draws(client: httpx.Client, scene: Path, t: float):
     camera = Camera.from_fov(level_pose(), SIZE, SIZE, 40.0)
-    drawn = rasterize(DeformationSession(scene).gaussians(t), camera, background=metadata().background)
+    drawn = draw(DeformationSession(scene).gaussians(t), camera, background=metadata().background)
     assert np.abs(render(client, t=t) / 255 - drawn.rgb).max() <= 0.5 / 255 + 1e-6
     float_pixels = render(client, t=t, format="exr", background="scene")
     assert np.abs(linear_to_srgb(float_pixels[..., :3]) - drawn.rgb).max() < 1e-5

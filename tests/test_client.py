@@ -40,7 +40,7 @@ def client(url: str) -> Iterator[Client]:
 def test_frames_are_arrays_as_drawn(client: Client, scene: Path):
     frame = client.render(LEVEL, 0.3, width=SIZE, height=SIZE, background="scene")
     camera = Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), SIZE, SIZE, 40.0)
-    drawn = rasterize(DeformationSession(scene).gaussians(0.3), camera, background=metadata().background)
+    drawn = rasterize(DeformationSession(scene).gaussians(0.3), camera, background=metadata().background, depth=True)
     for name in ("rgb", "alpha", "depth"):
         np.testing.assert_array_equal(getattr(frame, name), getattr(drawn, name))
     assert frame.plan == "network"

@@ -46,6 +46,7 @@ for model in ("pinhole", "orthographic", "fisheye"):
     view = dataclasses.replace(camera, model=model)
     for options in (
         RenderOptions(),
+        RenderOptions(depth=True),
         RenderOptions(background="transparent"),
         RenderOptions(background=(1.0, 0.5, 0.0), motion_dt=0.1),
         RenderOptions(shutter=Shutter(0.0, 0.1, 3)),
@@ -58,7 +59,7 @@ print(json.dumps([ahead, compiled()]))
 
 def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
     ahead, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
-    assert ahead["msdgs_serve.rasterizer.projection._project_ranges"]
+    assert ahead["msdgs_serve.rasterizer.projection._project_parts"]
     assert ahead["msdgs_serve.rasterizer.compositing._composite_tiles"]
     assert after == ahead
 

@@ -9,7 +9,7 @@ from msdgs_serve.rasterizer import GSPLAT, INRIA, Rendering, rasterize
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 from tests import reference
-from tests.scenes import as_dtype, front_camera, gaussians_of, joined, random_scene, select, unit_quats
+from tests.scenes import as_dtype, draw, front_camera, gaussians_of, joined, random_scene, select, unit_quats
 from tests.tolerances import assert_close, tolerance
 
 BACKGROUND = np.array([0.2, 0.6, 0.9])
@@ -49,7 +49,7 @@ def clear_pixels(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 def test_order_of_gaussians_does_not_matter(seed: int, dtype: type):
     gaussians, camera = scene(seed, dtype)
     order = np.random.default_rng(seed).permutation(len(gaussians))
-    assert_identical(rasterize(select(gaussians, order), camera), rasterize(gaussians, camera))
+    assert_identical(draw(select(gaussians, order), camera), draw(gaussians, camera))
 
 
 @DTYPES
@@ -59,10 +59,24 @@ def test_scaling_scene_and_camera_changes_nothing(factor: float, dtype: type):
     gaussians, camera = scene(20, dtype)
     pose = camera.camera_to_world.copy()
     pose[:3, 3] *= factor
-    small = rasterize(gaussians, camera, background=BACKGROUND)
+    small = draw(gaussians, camera, background=BACKGROUND)
     scaled = replace(gaussians, means=gaussians.means * dtype(factor), scales=gaussians.scales * dtype(factor))
-    large = rasterize(scaled, replace(camera, camera_to_world=pose), background=BACKGROUND)
+    large = draw(scaled, replace(camera, camera_to_world=pose), background=BACKGROUND)
     assert_identical(large._replace(depth=large.depth / factor), small)
+
+
+@DTYPES
+def test_what_is_asked_for_besides_changes_nothing_else(dtype: type):
+    gaussians, camera = scene(22, dtype)
+    plain = rasterize(gaussians, camera, background=BACKGROUND)
+    assert plain.depth.shape == plain.median_depth.shape == plain.counts.shape == (0, 0)
+    with_depth = draw(gaussians, camera, background=BACKGROUND)
+    assert with_depth.median_depth.shape == (0, 0)
+    with_median = rasterize(gaussians, camera, background=BACKGROUND, median_depth=True)
+    np.testing.assert_array_equal(with_median.depth, with_depth.depth)
+    for more in (with_depth, with_median):
+        np.testing.assert_array_equal(more.rgb, plain.rgb)
+        np.testing.assert_array_equal(more.alpha, plain.alpha)
 
 
 def rotated(gaussians: Gaussians, camera: Camera, turn: np.ndarray) -> tuple[Gaussians, Camera]:
@@ -90,14 +104,14 @@ def test_moving_world_and_camera_together_changes_nothing(seed: int):
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     gaussians = replace(gaussians, quats=quats)
     moved = rotated(gaussians, camera, to_matrix(unit_quats(np.random.default_rng(seed), 1)[0]))
-    assert_same(rasterize(*moved, background=BACKGROUND), rasterize(gaussians, camera, background=BACKGROUND))
+    assert_same(draw(*moved, background=BACKGROUND), draw(gaussians, camera, background=BACKGROUND))
 
 
 @DTYPES
 def test_sign_of_quaternions_does_not_matter(dtype: type):
     gaussians, camera = scene(20, dtype)
     negated = replace(gaussians, quats=-gaussians.quats)
-    assert_identical(rasterize(negated, camera), rasterize(gaussians, camera))
+    assert_identical(draw(negated, camera), draw(gaussians, camera))
 
 
 @pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
@@ -107,8 +121,8 @@ def test_opaque_front_hides_all(dtype: type, options):
     behind, camera = gaussians_of([[0, 0, 4], [0.2, 0, 5], [-0.3, 0.2, 6]], scales=0.5, dtype=dtype), front_camera()
     front = gaussians_of([[0, 0, 2], [0, 0, 2.5]], scales=1e4, opacities=1.0, rgb=[0.1, 0.7, 0.3], dtype=dtype)
     options = options._replace(transmittance_min=(1 - options.alpha_max) ** 2 * 2)
-    alone = rasterize(front, camera, background=BACKGROUND, options=options)
-    assert_identical(rasterize(joined(behind, front), camera, background=BACKGROUND, options=options), alone)
+    alone = draw(front, camera, background=BACKGROUND, options=options)
+    assert_identical(draw(joined(behind, front), camera, background=BACKGROUND, options=options), alone)
     want = options.alpha_max * np.array([0.1, 0.7, 0.3]) + (1 - options.alpha_max) * BACKGROUND
     assert_close(alone.rgb, np.broadcast_to(want, alone.rgb.shape), "rgb.float32")
     assert_close(alone.depth, np.full(alone.depth.shape, 2.0), "depth.float32.relative")
@@ -119,7 +133,7 @@ def test_opaque_front_hides_all(dtype: type, options):
 def test_background_shows_through_what_is_left(seed: int, dtype: type):
     """rgb(background) = rgb(black) + (1 - alpha) background; alpha and depth don't know of it."""
     gaussians, camera = scene(seed, dtype)
-    over, black = rasterize(gaussians, camera, background=BACKGROUND), rasterize(gaussians, camera)
+    over, black = draw(gaussians, camera, background=BACKGROUND), draw(gaussians, camera)
     assert_close(over.rgb, black.rgb + (1 - black.alpha)[..., None] * BACKGROUND, f"rgb.{np.dtype(dtype).name}")
     assert_identical(over._replace(rgb=black.rgb), black)
 
@@ -130,7 +144,7 @@ def test_alpha_is_the_weight_of_all_splats(seed: int, dtype: type):
     """White Gaussians over black: the colour is the sum of the weights."""
     gaussians, camera = scene(seed, dtype)
     white = np.full((len(gaussians), 1, 3), 0.5 / 0.28209479177387814, dtype)
-    picture = rasterize(replace(gaussians, sh=white), camera)
+    picture = draw(replace(gaussians, sh=white), camera)
     for channel in range(3):
         assert_close(picture.rgb[..., channel], picture.alpha, f"rgb.{np.dtype(dtype).name}")
     assert picture.alpha.min() >= 0
@@ -145,8 +159,8 @@ def test_colors_are_linear_without_the_clamp(seed: int, dtype: type):
     bright = gaussians_of(gaussians.means, rgb=np.linspace(0.2, 0.8, 450).reshape(-1, 3), dtype=dtype)
     dim = gaussians_of(gaussians.means, rgb=np.linspace(0.1, 0.4, 450).reshape(-1, 3), dtype=dtype)
     assert_close(
-        rasterize(replace(gaussians, sh=dim.sh), camera).rgb * 2,
-        rasterize(replace(gaussians, sh=bright.sh), camera).rgb,
+        draw(replace(gaussians, sh=dim.sh), camera).rgb * 2,
+        draw(replace(gaussians, sh=bright.sh), camera).rgb,
         f"rgb.{np.dtype(dtype).name}",
     )
 
@@ -158,13 +172,13 @@ def test_crops_show_the_same_pixels(dtype: type):
     means = np.column_stack([rng.uniform(-0.15, 0.15, size=(40, 2)), rng.uniform(1.5, 3, 40)])
     gaussians = gaussians_of(means, scales=rng.uniform(0.02, 1.5, 40), opacities=0.4, dtype=dtype)
     camera = front_camera(64, 48)
-    whole = rasterize(gaussians, camera, background=BACKGROUND)
+    whole = draw(gaussians, camera, background=BACKGROUND)
     clear = clear_pixels(gaussians, camera)
     for left, top, width, height in ((0, 0, 37, 29), (27, 0, 37, 31), (0, 19, 40, 29), (25, 17, 13, 11)):
         crop = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
         part = np.s_[top : top + height, left : left + width]
         expected = Rendering(*(channel[part] for channel in whole))
-        assert_same(rasterize(gaussians, crop, background=BACKGROUND), expected, clear[part])
+        assert_same(draw(gaussians, crop, background=BACKGROUND), expected, clear[part])
 
 
 @SEEDS
@@ -174,16 +188,16 @@ def test_mirrored_picture(seed: int):
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     gaussians = replace(gaussians, means=gaussians.means + np.array([0, 0, 4]), quats=quats, sh=gaussians.sh[:, :1])
     mirrored = replace(gaussians, means=gaussians.means * [-1, 1, 1], quats=quats * [1, 1, -1, -1])
-    picture, camera = rasterize(gaussians, front_camera()), front_camera()
-    turned = rasterize(mirrored, camera)
+    picture, camera = draw(gaussians, front_camera()), front_camera()
+    turned = draw(mirrored, camera)
     assert_same(Rendering(*(channel[:, ::-1] for channel in turned)), picture)
 
 
 @SEEDS
 def test_float32_is_close_to_float64(seed: int):
     gaussians, camera = scene(seed, np.float32)
-    double = rasterize(as_dtype(gaussians, np.float64), camera, background=BACKGROUND)
-    single = rasterize(gaussians, camera, background=BACKGROUND)
+    double = draw(as_dtype(gaussians, np.float64), camera, background=BACKGROUND)
+    single = draw(gaussians, camera, background=BACKGROUND)
     want = Rendering(*(channel.astype(np.float32) for channel in double))
     assert_same(single, want, clear_pixels(gaussians, camera))
     assert -10 * np.log10(np.mean((single.rgb - double.rgb) ** 2)) > tolerance("oracle_db")
@@ -198,13 +212,13 @@ def test_invisible_gaussians_change_no_byte(dtype: type):
     means = [middle, middle, camera.position - forward, middle + 30 * right]
     hidden = gaussians_of(means, scales=0.1, opacities=[0, 0.0039, 1, 1], dtype=dtype)
     hidden = replace(hidden, sh=np.pad(hidden.sh, ((0, 0), (0, 15), (0, 0))))
-    assert_identical(rasterize(joined(hidden, gaussians), camera), rasterize(gaussians, camera))
+    assert_identical(draw(joined(hidden, gaussians), camera), draw(gaussians, camera))
 
 
 @DTYPES
 def test_depth_of_one_splat_is_its_own(dtype: type):
     gaussians = gaussians_of([[0.1, -0.1, 3]], scales=0.5, dtype=dtype)
-    picture = rasterize(gaussians, front_camera())
+    picture = draw(gaussians, front_camera())
     seen = picture.alpha > 0
     assert 0 < seen.mean() < 1
     assert_close(picture.depth[seen], np.full(seen.sum(), 3.0), "depth.float32.relative")
@@ -217,8 +231,8 @@ def test_extra_channels_are_drawn_as_colors_are(channels: int, dtype: type):
     """Each channel as the red of the same Gaussians, over black; depth is what the camera's axis says."""
     gaussians, camera = scene(20, dtype)
     extra = np.random.default_rng(0).uniform(-1, 1, size=(len(gaussians), channels)).astype(dtype)
-    got = rasterize(gaussians, camera, background=BACKGROUND, extra=extra)
-    plain = rasterize(gaussians, camera, background=BACKGROUND)
+    got = draw(gaussians, camera, background=BACKGROUND, extra=extra)
+    plain = draw(gaussians, camera, background=BACKGROUND)
     for name in ("rgb", "alpha", "depth"):
         np.testing.assert_array_equal(getattr(got, name), getattr(plain, name))
     assert plain.extra.shape == (camera.height, camera.width, 0)
@@ -226,7 +240,7 @@ def test_extra_channels_are_drawn_as_colors_are(channels: int, dtype: type):
     for channel in range(channels):
         shifted = np.zeros((len(gaussians), 1, 3), dtype)
         shifted[:, 0, 0] = (extra[:, channel] + 2 - 0.5) * np.sqrt(4 * np.pi)  # colours can't be below 0
-        red = rasterize(replace(gaussians, sh=shifted), camera).rgb[:, :, 0]
+        red = draw(replace(gaussians, sh=shifted), camera).rgb[:, :, 0]
         assert_close(got.extra[:, :, channel], red - 2 * plain.alpha, f"rgb.{np.dtype(dtype).name}")
 
 
@@ -234,15 +248,15 @@ def test_extra_channels_are_drawn_as_colors_are(channels: int, dtype: type):
 def test_extra_channels_that_cannot_be(bad: np.ndarray):
     gaussians, camera = scene(20, np.float32)
     with pytest.raises(InvalidInput, match="extra"):
-        rasterize(gaussians, camera, extra=bad)
+        draw(gaussians, camera, extra=bad)
 
 
 @DTYPES
 def test_median_depth_is_where_half_of_the_light_is_gone(dtype: type):
     """Against a loop over the Gaussians, front to back, at pixels where no rounding decides."""
     gaussians, camera = scene(20, dtype)
-    got = rasterize(gaussians, camera, background=BACKGROUND, median_depth=True)
-    plain = rasterize(gaussians, camera, background=BACKGROUND)
+    got = draw(gaussians, camera, background=BACKGROUND, median_depth=True)
+    plain = draw(gaussians, camera, background=BACKGROUND)
     np.testing.assert_array_equal(got.rgb, plain.rgb)
     assert plain.median_depth.size == 0
     want, margin = np.full(got.alpha.shape, np.inf), np.full(got.alpha.shape, np.inf)
@@ -251,7 +265,7 @@ def test_median_depth_is_where_half_of_the_light_is_gone(dtype: type):
     before = np.ones_like(got.alpha)
     order = np.argsort(depths, kind="stable")
     for count, i in enumerate(order, start=1):
-        after = 1 - rasterize(select(gaussians, order[:count]), camera).alpha
+        after = 1 - draw(select(gaussians, order[:count]), camera).alpha
         margin = np.minimum(margin, np.abs(after - 0.5))
         want[(before > 0.5) & (after <= 0.5)] = depths[i]
         before = after

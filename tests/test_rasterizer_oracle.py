@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering, rasterize
+from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering
 from tests.reference import DEPTH_BAND, Reference, render
-from tests.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene, select
+from tests.scenes import ADVERSARIAL, as_dtype, draw, front_camera, gaussians_of, random_scene, select
 from tests.tolerances import tolerance
 
 BACKGROUND = (0.2, 0.6, 0.9)
@@ -58,7 +58,7 @@ def assert_same_depth(got: Rendering, want: Reference, row: str):
 )
 def test_random_scenes(seed: int, count: int, width: int, height: int, degree: int):
     gaussians, camera = random_scene(seed, count, width, height, sh_degree=degree)
-    got = rasterize(gaussians, camera, background=BACKGROUND)
+    got = draw(gaussians, camera, background=BACKGROUND)
     assert got.rgb.dtype == got.alpha.dtype == got.depth.dtype == np.float32
     assert got.rgb.shape == (height, width, 3)
     assert got.alpha.shape == got.depth.shape == (height, width)
@@ -69,7 +69,7 @@ def test_random_scenes(seed: int, count: int, width: int, height: int, degree: i
 def test_adversarial_scenes(name: str):
     gaussians, camera = ADVERSARIAL[name]()
     want = render(gaussians, camera, BACKGROUND, depth_band=0.0 if name in EXACT_DEPTHS else DEPTH_BAND)
-    assert_same_picture(rasterize(gaussians, camera, background=BACKGROUND), want, "float32")
+    assert_same_picture(draw(gaussians, camera, background=BACKGROUND), want, "float32")
 
 
 def test_largest_picture():
@@ -78,7 +78,7 @@ def test_largest_picture():
     camera = front_camera(side, side, focal=6000.0)
     means = np.array([[0, 0, 3], [-1.2, 1.3, 2], [0.5, -1.0, 2.2], [1.36, 1.36, 2]])
     gaussians = gaussians_of(means, scales=[0.3, 0.002, 1e-5, 0.01], opacities=0.8)
-    got = rasterize(gaussians, camera, background=BACKGROUND)
+    got = draw(gaussians, camera, background=BACKGROUND)
     assert got.rgb.shape == (side, side, 3)
     centers = means[:, :2] / means[:, 2:] * 6000 + side / 2
     for x, y in np.clip(centers.astype(int) - 30, 0, side - 60):
@@ -95,7 +95,7 @@ def test_largest_picture():
 def test_float64_agrees_to_rounding(name: str, options: RasterizerOptions):
     gaussians, camera = random_scene(8, 200) if name == "random" else ADVERSARIAL[name]()
     gaussians = as_dtype(gaussians, np.float64)
-    got = rasterize(gaussians, camera, background=BACKGROUND, options=options)
+    got = draw(gaussians, camera, background=BACKGROUND, options=options)
     assert got.rgb.dtype == np.float64
     assert_same_picture(got, render(gaussians, camera, BACKGROUND, options, depth_band=0.0), "float64")
 
@@ -105,8 +105,8 @@ def test_the_median_depth_lies_behind_half_of_the_light(dtype: type):
     """Three sheets of opacity 0.4: the light falls to 0.6, then to 0.36; where there is one sheet, never to a half."""
     sheets = gaussians_of([[0, 0, 2], [0, 0, 3], [0, 0, 4]], scales=1e4, opacities=0.4, dtype=dtype)
     camera = front_camera(20, 20)
-    picture = rasterize(sheets, camera, median_depth=True)
+    picture = draw(sheets, camera, median_depth=True)
     np.testing.assert_array_equal(picture.median_depth, np.full((20, 20), 3, dtype))
-    alone = rasterize(select(sheets, slice(1)), camera, median_depth=True)
+    alone = draw(select(sheets, slice(1)), camera, median_depth=True)
     assert np.isinf(alone.median_depth).all()
-    assert rasterize(sheets, camera).median_depth.shape == (0, 0)
+    assert draw(sheets, camera).median_depth.shape == (0, 0)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from msdgs_serve.rasterizer import Rendering, rasterize
+from msdgs_serve.rasterizer import Rendering
 from msdgs_serve.scene import Gaussians
 from tests.processes import run_python
-from tests.scenes import as_dtype, random_scene
+from tests.scenes import as_dtype, draw, random_scene
 from tests.tolerances import assert_close
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
@@ -21,9 +21,8 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh")
 RENDER_TO_FILE = """
 import sys
 import numpy as np
-from tests.scenes import random_scene
-from msdgs_serve.rasterizer import rasterize
-np.savez(sys.argv[1], **rasterize(*random_scene(40, 12, 19, 13))._asdict())
+from tests.scenes import draw, random_scene
+np.savez(sys.argv[1], **draw(*random_scene(40, 12, 19, 13))._asdict())
 """
 
 COUNT_COMPILATIONS = (
@@ -56,19 +55,19 @@ def bytes_of(picture: Rendering) -> list[bytes]:
 def test_same_bytes_for_any_number_of_threads(threads: str, monkeypatch: pytest.MonkeyPatch):
     """The pool is as large as it was first asked for; the work is split anew by each number."""
     gaussians, camera = random_scene(41, 500, 150, 90)
-    expected = bytes_of(rasterize(gaussians, camera))
+    expected = bytes_of(draw(gaussians, camera))
     monkeypatch.setenv("MSDGS_THREADS", threads)
-    assert bytes_of(rasterize(gaussians, camera)) == expected
+    assert bytes_of(draw(gaussians, camera)) == expected
 
 
 def test_several_callers_at_once_get_serial_bytes():
     scenes = [random_scene(seed, 300, 90 + seed, 70) for seed in range(8)]
-    expected = [bytes_of(rasterize(*scene)) for scene in scenes]
+    expected = [bytes_of(draw(*scene)) for scene in scenes]
     start = threading.Barrier(4)
 
     def caller(_: int) -> list[list[bytes]]:
         start.wait(timeout=30)
-        return [bytes_of(rasterize(*scene)) for scene in scenes]
+        return [bytes_of(draw(*scene)) for scene in scenes]
 
     with ThreadPoolExecutor(4) as callers:
         for got in callers.map(caller, range(4)):
@@ -77,12 +76,12 @@ def test_several_callers_at_once_get_serial_bytes():
 
 def test_repeated_calls_give_the_same_bytes():
     scene = random_scene(42, 300)
-    assert bytes_of(rasterize(*scene)) == bytes_of(rasterize(*scene))
+    assert bytes_of(draw(*scene)) == bytes_of(draw(*scene))
 
 
 def test_second_process_compiles_nothing(tmp_path: Path):
     """The first leaves its kernels in the cache on disk; the second finds all of them there."""
-    rasterize(*random_scene(40, 12, 19, 13))
+    draw(*random_scene(40, 12, 19, 13))
     hits, misses = map(int, run_python(COUNT_COMPILATIONS, tmp_path / "picture.npz").split())
     assert misses == 0
     assert hits > 0
@@ -91,7 +90,7 @@ def test_second_process_compiles_nothing(tmp_path: Path):
 def test_without_the_compiler_the_picture_is_the_same(tmp_path: Path):
     """The kernels are plain Python too: what a debugger and a coverage report see is what runs."""
     run_python(RENDER_TO_FILE, tmp_path / "picture.npz", NUMBA_DISABLE_JIT="1")
-    expected = rasterize(*random_scene(40, 12, 19, 13))
+    expected = draw(*random_scene(40, 12, 19, 13))
     with np.load(tmp_path / "picture.npz") as plain:
         for name in ("rgb", "alpha", "depth"):
             channel = getattr(expected, name)
@@ -109,10 +108,10 @@ def read_only(array: np.ndarray) -> np.ndarray:
 def test_no_layout_of_arrays_is_compiled_for_anew(layout, dtype: type):
     gaussians, camera = random_scene(43, 20)
     gaussians = as_dtype(gaussians, dtype)
-    expected = bytes_of(rasterize(gaussians, camera))
+    expected = bytes_of(draw(gaussians, camera))
     laid_out = Gaussians(**{name: layout(getattr(gaussians, name)) for name in FIELDS})
     before = compiled()
-    assert bytes_of(rasterize(laid_out, camera)) == expected
+    assert bytes_of(draw(laid_out, camera)) == expected
     assert compiled() == before
 
 
@@ -120,9 +119,9 @@ def test_cameras_of_any_number_type_are_compiled_for_once():
     """JSON brings integers, NumPy brings its own scalars."""
     gaussians, camera = random_scene(43, 20)
     square = replace(camera, fx=50.0, fy=50.0, cx=26.0, cy=18.0)
-    expected = bytes_of(rasterize(gaussians, square))
+    expected = bytes_of(draw(gaussians, square))
     for kind in (int, np.float32, np.int64):
         typed = replace(camera, fx=kind(50), fy=kind(50), cx=kind(26), cy=kind(18), width=np.int32(53))  # pyright: ignore
         before = compiled()
-        assert bytes_of(rasterize(gaussians, typed)) == expected
+        assert bytes_of(draw(gaussians, typed)) == expected
         assert compiled() == before

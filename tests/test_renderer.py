@@ -16,6 +16,7 @@ from msdgs_serve.scene.camera import orbit
 from tests.scene_files import UP, metadata, write_scene
 
 SIZE = 64
+BLUE = (0.1, 0.2, 0.3)
 POSE_BYTES = 2 * 10 * 4  # two Gaussians: means, quats, scales
 
 
@@ -55,7 +56,7 @@ def counting(session: DeformationSession) -> CountingSession:
 
 @pytest.mark.parametrize(("t", "row"), [(0.0, "below"), (1.0, "above")])
 def test_the_frame_shows_the_scene_at_its_time(session: DeformationSession, t: float, row: str):
-    image = Renderer().render(session, level_camera(), t)
+    image = Renderer().render(session, level_camera(), t, RenderOptions(depth=True))
     middle = SIZE // 2
     assert image.rgb[middle, middle].argmax() == 0, "the red ball rests in the middle"
     greens = np.argwhere(image.rgb[..., 1] > 0.8)
@@ -63,16 +64,17 @@ def test_the_frame_shows_the_scene_at_its_time(session: DeformationSession, t: f
     assert (greens[:, 0] > middle).all() if row == "below" else (greens[:, 0] < middle).all()
     np.testing.assert_allclose(image.rgb[0, 0], metadata().background, atol=1e-6)
     assert image.alpha[0, 0] == 0
+    assert image.depth is not None
     assert np.isinf(image.depth[0, 0])
     assert abs(image.depth[middle, middle] - 5) < 1e-3
 
 
 def test_the_image_is_what_the_rasterizer_draws(session: DeformationSession):
-    image = Renderer().render(session, level_camera(), 0.3, RenderOptions((0.1, 0.2, 0.3), rasterizer=INRIA))
-    drawn = rasterize(session.gaussians(0.3), level_camera(), background=(0.1, 0.2, 0.3), options=INRIA)
+    image = Renderer().render(session, level_camera(), 0.3, RenderOptions(BLUE, depth=True, rasterizer=INRIA))
+    drawn = rasterize(session.gaussians(0.3), level_camera(), background=BLUE, depth=True, options=INRIA)
     np.testing.assert_array_equal(image.rgb, drawn.rgb)
     np.testing.assert_array_equal(image.alpha, drawn.alpha)
-    np.testing.assert_array_equal(image.depth, drawn.depth)
+    np.testing.assert_array_equal(image.depth, drawn.depth)  # pyright: ignore[reportArgumentType]
     assert not image.transparent
 
 
@@ -144,7 +146,7 @@ def test_eight_threads_get_the_bytes_that_one_gets(session: DeformationSession):
 
     def draw(renderer: Renderer, number: int) -> bytes:
         image = renderer.render(session, level_camera(*sizes[number]), number % 3 / 2)
-        return image.rgb.tobytes() + image.alpha.tobytes() + image.depth.tobytes()
+        return image.rgb.tobytes() + image.alpha.tobytes()
 
     alone = [draw(Renderer(), number) for number in range(8)]
     shared = Renderer(cache_bytes=2 * POSE_BYTES)

@@ -80,7 +80,9 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     for t in times:
         check_times(scene.session, t, shutter, request.dt)
     scene.session.check_steps(request.steps)
-    options = RenderOptions(background, shutter, request.dt, "gaussians" in channels, request.steps)
+    options = RenderOptions(
+        background, shutter, request.dt, "depth" in channels, "gaussians" in channels, request.steps
+    )
     etag = _etag(scene, request)
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
 

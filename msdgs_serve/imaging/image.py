@@ -19,7 +19,7 @@ class Image:
 
     rgb: FloatArray  # [H, W, 3] sRGB-encoded, >= 0
     alpha: FloatArray  # [H, W] coverage by Gaussians in [0, 1], whatever the background
-    depth: FloatArray  # [H, W] along the camera axis, scene units; infinite where alpha is 0
+    depth: FloatArray | None = None  # [H, W] along the camera axis, scene units; infinite where alpha is 0
     transparent: bool = False
     camera: Camera | None = None  # that saw it, for formats that can say so
     t: float | None = None  # when, in the scene's time
@@ -30,8 +30,9 @@ class Image:
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3:
             raise InvalidInput("image.rgb", "of shape (height, width, 3)", self.rgb.shape)
         for name in ("alpha", "depth"):
-            if getattr(self, name).shape != self.rgb.shape[:2]:
-                raise InvalidInput(f"image.{name}", f"of shape {self.rgb.shape[:2]}", getattr(self, name).shape)
+            values = getattr(self, name)
+            if values is not None and values.shape != self.rgb.shape[:2]:
+                raise InvalidInput(f"image.{name}", f"of shape {self.rgb.shape[:2]}", values.shape)
 
     @property
     def width(self) -> int:
@@ -76,21 +77,22 @@ def average(images: Iterable[Image]) -> Image:
         coverage = coverage + image.alpha.astype(np.float64)
         if image.gaussians is not None:
             gaussians = gaussians + image.gaussians
-        depth = depth + np.where(image.alpha > 0, image.depth, 0).astype(np.float64) * image.alpha
+        if image.depth is not None:
+            depth = depth + np.where(image.alpha > 0, image.depth, 0).astype(np.float64) * image.alpha
     if first is None:
         raise InvalidInput("images", "at least one", 0)
     alpha = coverage / count
     linear = light / count
     rgb = linear_to_srgb(_straight(linear, alpha)) * alpha[..., None] if first.transparent else linear_to_srgb(linear)
-    mean_depth = np.full(alpha.shape, np.inf)
-    np.divide(depth, coverage, out=mean_depth, where=coverage > 0)
-    dtype = first.rgb.dtype
+    mean_depth, dtype = None, first.rgb.dtype
+    if first.depth is not None:
+        mean_depth = np.divide(depth, coverage, out=np.full(alpha.shape, np.inf), where=coverage > 0).astype(dtype)
     return replace(
         first,
         motion=None,
         rgb=rgb.astype(dtype),
         alpha=alpha.astype(dtype),
-        depth=mean_depth.astype(dtype),
+        depth=mean_depth,
         gaussians=None if first.gaussians is None else (gaussians / count).astype(dtype),
     )
 

@@ -41,9 +41,10 @@ def picture(image: Image, channel: Channel, depth_range: DepthRange | None = Non
     if channel == "gaussians":
         counts = channel_of(image, "gaussians")
         return (counts / max(float(counts.max(initial=0.0)), 1.0))[..., None]
-    near, far = depth_range or depths_of(image)
-    seen = np.isfinite(image.depth)
-    place = np.clip((np.where(seen, image.depth, far) - near) / max(far - near, 1e-12), 0, 1)
+    depth = channel_of(image, "depth")
+    near, far = depth_range or depths_of(depth)
+    seen = np.isfinite(depth)
+    place = np.clip((np.where(seen, depth, far) - near) / max(far - near, 1e-12), 0, 1)
     return (np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0) * image.alpha)[..., None]
 
 
@@ -62,7 +63,7 @@ def _motion_colors(motion: np.ndarray) -> np.ndarray:
     return brightness[..., None] * (0.5 + 0.5 * np.cos(angles))
 
 
-def depths_of(image: Image) -> DepthRange:
+def depths_of(depth: np.ndarray) -> DepthRange:
     """The nearest and farthest depth of an image; 0 and 1 where there is nothing."""
-    depths = image.depth[np.isfinite(image.depth)]
-    return DepthRange(float(depths.min()), float(depths.max())) if depths.size else DepthRange(0.0, 1.0)
+    seen = depth[np.isfinite(depth)]
+    return DepthRange(float(seen.min()), float(seen.max())) if seen.size else DepthRange(0.0, 1.0)

@@ -39,7 +39,7 @@ from msdgs_serve.rasterizer.lanes_memory import (
 from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_serve.threads import run_together, split_evenly, threads_to_use
+from msdgs_serve.threads import run_together, threads_to_use
 
 RECORD = LANES
 """Numbers that a splat's record has: one load. Their places:"""
@@ -67,14 +67,14 @@ class Splats(NamedTuple):
     records: np.ndarray  # [N, RECORD]
     rectangles: np.ndarray  # [N, 4] uint16: columns and rows of tiles, each first and past the last
     keys: np.ndarray  # [N] uint64: bits of the float32 depth above the index of each splat that is drawn
-    drawn: list[tuple[int, int]]  # (start, stop) of the keys that there are, in the order of the indices
+    drawn: np.ndarray  # [P, 2] start and stop of the keys that there are, in the order of the indices
     depth_range: tuple[int, int]  # bits of the least and the largest depth of what is drawn
     sound: bool  # whether `Gaussians.validate` has nothing to say; harmonics of what isn't drawn are not looked at
 
     @property
     def visible(self) -> int:
         """The number of splats that are drawn."""
-        return sum(stop - start for start, stop in self.drawn)
+        return sum(stop - start for start, stop in self.drawn.tolist())
 
     @property
     def extents(self) -> np.ndarray:
@@ -90,15 +90,13 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     records = empty_records(-(-count // LANES) * LANES, dtype)  # whole groups: stored without a look at the end
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
-    ranges = np.array(ranges_of_lanes(count))
     g = gaussians
     arrays = (g.means, g.quats, g.scales, g.opacities, g.sh.reshape(count, 3 * g.sh.shape[1]))
-    found = np.empty((len(ranges), 4), np.int64)
+    found = np.empty((parts_of_lanes(count), 5), np.int64)
     counters = np.zeros(2, np.int64)
-    run_together(_project_ranges, (counters, ranges, found, view, arrays, (records, rectangles, keys)))
-    ends, nearest, farthest, sound = found.T.tolist()
-    drawn = list(zip(ranges[:, 0].tolist(), ends, strict=True))
-    return Splats(records[:count], rectangles, keys, drawn, (min(nearest), max(farthest)), all(sound))
+    run_together(_project_parts, (counters, found, view, arrays, (records, rectangles, keys)))
+    _, _, nearest, farthest, sound = found.T.tolist()
+    return Splats(records[:count], rectangles, keys, found[:, :2], (min(nearest), max(farthest)), all(sound))
 
 
 def empty_records(count: int, dtype: np.dtype) -> np.ndarray:
@@ -109,11 +107,17 @@ def empty_records(count: int, dtype: np.dtype) -> np.ndarray:
     return raw[start : start + size].view(dtype).reshape(count, RECORD)
 
 
-def ranges_of_lanes(count: int) -> list[tuple[int, int]]:
-    """(start, stop) of parts of `range(count)` for the threads; each but the last has whole groups of 16."""
+def parts_of_lanes(count: int) -> int:
+    """How many parts of `range(count)` the threads take."""
     threads = threads_to_use()
-    groups = split_evenly(-(-count // LANES), max(2 * threads, LEAST_PARTS) if threads > 1 else 1) or [(0, 0)]
-    return [(first * LANES, min(past * LANES, count)) for first, past in groups]
+    return max(min(max(2 * threads, LEAST_PARTS) if threads > 1 else 1, -(-count // LANES)), 1)
+
+
+@kernel
+def part_of_lanes(part: int, parts: int, count: int) -> tuple[int, int]:
+    """Where a part of `range(count)` starts and stops; all but the last have whole groups of 16."""
+    groups = -(-count // LANES)
+    return groups * part // parts * LANES, min(groups * (part + 1) // parts * LANES, count)
 
 
 def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
@@ -124,24 +128,19 @@ def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
 
 
 @kernel
-def _project_ranges(
-    counters: np.ndarray,
-    ranges: np.ndarray,
-    found: np.ndarray,
-    view: View,
-    gaussians: tuple,
-    splats: tuple,
-) -> bool:
-    """Project `ranges` [P, 2], one at each turn, and write what each has found [P, 4]; whether all of them are done.
+def _project_parts(counters: np.ndarray, found: np.ndarray, view: View, gaussians: tuple, splats: tuple) -> bool:
+    """Project all parts, one at each turn, and write where each starts and what it has `found`, [P, 5]; whether all of
+    them are done.
 
     `gaussians` are the arrays of `Gaussians`, harmonics flat; `splats` the records, rectangles and keys of `Splats`.
     """
     while True:
         k = fetch_add(counters, TAKEN, 1)
-        if k >= len(ranges):
-            return all_done(counters, len(ranges))
-        end, nearest, farthest, sound = _project_range(ranges[k, 0], ranges[k, 1], view, gaussians, splats)
-        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = end, nearest, farthest, sound
+        if k >= len(found):
+            return all_done(counters, len(found))
+        start, stop = part_of_lanes(k, len(found), len(gaussians[0]))
+        end, nearest, farthest, sound = _project_range(start, stop, view, gaussians, splats)
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3], found[k, 4] = start, end, nearest, farthest, sound
         fetch_add(counters, DONE, 1)
 
 

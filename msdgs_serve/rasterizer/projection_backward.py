@@ -31,7 +31,8 @@ from msdgs_serve.rasterizer.projection import (
     four_coefficients,
     half_axis,
     last_coefficient,
-    ranges_of_lanes,
+    part_of_lanes,
+    parts_of_lanes,
     raw_colors,
     rotation_columns,
     seen_at,
@@ -76,15 +77,16 @@ def project_backward(
     g = gaussians
     arrays = (g.means, g.quats, g.scales, g.opacities, sh, splats.records, sums, flat, grad_sh)
     view = view_of(camera, options)
-    run_parallel(_backward_range, [(start, stop, view, *arrays) for start, stop in ranges_of_lanes(count)])
+    parts = parts_of_lanes(count)
+    run_parallel(_backward_part, [(part, parts, view, *arrays) for part in range(parts)])
     means, quats, scales, opacities, means2d, _ = np.split(flat, [3, 7, 10, 11, 13], axis=1)
     return GaussianGradients(means, quats, scales, opacities[:, 0], grad_sh.reshape(gaussians.sh.shape), means2d)
 
 
 @kernel
-def _backward_range(
-    start: int,
-    stop: int,
+def _backward_part(
+    part: int,
+    parts: int,
     view: View,
     means: np.ndarray,
     quats: np.ndarray,
@@ -99,6 +101,7 @@ def _backward_range(
     double = np.empty(1, np.float64)
     scratch, pulls = np.empty(48 * LANES, sh.dtype), np.zeros(LANES * LANES, sh.dtype)
     w, t = view.rotation, view.translation
+    start, stop = part_of_lanes(part, parts, len(means))
     for first in range(start, stop, LANES):
         record, moments = load_columns(records, first), load_columns(sums, first)
         drawn = record[_EXTENT] > 0

@@ -21,7 +21,7 @@ class Rendering(NamedTuple):
 
     rgb: np.ndarray  # [H, W, 3] display-referred, the background included
     alpha: np.ndarray  # [H, W] 1 - transmittance
-    depth: np.ndarray  # [H, W] expected distance along the camera axis, scene units, infinite where alpha is 0
+    depth: np.ndarray  # [H, W] expected distance along the camera axis, infinite where alpha is 0; [0, 0] unasked
     median_depth: np.ndarray  # [H, W] distance of the splat that takes half of the light, else infinite; [0, 0] unasked
     extra: np.ndarray  # [H, W, C] what was asked for besides, weighted as colours are; divide by alpha for a mean
     counts: np.ndarray  # [H, W] Gaussians that add to each pixel; [0, 0] unasked
@@ -33,6 +33,7 @@ def rasterize(
     camera: Camera,
     *,
     background: npt.ArrayLike = (0.0, 0.0, 0.0),
+    depth: bool = False,
     median_depth: bool = False,
     extra: np.ndarray | None = None,
     counts: bool = False,
@@ -40,9 +41,9 @@ def rasterize(
 ) -> Rendering:
     """Draw the Gaussians (equations 1 and 2) over a background colour.
 
+    Colour and alpha are drawn always. Depths are in scene units; with the median the expected depth is drawn too.
     `extra` [N, C] is any C numbers of each Gaussian, drawn as if they were colours over nothing; three of them take as
-    long as the colours do. Depth is always drawn: its part of the time is too small to measure. `counts` take a pass
-    of their own.
+    long as the colours do. `counts` take a pass of their own.
 
     Safe to call from several threads; the same input gives the same bytes, whatever the number of threads.
 
@@ -59,7 +60,7 @@ def rasterize(
     extra = _checked_extra(extra, gaussians)
     tiles = bin_into_tiles(splats, camera.width, camera.height)
     size = (camera.width, camera.height)
-    frame = composite(splats, tiles, *size, background, options, median_depth=median_depth)
+    frame = composite(splats, tiles, *size, background, options, depth=depth, median_depth=median_depth)
     dtype = splats.records.dtype
     counted = count_splats(splats, tiles, *size, options).blended if counts else np.empty((0, 0), dtype)
     return Rendering(*frame, _drawn_extra(extra, splats, tiles, camera, options), counted)

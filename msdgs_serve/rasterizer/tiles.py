@@ -36,15 +36,21 @@ class TileLists(NamedTuple):
 def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
     """Sort the visible splats by float32 depth, equal depths by index, and deal them out to the tiles."""
     columns, rows = -(-width // TILE), -(-height // TILE)
-    order = sorted_by_depth(splats)
-    parts = _parts(len(order))
-    rectangles = np.empty((len(order), 4), np.uint16)
+    count, (nearest, farthest) = splats.visible, splats.depth_range
+    digits = _digits(np.uint64(nearest), max(farthest - nearest, 0).bit_length())
+    offsets = np.empty(columns * rows + 1, np.int64)
+    if count < SPLATS_A_PART:
+        few = (count, splats.keys, splats.drawn, digits, splats.rectangles, rows, columns, offsets)
+        (splat_ids,) = run_serially(_bin_few, [few])
+        return TileLists(offsets, splat_ids, columns, rows)
+    order = _sorted_by_depth(splats, digits)
+    parts = _parts(count)
+    rectangles = np.empty((count, 4), np.uint16)
     corners = np.zeros((len(parts), rows + 1, columns + 1), np.int32)
     run_parallel(
         _gather_rectangles,
         [(*part, order, splats.rectangles, rectangles, corners[k]) for k, part in enumerate(parts)],
     )
-    offsets = np.empty(columns * rows + 1, np.int64)
     cursors = np.empty((len(parts), columns * rows), np.int64)
     _place_parts(corners, offsets, cursors)
     splat_ids = np.empty(offsets[-1], np.uint32)
@@ -54,23 +60,31 @@ def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
     return TileLists(offsets, splat_ids, columns, rows)
 
 
-def sorted_by_depth(splats: Splats) -> np.ndarray:
-    """Indices [V] uint32 of the splats that are drawn."""
-    count, keys, parts = splats.visible, splats.keys, splats.drawn
-    nearest, farthest = splats.depth_range
-    base, bits = np.uint64(nearest), max(farthest - nearest, 0).bit_length()
+class _Digits(NamedTuple):
+    """How depths are taken apart by a sort, one digit a pass, the last ones first."""
+
+    base: np.uint64  # bits of the least depth, which is taken from all
+    width: np.uint64  # bits of a digit
+    passes: int
+
+
+def _digits(base: np.uint64, bits: int) -> _Digits:
+    """Of depths that differ in so many bits."""
     passes = max(1, -(-bits // DIGIT_BITS))
-    together = count < SPLATS_A_PART  # one after the other, in order: they count and write as one part would
-    run = run_serially if together else run_parallel
-    for k in range(passes):
-        first, past = (bits * k // passes, bits * (k + 1) // passes)
-        shift, buckets = np.uint64(first), 1 << (past - first)
-        counts = np.zeros((1 if together else len(parts), buckets), np.int64)
-        rows = [counts[0]] * len(parts) if together else list(counts)
-        run(_count_digits, [(*part, keys, base, shift, row) for part, row in zip(parts, rows, strict=True)])
+    return _Digits(base, np.uint64(-(-bits // passes)), passes)
+
+
+def _sorted_by_depth(splats: Splats, digits: _Digits) -> np.ndarray:
+    """Indices [V] uint32 of the splats that are drawn."""
+    keys, parts, count = splats.keys, splats.drawn.tolist(), splats.visible
+    for k in range(digits.passes):
+        counts = np.zeros((len(parts), 1 << int(digits.width)), np.int64)
+        run_parallel(_count_digits, [(*part, keys, digits, k, row) for part, row in zip(parts, counts, strict=True)])
         _to_cursors(counts)
-        out = np.empty(count, np.uint32 if k == passes - 1 else np.uint64)  # in the end without the depths
-        run(_scatter_by_digit, [(*part, keys, base, shift, row, out) for part, row in zip(parts, rows, strict=True)])
+        out = np.empty(count, np.uint32 if k == digits.passes - 1 else np.uint64)  # in the end without the depths
+        run_parallel(
+            _scatter_by_digit, [(*part, keys, digits, k, row, out) for part, row in zip(parts, counts, strict=True)]
+        )
         keys, parts = out, _parts(count)
     return keys
 
@@ -81,16 +95,57 @@ def _parts(count: int) -> list[tuple[int, int]]:
 
 
 @kernel
-def _digit(key: np.uint64, base: np.uint64, shift: np.uint64, buckets: int) -> np.uint64:
-    return (((key >> np.uint64(32)) - base) >> shift) & np.uint64(buckets - 1)
+def _bin_few(
+    count: int,
+    keys: np.ndarray,
+    drawn: np.ndarray,
+    digits: _Digits,
+    rectangles: np.ndarray,
+    rows: int,
+    columns: int,
+    offsets: np.ndarray,
+) -> np.ndarray:
+    """All of it in one call, on one thread; returns the ids and writes where tiles begin.
+
+    Called one by one, the kernels of 10,000 splats at 400 × 400 take 1.3 times as long, and the frame 1.03 times.
+    """
+    order = np.empty(count, np.uint32)
+    for k in range(digits.passes):
+        counts = np.zeros((1, np.uint64(1) << digits.width), np.int64)
+        sorted_keys = np.empty(count, np.uint64)
+        parts = len(drawn) if k == 0 else 1
+        for part in range(parts):
+            start, stop = (drawn[part, 0], drawn[part, 1]) if k == 0 else (0, count)
+            _count_digits(start, stop, keys, digits, k, counts[0])
+        _to_cursors(counts)
+        for part in range(parts):
+            start, stop = (drawn[part, 0], drawn[part, 1]) if k == 0 else (0, count)
+            if k < digits.passes - 1:
+                _scatter_by_digit(start, stop, keys, digits, k, counts[0], sorted_keys)
+            else:
+                _scatter_by_digit(start, stop, keys, digits, k, counts[0], order)
+        keys = sorted_keys
+    ordered = np.empty((count, 4), np.uint16)
+    corners = np.zeros((1, rows + 1, columns + 1), np.int32)
+    _gather_rectangles(0, count, order, rectangles, ordered, corners[0])
+    cursors = np.empty((1, columns * rows), np.int64)
+    _place_parts(corners, offsets, cursors)
+    splat_ids = np.empty(offsets[-1], np.uint32)
+    _deal_out(0, count, order, ordered, cursors[0], columns, splat_ids)
+    return splat_ids
 
 
 @kernel
-def _count_digits(
-    start: int, stop: int, keys: np.ndarray, base: np.uint64, shift: np.uint64, counts: np.ndarray
-) -> None:
-    for k in range(np.uint64(start), np.uint64(stop)):
-        counts[_digit(keys[k], base, shift, len(counts))] += 1
+def _digit(key: np.uint64, digits: _Digits, k: int) -> np.uint64:
+    return (((key >> np.uint64(32)) - digits.base) >> (np.uint64(k) * digits.width)) & (
+        (np.uint64(1) << digits.width) - np.uint64(1)
+    )
+
+
+@kernel
+def _count_digits(start: int, stop: int, keys: np.ndarray, digits: _Digits, k: int, counts: np.ndarray) -> None:
+    for i in range(np.uint64(start), np.uint64(stop)):
+        counts[_digit(keys[i], digits, k)] += 1
 
 
 @kernel
@@ -106,11 +161,11 @@ def _to_cursors(counts: np.ndarray) -> None:
 
 @kernel
 def _scatter_by_digit(
-    start: int, stop: int, keys: np.ndarray, base: np.uint64, shift: np.uint64, cursors: np.ndarray, out: np.ndarray
+    start: int, stop: int, keys: np.ndarray, digits: _Digits, k: int, cursors: np.ndarray, out: np.ndarray
 ) -> None:
-    for k in range(np.uint64(start), np.uint64(stop)):
-        digit = _digit(keys[k], base, shift, len(cursors))
-        out[np.uint64(cursors[digit])] = keys[k]
+    for i in range(np.uint64(start), np.uint64(stop)):
+        digit = _digit(keys[i], digits, k)
+        out[np.uint64(cursors[digit])] = keys[i]
         cursors[digit] += 1
 
 

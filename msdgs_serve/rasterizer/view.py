@@ -61,18 +61,18 @@ class View(NamedTuple):
 def view_of(camera: Camera, options: RasterizerOptions) -> View:
     """The kernels' form of a camera; options out of range raise `InvalidInput`."""
     _check(options)
-    world_to_camera = camera.world_to_camera
+    rotation, position = np.ascontiguousarray(camera.camera_to_world[:3, :3].T), camera.position
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
     return View(
-        rotation=np.ascontiguousarray(world_to_camera[:3, :3]),
-        translation=np.ascontiguousarray(world_to_camera[:3, 3]),
-        position=np.ascontiguousarray(camera.position),
-        fx=float(camera.fx),
-        fy=float(camera.fy),
-        cx=float(camera.cx),
-        cy=float(camera.cy),
-        width=int(camera.width),
-        height=int(camera.height),
+        rotation=rotation,
+        translation=-(rotation @ position),
+        position=np.ascontiguousarray(position),
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        width=camera.width,
+        height=camera.height,
         min_x=-camera.cx / camera.fx - margin_x,
         max_x=(camera.width - camera.cx) / camera.fx + margin_x,
         min_y=-camera.cy / camera.fy - margin_y,
@@ -84,8 +84,8 @@ def view_of(camera: Camera, options: RasterizerOptions) -> View:
         mip=bool(options.mip),
         alpha_min=float(options.alpha_min),
         log2_alpha_min=math.log2(options.alpha_min),
-        tile_columns=-(-int(camera.width) // TILE),
-        tile_rows=-(-int(camera.height) // TILE),
+        tile_columns=-(-camera.width // TILE),
+        tile_rows=-(-camera.height // TILE),
     )
 
 
