@@ -157,9 +157,13 @@ struct Rectangle {
     uint16_t left, right, top, bottom;  // tiles, each first and past the last
 };
 
+using Clock = std::chrono::steady_clock;
+constexpr int kStages = 4;
+
 struct Part {
     std::vector<int32_t> digits, corners, cursors;
     uint32_t least, largest;
+    std::array<Clock::time_point, kStages> ends;
 };
 
 class Renderer {
@@ -167,23 +171,26 @@ public:
     explicit Renderer(int threads) : threads_(threads), barrier_(threads), parts_(threads) {}
 
     void draw(const Scene& scene, const View& view, float* rgb, double* seconds) {
-        prepare(scene, view, rgb, seconds);
+        auto start = Clock::now();  // of a stage, which ends when its last thread does
+        prepare(scene, view, rgb);
         std::vector<std::jthread> others;
         for (int t = 1; t < threads_; t++) others.emplace_back([this, t] { run(t); });
         run(0);
+        for (int stage = 0; stage < kStages; stage++) {
+            auto end = start;
+            for (const Part& part : parts_) end = std::max(end, part.ends[stage]);
+            seconds[stage] = std::chrono::duration<double>(end - start).count();
+            start = end;
+        }
     }
 
 private:
-    using Clock = std::chrono::steady_clock;
-
     int threads_;
     std::barrier<> barrier_;
     std::vector<Part> parts_;
     Scene scene_{};
     View view_{};
     float* rgb_ = nullptr;
-    double* seconds_ = nullptr;
-    Clock::time_point last_;
     int columns_ = 0, rows_ = 0, chunks_ = 0;
     int64_t visible_ = 0;
     std::atomic<int> next_chunk_{0}, next_tile_{0};
@@ -193,8 +200,8 @@ private:
     Scratch<uint32_t> ids_;
     std::vector<int32_t> found_, offsets_;
 
-    void prepare(const Scene& scene, const View& view, float* rgb, double* seconds) {
-        scene_ = scene, view_ = view, rgb_ = rgb, seconds_ = seconds, last_ = Clock::now(), visible_ = 0;
+    void prepare(const Scene& scene, const View& view, float* rgb) {
+        scene_ = scene, view_ = view, rgb_ = rgb, visible_ = 0;
         columns_ = (view.width + kTile - 1) / kTile, rows_ = (view.height + kTile - 1) / kTile;
         chunks_ = static_cast<int>((scene.count + kChunk - 1) / kChunk);
         size_t padded = static_cast<size_t>(chunks_) * kChunk;
@@ -222,12 +229,8 @@ private:
     }
 
     void finish(int thread, int stage) {
+        parts_[thread].ends[stage] = Clock::now();
         barrier_.arrive_and_wait();
-        if (thread == 0) {
-            auto now = Clock::now();
-            seconds_[stage] = std::chrono::duration<double>(now - last_).count();
-            last_ = now;
-        }
     }
 
     // Part `thread` of a number of things.
