@@ -85,6 +85,8 @@ def rows_and_columns(
     memory.store_rows(loaded, 1, memory.load_four_columns(matrix, 2, 7))
     memory.store_rows(loaded, 17, memory.load_triples(points, 2))
     memory.store_rows(loaded, 33, memory.load_triples(points, 1))
+    memory.store_rows(loaded, 50, (memory.load_square(squares, 2, 7),))
+    memory.store_rows(loaded, 66, memory.load_square_of_triples(triples, 1, 13))
     memory.prefetch(squares, 3)
 
 
@@ -94,7 +96,7 @@ def test_memory(dtype: type):
     matrix = np.arange(160, dtype=dtype).reshape(10, 16)
     points = np.arange(54, dtype=dtype).reshape(18, 3)
     got = [np.full((9, 16), -1, dtype), np.full(40, -1, dtype), np.full(60, -1, dtype)]
-    got += [np.arange(256, dtype=dtype).reshape(16, 16), np.full((50, 16), -1, dtype)]
+    got += [np.arange(256, dtype=dtype).reshape(16, 16), np.full((83, 16), -1, dtype)]
     want = [array.copy() for array in got]
     rows = np.array([1, 15, 4], np.uint32)
     rows_and_columns(matrix, *got, points, rows)
@@ -106,7 +108,10 @@ def test_memory(dtype: type):
     np.testing.assert_array_equal(got[4][1:17, :4], [*matrix[2:, 7:11], *[matrix[9, 7:11]] * 8])
     np.testing.assert_array_equal(got[4][17:33, :3], points[2:])
     np.testing.assert_array_equal(got[4][33:49, :3], points[1:17])
-    np.testing.assert_array_equal(got[4][[0, 49]], -1)
+    clamped = matrix[np.minimum(np.arange(3, 19), 9)]
+    np.testing.assert_array_equal(got[4][50:66, 0], clamped[:, 0])
+    np.testing.assert_array_equal(got[4][66:82, :3], clamped[:, :3])
+    np.testing.assert_array_equal(got[4][[0, 49, 82]], -1)
     np.testing.assert_array_equal(got[0][:5], -1)
     np.testing.assert_array_equal(got[0][:, :3], -1)
 

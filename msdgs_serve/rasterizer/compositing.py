@@ -385,11 +385,11 @@ def log2_alpha(
 
 
 @kernel
-def log2_alpha_of(record: np.ndarray, pixel_x: Lanes, pixel_y: Lanes) -> Lanes:
-    """The very same numbers of a single splat, whose record has its place in the tile."""
+def exponent_of(record: np.ndarray) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]:
+    """What `log2_alpha` takes before the pixels, of a single splat, whose record has its place in the tile."""
     a, b, c = spread(record[ROOT_A]), spread(record[ROOT_B]), spread(record[ROOT_C])
     p, q = _offsets(spread(record[X]), spread(record[Y]), a, b, c)
-    return log2_alpha(p, q, a, b, c, spread(record[LOG2_OPACITY]), pixel_x, pixel_y)
+    return p, q, a, b, c, spread(record[LOG2_OPACITY])
 
 
 @kernel

@@ -8,8 +8,9 @@ from msdgs_serve.rasterizer.compositing import (
     BLOCKS,
     PIXELS,
     PixelLimits,
+    exponent_of,
     grid_of_a_tile,
-    log2_alpha_of,
+    log2_alpha,
     pixel_limits,
     place_in_tile,
     touched_blocks,
@@ -59,12 +60,13 @@ def _count_tiles(
         for entry in range(tiles.offsets[tile], tiles.offsets[tile + 1]):
             store(record, 0, load(flat, np.uint64(tiles.splat_ids[entry]) * np.uint64(RECORD)) - load(origin, 0))
             touched = bits_of(touched_blocks(record, grid, limits.log2_alpha_min))
+            terms = exponent_of(record)
             for block in range(BLOCKS):
                 left = load(state, LANES * block)
                 if touched >> np.uint64(block) & np.uint64(1) == np.uint64(0) or bits_of(left > 0) == np.uint64(0):
                     continue
                 x, y = load(grid, 32) + grid[block], load(grid, 48) + grid[16 + block]
-                exponent = log2_alpha_of(record, x, y)
+                exponent = log2_alpha(*terms, x, y)
                 # 32 lanes as the compositing has them, so that LLVM makes the same instructions
                 alpha = first_of(exp2(pair(exponent, exponent), limits.exp2))
                 alpha = minimum(alpha, spread(limits.alpha_max))

@@ -422,6 +422,62 @@ def _lower_store_square_of_triples(context: Any, builder: Any, signature: Any, v
     return _store_pieces(context, builder, signature, values, rows, write)
 
 
+def load_square(array: np.ndarray, start: Index, stride: Index) -> Lanes:
+    """4 × 4 numbers of an array [n]: 4 from `start`, the next 4 `stride` further, and so on."""
+    return np.concatenate([array[int(start) + row * int(stride) :][:4] for row in range(4)])
+
+
+def load_square_of_triples(array: np.ndarray, start: Index, stride: Index) -> tuple[Lanes, Lanes, Lanes]:
+    """4 × 4 triples of an array [n], 4 of them from `start`, the next 4 `stride` further: the first of each triple,
+    the second, the third."""
+    triples = np.concatenate([array[int(start) + row * int(stride) :][:12] for row in range(4)])
+    return triples[0::3].copy(), triples[1::3].copy(), triples[2::3].copy()
+
+
+typed(load_square, lambda array, start, stride: LanesType(array.dtype) if _is_array(array, 1) else None)
+typed(
+    load_square_of_triples,
+    lambda array, start, stride: types.UniTuple(LanesType(array.dtype), 3) if _is_array(array, 1) else None,
+)
+
+
+def _load_pieces(context: Any, builder: Any, signature: Any, values: Any, count: int) -> list[Any]:
+    """Four vectors of `count` numbers of the array, the first argument, from the second on, each the third further."""
+    kind = signature.args[0]
+    data = context.make_array(kind)(context, builder, values[0]).data
+    start, stride = (
+        context.cast(builder, v, t, types.intp) for v, t in zip(values[1:], signature.args[1:], strict=True)
+    )
+    vector = ir.VectorType(context.get_data_type(kind.dtype), count).as_pointer()
+    pieces = []
+    for _ in range(4):
+        place = builder.bitcast(builder.gep(data, [start]), vector)
+        pieces.append(builder.load(place, align=kind.dtype.bitwidth // 8))
+        start = builder.add(start, stride)
+    return pieces
+
+
+def _every(builder: Any, pieces: list[Any], first: int, step: int) -> Any:
+    """16 numbers: of each of four vectors the one at `first` and three more, `step` apart."""
+    length = 4 * step
+    lanes = [first + k * step for k in range(4)]
+    halves = [
+        shuffled(builder, a, b, [*lanes, *(length + lane for lane in lanes)]) for a, b in (pieces[:2], pieces[2:])
+    ]
+    return shuffled(builder, *halves, range(LANES))
+
+
+@lower_builtin(load_square, types.Array, types.Integer, types.Integer)
+def _lower_load_square(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    return _every(builder, _load_pieces(context, builder, signature, values, 4), 0, 1)
+
+
+@lower_builtin(load_square_of_triples, types.Array, types.Integer, types.Integer)
+def _lower_load_square_of_triples(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    pieces = _load_pieces(context, builder, signature, values, 12)
+    return context.make_tuple(builder, signature.return_type, [_every(builder, pieces, k, 3) for k in range(3)])
+
+
 def prefetch(array: np.ndarray, place: Index) -> None:
     """Have the cache line of an element of an array [n] fetched meanwhile; nothing without the compiler."""
 
