@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from msdgs_serve import __version__
@@ -36,7 +37,8 @@ class Moving:
     scale_modulation: FloatArray | None  # [M, 3] factors of equation 12; None where the model has none
     mean_modulation: FloatArray | None = None  # [M, 3]
     quat_modulation: FloatArray | None = None  # [M, 4]
-    basis_weights: FloatArray | None = None  # [M, B] of shared motions, rows sum to 1; None where there are none
+    basis_weights: FloatArray | None = None  # [M, F] of shared motions that each follows, rows sum to 1; None: none
+    basis_ids: npt.NDArray[np.int64] | None = None  # [M, F] which ones these are
 
     def __len__(self) -> int:
         return len(self.means)
@@ -88,6 +90,7 @@ def _moving(model: DynamicGaussians) -> Moving:
         mean_modulation=factors["means"],
         quat_modulation=factors["quats"],
         basis_weights=None if g.basis_logits is None else _array(g.basis_logits.softmax(dim=1)),
+        basis_ids=None if g.basis_ids is None else g.basis_ids.numpy(),
     )
 
 

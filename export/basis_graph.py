@@ -3,9 +3,11 @@
 import numpy as np
 from onnx import TensorProto
 
+from export.bake import Moving
 from export.graph import GraphBuilder, to_numpy
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.basis_layer import LEAST_STRETCH, BasisLayer
+from msdgs_train.basis_kernels import LEAST_STRETCH
+from msdgs_train.basis_layer import BasisLayer
 
 KNOTS = 4
 """That a time reads."""
@@ -15,7 +17,7 @@ def basis_deltas(
     graph: GraphBuilder,
     name: str,
     layer: BasisLayer,
-    basis_weights: np.ndarray | None,
+    moving: Moving,
     means: str,
     quats: str,
     time: str,
@@ -23,8 +25,7 @@ def basis_deltas(
     share: str,
 ) -> str:
     """Deltas of the heads `used` of canonical means, [M, 3], and unit quaternions, [M, 4], times the layer's share."""
-    assert basis_weights is not None  # `bake` has seen to it
-    blended = _blended(graph, name, basis_weights, _motions(graph, f"{name}.motions", layer, time))
+    blended = _blended(graph, name, moving, _motions(graph, f"{name}.motions", layer, time))
     matrices, offsets, turns = graph.split(
         blended, [f"{name}.{p}" for p in ("matrices", "offsets", "turns")], [9, 3, 4]
     )
@@ -37,15 +38,14 @@ def basis_deltas(
     return graph.node("Mul", [graph.node("Concat", columns, f"{name}.raw", axis=1), share], f"{name}.shared")
 
 
-def _blended(graph: GraphBuilder, name: str, basis_weights: np.ndarray, motions: str) -> str:
-    """[M, 16] the mean of the motions [B, 16] that each Gaussian follows; those that it doesn't are not stored."""
-    most = max(int((basis_weights != 0).sum(axis=1).max(initial=0)), 1)
-    followed = np.argsort(-basis_weights, axis=1, kind="stable")[:, :most]
-    small = np.uint8 if basis_weights.shape[1] <= 256 else np.int64
-    ids = graph.node("Gather", [graph.constant("basis_ids", followed.astype(small)), "ids"], "ids.basis_ids")
+def _blended(graph: GraphBuilder, name: str, moving: Moving, motions: str) -> str:
+    """[M, 16] the mean of the motions [B, 16] that each Gaussian follows."""
+    assert moving.basis_weights is not None  # `bake` has seen to it
+    assert moving.basis_ids is not None
+    small = np.uint8 if moving.basis_ids.max(initial=0) < 256 else np.int64
+    ids = graph.node("Gather", [graph.constant("basis_ids", moving.basis_ids.astype(small)), "ids"], "ids.basis_ids")
     ids = graph.node("Cast", [ids], f"{name}.followed", to=TensorProto.INT64)
-    stored = graph.constant("basis_weights", np.take_along_axis(basis_weights, followed, axis=1))
-    weights = graph.node("Gather", [stored, "ids"], "ids.basis_weights")
+    weights = graph.node("Gather", [graph.constant("basis_weights", moving.basis_weights), "ids"], "ids.basis_weights")
     axis = graph.constant(f"{name}.axis", np.array([1], np.int64))
     row = graph.node("Unsqueeze", [weights, axis], f"{name}.row")
     picked = graph.node("Gather", [motions, ids], f"{name}.picked")

@@ -5,31 +5,29 @@ MLP's weights serve all places and times. Motion bases are those of Shape of Mot
 and what moves may stretch: a soft body takes few motions, where rigid ones must be many and each finds its own way.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_serve.threads import run_parallel, split_evenly
+from msdgs_train.basis_kernels import DELTAS, FOLLOWED, carry, carry_backward
 from msdgs_train.layers import LayerStep
 
 OPAQUE = 0.3
 """Opacity from which a Gaussian may be the pivot of a motion."""
 REACH = 0.5
 """Standard deviation of a motion's first weights, in distances between pivots."""
-FOLLOWED = 8
-"""Motions nearest to a Gaussian, that it may ever follow: a file stores so many of its weights."""
-NEVER = -1e4
-"""Logit of the others: their weights are 0 in float64 too, and so are gradients."""
 LEAST_LOGIT = -12.0
-"""Of the others of these at first: little enough, and still enough of a gradient to come back."""
+"""Of these, at first: little enough, and still enough of a gradient to come back."""
 LEAST_REACH = 1e-3  # scene units
 NEIGHBOURS = 4
 SHORTEST = 0.01  # scene units, added to distances between pivots
 TURNS_COUNT = 0.3  # scene units that a quaternion's unit is worth, and a stretch by as much again
-LEAST_STRETCH = 0.05  # of a Gaussian's own axes
-MOTION = 16
-"""Numbers of a motion at one time: a matrix row by row, what is added to means times the matrix, a quaternion."""
+PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
 
 
 class Carried(NamedTuple):
@@ -37,7 +35,8 @@ class Carried(NamedTuple):
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4] wxyz, unit
-    basis_weights: Tensor  # [N, B] of each motion; rows sum to 1
+    basis_weights: Tensor  # [N, F] of the motions that each follows; rows sum to 1
+    basis_ids: Tensor  # [N, F] int64, which of the layer's motions these are
 
     def rows(self, ids: Tensor | slice) -> "Carried":
         """Some of them."""
@@ -75,18 +74,11 @@ class BasisLayer(nn.Module):
 
     def forward(self, carried: Carried, t: Tensor) -> LayerStep:
         """The step of N Gaussians at time `t`, a scalar tensor of the same dtype and device."""
-        means = carried.means
-        blended = carried.basis_weights @ self.motions(t)
-        matrices, offsets, turns = blended[:, :9].view(-1, 3, 3), blended[:, 9:12], blended[:, 12:]
-        moved = torch.einsum("nij,nj->ni", matrices, means) + offsets
-        turned = product(_unit(turns), carried.quats)
-        # not `vector_norm`, which takes 6 ms for columns of 18,000 matrices, as long as the rasterizer
-        squares = (matrices @ rotation_matrices(carried.quats)).square().sum(dim=1)
-        stretched = 0.5 * squares.clamp_min(LEAST_STRETCH**2).log()
-        return LayerStep(moved - means, stretched, turned - carried.quats, means.new_ones(len(means), 1))
+        means, scales, quats = _Carry.apply(*carried, self.motions(t)).split((3, 3, 4), dim=1)
+        return LayerStep(means, scales, quats, means.new_ones(len(means), 1))
 
     def motions(self, t: Tensor) -> Tensor:
-        """[B, MOTION] at time `t`."""
+        """[B, 16] at time `t`, as `basis_kernels` has them: matrices, offsets, quaternions."""
         read, part = self.knots_at(t)
         weights = cubic_weights(part)
         shifts, turns, stretches = (torch.einsum("k,kbc->bc", weights, curve[read]) for curve in self._curves)
@@ -107,8 +99,9 @@ class BasisLayer(nn.Module):
         return slice(first, first + 4), place - first
 
     @torch.no_grad()
-    def place(self, means: Tensor, opacities: Tensor) -> Tensor:
-        """Put the pivots among opaque Gaussians, as far apart as can be; returns weights to begin with, [N, B] logits.
+    def place(self, means: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+        """Put the pivots among opaque Gaussians, as far apart as can be; returns the motions that each Gaussian
+        follows, logits of the weights to begin with and ids, [N, F] both.
 
         Args:
             means: [N, 3].
@@ -124,8 +117,7 @@ class BasisLayer(nn.Module):
         reach = max(REACH * float(distances.max()), LEAST_REACH)
         logits = -0.5 * (torch.cdist(means, self.pivots) / reach).square()
         nearest = logits.topk(min(FOLLOWED, logits.shape[1]), dim=1)
-        near = (nearest.values - nearest.values[:, :1]).clamp_min(LEAST_LOGIT)
-        return torch.full_like(logits, NEVER).scatter_(1, nearest.indices, near)
+        return (nearest.values - nearest.values[:, :1]).clamp_min(LEAST_LOGIT), nearest.indices
 
     @torch.no_grad()
     def carry_outwards(self, before: float, after: float) -> None:
@@ -166,6 +158,39 @@ class BasisLayer(nn.Module):
 
     def extra_repr(self) -> str:
         return f"{sum(p.numel() for p in self.parameters()):,} parameters"
+
+
+class _Carry(torch.autograd.Function):
+    """Deltas [N, DELTAS] of Gaussians, as `basis_kernels` has them. By matrices of torch a step of training takes 1.14
+    times as long."""
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> Tensor:
+        ctx.save_for_backward(*tensors)
+        arrays = [_array(tensor) for tensor in tensors]
+        deltas = np.empty((len(arrays[0]), DELTAS), arrays[0].dtype)
+        run_parallel(carry, [(*arrays, *rows, deltas) for rows in split_evenly(len(deltas), PARTS)])
+        return torch.from_numpy(deltas).to(tensors[0].device)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        arrays = means, quats, weights, _, motions = [_array(tensor) for tensor in ctx.saved_tensors]
+        own = [np.empty_like(array) for array in (means, quats, weights)]
+        parts = split_evenly(len(means), PARTS) or [(0, 0)]
+        sums = np.zeros((len(parts), *motions.shape), motions.dtype)
+        pulls = _array(grad)
+        run_parallel(
+            carry_backward, [(*arrays, pulls, *rows, *own, part) for rows, part in zip(parts, sums, strict=True)]
+        )
+        of_means, of_quats, of_weights, of_motions = (
+            torch.from_numpy(array).to(grad.device) for array in (*own, sums.sum(axis=0))
+        )
+        return of_means, of_quats, of_weights, None, of_motions
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().contiguous().numpy()
 
 
 def cubic_weights(part: Tensor) -> Tensor:

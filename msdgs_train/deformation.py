@@ -6,7 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from msdgs_train.basis_layer import MOTION, BasisLayer, Carried
+from msdgs_train.basis_kernels import FOLLOWED, MOTION
+from msdgs_train.basis_layer import BasisLayer, Carried
 from msdgs_train.layers import LayerStep
 
 CHUNK = 4096
@@ -77,7 +78,8 @@ def _sum(total: Tensor | None, weight: Tensor, delta: Tensor | None) -> Tensor |
 
 def operations(layers: Iterable[nn.Module]) -> int:
     """About how many layers take for a Gaussian: a product and a sum for each weight of a Linear and for each number of
-    a motion."""
+    a motion that it follows."""
     modules = [module for layer in layers for module in layer.modules()]
     linears = sum(module.weight.numel() for module in modules if isinstance(module, nn.Linear))
-    return 2 * (linears + sum(MOTION * len(module.pivots) for module in modules if isinstance(module, BasisLayer)))
+    blends = sum(MOTION * min(FOLLOWED, len(module.pivots)) for module in modules if isinstance(module, BasisLayer))
+    return 2 * (linears + blends)

@@ -25,6 +25,7 @@ class StoredGaussians(NamedTuple):
     sh_rest: Tensor
     embeddings: Tensor | None
     basis_logits: Tensor | None
+    basis_ids: Tensor | None
 
 
 class CanonicalGaussians(nn.Module):
@@ -37,7 +38,8 @@ class CanonicalGaussians(nn.Module):
     sh_dc: nn.Parameter  # [N, 1, 3]
     sh_rest: nn.Parameter  # [N, (degree + 1)² - 1, 3]
     embeddings: nn.Parameter | None  # [N, embedding_size]; None without scale modulation
-    basis_logits: nn.Parameter | None  # [N, basis_count] how much it follows each motion; None without such a layer
+    basis_logits: nn.Parameter | None  # [N, F] of the weights of motions; None without such a layer
+    basis_ids: nn.Parameter | None  # [N, F] int64, which motions these are; not trained
 
     def __init__(
         self,
@@ -49,6 +51,7 @@ class CanonicalGaussians(nn.Module):
         sh_rest: Tensor,
         embeddings: Tensor | None = None,
         basis_logits: Tensor | None = None,
+        basis_ids: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.means = nn.Parameter(means)
@@ -59,6 +62,7 @@ class CanonicalGaussians(nn.Module):
         self.sh_rest = nn.Parameter(sh_rest)
         self.embeddings = None if embeddings is None else nn.Parameter(embeddings)
         self.basis_logits = None if basis_logits is None else nn.Parameter(basis_logits)
+        self.basis_ids = None if basis_ids is None else nn.Parameter(basis_ids, requires_grad=False)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -66,7 +70,7 @@ class CanonicalGaussians(nn.Module):
     def rows(self, ids: Tensor) -> StoredGaussians:
         """The Gaussians `ids`, int64 [M]; gradients flow through."""
         tensors = {name: parameter[ids] for name, parameter in self.named_parameters()}
-        return StoredGaussians(**{"embeddings": None, "basis_logits": None, **tensors})
+        return StoredGaussians(**{"embeddings": None, "basis_logits": None, "basis_ids": None, **tensors})
 
     @classmethod
     def from_points(
@@ -76,10 +80,10 @@ class CanonicalGaussians(nn.Module):
         sh_degree: int,
         embedding_size: int,
         generator: torch.Generator,
-        basis_count: int = 0,
+        motions: int = 0,
     ) -> Self:
         """One Gaussian a point, [N, 3], of colours in [0, 1], [N, 3]: round, opacity 0.1, as large as its neighbours
-        are near. `embedding_size` 0 means no modulation, `basis_count` 0 no shared motions."""
+        are near. `embedding_size` 0 means no modulation, `motions`, that each follows, 0 no shared ones."""
         n = len(points)
         log_scales = neighbour_distances(points).clamp_min(MIN_NEIGHBOUR_DISTANCE).log()
         embeddings = 0.1 * torch.randn(n, embedding_size, generator=generator) if embedding_size else None
@@ -91,18 +95,19 @@ class CanonicalGaussians(nn.Module):
             sh_dc=((colours - 0.5) / SH_C0)[:, None],
             sh_rest=torch.zeros(n, sh_coefficients(sh_degree) - 1, 3),
             embeddings=embeddings,
-            basis_logits=torch.zeros(n, basis_count) if basis_count else None,
+            basis_logits=torch.zeros(n, motions) if motions else None,
+            basis_ids=torch.arange(motions).repeat(n, 1) if motions else None,
         )
 
     @classmethod
     def random_in_cube(
-        cls, count: int, half_extent: float, sh_degree: int, embedding_size: int, seed: int, basis_count: int = 0
+        cls, count: int, half_extent: float, sh_degree: int, embedding_size: int, seed: int, motions: int = 0
     ) -> Self:
         """`count` Gaussians of random colours, uniform in the cube [-half_extent, half_extent]³."""
         generator = torch.Generator().manual_seed(seed)
         points = (2 * torch.rand(count, 3, generator=generator) - 1) * half_extent
         colours = torch.rand(count, 3, generator=generator)
-        return cls.from_points(points, colours, sh_degree, embedding_size, generator, basis_count)
+        return cls.from_points(points, colours, sh_degree, embedding_size, generator, motions)
 
     @classmethod
     def from_sparse_points(
@@ -113,7 +118,7 @@ class CanonicalGaussians(nn.Module):
         sh_degree: int,
         embedding_size: int,
         seed: int,
-        basis_count: int = 0,
+        motions: int = 0,
     ) -> Self:
         """At most `max_count` of the points, [M, 3], that came with a dataset; of random colours where there are none,
         [M, 3] in [0, 1]."""
@@ -122,7 +127,7 @@ class CanonicalGaussians(nn.Module):
         random = torch.rand(len(chosen), 3, generator=generator)
         known = random if colours is None else torch.from_numpy(colours).float()[chosen]
         means = torch.from_numpy(points).float()[chosen]
-        return cls.from_points(means, known, sh_degree, embedding_size, generator, basis_count)
+        return cls.from_points(means, known, sh_degree, embedding_size, generator, motions)
 
 
 def neighbour_distances(points: Tensor, neighbours: int = 3) -> Tensor:

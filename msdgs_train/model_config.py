@@ -5,6 +5,7 @@ from typing import Any, Literal, get_args
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
+from msdgs_train.basis_kernels import FOLLOWED
 from msdgs_train.heads import Heads
 
 LayerKind = Literal["mlp", "plane", "bases"]
@@ -106,8 +107,8 @@ class ModelConfig:
 
     @property
     def motions(self) -> int:
-        """Weights of shared motions that each Gaussian has."""
-        return self.basis_count if "bases" in self.layers else 0
+        """Shared motions that each Gaussian may follow."""
+        return min(FOLLOWED, self.basis_count) if "bases" in self.layers else 0
 
     @property
     def heads(self) -> Heads:

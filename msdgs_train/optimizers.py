@@ -56,7 +56,9 @@ def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
 
 def make_optimizer(model: DynamicGaussians, config: TrainConfig) -> torch.optim.Adam:
     """One Adam; a group for each attribute of the Gaussians, one for the deformation, one for the modulation."""
-    named: dict[str, list[nn.Parameter]] = {name: [p] for name, p in model.gaussians.named_parameters()}
+    named: dict[str, list[nn.Parameter]] = {
+        name: [p] for name, p in model.gaussians.named_parameters() if p.requires_grad
+    }
     named["grids"] = [planes for grid in model.plane_grids() for planes in (grid.space, grid.time)]
     named["bases"] = list(model.bases.parameters()) if model.bases is not None else []
     own = {id(p) for name in ("grids", "bases") for p in named[name]}
@@ -83,7 +85,7 @@ def replace_rows(
     The moments of kept rows stay as they are; those of added rows start at zero.
     """
     for name, old in list(gaussians.named_parameters()):
-        new = nn.Parameter(torch.cat([old.detach()[kept], added[name]]))
+        new = nn.Parameter(torch.cat([old.detach()[kept], added[name]]), old.requires_grad)
         _replace(optimizer, gaussians, name, new, lambda moment, rows=added[name]: _extended(moment, kept, rows))
 
 
@@ -97,7 +99,8 @@ def forget_rows(optimizer: torch.optim.Optimizer, gaussians: nn.Module, rows: Te
 
 def replace_values(optimizer: torch.optim.Optimizer, gaussians: nn.Module, name: str, values: Tensor) -> None:
     """Set one parameter to `values`, of the same shape, and its moments to zero."""
-    _replace(optimizer, gaussians, name, nn.Parameter(values), torch.zeros_like)
+    new = nn.Parameter(values, getattr(gaussians, name).requires_grad)
+    _replace(optimizer, gaussians, name, new, torch.zeros_like)
 
 
 def _extended(moment: Tensor, kept: Tensor, rows: Tensor) -> Tensor:
@@ -109,6 +112,8 @@ def _replace(
 ) -> None:
     old = getattr(gaussians, name)
     setattr(gaussians, name, new)
+    if not new.requires_grad:
+        return
     group = next(group for group in optimizer.param_groups if group["name"] == name)
     group["params"] = [new]
     state = optimizer.state.pop(old, None)

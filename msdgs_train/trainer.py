@@ -177,7 +177,7 @@ class Trainer:
             parameter.grad = sum(known[1:], known[0]) / len(shots) if known else None
 
     def _parameters(self) -> list[nn.Parameter]:
-        return list(self.model.parameters())
+        return [p for p in self.model.parameters() if p.requires_grad]
 
     @torch.no_grad()
     def evaluate(self, split: str) -> Iterator[Evaluated]:
@@ -330,8 +330,9 @@ class Trainer:
             self.density.forget(len(gaussians))
         bases = self.model.bases
         if bases is not None and step == self.config.still_steps:
-            logits = bases.place(gaussians.means.detach(), gaussians.raw_opacities.detach().sigmoid())
+            logits, ids = bases.place(gaussians.means.detach(), gaussians.raw_opacities.detach().sigmoid())
             replace_values(self.optimizer, gaussians, "basis_logits", logits)
+            replace_values(self.optimizer, gaussians, "basis_ids", ids)
         before, after = (self._curriculum.window(k) for k in (step - 1, step))
         if before < after:
             for part in [*self.model.plane_grids(), *([bases] if bases is not None else [])]:
@@ -422,7 +423,8 @@ def _new_model(config: TrainConfig, scene: SceneData, domain: Domain) -> Dynamic
 def _resize(gaussians: nn.Module, state: dict[str, Tensor]) -> None:
     for name, parameter in list(gaussians.named_parameters()):
         rows = len(state[f"gaussians.{name}"])
-        setattr(gaussians, name, nn.Parameter(parameter.new_empty(rows, *parameter.shape[1:])))
+        new = parameter.new_empty(rows, *parameter.shape[1:])
+        setattr(gaussians, name, nn.Parameter(new, parameter.requires_grad))
 
 
 def _camera_entry(frame: Frame) -> dict[str, Any]:

@@ -50,7 +50,9 @@ def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config:
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(seed)
         model = DynamicGaussians(settings, gaussians)
+        if gaussians.basis_ids is not None:
+            gaussians.basis_ids.add_(torch.randint(settings.basis_count, (count, 1))).remainder_(settings.basis_count)
         for parameter in model.parameters():
-            if parameter is not gaussians.means:
+            if parameter.requires_grad and parameter is not gaussians.means:
                 parameter += noise * torch.randn_like(parameter)
     return model

@@ -1,5 +1,7 @@
 """Shared motions: splines, turns, blends, where they begin, and how they go on where nothing is known yet."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,8 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.basis_layer import FOLLOWED, BasisLayer, Carried, cubic_weights, product, rotation_matrices
+from msdgs_train.basis_kernels import FOLLOWED, LEAST_STRETCH
+from msdgs_train.basis_layer import BasisLayer, Carried, cubic_weights, product, rotation_matrices
 from msdgs_train.model_config import ModelConfig
 from tests.models import random_model
 from tests.tolerances import tolerance
@@ -31,7 +34,8 @@ def carried_of(count: int, motions: int) -> Carried:
     means, quats, logits = (
         torch.randn(count, columns, generator=generator, dtype=torch.float64) for columns in (3, 4, motions)
     )
-    return Carried(means, quats / quats.norm(dim=1, keepdim=True), logits.softmax(dim=1))
+    ids = torch.stack([torch.randperm(motions, generator=generator) for _ in range(count)])
+    return Carried(means, quats / quats.norm(dim=1, keepdim=True), logits.softmax(dim=1), ids)
 
 
 def time(t: float) -> torch.Tensor:
@@ -50,8 +54,8 @@ def test_motions_are_on_splines(t: float) -> None:
     shift, turn, stretch = np.split(BSpline(knots, curves, 3)(t), [3, 7], axis=1)
     for k in range(3):
         quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
-        point, weights = torch.randn(1, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)[k : k + 1]
-        step = layer(Carried(point, quats, weights), time(t))
+        point, one = torch.randn(1, 3, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
+        step = layer(Carried(point, quats, one, torch.tensor([[k]])), time(t))
         rotation, pivot = as_rotation(torch.from_numpy(turn[k])), layer.pivots[k].numpy()
         longer = np.eye(3) + stretch[k][[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
         expected = rotation.apply(longer @ (point[0].numpy() - pivot)) + pivot + shift[k]
@@ -67,7 +71,8 @@ def test_scales_grow_along_a_gaussians_own_axes() -> None:
     with torch.no_grad():
         layer.stretches[:, 0, 0] = 1.0  # twice as long along x
     quats = torch.tensor([[half, 0.0, 0.0, half]], dtype=torch.float64)  # its second axis is -x
-    step = layer(Carried(torch.zeros(1, 3).double(), quats, torch.ones(1, 1).double()), time(0.5))
+    zeros, ones = (torch.full((1, 3), value, dtype=torch.float64) for value in (0, 1))
+    step = layer(Carried(zeros, quats, ones[:, :1], torch.tensor([[0]])), time(0.5))
     assert np.abs(step.delta_scales.exp().detach().numpy() - [[1, 2, 1]]).max() <= EXACT
 
 
@@ -86,15 +91,38 @@ def test_a_new_layer_moves_nothing() -> None:
     assert float(step.delta_scales.abs().max().detach()) <= EXACT
 
 
+def plainly(carried: Carried, motions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What the kernels do, by matrices."""
+    blended = torch.einsum("nk,nkm->nm", carried.basis_weights, motions[carried.basis_ids])
+    matrices, offsets, turns = blended[:, :9].view(-1, 3, 3), blended[:, 9:12], blended[:, 12:]
+    moved = torch.einsum("nij,nj->ni", matrices, carried.means) + offsets
+    lengths = (matrices @ rotation_matrices(carried.quats)).norm(dim=1)
+    turned = product(turns / turns.norm(dim=1, keepdim=True), carried.quats)
+    return moved - carried.means, lengths.clamp_min(LEAST_STRETCH).log(), turned - carried.quats
+
+
+def test_kernels_do_what_matrices_do() -> None:
+    layer, carried = layer_of(6), carried_of(9, 6)
+    with torch.no_grad():
+        layer.stretches[:, 2, :3] = -1.2  # squeezed to nothing and a bit beyond
+        carried.basis_weights[0] = (carried.basis_ids[0] == 2).double()
+    want = plainly(carried, layer.motions(time(0.3)))
+    step = layer(carried, time(0.3))
+    for got, expected in zip((step.delta_means, step.delta_scales, step.delta_quats), want, strict=True):
+        assert float((got - expected).abs().max().detach()) <= EXACT
+
+
 def test_gradients() -> None:
-    layer, carried = layer_of(), carried_of(4, 3)
-    tensors = [tensor.detach().requires_grad_() for tensor in carried]
+    layer, carried = layer_of(5), carried_of(4, 5)
+    curves = dict(layer.named_parameters())
+    learning = [tensor.detach().requires_grad_() for tensor in (*carried[:3], *curves.values())]
 
-    def moved(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        step = layer(Carried(*values), time(0.41))
-        return step.delta_means, step.delta_scales, step.delta_quats
+    def moved(means: torch.Tensor, quats: torch.Tensor, weights: torch.Tensor, *values: torch.Tensor) -> Any:
+        replaced = dict(zip(curves, values, strict=True))
+        of_now = Carried(means, quats, weights, carried.basis_ids)
+        return torch.func.functional_call(layer, replaced, (of_now, time(0.41)))[:3]
 
-    assert torch.autograd.gradcheck(moved, tensors)
+    assert torch.autograd.gradcheck(moved, learning)
 
 
 def test_quaternions_as_scipy_has_them() -> None:
@@ -109,19 +137,20 @@ def test_pivots_are_spread_among_what_is_opaque() -> None:
     means = torch.rand(400, 3, generator=generator)
     opacities = torch.where(means[:, 0] < 0.5, 0.9, 0.01)
     layer = BasisLayer(20, 4)
-    weights = layer.place(means, opacities).softmax(dim=1)
+    logits, ids = layer.place(means, opacities)
     assert bool((layer.pivots[:, 0] < 0.5).all())
     assert len(layer.pivots.unique(dim=0)) == 20
-    assert bool(((weights > 0).sum(dim=1) == FOLLOWED).all())
-    nearest = torch.cdist(means, layer.pivots).argmin(dim=1)
-    assert torch.equal(weights.argmax(dim=1), nearest)
+    nearest = torch.cdist(means, layer.pivots).topk(FOLLOWED, largest=False).indices
+    assert torch.equal(ids.sort(dim=1).values, nearest.sort(dim=1).values)
+    assert torch.equal(ids.gather(1, logits.argmax(dim=1, keepdim=True)), nearest[:, :1])
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_fewer_gaussians_than_motions(count: int) -> None:
     layer = BasisLayer(12, 4)
-    weights = layer.place(torch.rand(count, 3), torch.full((count,), 0.1)).softmax(dim=1)
-    assert bool(torch.isfinite(weights).all())
+    logits, ids = layer.place(torch.rand(count, 3), torch.full((count,), 0.1))
+    assert bool(torch.isfinite(logits).all())
+    assert ids.shape == (count, FOLLOWED)
 
 
 def test_beyond_the_window_motions_stay_and_turn_on() -> None:

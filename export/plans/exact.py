@@ -28,8 +28,9 @@ class ExactPoses:
         self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
         factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
         self._factors = [None if f is None else _double(f) for f in factors]
-        weights = m.basis_weights
-        self._carried = None if weights is None else Carried(self._means, self._quats, _double(weights))
+        self._carried = None
+        if m.basis_weights is not None and m.basis_ids is not None:
+            self._carried = Carried(self._means, self._quats, _double(m.basis_weights), torch.from_numpy(m.basis_ids))
         self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
 
     @property

@@ -42,7 +42,7 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[Layer, ...], delt
         name = f"layer{k}"
         share = _share(graph, name, steps, k)
         if isinstance(layer, BasisLayer):
-            step = basis_deltas(graph, name, layer, moving.basis_weights, means, quats, time, used, share)
+            step = basis_deltas(graph, name, layer, moving, means, quats, time, used, share)
         else:
             step = _layer(graph, name, layer, moved, time, used, share)  # equation 7
         deltas = graph.node("Add", [deltas, step], f"{name}.deltas") if deltas else step  # equation 9

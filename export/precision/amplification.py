@@ -81,7 +81,9 @@ def spectral_norm(matrices: Tensor) -> Tensor:
 def _moved(layer: torch.nn.Module, means: Tensor, t: float, carried: Carried | None) -> Tensor:
     """[M, 3] x + w f(x, t)."""
     if carried is not None:
-        carried = Carried(means, carried.quats.to(means.dtype), carried.basis_weights.to(means.dtype))
+        carried = carried._replace(
+            means=means, quats=carried.quats.to(means.dtype), basis_weights=carried.basis_weights.to(means.dtype)
+        )
     step = step_of(layer, means, torch.tensor(t, dtype=means.dtype), carried)
     return torch.addcmul(means, step.weight, step.delta_means)
 

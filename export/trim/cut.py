@@ -114,6 +114,7 @@ def _model(model: DynamicGaussians, network: Network, which: slice | torch.Tenso
         tensors.pop("embeddings", None)
     if not any(model.config.layers[k] == "bases" for k in network.layers):
         tensors.pop("basis_logits", None)
+        tensors.pop("basis_ids", None)
     layers = [model.deformation.layers[k] for k in network.layers]
     config = replace(
         model.config,

@@ -8,7 +8,8 @@ from export.trim.cut import Cut, TrimmedModel, trimmed, whole
 from export.trim.evidence import Evidence
 from export.trim.rules import RULES
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.basis_layer import FOLLOWED, BasisLayer
+from msdgs_train.basis_kernels import FOLLOWED
+from msdgs_train.basis_layer import BasisLayer
 from msdgs_train.model import DynamicGaussians
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12

@@ -45,8 +45,8 @@ from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_parallel, run_together, threads_to_use
 
-# places in a tile's scratch: what is left of the light (0 where a pixel is done), the pixel's gradient,
-# and what is still behind
+# places in a tile's scratch: what is left of the light (0 where a pixel is done), the pixel's gradient, what is still
+# behind, and where the pixels are in the tile
 LEFT, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND, PIXEL_X, PIXEL_Y = (
     np.uint64(PIXELS * place) for place in range(8)
 )
@@ -58,6 +58,7 @@ PAIRS_A_ROUND = 1 << 18
 """16 MB of sums: with those of 1,400,000 pairs at once, 85 MB, the gradient takes 1.1 times as long."""
 
 DEPTHS_LOOKED_AT = 1000
+"""To find those that part the splats among threads."""
 AHEAD = np.uint64(16)
 """Pairs between asking for a record and needing it."""
 

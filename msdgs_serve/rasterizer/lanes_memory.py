@@ -461,10 +461,9 @@ def _every(builder: Any, pieces: list[Any], first: int, step: int) -> Any:
     """16 numbers: of each of four vectors the one at `first` and three more, `step` apart."""
     length = 4 * step
     lanes = [first + k * step for k in range(4)]
-    halves = [
-        shuffled(builder, a, b, [*lanes, *(length + lane for lane in lanes)]) for a, b in (pieces[:2], pieces[2:])
-    ]
-    return shuffled(builder, *halves, range(LANES))
+    both = [*lanes, *(length + lane for lane in lanes)]
+    upper, lower = (shuffled(builder, a, b, both) for a, b in (pieces[:2], pieces[2:]))
+    return shuffled(builder, upper, lower, range(LANES))
 
 
 @lower_builtin(load_square, types.Array, types.Integer, types.Integer)
