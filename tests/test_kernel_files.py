@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from msdgs_serve.rasterizer.kernel_files import copy_kernels, is_writable
+from msdgs_serve.rasterizer.kernel_files import CheckedFiles, copy_kernels, is_writable
 from tests.processes import ROOT, run_python
 
 KERNEL = """
@@ -113,3 +113,37 @@ print(len(double.stats.cache_misses))
     again = tmp_path / "again"
     copy_kernels(copy, again, nested=False)
     assert run_python(run, NUMBA_CACHE_DIR=str(again)).split() == ["0"]
+
+
+def files_of(folder: Path, stamp: str = "now") -> CheckedFiles:
+    return CheckedFiles(str(folder), "room.kernel", stamp)
+
+
+def test_code_that_two_processes_store_at_once_is_not_mixed_up(tmp_path: Path):
+    """Each has seen an index without the other's code; whichever is written last, no type gets the other's."""
+    files_of(tmp_path).save("float32", "code for float32")
+    index = (tmp_path / "room.kernel.nbi").read_bytes()
+    (tmp_path / "room.kernel.nbi").unlink()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CheckedFiles, "_remove", lambda *_: None)  # as if the other's file weren't there yet
+        files_of(tmp_path).save("float64", "code for float64")
+    (tmp_path / "room.kernel.nbi").write_bytes(index)
+    assert files_of(tmp_path).load("float32") == "code for float32"
+    assert files_of(tmp_path).load("float64") is None
+    files_of(tmp_path).save("float64", "code for float64")
+    assert [files_of(tmp_path).load(key) for key in ("float32", "float64")] == ["code for float32", "code for float64"]
+
+
+def test_code_of_older_sources_goes(tmp_path: Path):
+    files_of(tmp_path, "before").save("float32", "old code")
+    assert files_of(tmp_path).load("float32") is None
+    files_of(tmp_path).save("float64", "new code")
+    assert len(list(tmp_path.glob("*.nbc"))) == 1
+    assert files_of(tmp_path).load("float64") == "new code"
+
+
+def test_code_whose_file_is_gone_is_compiled_anew(tmp_path: Path):
+    files_of(tmp_path).save("float32", "code")
+    for file in tmp_path.glob("*.nbc"):
+        file.unlink()
+    assert files_of(tmp_path).load("float32") is None

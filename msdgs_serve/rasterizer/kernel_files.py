@@ -17,12 +17,18 @@ from numba.core import config
 from numba.core.caching import IndexDataCacheFile, UserProvidedCacheLocator
 
 DIGEST_BYTES = hashlib.sha256().digest_size
+NAME_DIGITS = 16
+"""Of a file of machine code."""
 
 logger = logging.getLogger("msdgs_serve")
 
 
 class CheckedFiles(IndexDataCacheFile):
-    """One kernel's files, each with the SHA-256 of its contents. What doesn't match is wiped, then made anew."""
+    """One kernel's files, each with the SHA-256 of its contents. What doesn't match is wiped, then made anew.
+
+    Machine code lies under the digest of itself. numba numbers its files: of two processes that store code for other
+    types at the same time both take the same number, and a call may run the code of other types.
+    """
 
     def load(self, key: Any) -> Any:
         """The stored machine code; None where there is none that is whole."""
@@ -35,12 +41,27 @@ class CheckedFiles(IndexDataCacheFile):
     def save(self, key: Any, data: Any) -> None:
         """Store machine code; a disk that is full or gone costs the next start its time, not this call its answer."""
         try:
-            super().save(key, data)
+            self._save(key, data)
         except OSError as error:
             logger.warning("kernels can't be stored: %s", error.strerror)
         except Exception as error:
             self._wipe(error)
-            super().save(key, data)
+            self._save(key, data)
+
+    def _save(self, key: Any, data: Any) -> None:
+        """The data before the index that names it; where the sources have changed, what was stored before goes."""
+        known: dict[Any, str] = self._load_index()  # pyright: ignore[reportAttributeAccessIssue]
+        if not known:
+            self._remove(self._data_files())
+        name = self._data_name(hashlib.sha256(self._dump(data)).hexdigest()[:NAME_DIGITS])
+        self._save_data(name, data)  # pyright: ignore[reportAttributeAccessIssue]
+        self._save_index(known | {key: name})  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _data_name(self, digest: str) -> str:
+        return self._index_name.removesuffix("nbi") + f"{digest}.nbc"
+
+    def _data_files(self) -> list[Path]:
+        return list(Path(self._cache_path).glob(self._data_name("*")))
 
     def _dump(self, obj: Any) -> bytes:
         payload = super()._dump(obj)  # pyright: ignore[reportAttributeAccessIssue]
@@ -55,8 +76,10 @@ class CheckedFiles(IndexDataCacheFile):
 
     def _wipe(self, error: Exception) -> None:
         logger.warning("stored kernel %s is damaged (%s), it is compiled anew", self._index_name, type(error).__name__)
-        folder = Path(self._cache_path)
-        for file in [folder / self._index_name, *folder.glob(self._index_name.removesuffix(".nbi") + ".*.nbc")]:
+        self._remove([Path(self._cache_path) / self._index_name, *self._data_files()])
+
+    def _remove(self, files: list[Path]) -> None:
+        for file in files:
             with contextlib.suppress(OSError):
                 file.unlink()
 
