@@ -64,8 +64,8 @@ class Offline:
         view = framing(session.scene.metadata)
         pose = orbit(view.target, view.distance, wanted.azimuth, ELEVATION, view.up)
         camera = Camera.from_fov(pose, wanted.size, wanted.size, view.fov_y)
-        depth = FORMATS[wanted.image_format].holds_float
-        options = RenderOptions("transparent" if depth else "scene", depth=depth)
+        holds_float = FORMATS[wanted.image_format].holds_float
+        options = RenderOptions("transparent" if holds_float else "scene", depth=holds_float)
         image = self._renderer.render(session, camera, wanted.t, options)
         return encode(image, wanted.image_format) if encoded else b""
 

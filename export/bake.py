@@ -13,7 +13,7 @@ from msdgs_serve.scene.gaussians import FloatArray
 from msdgs_train.basis_layer import BasisLayer
 from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.layers import MLPLayer
-from msdgs_train.model import DynamicGaussians, unit_quats
+from msdgs_train.model import DynamicGaussians, carried, unit_quats
 from msdgs_train.plane_layer import PlaneLayer
 
 STARTING_CAMERAS = 8
@@ -78,7 +78,7 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
 
 
 def _moving(model: DynamicGaussians) -> Moving:
-    g = model.gaussians
+    g, followed = model.gaussians, carried(model.gaussians)
     factors = {"means": None, "scales": None, "quats": None}
     if model.modulation is not None:
         factors |= {name: _array(values) for name, values in model.modulation(g.embeddings).present().items()}
@@ -89,8 +89,8 @@ def _moving(model: DynamicGaussians) -> Moving:
         scale_modulation=factors["scales"],
         mean_modulation=factors["means"],
         quat_modulation=factors["quats"],
-        basis_weights=None if g.basis_logits is None else _array(g.basis_logits.softmax(dim=1)),
-        basis_ids=None if g.basis_ids is None else g.basis_ids.numpy(),
+        basis_weights=None if followed is None else _array(followed.basis_weights),
+        basis_ids=None if followed is None else followed.basis_ids.numpy(),
     )
 
 

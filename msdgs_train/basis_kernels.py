@@ -15,6 +15,8 @@ import numpy as np
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.lanes import fma, spread
 from msdgs_serve.rasterizer.lanes_memory import load, store, sums_of
+from msdgs_serve.rasterizer.projection import rotation_columns
+from msdgs_serve.rasterizer.projection_backward import quaternion_gradient
 from msdgs_serve.scene.quaternion import MIN_NORM
 
 FOLLOWED = 8
@@ -47,7 +49,7 @@ def carry(
         matrix, turn, _ = _parts(blended)
         mean, quat = (means[n, 0], means[n, 1], means[n, 2]), (quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
         moved, turned = _times(matrix, mean), _product(turn, quat)
-        axes = _columns(quat)
+        axes = rotation_columns(*quat)
         for i in range(3):
             deltas[n, i] = moved[i] + blended[OFFSET + i] - mean[i]
             deltas[n, 3 + i] = 0.5 * math.log(max(_square(_times(matrix, axes[i])), LEAST_STRETCH**2))
@@ -79,7 +81,7 @@ def carry_backward(
         matrix, turn, norm = _parts(blended)
         mean, quat = (means[n, 0], means[n, 1], means[n, 2]), (quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
         on_mean, on_quat = (g[n, 0], g[n, 1], g[n, 2]), (g[n, 6], g[n, 7], g[n, 8], g[n, 9])
-        axes = _columns(quat)
+        axes = rotation_columns(*quat)
         on_0, on_1, on_2 = (
             _on_stretched(matrix, axes[0], g[n, 3]),
             _on_stretched(matrix, axes[1], g[n, 4]),
@@ -91,12 +93,12 @@ def carry_backward(
                     on_mean[i] * mean[j] + on_0[i] * axes[0][j] + on_1[i] * axes[1][j] + on_2[i] * axes[2][j]
                 )
             pulls[OFFSET + i] = on_mean[i]
-        back = _times_transposed(matrix, on_mean)
+        transposed = _transposed(matrix)
+        back = _times(transposed, on_mean)
         for i in range(3):
             grad_means[n, i] = back[i] - on_mean[i]
-        of_axes = _on_quaternion(
-            quat, _times_transposed(matrix, on_0), _times_transposed(matrix, on_1), _times_transposed(matrix, on_2)
-        )
+        on_axes = _times(transposed, on_0), _times(transposed, on_1), _times(transposed, on_2)
+        of_axes = quaternion_gradient(*quat, on_axes)
         of_turned = _product(_conjugate(turn), on_quat)
         on_turn = _product(on_quat, _conjugate(quat))
         along = turn[0] * on_turn[0] + turn[1] * on_turn[1] + turn[2] * on_turn[2] + turn[3] * on_turn[3]
@@ -141,28 +143,13 @@ def _times(m: tuple, v: tuple) -> tuple:
 
 
 @inlined_kernel
-def _times_transposed(m: tuple, v: tuple) -> tuple:
-    return (
-        m[0][0] * v[0] + m[1][0] * v[1] + m[2][0] * v[2],
-        m[0][1] * v[0] + m[1][1] * v[1] + m[2][1] * v[2],
-        m[0][2] * v[0] + m[1][2] * v[1] + m[2][2] * v[2],
-    )
+def _transposed(m: tuple) -> tuple:
+    return (m[0][0], m[1][0], m[2][0]), (m[0][1], m[1][1], m[2][1]), (m[0][2], m[1][2], m[2][2])
 
 
 @inlined_kernel
 def _square(v: tuple) -> float:
     return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-
-
-@inlined_kernel
-def _columns(quat: tuple) -> tuple:
-    """Of the rotation matrix of a unit quaternion."""
-    w, x, y, z = quat
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
 
 
 @inlined_kernel
@@ -172,18 +159,6 @@ def _on_stretched(matrix: tuple, axis: tuple, pull: float) -> tuple:
     square = _square(c)
     share = pull / square if square > LEAST_STRETCH**2 else 0 * square
     return share * c[0], share * c[1], share * c[2]
-
-
-@inlined_kernel
-def _on_quaternion(quat: tuple, a: tuple, b: tuple, c: tuple) -> tuple:
-    """The gradient of a quaternion from those of the columns of its matrix."""
-    w, x, y, z = quat
-    return (
-        2 * (x * (b[2] - c[1]) + y * (c[0] - a[2]) + z * (a[1] - b[0])),
-        2 * (y * (b[0] + a[1]) + z * (c[0] + a[2]) + w * (b[2] - c[1])) - 4 * x * (b[1] + c[2]),
-        2 * (x * (b[0] + a[1]) + z * (c[1] + b[2]) + w * (c[0] - a[2])) - 4 * y * (a[0] + c[2]),
-        2 * (x * (c[0] + a[2]) + y * (c[1] + b[2]) + w * (a[1] - b[0])) - 4 * z * (a[0] + b[1]),
-    )
 
 
 @inlined_kernel

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_serve.threads import run_parallel, split_evenly
 from msdgs_train.basis_kernels import DELTAS, FOLLOWED, carry, carry_backward
-from msdgs_train.layers import LayerStep
+from msdgs_train.layers import LayerStep, to_array
 
 OPAQUE = 0.3
 """Opacity from which a Gaussian may be the pivot of a motion."""
@@ -167,7 +167,7 @@ class _Carry(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:
         ctx.save_for_backward(*tensors)
-        arrays = [_array(tensor) for tensor in tensors]
+        arrays = [to_array(tensor) for tensor in tensors]
         deltas = np.empty((len(arrays[0]), DELTAS), arrays[0].dtype)
         run_parallel(carry, [(*arrays, *rows, deltas) for rows in split_evenly(len(deltas), PARTS)])
         return torch.from_numpy(deltas).to(tensors[0].device)
@@ -175,11 +175,11 @@ class _Carry(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        arrays = means, quats, weights, _, motions = [_array(tensor) for tensor in ctx.saved_tensors]
+        arrays = means, quats, weights, _, motions = [to_array(tensor) for tensor in ctx.saved_tensors]
         own = [np.empty_like(array) for array in (means, quats, weights)]
         parts = split_evenly(len(means), PARTS) or [(0, 0)]
         sums = np.zeros((len(parts), *motions.shape), motions.dtype)
-        pulls = _array(grad)
+        pulls = to_array(grad)
         run_parallel(
             carry_backward, [(*arrays, pulls, *rows, *own, part) for rows, part in zip(parts, sums, strict=True)]
         )
@@ -187,10 +187,6 @@ class _Carry(torch.autograd.Function):
             torch.from_numpy(array).to(grad.device) for array in (*own, sums.sum(axis=0))
         )
         return of_means, of_quats, of_weights, None, of_motions
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().contiguous().numpy()
 
 
 def cubic_weights(part: Tensor) -> Tensor:

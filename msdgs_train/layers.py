@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
@@ -147,3 +148,8 @@ class MLPLayer(nn.Module):
 
     def extra_repr(self) -> str:
         return f"{sum(p.numel() for p in self.parameters()):,} parameters"
+
+
+def to_array(tensor: Tensor) -> np.ndarray:
+    """As kernels take it."""
+    return tensor.detach().cpu().contiguous().numpy()

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from msdgs_serve.threads import run_parallel, split_evenly
 from msdgs_train.heads import PAPER_HEADS, Heads
-from msdgs_train.layers import LayerStep
+from msdgs_train.layers import LayerStep, to_array
 from msdgs_train.plane_kernels import plane_features, plane_gradients
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
@@ -158,7 +158,7 @@ class _PlaneFeatures(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, space: Tensor, lines: Tensor, positions: Tensor) -> Tensor:
         ctx.save_for_backward(space, lines, positions)
-        arrays = [_array(tensor) for tensor in (space, lines, positions)]
+        arrays = [to_array(tensor) for tensor in (space, lines, positions)]
         features = np.empty((len(positions), space.shape[3]), arrays[0].dtype)
         run_parallel(plane_features, [(*arrays, a, b, features) for a, b in split_evenly(len(positions), PARTS)])
         return torch.from_numpy(features).to(positions.device)
@@ -166,8 +166,8 @@ class _PlaneFeatures(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
-        space, lines, positions = (_array(tensor) for tensor in ctx.saved_tensors)
-        grad_features, grad_positions = _array(grad), np.empty_like(positions)
+        space, lines, positions = (to_array(tensor) for tensor in ctx.saved_tensors)
+        grad_features, grad_positions = to_array(grad), np.empty_like(positions)
         rows = split_evenly(len(positions), PARTS) or [(0, 0)]
         grads = [(np.zeros_like(space), np.zeros_like(lines)) for _ in rows]
         run_parallel(
@@ -179,7 +179,3 @@ class _PlaneFeatures(torch.autograd.Function):
         )
         sums = (np.sum(parts, axis=0) for parts in zip(*grads, strict=True))
         return (*(torch.from_numpy(array).to(grad.device) for array in (*sums, grad_positions)),)
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().contiguous().numpy()

@@ -12,6 +12,7 @@ from msdgs_serve.scene.camera import look_at
 Scene = tuple[Gaussians, Camera]
 
 draw = functools.partial(rasterize, depth=True)
+"""All that is drawn without naming a further channel."""
 
 IDENTITY_ROTATION = (1.0, 0.0, 0.0, 0.0)
 

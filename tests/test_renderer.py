@@ -145,8 +145,9 @@ def test_eight_threads_get_the_bytes_that_one_gets(session: DeformationSession):
     sizes = [(17 + 13 * i, 80 - 7 * i) for i in range(8)]
 
     def draw(renderer: Renderer, number: int) -> bytes:
-        image = renderer.render(session, level_camera(*sizes[number]), number % 3 / 2)
-        return image.rgb.tobytes() + image.alpha.tobytes()
+        image = renderer.render(session, level_camera(*sizes[number]), number % 3 / 2, RenderOptions(depth=True))
+        assert image.depth is not None
+        return image.rgb.tobytes() + image.alpha.tobytes() + image.depth.tobytes()
 
     alone = [draw(Renderer(), number) for number in range(8)]
     shared = Renderer(cache_bytes=2 * POSE_BYTES)

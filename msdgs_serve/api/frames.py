@@ -81,7 +81,12 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
         check_times(scene.session, t, shutter, request.dt)
     scene.session.check_steps(request.steps)
     options = RenderOptions(
-        background, shutter, request.dt, "depth" in channels, "gaussians" in channels, request.steps
+        background,
+        shutter,
+        request.dt,
+        depth="depth" in channels,
+        counts="gaussians" in channels,
+        steps=request.steps,
     )
     etag = _etag(scene, request)
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)

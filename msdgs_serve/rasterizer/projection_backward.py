@@ -151,7 +151,7 @@ def _backward_part(
         grad_z += -grad_x_free * free_x - grad_y_free * free_y
         gx, gy, gz = _turned_back(w, grad_x + grad_x_free, grad_y + grad_y_free, grad_z)
         dx, dy, dz = _color_gradient(view, sh, first, scratch, pulls, drawn, wx, wy, wz, moments, grad_sh)
-        grad_quat = _quaternion_gradient(qw, qx, qy, qz, (axis0, axis1, axis2))
+        grad_quat = quaternion_gradient(qw, qx, qy, qz, (axis0, axis1, axis2))
         nothing = filled(0, record[0])
         opacity = load_or(opacities, first, filled(1, nothing))
         store_columns(
@@ -223,7 +223,7 @@ def _mean_gradient(record: tuple, moments: tuple) -> tuple[Lanes, Lanes]:
 
 
 @kernel
-def _quaternion_gradient(w: Lanes, x: Lanes, y: Lanes, z: Lanes, columns: tuple) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+def quaternion_gradient(w: Lanes, x: Lanes, y: Lanes, z: Lanes, columns: tuple) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """From the gradient of the rotation matrix, by columns."""
     (g00, g10, g20), (g01, g11, g21), (g02, g12, g22) = columns
     return (
