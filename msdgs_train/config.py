@@ -63,6 +63,12 @@ class TrainConfig:
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
     """λ in L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
+    squares_part: float = 0.0
+    """This part of L is squared errors instead, which ask most where most is wrong: where it moves, not all over the
+    ground."""
+    blocks_weight: float = 0.0
+    """Of L1 of pictures averaged over blocks of 8 to 32 pixels, added where photographs teach motion alone: what is
+    out of place by more than its own size is found again."""
     rigidity_weight: float = 0.0
     """Of the mean relative change of distances between Gaussians, added to the loss; 0: none."""
     bases_bends_weight: float = 0.1
@@ -104,7 +110,7 @@ class TrainConfig:
     modulation_rate_end: float = 1.6e-6
     """At the last step."""
     sh_dc_rate: float = 2.5e-3
-    """Learning rate of the colours; this and those below stay the same all along."""
+    """Learning rate of the colours; this and those below stay the same until all times take part."""
     sh_rest_rate: float = 1.25e-4
     """Of how colours change with the direction of view."""
     opacities_rate: float = 5e-2
@@ -113,6 +119,8 @@ class TrainConfig:
     """Of the logarithms of the scales."""
     quats_rate: float = 1e-3
     """Of the quaternions."""
+    settled_rates: float = 1.0
+    """What these rates are multiplied by at the last step; they fall to it once all times take part."""
 
     densify_strategy: Literal["gradient", "mcmc"] = "gradient"
     """Density control: `gradient` clones and splits where the picture pulls hardest on the Gaussians, and prunes;
@@ -156,7 +164,7 @@ class TrainConfig:
         for name in ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed"):
             self._require(name, "0 or above", lambda v: v >= 0)
         parts = ("warmup_fraction", "settling_fraction", "window_until_fraction", "densify_until_fraction")
-        for name in ("l1_weight", "prune_opacity", *parts):
+        for name in ("l1_weight", "squares_part", "prune_opacity", *parts):
             self._require(name, "in [0, 1]", lambda v: 0 <= v <= 1)
         for item in dataclasses.fields(self):
             if "_rate" in item.name:
@@ -164,6 +172,7 @@ class TrainConfig:
         self._require("sown_fraction", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         more = (
+            "blocks_weight",
             "bases_bends_weight",
             "bases_strains_weight",
             "plane_space_bends_weight",

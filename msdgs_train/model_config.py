@@ -48,7 +48,7 @@ class ModelConfig:
     plane_width: int = 32
     plane_scales: tuple[int, ...] = (1,)
     """Grids a layer, with so many times `plane_space_nodes`; their features are put side by side. 4DGS has 1 2."""
-    basis_count: int = 96
+    basis_count: int = 256
     """Motions of a layer of kind `bases`, each of which many Gaussians follow. Such a layer is the first."""
     basis_knots: int = 24
     """Of their splines, over the time range of the scene."""

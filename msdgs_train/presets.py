@@ -74,11 +74,15 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "msdgs-bases": TrainConfig(
         model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
-        steps=54_000,
+        steps=58_000,
         warmup_fraction=0.05,
         max_gaussians=18_000,
         densify_gradient=8e-4,
         densify_until_fraction=0.75,
+        means_rate_end=5e-5,
+        squares_part=0.8,
+        blocks_weight=1.0,
+        settled_rates=0.1,
     ),
     "static": TrainConfig(
         model=replace(TrainConfig().model, layers=(), embedding_size=0),

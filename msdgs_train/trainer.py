@@ -19,7 +19,7 @@ from msdgs_train.curriculum import Curriculum, Lesson
 from msdgs_train.datasets import Frame, SceneData, composite
 from msdgs_train.density import sow, start_density_control
 from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.losses import photometric_loss, still_loss
+from msdgs_train.losses import blocks_loss, photometric_loss, still_loss
 from msdgs_train.metrics import Quality, mean_quality, psnr_from_mse, quality
 from msdgs_train.model import SMALLEST_SCALE, Domain, DynamicGaussians, PosedGaussians
 from msdgs_train.optimizers import learning_rates, make_optimizer, replace_values, set_learning_rates
@@ -149,10 +149,13 @@ class Trainer:
         truth = self._photograph(lesson.frame, background)
         posed = self._pose(lesson.t)
         rgb, _, info = rasterize(*posed, lesson.frame.camera, background)
+        c = self.config
         if lesson.subject == "stillness":
-            loss = still_loss(rgb, truth, self.config.l1_weight)
+            loss = still_loss(rgb, truth, c.l1_weight)
         else:
-            loss = photometric_loss(rgb, truth, self.config.l1_weight) + self._priors(posed, lesson.t, pairs)
+            loss = photometric_loss(rgb, truth, c.l1_weight, c.squares_part) + self._priors(posed, lesson.t, pairs)
+        if lesson.subject == "motion" and c.blocks_weight:
+            loss = loss + c.blocks_weight * blocks_loss(rgb, truth)
         gradients = self._gradients(loss, lesson)
         squared_error = float((rgb.detach() - truth).square().mean())
         return _Shot(lesson, loss.item(), squared_error, gradients, info, self._floored(posed))

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from msdgs_train import trainer as trainer_module
 from msdgs_train.curriculum import MIDDLE, NEW, Curriculum, Lesson
 from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.trainer import Trainer
@@ -100,3 +101,17 @@ def test_a_lesson_changes_only_what_it_teaches(scene: SceneData) -> None:
         assert changed == {"motion": subject != "stillness", "still": subject != "motion"}
         seen.add(subject)
     assert seen == {"everything", "motion", "stillness"}
+
+
+def test_blocks_of_pictures_are_compared_where_motion_alone_is_taught(
+    scene: SceneData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared = []
+    monkeypatch.setattr(trainer_module, "blocks_loss", lambda *pictures: compared.append(pictures) or 0.0)
+    config = small_config(warmup_fraction=0.1, settling_fraction=0.1, steps=100, blocks_weight=1.0)
+    trainer, taught = Trainer(config, scene), []
+    while trainer.step_count < 40:
+        (shot,) = trainer._shots()
+        taught.append(shot.lesson.subject)
+        trainer.step_count += 1
+    assert len(compared) == taught.count("motion") > 0

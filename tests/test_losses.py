@@ -8,7 +8,7 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from msdgs_serve.scene import InvalidInput
-from msdgs_train.losses import RADIUS, photometric_loss, ssim, still_loss
+from msdgs_train.losses import EVEN, RADIUS, blocks_loss, photometric_loss, ssim, still_loss
 from tests.tolerances import assert_close, tolerance
 
 
@@ -96,3 +96,32 @@ def test_what_has_moved_away_teaches_nothing_of_what_stands_still() -> None:
     elsewhere[2:7, 3:8] = False
     assert torch.equal(gradient.any(dim=2), elsewhere)
     assert float(loss.detach()) == pytest.approx(0.8 * 0.1 * float(elsewhere.double().mean()))
+
+
+@pytest.mark.parametrize("l1_weight", [0.8, 1.0])
+def test_squared_errors_take_their_part_of_the_loss(l1_weight: float) -> None:
+    rgb, truth = torch.rand(2, 20, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    whole, squares = photometric_loss(rgb, truth, l1_weight), EVEN * (rgb - truth).square().mean()
+    assert float(photometric_loss(rgb, truth, l1_weight, 0.3)) == pytest.approx(float(0.7 * whole + 0.3 * squares))
+    assert float(photometric_loss(rgb, truth, l1_weight, 1.0)) == pytest.approx(float(squares))
+
+
+def _spot(left: torch.Tensor) -> torch.Tensor:
+    """[40, 60, 3] a soft spot 3 pixels wide, `left` of which is its column."""
+    rows, columns = torch.arange(40.0)[:, None], torch.arange(60.0)
+    return torch.exp(-((rows - 20) ** 2 + (columns - left) ** 2) / 2).expand(3, -1, -1).permute(1, 2, 0)
+
+
+def test_what_is_far_from_its_place_is_pulled_there_by_blocks() -> None:
+    """Pixel by pixel a spot twelve pixels off has nothing to gain by coming nearer."""
+    truth, place = _spot(torch.tensor(30.0)), torch.tensor(42.0, requires_grad=True)
+    (by_pixels,) = torch.autograd.grad(photometric_loss(_spot(place), truth, 1.0), [place])
+    (by_blocks,) = torch.autograd.grad(blocks_loss(_spot(place), truth), [place])
+    assert abs(float(by_pixels)) < 1e-6
+    assert float(by_blocks) > 1e-4
+
+
+def test_blocks_of_pictures_smaller_than_they_are() -> None:
+    rgb, truth = torch.full((3, 5, 3), 0.75), torch.full((3, 5, 3), 0.5)
+    assert float(blocks_loss(rgb, truth)) == pytest.approx(3 * 0.25)
+    assert float(blocks_loss(truth, truth)) == 0.0

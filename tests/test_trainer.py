@@ -179,7 +179,7 @@ def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.Mo
     trainer = Trainer(small_config(steps=100, densify_every=0), load_scene(data))
     trainer.step()
     before = [p.detach().clone() for p in trainer.model.parameters()]
-    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, weight: rgb.sum() * float("nan"))
+    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, *parts: rgb.sum() * float("nan"))
     result = trainer.step()
     assert (result.step, result.skipped) == (2, 1)
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.model.parameters(), strict=True))
@@ -323,7 +323,7 @@ def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
 
 def test_an_outlier_of_a_gradient_is_cut(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(small_config(steps=100, warmup_fraction=0.0), load_scene(data))
-    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, weight: 1e9 * (rgb - truth).sum() ** 2)
+    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, *parts: 1e9 * (rgb - truth).sum() ** 2)
     _steps(trainer, 3)
     gradients = [p.grad for p in trainer.model.deformation.parameters() if p.grad is not None]
     assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer_module.MAX_FIELD_GRADIENT)
@@ -350,12 +350,20 @@ def test_learning_rates() -> None:
     while_the_window_grows = learning_rates(config, round(config.window_until_fraction * config.steps))
     assert while_the_window_grows["deformation"] == config.field_rate_start
     assert while_the_window_grows["means"] < config.means_rate_start
+    settling = dataclasses.replace(config, settled_rates=0.01)
+    grown = round(config.window_until_fraction * config.steps)
+    for step, part in ((0, 1.0), (grown, 1.0), ((grown + config.steps) // 2, 0.1), (config.steps, 0.01)):
+        rates, constant = learning_rates(settling, step), learning_rates(config, step)
+        for group in ("raw_opacities", "log_scales", "raw_quats", "sh_dc", "sh_rest"):
+            assert rates[group] == pytest.approx(part * constant[group])
+        assert rates["means"] == constant["means"]
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("steps", 0), ("l1_weight", 1.5), ("l1_weight", float("nan")), ("means_rate_start", 0.0),
+        ("squares_part", 1.1), ("blocks_weight", -1.0), ("settled_rates", 0.0),
         ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("densify_every", -1),
         ("quats_rate", float("inf")), ("size", 0), ("densify_strategy", "none"), ("mcmc_noise", -1.0),
     ],
