@@ -18,6 +18,8 @@ def read_records(path: Path) -> np.ndarray:
 
 def read_gaussians(path: Path) -> Gaussians:
     """Of a .splat file, or of a PLY that is binary with all properties float32; float32, all harmonics it has."""
+    if not path.is_file():
+        raise SystemExit(f"{path} is no file; name .splat or .ply files themselves")
     if path.suffix == ".splat":
         return gaussians_of(np.fromfile(path, SPLAT))
     header, _, body = path.read_bytes().partition(b"end_header\n")

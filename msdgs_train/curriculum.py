@@ -21,7 +21,7 @@ from msdgs_train.datasets import Frame
 
 Subject = Literal["everything", "motion", "stillness"]
 
-NEW = 0.03
+NEW = 0.01
 """Parts of the scene's time from the window's border inwards: photographs that teach motion."""
 MIDDLE = 0.7
 """Of the window; they are at least this far out, and there is always one."""

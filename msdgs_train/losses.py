@@ -23,7 +23,7 @@ C2 = 0.03**2
 ELSEWHERE = 0.25
 """Mean difference of a pixel's colours where something has moved away, or come."""
 EVEN = 4.0
-"""What squared errors are multiplied by: they pull as L1 does, twice as much, where a channel is off by a quarter."""
+"""Squared errors times this are as large as L1 where a channel is off by a quarter."""
 BLOCKS = (8, 16, 32)
 """Widths in pixels that pictures are averaged over to see what is far from its place."""
 
