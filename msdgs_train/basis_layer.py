@@ -57,7 +57,7 @@ class BasisLayer(nn.Module):
     time_knots: Tensor
 
     def __init__(
-        self, count: int = 256, knots: int = 24, time_range: tuple[float, float] = (0.0, 1.0), stretching: bool = True
+        self, count: int = 256, knots: int = 36, time_range: tuple[float, float] = (0.0, 1.0), stretching: bool = True
     ) -> None:
         super().__init__()
         first, last = time_range

@@ -71,7 +71,7 @@ class TrainConfig:
     out of place by more than its own size is found again."""
     rigidity_weight: float = 0.0
     """Of the mean relative change of distances between Gaussians, added to the loss; 0: none."""
-    bases_bends_weight: float = 0.1
+    bases_bends_weight: float = 0.2
     """Of the mean size of second differences along time of shared motions."""
     bases_strains_weight: float = 0.1
     """Of how far neighbouring motions are from being one, on average: a part of the distance between them."""

@@ -50,7 +50,7 @@ class ModelConfig:
     """Grids a layer, with so many times `plane_space_nodes`; their features are put side by side. 4DGS has 1 2."""
     basis_count: int = 256
     """Motions of a layer of kind `bases`, each of which many Gaussians follow. Such a layer is the first."""
-    basis_knots: int = 24
+    basis_knots: int = 36
     """Of their splines, over the time range of the scene."""
     basis_stretches: bool = True
     """They stretch what follows them; else they are rigid."""

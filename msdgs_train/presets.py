@@ -73,8 +73,7 @@ PRESETS: dict[str, TrainConfig] = {
         plane_time_l1_weight=1e-4 * _4DGS_PLANES,
     ),
     "msdgs-bases": TrainConfig(
-        model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0, basis_knots=36),
-        bases_bends_weight=0.2,
+        model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
         steps=58_000,
         warmup_fraction=0.05,
         max_gaussians=18_000,
