@@ -158,8 +158,26 @@ def test_the_plots_show_errors() -> None:
     assert y.tolist() == pytest.approx([10 ** (-psnr / 20) for psnr in (28, 29, 30)])
     (axes,) = draw_layers([*RESULTS, _wide()]).axes
     lines = [container[0].get_data() for container in axes.containers]
-    assert [list(x) for x, _ in lines] == [[1, 2, 4], [2]]
+    assert [np.round(x).tolist() for x, _ in lines] == [[1, 2, 4], [2]]
     assert lines[0][1][1] == pytest.approx(10 ** (-30 / 20))
+
+
+def test_each_scene_has_its_panel_and_each_system_its_look() -> None:
+    systems = [f"s{i}" for i in range(12)]
+    here = [made_result(name, 1, 0, 20.0 + i) for i, name in enumerate(systems)]
+    there = [dataclasses.replace(r, run=dataclasses.replace(r.run, scene="other"), psnr=10.0) for r in here[5:]]
+    figure = draw_time([*here, *there])
+    assert [axes.get_title() for axes in figure.axes] == ["toy", "other"]
+    looks = [
+        {str(line.get_label()): (line.get_color(), line.get_linestyle()) for line in a.get_lines()} for a in figure.axes
+    ]
+    assert list(looks[0]) == systems
+    assert len(set(looks[0].values())) == 12
+    assert looks[1] == {name: looks[0][name] for name in systems[5:]}
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == systems
+    panels = draw_layers([*RESULTS, *there]).axes
+    assert [len(axes.containers) for axes in panels] == [1, 1]
 
 
 def _wide() -> Result:

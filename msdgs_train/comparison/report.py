@@ -1,16 +1,18 @@
 """The table and the plots of a comparison."""
 
 import dataclasses
+import itertools
 import json
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -22,6 +24,8 @@ HEADINGS = (
     "system", "scene", "seeds", "PSNR, dB", "SSIM", "deformation parameters", "with modulation", "Gaussians",
     "training, s", "frame, ms",
 )  # fmt: skip
+BESIDE = 0.04  # layers that bars of the same K stand apart
+COLORS, DASHES = [f"C{i}" for i in range(10)], ["-", "--", ":", "-."]
 
 
 def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list[Path]:
@@ -91,39 +95,43 @@ def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
 
 
 def draw_time(results: Sequence[Result]) -> Figure:
-    """Error on held-out photographs against training time: a line a system, the mean of its seeds and scenes."""
-    figure = Figure(figsize=(8, 5.5), layout="constrained")
-    axes = figure.subplots()
-    for group in _groups(results, lambda r: r.run.system):
-        shortest = min(len(result.curve) for result in group)
-        seconds, psnr = (
-            np.array([[getattr(point, name) for point in result.curve[:shortest]] for result in group])
-            for name in ("seconds", "psnr")
-        )
-        errors = rms_error(psnr)
-        (line,) = axes.plot(seconds.mean(axis=0), errors.mean(axis=0), marker="o", ms=3, label=group[0].run.system)
-        if len(group) > 1:
-            low, high = errors.min(axis=0), errors.max(axis=0)
-            axes.fill_between(seconds.mean(axis=0), low, high, color=line.get_color(), alpha=0.15, lw=0)
-    _finish(axes, "seconds of training")
-    return figure
+    """Error on held-out photographs against training time: a panel a scene, a line a system, the mean of its seeds."""
+    figure, panels = _panels(results, "seconds of training")
+    styles = _styles(_names(results, lambda r: r.run.system))
+    for axes, of_scene in panels:
+        for group in _groups(of_scene, lambda r: r.run.system):
+            shortest = min(len(result.curve) for result in group)
+            seconds, psnr = (
+                np.array([[getattr(point, name) for point in result.curve[:shortest]] for result in group])
+                for name in ("seconds", "psnr")
+            )
+            at, errors, name = seconds.mean(axis=0), rms_error(psnr), group[0].run.system
+            axes.plot(at, errors.mean(axis=0), marker="o", ms=3, label=name, **styles[name])
+            if len(group) > 1:
+                low, high = errors.min(axis=0), errors.max(axis=0)
+                axes.fill_between(at, low, high, color=styles[name]["color"], alpha=0.15, lw=0)
+    return _finished(figure)
 
 
 def draw_layers(results: Sequence[Result]) -> Figure:
-    """Error against K. Systems that differ in nothing but their number of layers of a kind are joined by a line."""
-    figure = Figure(figsize=(8, 5.5), layout="constrained")
-    axes = figure.subplots()
-    for family in _groups(results, _family):
-        points = []
-        for group in _groups(family, lambda r: len(r.run.config.model.layers)):
-            errors = rms_error(np.array([result.psnr for result in group]))
-            points.append((len(group[0].run.config.model.layers), errors.mean(), errors.min(), errors.max()))
-        count, mean, low, high = np.array(sorted(points)).T
-        name = ", ".join(dict.fromkeys(result.run.system for result in family))
-        axes.errorbar(count, mean, [mean - low, high - mean], marker="o", ms=4, capsize=3, label=name)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    _finish(axes, "K, layers of the deformation")
-    return figure
+    """Error against K, a panel a scene. Systems that differ in nothing but their number of layers of a kind are joined
+    by a line; bars reach from the best seed to the worst, side by side."""
+    figure, panels = _panels(results, "K, layers of the deformation")
+    families = _names(results, _family)
+    styles = _styles(families)
+    for axes, of_scene in panels:
+        for family in _groups(of_scene, _family):
+            key, points = _family(family[0]), []
+            aside = BESIDE * (families.index(key) - (len(families) - 1) / 2)
+            for group in _groups(family, lambda r: len(r.run.config.model.layers)):
+                errors = rms_error(np.array([result.psnr for result in group]))
+                points.append((len(group[0].run.config.model.layers), errors.mean(), errors.min(), errors.max()))
+            count, mean, low, high = np.array(sorted(points)).T
+            name = "\n".join(_names(family, lambda r: r.run.system))
+            bars = [mean - low, high - mean]
+            axes.errorbar(count + aside, mean, bars, marker="o", ms=4, capsize=3, label=name, **styles[key])
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return _finished(figure)
 
 
 def rms_error(psnr: np.ndarray) -> np.ndarray:
@@ -138,10 +146,32 @@ def _family(result: Result) -> str:
     return kinds + json.dumps(rest)
 
 
-def _finish(axes: Any, label: str) -> None:
-    axes.set(xlabel=label, ylabel="root mean square error of held-out pixels in [0, 1]", yscale="log")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize="small")
+def _panels(results: Sequence[Result], label: str) -> tuple[Figure, list[tuple[Axes, list[Result]]]]:
+    """A figure with a panel for each scene, and what is drawn there."""
+    scenes = _groups(results, lambda r: r.run.scene)
+    figure = Figure(figsize=(2.5 + 5.5 * len(scenes), 5.5), layout="constrained")
+    panels: list[Axes] = list(np.ravel(figure.subplots(1, len(scenes), squeeze=False)))
+    for axes, of_scene in zip(panels, scenes, strict=True):
+        axes.set(title=of_scene[0].run.scene, xlabel=label, yscale="log")
+        axes.grid(alpha=0.3, which="both")
+    panels[0].set_ylabel("root mean square error of held-out pixels in [0, 1]")
+    return figure, list(zip(panels, scenes, strict=True))
+
+
+def _finished(figure: Figure) -> Figure:
+    entries = [axes.get_legend_handles_labels() for axes in figure.axes]
+    labelled = {label: handle for handles, labels in entries for handle, label in zip(handles, labels, strict=True)}
+    figure.legend(list(labelled.values()), list(labelled), loc="outside right upper", fontsize="small")
+    return figure
+
+
+def _styles(names: list[str]) -> dict[str, dict[str, Any]]:
+    looks = itertools.cycle({"color": color, "linestyle": dashes} for dashes in DASHES for color in COLORS)
+    return dict(zip(names, looks, strict=False))
+
+
+def _names(results: Sequence[Result], key: Callable[[Result], str]) -> list[str]:
+    return list(dict.fromkeys(map(key, results)))
 
 
 def _groups(results: Sequence[Result], key: Any) -> list[list[Result]]:
