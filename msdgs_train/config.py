@@ -75,6 +75,8 @@ class TrainConfig:
     """Of the mean size of second differences along time of shared motions."""
     bases_strains_weight: float = 0.1
     """Of how far neighbouring motions are from being one, on average: a part of the distance between them."""
+    bases_swellings_weight: float = 0.1
+    """Of the mean square of the logarithms of volumes that motions stretch: what is out of its place would vanish."""
     plane_bends_weight: float = 1e-2
     """Of the mean squared second difference along time of the grids of plane layers."""
     plane_slopes_weight: float = 1e-4
@@ -175,6 +177,7 @@ class TrainConfig:
             "blocks_weight",
             "bases_bends_weight",
             "bases_strains_weight",
+            "bases_swellings_weight",
             "plane_space_bends_weight",
             "plane_time_l1_weight",
             "mcmc_noise",

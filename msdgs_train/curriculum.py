@@ -2,7 +2,7 @@
 
 First all photographs teach a scene that stands still: what does stand still is in place before anything moves. Then
 what moves is followed from the middle of the scene's time outwards, in a window that grows photograph by photograph.
-While it grows, of four steps
+While it grows, of four lessons
 
 - one draws from all photographs of the window alike, and teaches everything;
 - two draw from its outermost ones, which are new, and teach motion alone. Were the Gaussians to learn from these few as
@@ -52,17 +52,18 @@ class Curriculum:
         growth = done / max(c.window_until_fraction * c.steps - c.still_steps, 1e-9)
         return min(c.window_start + (0.5 - c.window_start) * max(growth, 0.0), 0.5)
 
-    def next(self, step: int, generator: torch.Generator) -> Lesson:
-        """The lesson of this step, counted from 0."""
+    def next(self, number: int, generator: torch.Generator) -> Lesson:
+        """The lesson of this number, counted from 0: a step takes as many as photographs."""
+        step = number // self._config.photographs
         window = self.window(step)
         if (
             self._config.teach_stillness
             and window < 0.5
-            and step % 4 == 0
+            and number % 4 == 0
             and len(outside := torch.nonzero(self.distances > window)[:, 0])
         ):
             return self._lesson(self._drawn(outside, generator), window, "stillness")
-        if window < 0.5 and step % 2 == 1 and step >= self._config.still_steps:
+        if window < 0.5 and number % 2 == 1 and step >= self._config.still_steps:
             border = min(float(self.distances[self.distances <= window].max()), max(window - NEW, MIDDLE * window))
             new = torch.nonzero((self.distances <= window) & (self.distances >= border))[:, 0]
             subject = "motion" if self._config.teach_motion else "everything"

@@ -127,13 +127,14 @@ class Trainer:
 
     def _shots(self) -> list[_Shot]:
         """Render the next photographs' views and differentiate the loss of each, side by side."""
+        first = self.step_count * self.config.photographs
         drawn = [
             (
-                self._curriculum.next(self.step_count, self._generator),
+                self._curriculum.next(number, self._generator),
                 self._next_background(),
                 _offspring(self._pairs_generator),
             )
-            for _ in range(self.config.photographs)
+            for number in range(first, first + self.config.photographs)
         ]
         if len(drawn) == 1:
             return [self._shoot(*drawn[0])]
@@ -174,10 +175,11 @@ class Trainer:
         return tuple(next(found) if learns else None for learns in taught)
 
     def _set_gradients(self, shots: list[_Shot]) -> None:
-        """The mean over the photographs, added up in their order, so that the same seed gives the same bits."""
+        """The mean over the photographs that teach each parameter, added up in their order, so that the same seed gives
+        the same bits."""
         for parameter, *gradients in zip(self._parameters(), *(shot.gradients for shot in shots), strict=True):
             known = [gradient for gradient in gradients if gradient is not None]
-            parameter.grad = sum(known[1:], known[0]) / len(shots) if known else None
+            parameter.grad = sum(known[1:], known[0]) / len(known) if known else None
 
     def _parameters(self) -> list[nn.Parameter]:
         return [p for p in self.model.parameters() if p.requires_grad]
@@ -314,7 +316,12 @@ class Trainer:
         bases = self.model.bases
         if bases is not None:
             time = torch.tensor(t, dtype=posed.means.dtype)
-            total = total + c.bases_bends_weight * bases.bends(time) + c.bases_strains_weight * bases.strains(time)
+            for weight, prior in (
+                (c.bases_bends_weight, bases.bends),
+                (c.bases_strains_weight, bases.strains),
+                (c.bases_swellings_weight, bases.swellings),
+            ):
+                total = total + weight * prior(time) if weight else total
         for grid in self.model.plane_grids():
             for weight, roughness in (
                 (c.plane_bends_weight, grid.time_bends),

@@ -19,12 +19,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneData:
     return load_scene(write_scene(tmp_path_factory.mktemp("scene"), train=41))
 
 
-def lessons(scene: SceneData, steps: range, **changes: Any) -> list[Lesson]:
-    """Those of some steps of a run of 1,000: 100 on all photographs, 100 around the middle, then up to step 600."""
+def lessons(scene: SceneData, numbers: range, **changes: Any) -> list[Lesson]:
+    """Some of a run of 1,000 steps: 100 on all photographs, 100 around the middle, then up to step 600."""
     settings = {"steps": 1000, "warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6}
     curriculum = Curriculum(small_config(**{**settings, **changes}), scene.splits["train"], scene.time_range)
     generator = torch.Generator().manual_seed(0)
-    return [curriculum.next(step, generator) for step in steps]
+    return [curriculum.next(number, generator) for number in numbers]
 
 
 def distance(scene: SceneData, t: float) -> float:
@@ -54,7 +54,16 @@ def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
             assert distance(scene, lesson.t) <= window + 1e-9
 
 
-def test_of_four_steps_two_teach_motion_and_one_stillness(scene: SceneData) -> None:
+def test_lessons_of_one_step_differ_and_its_window_is_theirs(scene: SceneData) -> None:
+    drawn = lessons(scene, range(400, 1120), photographs=2, window_start=0.1)
+    assert [lesson.subject for lesson in drawn[:4]] == ["stillness", "motion", "everything", "motion"]
+    assert Counter(lesson.subject for lesson in drawn) == {"everything": 180, "motion": 360, "stillness": 180}
+    for number, lesson in enumerate(drawn, 400):
+        window = 0.1 + 0.4 * (number // 2 - 200) / 400
+        assert distance(scene, lesson.t) <= window + 1e-9
+
+
+def test_of_four_lessons_two_teach_motion_and_one_stillness(scene: SceneData) -> None:
     drawn = lessons(scene, range(200, 560), window_start=0.1)
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 90, "motion": 180, "stillness": 90}
 
