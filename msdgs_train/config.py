@@ -75,7 +75,7 @@ class TrainConfig:
     """Of the mean size of second differences along time of shared motions."""
     bases_strains_weight: float = 0.1
     """Of how far neighbouring motions are from being one, on average: a part of the distance between them."""
-    bases_swellings_weight: float = 0.1
+    bases_swellings_weight: float = 0.0
     """Of the mean square of the logarithms of volumes that motions stretch: what is out of its place would vanish."""
     plane_bends_weight: float = 1e-2
     """Of the mean squared second difference along time of the grids of plane layers."""

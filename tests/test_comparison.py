@@ -64,6 +64,13 @@ def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) 
         assert (config.steps, config.init_count, config.max_gaussians, config.threads) == (6, 60, 90, 1)
 
 
+@pytest.mark.parametrize("name", ["ablation.toml", "shared_motions.toml"])
+def test_tables_of_systems_in_the_repository_can_be_compared(name: str) -> None:
+    file = Path(__file__).resolve().parents[1] / "benchmarks" / name
+    systems = read_systems([str(file)], Budget(steps=6, init_count=4000, max_gaussians=5000))
+    assert len({json.dumps(system.config.to_dict()) for system in systems}) == len(systems) > 10
+
+
 def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_path: Path) -> None:
     systems = read_systems([str(systems_file)], BUDGET)
     runs = make_runs(systems, [Path("a/one"), Path("b/two")], [3, 5], tmp_path)
