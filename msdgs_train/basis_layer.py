@@ -24,8 +24,6 @@ REACH = 0.5
 LEAST_LOGIT = -12.0
 """Of these, at first: little enough, and still enough of a gradient to come back."""
 LEAST_REACH = 1e-3  # scene units
-LEAST_VOLUME = 1e-3
-"""Of what is pressed together, or turned inside out, that asks for more."""
 NEIGHBOURS = 4
 SHORTEST = 0.01  # scene units, added to distances between pivots
 TURNS_COUNT = 0.3  # scene units that a quaternion's unit is worth, and a stretch by as much again
@@ -157,13 +155,6 @@ class BasisLayer(nn.Module):
         carried = torch.einsum("bij,bkj->bki", matrices.view(-1, 3, 3), self.pivots[near]) + offsets[:, None]
         lengths = torch.linalg.vector_norm(self.pivots[near] - self.pivots[:, None], dim=2)
         return (torch.linalg.vector_norm(carried - own[near], dim=2) / (lengths + SHORTEST)).mean()
-
-    def swellings(self, t: Tensor) -> Tensor:
-        """Mean square of the logarithms of the volumes that a unit of volume is stretched to at a time."""
-        read, part = self.knots_at(t)
-        rows = stretch_matrices(torch.einsum("k,kbc->bc", cubic_weights(part), self.stretches[read])).unbind(dim=1)
-        volumes = (torch.linalg.cross(rows[0], rows[1]) * rows[2]).sum(dim=1)
-        return volumes.clamp_min(LEAST_VOLUME).log().square().mean()
 
     def extra_repr(self) -> str:
         return f"{sum(p.numel() for p in self.parameters()):,} parameters"

@@ -21,7 +21,7 @@ class TrainConfig:
     """Optimiser steps."""
     photographs: int = 1
     """Photographs a step, rendered side by side on `threads`; what they teach of each parameter is averaged. On two
-    cores four take 2.7 times the time of one."""
+    cores four take 2.7 times the time of one; whether a run learns more a minute has not been measured."""
     size: int | None = None
     """Width in pixels to train at; the photographs' own width if not given."""
     seed: int = 0
@@ -75,8 +75,6 @@ class TrainConfig:
     """Of the mean size of second differences along time of shared motions."""
     bases_strains_weight: float = 0.1
     """Of how far neighbouring motions are from being one, on average: a part of the distance between them."""
-    bases_swellings_weight: float = 0.0
-    """Of the mean square of the logarithms of volumes that motions stretch: what is out of its place would vanish."""
     plane_bends_weight: float = 1e-2
     """Of the mean squared second difference along time of the grids of plane layers."""
     plane_slopes_weight: float = 1e-4
@@ -177,7 +175,6 @@ class TrainConfig:
             "blocks_weight",
             "bases_bends_weight",
             "bases_strains_weight",
-            "bases_swellings_weight",
             "plane_space_bends_weight",
             "plane_time_l1_weight",
             "mcmc_noise",

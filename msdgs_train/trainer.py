@@ -316,12 +316,7 @@ class Trainer:
         bases = self.model.bases
         if bases is not None:
             time = torch.tensor(t, dtype=posed.means.dtype)
-            for weight, prior in (
-                (c.bases_bends_weight, bases.bends),
-                (c.bases_strains_weight, bases.strains),
-                (c.bases_swellings_weight, bases.swellings),
-            ):
-                total = total + weight * prior(time) if weight else total
+            total = total + c.bases_bends_weight * bases.bends(time) + c.bases_strains_weight * bases.strains(time)
         for grid in self.model.plane_grids():
             for weight, roughness in (
                 (c.plane_bends_weight, grid.time_bends),

@@ -196,20 +196,6 @@ def test_straight_motion_does_not_bend() -> None:
         assert float(layer.bends(time(0.1))) <= EXACT
 
 
-def test_swelling_is_the_change_of_volumes_and_not_of_shapes() -> None:
-    layer = BasisLayer(2, 4).double()
-    with torch.no_grad():
-        assert float(layer.swellings(time(0.4))) == 0.0
-        layer.turns[:] = torch.tensor([0.8, 0.6, 0.0, 0.0], dtype=torch.float64)
-        layer.stretches[:, 0] = torch.tensor([1.0, -0.5, 0.0, 0.0, 0.0, 0.0])
-        assert float(layer.swellings(time(0.4))) <= EXACT
-        layer.stretches[:, 1] = torch.tensor([-0.5, -0.5, -0.5, 0.1, -0.2, 0.3])
-        volume = np.linalg.det(np.array([[0.5, 0.1, -0.2], [0.1, 0.5, 0.3], [-0.2, 0.3, 0.5]]))
-        assert float(layer.swellings(time(0.4))) == pytest.approx(np.log(volume) ** 2 / 2)
-        layer.stretches[:, 1] = -1.0
-        assert np.isfinite(float(layer.swellings(time(0.4))))
-
-
 def test_only_the_first_layer_may_be_of_bases() -> None:
     with pytest.raises(InvalidInput, match="layers"):
         ModelConfig(layers=("mlp", "bases"))

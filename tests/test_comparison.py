@@ -166,6 +166,7 @@ def test_the_plots_show_errors() -> None:
     (axes,) = draw_layers([*RESULTS, _wide()]).axes
     lines = [container[0].get_data() for container in axes.containers]
     assert [np.round(x).tolist() for x, _ in lines] == [[1, 2, 4], [2]]
+    assert lines[0][0][1] != lines[1][0][0], "bars of the same K stand beside each other"
     assert lines[0][1][1] == pytest.approx(10 ** (-30 / 20))
 
 

@@ -207,6 +207,20 @@ def test_photographs_of_a_step_share_it_evenly(data: Path) -> None:
     assert all(map(torch.equal, at_once, gradients(6, 2)[0])), "the same bits for any number of threads"
 
 
+def test_a_parameter_learns_the_mean_of_the_photographs_that_teach_it(data: Path) -> None:
+    trainer = Trainer(small_config(photographs=2, window_until_fraction=0.0), load_scene(data))
+    first, second = trainer._shots()
+    of_first, of_second = first.gradients[0], second.gradients[0]
+    assert of_first is not None
+    assert of_second is not None
+    means = trainer._parameters()[0]
+    trainer._set_gradients([first, second])
+    assert means.grad is not None
+    assert torch.equal(means.grad, (of_first + of_second) / 2)
+    trainer._set_gradients([first, second._replace(gradients=(None, *second.gradients[1:]))])
+    assert torch.equal(means.grad, of_first)
+
+
 class _Rollbacks(Observer):
     def __init__(self) -> None:
         self.seen: list[tuple[int, float]] = []
