@@ -93,8 +93,8 @@ class TrainConfig:
     field_rate_end: float = 2e-5
     """At the last step."""
     bases_rate_start: float = 6e-4
-    """Learning rate of shared motions, their shifts and turns alike; as long as all times don't take part it stays, and
-    is four times as much where photographs teach motion alone."""
+    """Learning rate of shared motions, alike for shifts, turns and stretches; as long as all times don't take part it
+    stays, and what only photographs that teach motion alone see goes eight times as far."""
     bases_rate_end: float = 6e-5
     """At the last step."""
     basis_logits_rate_start: float = 2e-2

@@ -74,7 +74,8 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "msdgs-bases": TrainConfig(
         model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
-        steps=58_000,
+        steps=36_000,
+        photographs=2,
         warmup_fraction=0.05,
         max_gaussians=18_000,
         densify_gradient=8e-4,
