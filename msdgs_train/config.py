@@ -21,7 +21,7 @@ class TrainConfig:
     """Optimiser steps."""
     photographs: int = 1
     """Photographs a step, rendered side by side on `threads`; what they teach of each parameter is averaged. On two
-    cores four take 2.7 times the time of one; whether a run learns more a minute has not been measured."""
+    cores four take 2.7 times the time of one; whether a run learns more a minute by four has not been measured."""
     size: int | None = None
     """Width in pixels to train at; the photographs' own width if not given."""
     seed: int = 0
@@ -94,7 +94,7 @@ class TrainConfig:
     """At the last step."""
     bases_rate_start: float = 6e-4
     """Learning rate of shared motions, alike for shifts, turns and stretches; as long as all times don't take part it
-    stays, and what only photographs that teach motion alone see goes eight times as far."""
+    stays, and a step at the time of a photograph that teaches motion alone is eight times as long."""
     bases_rate_end: float = 6e-5
     """At the last step."""
     basis_logits_rate_start: float = 2e-2
