@@ -53,6 +53,9 @@ class TrainConfig:
     window_start: float = 0.03
     """These are up to this part of the scene's time away from its middle. What moves is sharp there, and is then
     followed outwards, photograph by photograph."""
+    second_window_start: float = 0.5
+    """Half-way to `window_until_fraction` the window shrinks to this and grows again: what was blurred where motions
+    weren't known well gets sharp in the middle, and is followed anew along motions nearly right. 0.5: it doesn't."""
     window_until_fraction: float = 0.75
     """The part of the run after which all times take part; 0: from the start, and nothing is sown or settles."""
     teach_motion: bool = True
@@ -170,7 +173,8 @@ class TrainConfig:
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
         self._require("sown_fraction", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
-        self._require("window_start", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
+        for name in ("window_start", "second_window_start"):
+            self._require(name, "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         more = (
             "blocks_weight",
             "bases_bends_weight",

@@ -48,9 +48,26 @@ class Curriculum:
         c = self._config
         if c.window_until_fraction == 0 or not c.model.layers or step < c.warmup_steps:
             return 0.5
-        done = step - c.still_steps
-        growth = done / max(c.window_until_fraction * c.steps - c.still_steps, 1e-9)
-        return min(c.window_start + (0.5 - c.window_start) * max(growth, 0.0), 0.5)
+        starts, grown = self._starts, self._growth(step)
+        if grown >= len(starts):
+            return 0.5
+        start = starts[int(grown)]
+        return start + (0.5 - start) * (grown % 1)
+
+    def discovers(self, step: int) -> bool:
+        """Whether times that the window takes in now have never been in it."""
+        return self._growth(step) <= 1
+
+    @property
+    def _starts(self) -> list[float]:
+        c = self._config
+        return [c.window_start] + ([c.second_window_start] if c.second_window_start < 0.5 else [])
+
+    def _growth(self, step: int) -> float:
+        """How many times the window has grown to all times."""
+        c = self._config
+        done = max(step - c.still_steps, 0) / max(c.window_until_fraction * c.steps - c.still_steps, 1e-9)
+        return done * len(self._starts)
 
     def next(self, number: int, generator: torch.Generator) -> Lesson:
         """The lesson of this number, counted from 0: a step takes as many as photographs."""

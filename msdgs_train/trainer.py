@@ -263,12 +263,15 @@ class Trainer:
 
     @torch.no_grad()
     def _move(self, shots: list[_Shot]) -> None:
-        """A step of the optimiser; shared motions go `AHEAD` times as far at the times that teach motion alone."""
+        """A step of the optimiser; shared shifts and turns go `AHEAD` times as far at the times that teach motion alone.
+
+        Stretches don't: what is out of its place would shrink until nothing pulls at it, before it gets there.
+        """
         bases, ahead = self.model.bases, [shot.lesson.t for shot in shots if shot.lesson.subject == "motion"]
         if bases is None or not ahead:
             self.optimizer.step()
             return
-        curves, read = list(bases.parameters()), torch.zeros(len(bases.shifts), dtype=torch.bool)
+        curves, read = (bases.shifts, bases.turns), torch.zeros(len(bases.shifts), dtype=torch.bool)
         for t in ahead:
             read[bases.knots_at(torch.tensor(t))[0]] = True
         before = [curve[read] for curve in curves]
@@ -339,7 +342,7 @@ class Trainer:
             replace_values(self.optimizer, gaussians, "basis_logits", logits)
             replace_values(self.optimizer, gaussians, "basis_ids", ids)
         before, after = (self._curriculum.window(k) for k in (step - 1, step))
-        if before < after:
+        if before < after and self._curriculum.discovers(step):
             for part in [*self.model.plane_grids(), *([bases] if bases is not None else [])]:
                 part.carry_outwards(before, after)
 

@@ -1,6 +1,7 @@
 """Which photographs come, and what they teach: of passes, the window, and the three kinds of steps."""
 
 from collections import Counter
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,11 @@ import pytest
 import torch
 
 from msdgs_train import trainer as trainer_module
+from msdgs_train.basis_layer import BasisLayer
 from msdgs_train.curriculum import MIDDLE, NEW, Curriculum, Lesson
 from msdgs_train.datasets import SceneData, load_scene
-from msdgs_train.trainer import Trainer
+from msdgs_train.model_config import ModelConfig
+from msdgs_train.trainer import AHEAD, Trainer
 from tests.training_scene import small_config, write_scene
 
 
@@ -52,6 +55,31 @@ def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
             inside = distance(scene, lesson.frame.t) <= window + 1e-9
             assert inside == (lesson.subject != "stillness")
             assert distance(scene, lesson.t) <= window + 1e-9
+
+
+def test_second_window_grows_as_the_first(scene: SceneData) -> None:
+    changes = {"window_start": 0.1, "second_window_start": 0.3}
+    for step, lesson in enumerate(lessons(scene, range(1000), **changes)):
+        if 200 <= step < 600:
+            window = 0.1 + 0.4 * (step - 200) / 200 if step < 400 else 0.3 + 0.2 * (step - 400) / 200
+            assert (distance(scene, lesson.frame.t) <= window + 1e-9) == (lesson.subject != "stillness")
+            assert distance(scene, lesson.t) <= window + 1e-9
+    subjects = Counter(lesson.subject for lesson in lessons(scene, range(400, 560), **changes))
+    assert subjects == {"everything": 40, "motion": 80, "stillness": 40}
+
+
+def test_second_window_keeps_the_motions_that_the_first_has_found(
+    scene: SceneData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    carried = []
+    monkeypatch.setattr(BasisLayer, "carry_outwards", lambda _, before, after: carried.append((before, after)))
+    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
+    changes = {"warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6, "steps": 50}
+    config = small_config(model=model, window_start=0.1, second_window_start=0.2, **changes)
+    trainer = Trainer(config, scene)
+    while trainer.step_count < 50:
+        trainer.step()
+    assert carried == [(pytest.approx(0.1 + 0.04 * k), pytest.approx(0.14 + 0.04 * k)) for k in range(9)]
 
 
 def test_lessons_of_one_step_differ_and_its_window_is_theirs(scene: SceneData) -> None:
@@ -110,6 +138,34 @@ def test_a_lesson_changes_only_what_it_teaches(scene: SceneData) -> None:
         assert changed == {"motion": subject != "stillness", "still": subject != "motion"}
         seen.add(subject)
     assert seen == {"everything", "motion", "stillness"}
+
+
+def test_motions_hurry_to_where_new_photographs_show_them_but_stretches_do_not(scene: SceneData) -> None:
+    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
+    config = small_config(model=model, warmup_fraction=0.1, settling_fraction=0.1, steps=100, densify_every=0)
+    trainer = Trainer(config, scene)
+    while trainer.step_count < 25:
+        trainer.step()
+    assert (bases := trainer.model.bases) is not None
+    curves = {"shifts": bases.shifts, "turns": bases.turns, "stretches": bases.stretches}
+    (shot,) = shots = trainer._shots()
+    assert shot.lesson.subject == "motion"
+    read, _ = bases.knots_at(torch.tensor(shot.lesson.t))
+    trainer._set_gradients(shots)
+    start = deepcopy((trainer.model.state_dict(), trainer.optimizer.state_dict()))
+    before = {name: curve.detach().clone() for name, curve in curves.items()}
+    trainer.optimizer.step()
+    steps = {name: curve.detach() - before[name] for name, curve in curves.items()}
+    trainer.model.load_state_dict(start[0])
+    trainer.optimizer.load_state_dict(start[1])
+    trainer._move(shots)
+    for name, curve in curves.items():
+        times = torch.ones(len(curve))
+        times[read] = 1.0 if name == "stretches" else AHEAD
+        assert steps[name][read].abs().max() > 0
+        torch.testing.assert_close(
+            curve.detach() - before[name], steps[name] * times[:, None, None], rtol=1e-4, atol=1e-6
+        )
 
 
 def test_blocks_of_pictures_are_compared_where_motion_alone_is_taught(
