@@ -263,7 +263,7 @@ class Trainer:
 
     @torch.no_grad()
     def _move(self, shots: list[_Shot]) -> None:
-        """A step of the optimiser; shared shifts and turns go `AHEAD` times as far at the times that teach motion alone.
+        """A step of the optimiser; shared shifts and turns go `AHEAD` times as far at times that teach motion alone.
 
         Stretches don't: what is out of its place would shrink until nothing pulls at it, before it gets there.
         """

@@ -146,7 +146,8 @@ def test_motions_hurry_to_where_new_photographs_show_them_but_stretches_do_not(s
     trainer = Trainer(config, scene)
     while trainer.step_count < 25:
         trainer.step()
-    assert (bases := trainer.model.bases) is not None
+    bases = trainer.model.bases
+    assert bases is not None
     curves = {"shifts": bases.shifts, "turns": bases.turns, "stretches": bases.stretches}
     (shot,) = shots = trainer._shots()
     assert shot.lesson.subject == "motion"
