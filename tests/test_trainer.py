@@ -95,6 +95,19 @@ def _assert_same_bits(one: dict[str, Any], other: dict[str, Any]) -> None:
 
 
 @pytest.mark.usefixtures("_no_curve")
+@pytest.mark.parametrize("stop", [8, 13])
+def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
+    """Stopped in the first and in the second window."""
+    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
+    config = small_config(model=model, second_window_start=0.2)
+    fit(config, data, tmp_path / "whole")
+    fit(config, data, tmp_path / "parts", observer=_StopAfter(stop))
+    assert (_state(tmp_path / "parts")["/seen"] is None) == (stop == 8)
+    fit(config, data, tmp_path / "parts", resume=True)
+    _assert_same_bits(*(_state(tmp_path / name) for name in ("whole", "parts")))
+
+
+@pytest.mark.usefixtures("_no_curve")
 @pytest.mark.parametrize("stop", [3, 11, 16])
 @pytest.mark.parametrize("background", ["white", "random"])
 def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, background: str) -> None:
