@@ -32,7 +32,8 @@ def _seen(model: DynamicGaussians, frame: Frame) -> Tensor:
     with torch.no_grad():
         posed = model.pose(frame.t)
         followed, bases = carried(model.gaussians), model.bases
-    assert followed is not None and bases is not None
+    assert followed is not None
+    assert bases is not None
     sh = posed.sh.requires_grad_()
     rgb, _, _ = rasterize(*posed[:4], sh, frame.camera, sh.new_zeros(3))
     (grads,) = torch.autograd.grad(rgb.sum(), sh)

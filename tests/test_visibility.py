@@ -55,7 +55,8 @@ def scene(hidden_from: float, time_range: tuple[float, float] = (0.0, 1.0)) -> D
 def test_what_goes_behind_a_wall_is_seen_until_then(time_range: tuple[float, float]) -> None:
     seen = seen_until(scene(0.75, time_range), frames(time_range=time_range), time_range)
     assert seen.shape == (2, 3)
-    assert (seen[0] == 0.5).all() and seen[1, WALL] == seen[1, CORK] == 0.5
+    assert (seen[0] == 0.5).all()
+    assert seen[1, WALL] == seen[1, CORK] == 0.5
     assert 0.15 <= seen[1, BALL] <= 0.3
 
 
