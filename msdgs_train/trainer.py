@@ -156,7 +156,7 @@ class Trainer:
         if lesson.subject == "stillness":
             loss = still_loss(rgb, truth, c.l1_weight)
         else:
-            loss = photometric_loss(rgb, truth, c.l1_weight, c.squares_part) + self._priors(posed, lesson.t, pairs)
+            loss = photometric_loss(rgb, truth, c.l1_weight, c.squares_part) + self._priors(posed, lesson, pairs)
         if lesson.subject == "motion" and c.blocks_weight:
             loss = loss + c.blocks_weight * blocks_loss(rgb, truth)
         gradients = self._gradients(loss, lesson)
@@ -308,7 +308,7 @@ class Trainer:
     def _deforms(self) -> bool:
         return self.step_count >= self.config.still_steps and len(self.model.deformation) > 0
 
-    def _priors(self, posed: PosedGaussians, t: float, pairs: torch.Generator) -> Tensor | float:
+    def _priors(self, posed: PosedGaussians, lesson: Lesson, pairs: torch.Generator) -> Tensor | float:
         """What is asked besides likeness to the photographs: few and small Gaussians, rigid motion, smooth grids."""
         c, total = self.config, 0.0
         if c.densify_strategy == "mcmc":
@@ -321,8 +321,10 @@ class Trainer:
             total = total + c.rigidity_weight * stretched
         bases = self.model.bases
         if bases is not None:
-            time = torch.tensor(t, dtype=posed.means.dtype)
-            total = total + c.bases_bends_weight * bases.bends(time) + c.bases_strains_weight * bases.strains(time)
+            time = torch.tensor(lesson.t, dtype=posed.means.dtype)
+            total = total + c.bases_strains_weight * bases.strains(time)
+            if lesson.subject != "motion":  # a ball that a photograph shows from above would fall on, straight ahead
+                total = total + c.bases_bends_weight * bases.bends(time)
         for grid in self.model.plane_grids():
             for weight, roughness in (
                 (c.plane_bends_weight, grid.time_bends),

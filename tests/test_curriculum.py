@@ -190,3 +190,19 @@ def test_blocks_of_pictures_are_compared_where_motion_alone_is_taught(
         taught.append(shot.lesson.subject)
         trainer.step_count += 1
     assert len(compared) == taught.count("motion") > 0
+
+
+def test_motions_of_new_photographs_may_bend(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
+    bends, strains, taught = [], [], []
+    monkeypatch.setattr(BasisLayer, "bends", lambda _, t: bends.append(float(t)) or 0.0)
+    monkeypatch.setattr(BasisLayer, "strains", lambda _, t: strains.append(float(t)) or 0.0)
+    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
+    config = small_config(model=model, warmup_fraction=0.1, settling_fraction=0.1, steps=100, teach_stillness=False)
+    trainer = Trainer(config, scene)
+    while trainer.step_count < 40:
+        (shot,) = trainer._shots()
+        taught += [shot.lesson] if trainer.parts_in_use[0] else []
+        trainer.step_count += 1
+    assert {lesson.subject for lesson in taught} == {"everything", "motion"}
+    assert strains == [pytest.approx(lesson.t) for lesson in taught]
+    assert bends == [pytest.approx(lesson.t) for lesson in taught if lesson.subject != "motion"]
