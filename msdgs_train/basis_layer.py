@@ -120,7 +120,7 @@ class BasisLayer(nn.Module):
         return (nearest.values - nearest.values[:, :1]).clamp_min(LEAST_LOGIT), nearest.indices
 
     @torch.no_grad()
-    def carry_outwards(self, before: float, after: float, seen: Tensor | None = None) -> None:
+    def carry_outwards(self, before: float, after: float) -> None:
         """Go on with what is known when training's time window, around the middle of the range, widens from half a
         width of `before` to `after`, parts of the range.
 
@@ -129,16 +129,13 @@ class BasisLayer(nn.Module):
         """
         knots = len(self.shifts) - 3
         known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
-        if seen is None:
-            seen = self.pivots.new_zeros(2, len(self.pivots))
-        for last, outwards, ids in ((known[0], -1, seen[0] < after), (known[-1], 1, seen[1] < after)):
+        for last, outwards in ((known[0], -1), (known[-1], 1)):
             turn, inner = (_unit(self.turns[k]) for k in (last, last - outwards))
             step = product(turn, inner * turn.new_tensor([1.0, -1.0, -1.0, -1.0]))
             for k in range(last + outwards, knots + 3 if outwards > 0 else -1, outwards):
                 if abs(k - last) <= 3:  # as many as a time within the window reads
                     turn = _unit(product(step, turn))
-                for curve, values in zip(self._curves, (self.shifts[last], turn, self.stretches[last]), strict=True):
-                    curve[k, ids] = values[ids]
+                self.shifts[k], self.turns[k], self.stretches[k] = self.shifts[last], turn, self.stretches[last]
 
     def bends(self, t: Tensor) -> Tensor:
         """Mean size of second differences along time of the knots that a time reads; shifts count most."""

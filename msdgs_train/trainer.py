@@ -25,7 +25,6 @@ from msdgs_train.model import SMALLEST_SCALE, Domain, DynamicGaussians, PosedGau
 from msdgs_train.optimizers import learning_rates, make_optimizer, replace_values, set_learning_rates
 from msdgs_train.rasterization import RasterizationInfo, rasterize
 from msdgs_train.rigidity import stretch
-from msdgs_train.visibility import seen_until
 
 MAX_SKIPPED_IN_A_ROW = 20
 ROLLBACK_RATE = 0.5  # of the learning rates, each time that training goes back to a checkpoint
@@ -87,7 +86,6 @@ class Trainer:
         self.rollbacks = 0
         self._skipped_in_a_row = 0
         self._averages: tuple[float, float] | None = None  # loss, squared error
-        self._seen: Tensor | None = None  # how far out each shared motion is known, once the second window begins
         self._generator = torch.Generator().manual_seed(config.seed)
         self._curriculum = Curriculum(config, self.frames, scene.time_range)
         self._half_extent = config.half_extent or scene.half_extent
@@ -208,7 +206,6 @@ class Trainer:
             "skipped": (self.skipped, self._skipped_in_a_row),
             "rollbacks": self.rollbacks,
             "averages": self._averages,
-            "seen": self._seen,
             "generators": [generator.get_state() for generator in self._generators],
             "order": self._curriculum.order,
             "model": self.model.state_dict(),
@@ -225,7 +222,7 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, self.config)
         self.optimizer.load_state_dict(state["optimizer"])
         self.step_count, self._averages = state["step_count"], state["averages"]
-        self._curriculum.order, self._seen = state["order"], state.get("seen")
+        self._curriculum.order = state["order"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self.rollbacks = state.get("rollbacks", 0)
         for generator, stored in zip(self._generators, state["generators"], strict=True):
@@ -347,13 +344,9 @@ class Trainer:
             replace_values(self.optimizer, gaussians, "basis_logits", logits)
             replace_values(self.optimizer, gaussians, "basis_ids", ids)
         before, after = (self._curriculum.window(k) for k in (step - 1, step))
-        if bases is not None and before > after and step > self.config.still_steps:
-            self._seen = seen_until(self.model, self.frames, self.scene.time_range)
-        if before < after and bases is not None:
-            bases.carry_outwards(before, after, self._seen)
         if before < after and self._curriculum.discovers(step):
-            for grid in self.model.plane_grids():
-                grid.carry_outwards(before, after)
+            for part in [*self.model.plane_grids(), *([bases] if bases is not None else [])]:
+                part.carry_outwards(before, after)
 
     def _next_background(self) -> Tensor:
         if self.config.background == "random":

@@ -68,19 +68,18 @@ def test_second_window_grows_as_the_first(scene: SceneData) -> None:
     assert subjects == {"everything": 40, "motion": 80, "stillness": 40}
 
 
-def test_second_window_begins_with_what_the_first_has_found(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    carried, known = [], torch.tensor([[0.5, 0.2, 0.5, 0.5], [0.5, 0.5, 0.5, 0.3]])
-    monkeypatch.setattr(BasisLayer, "carry_outwards", lambda _, before, after, seen: carried.append((after, seen)))
-    monkeypatch.setattr(trainer_module, "seen_until", lambda *_: known)
+def test_second_window_keeps_the_motions_that_the_first_has_found(
+    scene: SceneData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    carried = []
+    monkeypatch.setattr(BasisLayer, "carry_outwards", lambda _, before, after: carried.append((before, after)))
     model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
     changes = {"warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6, "steps": 50}
     config = small_config(model=model, window_start=0.1, second_window_start=0.2, **changes)
     trainer = Trainer(config, scene)
     while trainer.step_count < 50:
         trainer.step()
-    first, second = carried[:9], carried[9:]
-    assert first == [(pytest.approx(0.14 + 0.04 * k), None) for k in range(9)]
-    assert second == [(pytest.approx(0.23 + 0.03 * k), known) for k in range(10)]
+    assert carried == [(pytest.approx(0.1 + 0.04 * k), pytest.approx(0.14 + 0.04 * k)) for k in range(9)]
 
 
 def test_first_window_discovers_and_the_second_does_not(scene: SceneData) -> None:
