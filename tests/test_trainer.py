@@ -17,6 +17,7 @@ from msdgs_train import fit as fit_module
 from msdgs_train import trainer as trainer_module
 from msdgs_train.checkpoint import load_model
 from msdgs_train.config import TrainConfig
+from msdgs_train.curriculum import Lesson
 from msdgs_train.datasets import load_scene
 from msdgs_train.fit import Observer, fit
 from msdgs_train.model import ModelConfig
@@ -332,7 +333,8 @@ def test_what_is_added_to_the_loss(data: Path, mcmc: bool) -> None:
         if mcmc:
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(trainer.model.plane_grids()) == 2
-        assert float(trainer._priors(posed, 0.3, torch.Generator())) == pytest.approx(
+        lesson = Lesson(trainer.frames[0], 0.3, "everything")
+        assert float(trainer._priors(posed, lesson, torch.Generator())) == pytest.approx(
             float(expected), rel=tolerance("float32.relative")
         )
 
