@@ -241,9 +241,8 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(systems_file: Path, tmp_p
     assert all(how.status == "failed" and "nowhere" in how.message for _, how in ended)
 
 
-@pytest.mark.slow
-def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def begin_training(systems_file: Path, data: Path, out: Path) -> subprocess.Popen[str]:
+    """A comparison in a process of its own, once its first run has begun."""
     command = arguments(systems_file, data, out, "--seeds", "0")
     command[command.index("--steps") + 1] = "100000"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
@@ -251,13 +250,20 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Pat
         [sys.executable, "-m", "msdgs_train", *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env=environment,
     )  # fmt: skip
-    checkpoint = out / "still" / "scene_0" / "config.json"
+    deadline = time.monotonic() + 300
+    while not (out / "still" / "scene_0" / "config.json").exists():
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            pytest.fail(process.communicate()[0])
+        time.sleep(0.1)
+    return process
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    process = begin_training(systems_file, data, out)
     try:
-        deadline = time.monotonic() + 300
-        while not checkpoint.exists():
-            assert process.poll() is None, process.communicate()[0]
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
         process.send_signal(signal.SIGINT)
         output = process.communicate(timeout=120)[0]
     finally:
@@ -267,3 +273,12 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Pat
     assert "the same command goes on" in output
     assert (out / "still" / "scene_0" / "checkpoint.pt").exists()
     assert not (out / "k1").exists()
+
+
+@pytest.mark.slow
+def test_where_the_command_is_killed_its_runs_save_and_end(systems_file: Path, data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    process = begin_training(systems_file, data, out)
+    process.kill()
+    process.communicate(timeout=120)  # ends when nobody is left to write
+    assert (out / "still" / "scene_0" / "checkpoint.pt").exists()

@@ -146,7 +146,7 @@ class _AskingFlag(Observer):
 
 class _AskingParent(Observer):
     def should_stop(self) -> bool:
-        return _stop is not None and _stop.is_set()
+        return _is_orphan() or (_stop is not None and _stop.is_set())
 
 
 def _train_on_ray(flag: list[Any], run: Run) -> Ended:
@@ -154,7 +154,15 @@ def _train_on_ray(flag: list[Any], run: Run) -> Ended:
 
 
 def _train_here(run: Run) -> Ended:
-    return _train(run, _AskingParent())
+    ended = _train(run, _AskingParent())
+    if _is_orphan():
+        os._exit(1)  # the executor would wait for more for ever
+    return ended
+
+
+def _is_orphan() -> bool:
+    parent = multiprocessing.parent_process()
+    return parent is not None and not parent.is_alive()
 
 
 def _train(run: Run, observer: Observer) -> Ended:
