@@ -1,8 +1,8 @@
 """Which photograph comes next, and what it may teach.
 
 First all photographs teach a scene that stands still: what does stand still is in place before anything moves. Then
-what moves is followed from the middle of the scene's time outwards, in a window that grows photograph by photograph.
-While it grows, of four lessons
+what moves is followed from the middle of the scene's time outwards, in a window that grows photograph by photograph,
+once or twice. While it grows, of four lessons
 
 - one draws from all photographs of the window alike, and teaches everything;
 - two draw from its outermost ones, which are new, and teach motion alone. Were the Gaussians to learn from these few as

@@ -12,9 +12,8 @@ from msdgs_train import trainer as trainer_module
 from msdgs_train.basis_layer import BasisLayer
 from msdgs_train.curriculum import MIDDLE, NEW, Curriculum, Lesson
 from msdgs_train.datasets import SceneData, load_scene
-from msdgs_train.model_config import ModelConfig
 from msdgs_train.trainer import AHEAD, Trainer
-from tests.training_scene import small_config, write_scene
+from tests.training_scene import SHARED_MOTIONS, small_config, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +72,8 @@ def test_second_window_keeps_the_motions_that_the_first_has_found(
 ) -> None:
     carried = []
     monkeypatch.setattr(BasisLayer, "carry_outwards", lambda _, before, after: carried.append((before, after)))
-    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
     changes = {"warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6, "steps": 50}
-    config = small_config(model=model, window_start=0.1, second_window_start=0.2, **changes)
+    config = small_config(model=SHARED_MOTIONS, window_start=0.1, second_window_start=0.2, **changes)
     trainer = Trainer(config, scene)
     while trainer.step_count < 50:
         trainer.step()
@@ -149,8 +147,7 @@ def test_a_lesson_changes_only_what_it_teaches(scene: SceneData) -> None:
 
 
 def test_motions_hurry_to_where_new_photographs_show_them_but_stretches_do_not(scene: SceneData) -> None:
-    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
-    config = small_config(model=model, warmup_fraction=0.1, settling_fraction=0.1, steps=100, densify_every=0)
+    config = small_config(model=SHARED_MOTIONS, warmup_fraction=0.1, settling_fraction=0.1, steps=100, densify_every=0)
     trainer = Trainer(config, scene)
     while trainer.step_count < 25:
         trainer.step()
@@ -195,8 +192,9 @@ def test_motions_of_new_photographs_may_bend(scene: SceneData, monkeypatch: pyte
     bends, strains, taught = [], [], []
     monkeypatch.setattr(BasisLayer, "bends", lambda _, t: bends.append(float(t)) or 0.0)
     monkeypatch.setattr(BasisLayer, "strains", lambda _, t: strains.append(float(t)) or 0.0)
-    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
-    config = small_config(model=model, warmup_fraction=0.1, settling_fraction=0.1, steps=100, teach_stillness=False)
+    config = small_config(
+        model=SHARED_MOTIONS, warmup_fraction=0.1, settling_fraction=0.1, steps=100, teach_stillness=False
+    )
     trainer = Trainer(config, scene)
     while trainer.step_count < 40:
         (shot,) = trainer._shots()

@@ -25,7 +25,7 @@ from msdgs_train.optimizers import exponential, learning_rates
 from msdgs_train.report import MetricsLog, read_metrics
 from msdgs_train.trainer import StepResult, Trainer, TrainingDiverged
 from tests.tolerances import tolerance
-from tests.training_scene import SIZE, small_config, write_scene
+from tests.training_scene import SHARED_MOTIONS, SIZE, small_config, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +99,7 @@ def _assert_same_bits(one: dict[str, Any], other: dict[str, Any]) -> None:
 @pytest.mark.parametrize("stop", [8, 13])
 def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
     """Stopped in the first and in the second window."""
-    model = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
-    config = small_config(model=model, second_window_start=0.2)
+    config = small_config(model=SHARED_MOTIONS, second_window_start=0.2)
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=_StopAfter(stop))
     fit(config, data, tmp_path / "parts", resume=True)

@@ -24,6 +24,8 @@ SMALL_MODEL = ModelConfig(
     time_features=4, embedding_size=4,
 )  # fmt: skip
 
+SHARED_MOTIONS = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
+
 
 def small_config(**changes: Any) -> TrainConfig:
     """A run of 24 steps that goes through warm-up, densification, opacity reset and every SH degree."""
