@@ -55,7 +55,8 @@ class TrainConfig:
     followed outwards, photograph by photograph."""
     second_window_start: float = 0.5
     """Half-way to `window_until_fraction` the window shrinks to this and grows again: what was blurred where motions
-    weren't known well gets sharp in the middle, and is followed anew along motions nearly right. 0.5: it doesn't."""
+    weren't known well gets sharp in the middle, and is followed anew along motions nearly right, by photographs that
+    all teach everything. 0.5: it doesn't."""
     window_until_fraction: float = 0.75
     """The part of the run after which all times take part; 0: from the start, and nothing is sown or settles."""
     teach_motion: bool = True
@@ -113,7 +114,7 @@ class TrainConfig:
     modulation_rate_end: float = 1.6e-6
     """At the last step."""
     sh_dc_rate: float = 2.5e-3
-    """Learning rate of the colours; this and those below stay the same until all times take part."""
+    """Learning rate of the colours; this and those below stay the same."""
     sh_rest_rate: float = 1.25e-4
     """Of how colours change with the direction of view."""
     opacities_rate: float = 5e-2
@@ -122,8 +123,6 @@ class TrainConfig:
     """Of the logarithms of the scales."""
     quats_rate: float = 1e-3
     """Of the quaternions."""
-    settled_rates: float = 1.0
-    """What these rates are multiplied by at the last step; they fall to it once all times take part."""
 
     densify_strategy: Literal["gradient", "mcmc"] = "gradient"
     """Density control: `gradient` clones and splits where the picture pulls hardest on the Gaussians, and prunes;

@@ -2,13 +2,15 @@
 
 First all photographs teach a scene that stands still: what does stand still is in place before anything moves. Then
 what moves is followed from the middle of the scene's time outwards, in a window that grows photograph by photograph,
-once or twice. While it grows, of four lessons
+once or twice. While it grows for the first time, of four lessons
 
 - one draws from all photographs of the window alike, and teaches everything;
 - two draw from its outermost ones, which are new, and teach motion alone. Were the Gaussians to learn from these few as
   often, they would take on what explains only them, and lose their textures;
 - one draws from those outside, and teaches what stands still alone, where that is what they see. Else a few photographs
   in the middle of time would be explained by whatever geometry their few cameras can't tell from the true one.
+
+Where it grows again motions are nearly right: all its photographs teach everything.
 """
 
 from typing import Literal, NamedTuple
@@ -73,14 +75,15 @@ class Curriculum:
         """The lesson of this number, counted from 0: a step takes as many as photographs."""
         step = number // self._config.photographs
         window = self.window(step)
+        discovers = window < 0.5 and self.discovers(step)
         if (
             self._config.teach_stillness
-            and window < 0.5
+            and discovers
             and number % 4 == 0
             and len(outside := torch.nonzero(self.distances > window)[:, 0])
         ):
             return self._lesson(self._drawn(outside, generator), window, "stillness")
-        if window < 0.5 and number % 2 == 1 and step >= self._config.still_steps:
+        if discovers and number % 2 == 1 and step >= self._config.still_steps:
             border = min(float(self.distances[self.distances <= window].max()), max(window - NEW, MIDDLE * window))
             new = torch.nonzero((self.distances <= window) & (self.distances >= border))[:, 0]
             subject = "motion" if self._config.teach_motion else "everything"

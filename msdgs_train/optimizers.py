@@ -20,7 +20,7 @@ MOMENTS = frozenset({"exp_avg", "exp_avg_sq"})
 EPSILON = 1e-15
 """Adam's own default, 1e-8, is as large as the gradients of small Gaussians."""
 
-_SETTLING_RATES = {
+_CONSTANT_RATES = {
     "log_scales": "scales_rate",
     "raw_quats": "quats_rate",
     "raw_opacities": "opacities_rate",
@@ -47,8 +47,7 @@ def exponential(start: float, end: float, step: float, steps: float) -> float:
 def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
     """The rate of each group of parameters at one step."""
     grown = config.window_until_fraction * config.steps
-    settled = exponential(1.0, config.settled_rates, max(step - grown, 0), config.steps - grown)
-    rates = {group: settled * getattr(config, name) for group, name in _SETTLING_RATES.items()}
+    rates: dict[str, float] = {group: getattr(config, name) for group, name in _CONSTANT_RATES.items()}
     for group, name in _DECAYING_RATES.items():
         start, end = getattr(config, f"{name}_rate_start"), getattr(config, f"{name}_rate_end")
         held = grown if name in _HELD_RATES else 0

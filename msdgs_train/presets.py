@@ -74,7 +74,7 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "msdgs-bases": TrainConfig(
         model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
-        steps=36_000,
+        steps=40_000,
         photographs=2,
         warmup_fraction=0.05,
         second_window_start=0.12,
@@ -85,7 +85,6 @@ PRESETS: dict[str, TrainConfig] = {
         means_rate_end=5e-5,
         squares_part=0.8,
         blocks_weight=1.0,
-        settled_rates=0.1,
     ),
     "static": TrainConfig(
         model=replace(TrainConfig().model, layers=(), embedding_size=0),

@@ -63,8 +63,18 @@ def test_second_window_grows_as_the_first(scene: SceneData) -> None:
             window = 0.1 + 0.4 * (step - 200) / 200 if step < 400 else 0.3 + 0.2 * (step - 400) / 200
             assert (distance(scene, lesson.frame.t) <= window + 1e-9) == (lesson.subject != "stillness")
             assert distance(scene, lesson.t) <= window + 1e-9
-    subjects = Counter(lesson.subject for lesson in lessons(scene, range(400, 560), **changes))
-    assert subjects == {"everything": 40, "motion": 80, "stillness": 40}
+
+
+def test_all_photographs_of_the_second_window_teach_everything(scene: SceneData) -> None:
+    changes = {"window_start": 0.1, "second_window_start": 0.3, "window_until_fraction": 0.9, "steps": 2000}
+    subjects = Counter(lesson.subject for lesson in lessons(scene, range(480, 800), **changes))
+    assert subjects == {"everything": 80, "motion": 160, "stillness": 80}
+    second = lessons(scene, range(1101, 1800), **changes)
+    assert {lesson.subject for lesson in second} == {"everything"}
+    inside = [frame for frame in scene.splits["train"] if distance(scene, frame.t) <= 0.3]
+    drawn = Counter(lesson.frame.name for lesson in second)
+    times = [drawn[frame.name] for frame in inside]
+    assert max(times) - min(times) <= 2
 
 
 def test_second_window_keeps_the_motions_that_the_first_has_found(

@@ -377,20 +377,14 @@ def test_learning_rates() -> None:
     while_the_window_grows = learning_rates(config, round(config.window_until_fraction * config.steps))
     assert while_the_window_grows["deformation"] == config.field_rate_start
     assert while_the_window_grows["means"] < config.means_rate_start
-    settling = dataclasses.replace(config, settled_rates=0.01)
-    grown = round(config.window_until_fraction * config.steps)
-    for step, part in ((0, 1.0), (grown, 1.0), ((grown + config.steps) // 2, 0.1), (config.steps, 0.01)):
-        rates, constant = learning_rates(settling, step), learning_rates(config, step)
-        for group in ("raw_opacities", "log_scales", "raw_quats", "sh_dc", "sh_rest"):
-            assert rates[group] == pytest.approx(part * constant[group])
-        assert rates["means"] == constant["means"]
+    assert rates["means"] < while_the_window_grows["means"]
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("steps", 0), ("l1_weight", 1.5), ("l1_weight", float("nan")), ("means_rate_start", 0.0),
-        ("squares_part", 1.1), ("blocks_weight", -1.0), ("settled_rates", 0.0),
+        ("squares_part", 1.1), ("blocks_weight", -1.0),
         ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("densify_every", -1),
         ("quats_rate", float("inf")), ("size", 0), ("densify_strategy", "none"), ("mcmc_noise", -1.0),
     ],
