@@ -60,9 +60,11 @@ class TrainConfig:
     window_until_fraction: float = 0.75
     """The part of the run after which all times take part; 0: from the start, and nothing is sown or settles."""
     teach_motion: bool = True
-    """Half of the steps while the window grows, of its outermost photographs, teach motion alone; else everything."""
+    """Half of the steps while the window first grows, of its outermost photographs, teach motion alone; else
+    everything."""
     teach_stillness: bool = True
-    """A quarter of the steps while it grows, of photographs outside, teach what stands still; else there are none."""
+    """A quarter of the steps while it first grows, of photographs outside, teach what stands still; else there are
+    none."""
     sh_interval: int = 2000
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
