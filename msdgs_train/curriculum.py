@@ -75,15 +75,15 @@ class Curriculum:
         """The lesson of this number, counted from 0: a step takes as many as photographs."""
         step = number // self._config.photographs
         window = self.window(step)
-        discovers = window < 0.5 and self.discovers(step)
+        follows = window < 0.5 and self.discovers(step)
         if (
             self._config.teach_stillness
-            and discovers
+            and follows
             and number % 4 == 0
             and len(outside := torch.nonzero(self.distances > window)[:, 0])
         ):
             return self._lesson(self._drawn(outside, generator), window, "stillness")
-        if discovers and number % 2 == 1 and step >= self._config.still_steps:
+        if follows and number % 2 == 1 and step >= self._config.still_steps:
             border = min(float(self.distances[self.distances <= window].max()), max(window - NEW, MIDDLE * window))
             new = torch.nonzero((self.distances <= window) & (self.distances >= border))[:, 0]
             subject = "motion" if self._config.teach_motion else "everything"

@@ -378,6 +378,9 @@ def test_learning_rates() -> None:
     assert while_the_window_grows["deformation"] == config.field_rate_start
     assert while_the_window_grows["means"] < config.means_rate_start
     assert rates["means"] < while_the_window_grows["means"]
+    first = learning_rates(config, 0)
+    for group in ("raw_opacities", "log_scales", "raw_quats", "sh_dc", "sh_rest"):
+        assert first[group] == while_the_window_grows[group] == rates[group]
 
 
 @pytest.mark.parametrize(
