@@ -53,6 +53,7 @@ class BasisLayer(nn.Module):
     kind = "bases"
     stretches: Tensor
     pivots: Tensor
+    neighbours: Tensor
     first_time: Tensor
     time_knots: Tensor
 
@@ -69,6 +70,7 @@ class BasisLayer(nn.Module):
         else:
             self.register_buffer("stretches", stretches)
         self.register_buffer("pivots", torch.zeros(count, 3))
+        self.register_buffer("neighbours", torch.zeros(count, min(NEIGHBOURS, count - 1), dtype=torch.int64))
         self.register_buffer("first_time", torch.tensor(first))
         self.register_buffer("time_knots", torch.tensor(knots / ((last - first) or 1.0)))  # a unit of time
 
@@ -114,6 +116,8 @@ class BasisLayer(nn.Module):
             self.pivots[k] = opaque[chosen]
             distances = torch.minimum(distances, (opaque - opaque[chosen]).norm(dim=1))
             chosen = int(distances.argmax())
+        near = torch.cdist(self.pivots, self.pivots).topk(self.neighbours.shape[1] + 1, largest=False)
+        self.neighbours.copy_(near.indices[:, 1:])
         reach = max(REACH * float(distances.max()), LEAST_REACH)
         logits = -0.5 * (torch.cdist(means, self.pivots) / reach).square()
         nearest = logits.topk(min(FOLLOWED, logits.shape[1]), dim=1)
@@ -146,11 +150,7 @@ class BasisLayer(nn.Module):
     def strains(self, t: Tensor) -> Tensor:
         """Mean distance of where motions and their neighbours carry a pivot, as a part of that between the pivots."""
         matrices, offsets, _ = self.motions(t).split((9, 3, 4), dim=1)
-        near = (
-            torch.cdist(self.pivots, self.pivots)
-            .topk(min(NEIGHBOURS + 1, len(self.pivots)), largest=False)
-            .indices[:, 1:]
-        )
+        near = self.neighbours
         own = torch.einsum("bij,bj->bi", matrices.view(-1, 3, 3), self.pivots) + offsets
         carried = torch.einsum("bij,bkj->bki", matrices.view(-1, 3, 3), self.pivots[near]) + offsets[:, None]
         lengths = torch.linalg.vector_norm(self.pivots[near] - self.pivots[:, None], dim=2)

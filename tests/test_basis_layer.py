@@ -172,7 +172,8 @@ def test_beyond_the_window_motions_stay_and_turn_on() -> None:
 def test_a_body_that_moves_as_one_has_no_strain() -> None:
     layer = BasisLayer(6, 4).double()
     with torch.no_grad():
-        layer.pivots.copy_(torch.rand(6, 3, generator=torch.Generator().manual_seed(4)))
+        means = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+        layer.place(means, torch.ones(6))
         turn = torch.tensor([0.8, 0.6, 0.0, 0.0], dtype=torch.float64)
         layer.turns[:] = turn
         turned = torch.from_numpy(as_rotation(turn).apply(layer.pivots.numpy()))
