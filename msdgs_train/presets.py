@@ -73,8 +73,8 @@ PRESETS: dict[str, TrainConfig] = {
         plane_time_l1_weight=1e-4 * _4DGS_PLANES,
     ),
     "msdgs-bases": TrainConfig(
-        model=ModelConfig(layers=("bases",), embedding_size=0),
-        steps=28_000,
+        model=ModelConfig(sh_degree=2, layers=("bases",), embedding_size=0),
+        steps=40_000,
         photographs=2,
         warmup_fraction=0.05,
         second_window_start=0.12,
