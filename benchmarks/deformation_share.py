@@ -15,7 +15,7 @@ from rich.table import Table
 
 from export.views import GOLDEN
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.rasterizer import as_trained, rasterize
 from msdgs_serve.scene.errors import MsdgsError
 
 
@@ -61,7 +61,7 @@ def _lap(session: DeformationSession, width: int, part: float) -> tuple[float, f
     start = time.perf_counter()
     gaussians = session.gaussians(t0 + (t1 - t0) * part)
     posed = time.perf_counter()
-    rasterize(gaussians, camera, background=metadata.background)
+    rasterize(gaussians, camera, background=metadata.background, options=as_trained(metadata))
     return 1e3 * (posed - start), 1e3 * (time.perf_counter() - posed)
 
 

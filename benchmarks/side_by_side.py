@@ -74,7 +74,7 @@ def name(model: LoadedModel) -> str:
 def render(model: LoadedModel, frame: Frame) -> torch.Tensor:
     """The model seen from the frame's camera at its time, [H, W, 3] in [0, 1]."""
     background = torch.tensor(model.scene.background)
-    return rasterize(*model.model.pose(frame.t), frame.camera, background)[0].clamp(0, 1)
+    return rasterize(*model.model.pose(frame.t), frame.camera, background, model.model.rasterizer)[0].clamp(0, 1)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
     console = Console(soft_wrap=True, highlight=False)
     try:
         session = DeformationSession(scene)
-        proof = Proof(session, mip=session.scene.metadata.antialiasing == "mip")
+        proof = Proof(session)
         t0, _ = session.scene.metadata.time_range
         with tempfile.TemporaryDirectory() as folder:
             for suffix in WRITTEN:

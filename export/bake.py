@@ -117,6 +117,7 @@ def _metadata(
         measured_error={},
         package_version=__version__,
         checkpoint_sha256=checkpoint_sha256,
+        eps2d=float(model.config.eps2d),
     )
     # through its own reader: what a later reader would refuse is refused here
     return SceneMetadata.from_properties(draft.to_properties(), "the model's scene")

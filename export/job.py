@@ -18,7 +18,7 @@ from export.trim.bake import bake_trimmed
 from export.trim.cut import rows, untrimmed, with_sh_degree
 from export.views import cameras_of, deciding_views, measuring_views
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
+from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -50,7 +50,7 @@ class Candidate:
     trim_db: float | None  # what trimming alone may cost, dB on the worst frame; None: nothing was left out
     trimmed: TrimmedModel
     path: Path
-    options: RasterizerOptions = GSPLAT  # what it is drawn with; no file sets it
+    options: RasterizerOptions  # what it is drawn with
 
     @cached_property
     def session(self) -> DeformationSession:
@@ -201,7 +201,7 @@ class Job:
         if parse(plan).fitted and len(baked.moving):
             sampled = self._trajectories(baked, trimmed.ids[: len(baked.moving)])
         path.write_bytes(build(plan, baked, sampled).SerializeToString())
-        return Candidate(plan, trim_db, trimmed, path)
+        return Candidate(plan, trim_db, trimmed, path, self.model.rasterizer)
 
     def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
         """Those of the model's Gaussians `ids`, ascending, sampled once: what is trimmed further moves as before."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from export.rendered_error import Pose, shown
-from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
+from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.datasets import Frame, composite, load_scene
@@ -33,7 +33,7 @@ class Photographs:
             self._frames.append((held_out[i], composite(held_out[i].load_rgba(), info.background)))
             on_photograph()
 
-    def psnr(self, pose: Pose, options: RasterizerOptions = GSPLAT) -> float | None:
+    def psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
         """Mean PSNR in dB over the photographs, as papers report it; None where there are none."""
         values = []
         for frame, truth in self._frames:

@@ -70,7 +70,7 @@ class ExactFrames:
             first = next(iter(self._poses.values()), gaussians)
             self._poses[t] = Gaussians(gaussians.means, quats, scales, first.opacities, first.sh)
             for view in views_then:
-                self._frames.append(shown(gaussians, view.camera, background).astype(np.float32))
+                self._frames.append(shown(gaussians, view.camera, background, model.rasterizer).astype(np.float32))
                 on_frame()
 
     def pose(self, t: float) -> Gaussians:
@@ -86,10 +86,13 @@ class ExactFrames:
         pose: Pose,
         ids: np.ndarray,
         *,
-        options: RasterizerOptions = GSPLAT,
+        options: RasterizerOptions | None = None,
         every: int = 1,
     ) -> RenderedError:
-        """The error of `pose`, whose rows are the model's Gaussians `ids`, over all views or every n-th of them."""
+        """The error of `pose`, whose rows are the model's Gaussians `ids`, over all views or every n-th of them.
+
+        It is drawn with the model's own rasterizer options, or with others."""
+        options = options or self._model.rasterizer
         psnrs: list[float] = []
         worst, worst_frame, worst_pixel, position, position_pixels = np.inf, None, 0.0, 0.0, 0.0
         chosen = list(zip(self.views, self._frames, strict=True))[::every]

@@ -14,7 +14,7 @@ from export.points import DEFAULT_RASTERIZER, Look, Point, choose
 from export.rendered_error import RenderedError
 from export.timing import REPEATS, time_frames
 from export.views import View
-from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
+from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
 
@@ -48,10 +48,7 @@ LOWER_DEGREES = 3
 
 TIMED_VIEWS = 3
 
-RASTERIZERS: dict[str, RasterizerOptions] = {
-    "alpha ≥ 2/255": GSPLAT._replace(alpha_min=2 / 255),
-    "ends at 1 %": GSPLAT._replace(transmittance_min=1e-2),
-}
+RASTERIZERS = {"alpha ≥ 2/255": {"alpha_min": 2 / 255}, "ends at 1 %": {"transmittance_min": 1e-2}}
 """Tried on the chosen point, to show what they would buy."""
 
 
@@ -133,7 +130,7 @@ class Sweep:
         start = time.process_time()
         gaussians = candidate.session.gaussians(view.t)
         posed = time.process_time()
-        rasterize(gaussians, view.camera, background=self.job.info.background)
+        rasterize(gaussians, view.camera, background=self.job.info.background, options=candidate.options)
         return 1e3 * (time.process_time() - start), 1e3 * (posed - start)
 
     def _reachable(self, look: Look | None) -> None:
@@ -189,7 +186,8 @@ class Sweep:
         within = [c for c, error in zip(candidates, errors, strict=True) if error.psnr_worst >= self.max_error]
         names = [DEFAULT_RASTERIZER] * len(candidates)
         if within:  # candidates are in the order of their processor times
-            variants = [replace(within[0], options=options) for options in RASTERIZERS.values()]
+            usual = within[0].options
+            variants = [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
             candidates, names = [*candidates, *variants], [*names, *RASTERIZERS]
             errors += self._errors(variants)
         photographs = [self._photographs_db(candidate) for candidate in candidates]
@@ -213,7 +211,7 @@ class Sweep:
         return self.photographs.psnr(candidate.session.gaussians, candidate.options) if self.photographs else None
 
     def _exact_photographs(self) -> float | None:
-        return self.photographs.psnr(self.job.exact_pose) if self.photographs else None
+        return self.photographs.psnr(self.job.exact_pose, self.job.model.rasterizer) if self.photographs else None
 
     def _tell(self, what: str, calls: list[tuple[Callable[..., object], tuple]]) -> None:
         on_call = self.job.progress(what, len(calls))

@@ -9,7 +9,7 @@ import numpy as np
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import Image, average
 from msdgs_serve.pose_cache import PoseCache
-from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, as_trained, rasterize
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_serve.watch import Watch
 
@@ -102,7 +102,7 @@ class Renderer:
             later = self.posed(session, moment + options.motion_dt, watch, options.steps)
         with watch.stage("draw"):
             background = resolve_background(session, options.background)
-            constants = options.rasterizer._replace(mip=session.scene.metadata.antialiasing == "mip")
+            constants = as_trained(session.scene.metadata, options.rasterizer)
             extra = None if later is None else displacements(gaussians, later, camera)
             drawn = rasterize(
                 gaussians,

@@ -48,8 +48,8 @@ class JudgedModel(NamedTuple):
     @torch.no_grad()
     def render(self, frame: Frame) -> Tensor:
         """[H, W, 3] in [0, 1], as the frame's camera sees the model at its time."""
-        background = torch.tensor(self.loaded.scene.background)
-        return rasterize(*self.loaded.model.pose(frame.t), frame.camera, background)[0].clamp(0, 1)
+        model, background = self.loaded.model, torch.tensor(self.loaded.scene.background)
+        return rasterize(*model.pose(frame.t), frame.camera, background, model.rasterizer)[0].clamp(0, 1)
 
     def photograph(self, frame: Frame) -> Tensor:
         """[H, W, 3] in [0, 1], over the background that the model was trained with."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
@@ -61,6 +62,11 @@ class DynamicGaussians(nn.Module):
         """Those of all plane layers."""
         layers = [layer for layer in self.deformation.layers if isinstance(layer, PlaneLayer)]
         return [grid for layer in layers for grid in layer.plane_grids()]
+
+    @property
+    def rasterizer(self) -> RasterizerOptions:
+        """The constants that it is drawn with."""
+        return GSPLAT._replace(eps2d=self.config.eps2d)
 
     @property
     def bases(self) -> BasisLayer | None:

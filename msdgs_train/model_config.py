@@ -1,5 +1,6 @@
 """What a model is made of: layers, their sizes, and every switch of the method, checked when it is built."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
@@ -68,6 +69,9 @@ class ModelConfig:
     """Layers also change colours, as SH coefficients. Such a model can't be exported yet."""
     detach_means: bool = True
     """Photometric gradients through the layers' input don't reach the canonical means, as in DeformGS."""
+    eps2d: float = 0.3
+    """Added to the diagonal of projected covariances, px², so that nothing is missed between pixels: 0.3 in the field.
+    With less what is small is sharper; other programs, which add 0.3, then draw the model softer."""
 
     def __post_init__(self) -> None:
         self._check_list("layers", get_args(LayerKind))
@@ -79,6 +83,8 @@ class ModelConfig:
                 raise InvalidInput(f"model.{field.name}", f"an integer of {LEAST.get(field.name, 0)} or more", value)
             if field.type is bool and type(value) is not bool:
                 raise InvalidInput(f"model.{field.name}", "true or false", value)
+        if type(self.eps2d) not in (int, float) or not 0 <= self.eps2d < math.inf:
+            raise InvalidInput("model.eps2d", "finite and 0 or above", self.eps2d)
         if self.sh_degree > 3:
             raise InvalidInput("model.sh_degree", "0, 1, 2 or 3", self.sh_degree)
         if not self.modulate or len(set(self.modulate)) < len(self.modulate):

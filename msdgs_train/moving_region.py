@@ -70,7 +70,7 @@ class _ModelRegion:
         still = ~travels(self.centres, camera)
         posed = self.model.pose(t)
         whole, without = (
-            rasterize(*gaussians, camera, self.background)[0].clamp(0, 1).numpy()
+            rasterize(*gaussians, camera, self.background, self.model.rasterizer)[0].clamp(0, 1).numpy()
             for gaussians in (posed, PosedGaussians(*(tensor[still] for tensor in posed)))
         )
         return _differs(whole, without)

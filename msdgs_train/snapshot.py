@@ -35,9 +35,9 @@ class Snapshot:
         Alpha is white where nothing shines through, depth where it is nearest. Raises `InvalidInput` where Gaussians
         aren't finite.
         """
-        return _picture(
-            rasterize(self._pose(t, layers), camera, background=self.background, depth=channel == "depth"), channel
-        )
+        posed, options = self._pose(t, layers), self.model.rasterizer
+        drawn = rasterize(posed, camera, background=self.background, depth=channel == "depth", options=options)
+        return _picture(drawn, channel)
 
     @torch.no_grad()
     def _pose(self, t: float, layers: int) -> Gaussians:

@@ -49,9 +49,9 @@ def write_steps(
 @torch.no_grad()
 def render_steps(loaded: LoadedModel, t: float, camera: Camera) -> list[np.ndarray]:
     """K + 1 pictures, [H, W, 3] uint8: after no layer, after the first, …, after all."""
-    background = torch.tensor(loaded.scene.background)
-    counts = range(len(loaded.model.deformation) + 1)
-    return [to_bytes(rasterize(*loaded.model.pose(t, steps=k), camera, background)[0].numpy()) for k in counts]
+    model, background = loaded.model, torch.tensor(loaded.scene.background)
+    states = (model.pose(t, steps=k) for k in range(len(model.deformation) + 1))
+    return [to_bytes(rasterize(*state, camera, background, model.rasterizer)[0].numpy()) for state in states]
 
 
 def _stored_camera(loaded: LoadedModel, t: float, name: str | None) -> dict[str, Any]:

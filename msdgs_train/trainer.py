@@ -149,7 +149,7 @@ class Trainer:
     def _shoot(self, lesson: Lesson, background: Tensor, pairs: torch.Generator) -> _Shot:
         truth = self._photograph(lesson.frame, background)
         posed = self._pose(lesson.t)
-        rgb, _, info = rasterize(*posed, lesson.frame.camera, background)
+        rgb, _, info = rasterize(*posed, lesson.frame.camera, background, self.model.rasterizer)
         c = self.config
         if lesson.subject == "stillness":
             loss = still_loss(rgb, truth, c.l1_weight)
@@ -190,7 +190,8 @@ class Trainer:
         background = torch.tensor(self.config.evaluation_background)
         for frame in self.scene.splits[split]:
             truth = self._photograph(frame, background)
-            rgb = rasterize(*self._pose(frame.t), frame.camera, background)[0].clamp(0, 1)
+            rgb, _, _ = rasterize(*self._pose(frame.t), frame.camera, background, self.model.rasterizer)
+            rgb = rgb.clamp(0, 1)
             yield Evaluated(frame, truth, rgb, quality(rgb, truth))
 
     def evaluate_mean(self, split: str) -> Quality:

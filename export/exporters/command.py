@@ -19,6 +19,7 @@ from export.exporters.visionary_scene import visionary_scene
 from export.importers.recognise import read_splats
 from export.importers.sequence import is_switched, of_the_moment
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.files import replacing
@@ -64,12 +65,15 @@ def convert(settings: Settings, console: Console) -> None:
         _sequence(session, settings, console)
     else:
         raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD))} or {VISIONARY}", out.name)
+    eps2d = session.scene.metadata.eps2d
+    if eps2d != GSPLAT.eps2d:
+        wider = "softer" if eps2d < GSPLAT.eps2d else "harder"
+        console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {wider}")
 
 
 def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | None) -> float:
     metadata = session.scene.metadata
     gaussians = of_the_moment(session.gaussians(t), metadata.plan)
-    mip = metadata.antialiasing == "mip"
     with replacing(file) as temporary:
         if file.suffix == ".spz":
             write_spz(temporary, gaussians, metadata.antialiasing)
@@ -77,7 +81,7 @@ def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | No
             (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
         default = LOSSY if file.suffix == ".spz" else LOSSLESS
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
-        psnr = Proof(session, mip=mip).psnr(written, t)
+        psnr = Proof(session).psnr(written, t)
         require(psnr, default if min_psnr is None else min_psnr, file.name)
     return psnr
 
@@ -109,7 +113,7 @@ def _usd(session: DeformationSession, settings: Settings, console: Console) -> N
     if moves and settings.frames < 2:
         raise InvalidInput("frames", "2 or more", settings.frames)
     times = np.linspace(t0, t1, settings.frames).tolist() if moves else [t0 if settings.t is None else settings.t]
-    proof = Proof(session, mip=session.scene.metadata.antialiasing == "mip")
+    proof = Proof(session)
     with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
         task = progress.add_task("writing frames", total=len(times))
         write_usd(temporary, lambda t: of_the_moment(session.gaussians(t), plan), times, lambda: progress.advance(task))

@@ -10,7 +10,7 @@ from export.exporters.visionary import unpacked
 from export.exporters.visionary_rules import COLORS, COUNT, GAUSSIANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
-from msdgs_serve.rasterizer import GSPLAT, rasterize
+from msdgs_serve.rasterizer import as_trained, rasterize
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
@@ -27,10 +27,11 @@ class ConversionFailed(MsdgsError):
 class Proof:
     """Pictures of a scene, to compare others with."""
 
-    def __init__(self, session: DeformationSession, *, mip: bool) -> None:
-        """`mip`: with the anti-aliasing of Mip-Splatting, as far as the other format knows it."""
-        self._session, self._options = session, GSPLAT._replace(mip=mip)
-        metadata = session.scene.metadata
+    def __init__(self, session: DeformationSession, *, mip: bool = True) -> None:
+        """`mip`: whether the other format knows the anti-aliasing of Mip-Splatting."""
+        self._session, metadata = session, session.scene.metadata
+        options = as_trained(metadata)
+        self._options = options._replace(mip=options.mip and mip)
         view = framing(metadata)
         shown = SIZE / min(view.width, view.height)
         size = max(1, round(view.width * shown)), max(1, round(view.height * shown))

@@ -63,7 +63,7 @@ class _Assessment:
         self.single = self.models[FLOAT32.name]
         self.double = in_format(model, Format("float64", torch.float64, torch.float64, "nowhere", "the reference"))
         self.mean_factors = _mean_factors(self.double)
-        self.view = View(scene)
+        self.view = View(scene, model.rasterizer)
 
     def run(self, times: int, on_time: Callable[[], object]) -> StabilityReport:
         moments = []

@@ -7,7 +7,7 @@ import numpy as np
 
 from export.bake import starting_cameras
 from export.precision.gap import PosedArrays, usable_rows
-from msdgs_serve.rasterizer import GSPLAT, rasterize
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.camera import orbit
 from msdgs_train.checkpoint import SceneInfo
@@ -32,8 +32,8 @@ class ImageGap:
 class View:
     """Draws poses of a scene's Gaussians, `PosedArrays`, from its cameras."""
 
-    def __init__(self, scene: SceneInfo) -> None:
-        self.background = scene.background
+    def __init__(self, scene: SceneInfo, options: RasterizerOptions = GSPLAT) -> None:
+        self.background, self._options = scene.background, options
         self.cameras = views_of(scene)
 
     def draw(self, posed: PosedArrays, camera: Camera, keep: np.ndarray | None = None) -> np.ndarray:
@@ -43,7 +43,7 @@ class View:
         usable[usable] &= np.abs(posed["means"][usable]).max(axis=1, initial=0) < np.finfo(np.float32).max
         chosen = usable if keep is None else usable & keep
         gaussians = Gaussians(**{name: array[chosen].astype(np.float32) for name, array in posed.items()})
-        return rasterize(gaussians, camera, background=self.background).rgb.clip(0, 1)
+        return rasterize(gaussians, camera, background=self.background, options=self._options).rgb.clip(0, 1)
 
     def pixel_gaps(self, got: PosedArrays, expected: PosedArrays, camera: Camera) -> np.ndarray:
         """[N] distance of each projected mean in pixels; 0 where the Gaussian isn't drawn in either pose."""

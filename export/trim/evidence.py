@@ -9,7 +9,7 @@ import torch
 from export.rendered_error import as_gaussians, shown
 from export.trim.cut import Cut, Network, rows, whole, with_network
 from export.views import View
-from msdgs_serve.rasterizer import GSPLAT
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -66,7 +66,7 @@ class Evidence:
         for t in self._whole[1].times:
             self._whole[1].at(t)
             on_time()
-        self._frames = [shown(self._whole[1].at(view.t), view.camera, background) for view in views]
+        self._frames = [shown(self._whole[1].at(view.t), view.camera, background, model.rasterizer) for view in views]
         self.peaks, self.amounts = self._seen()
 
     def poses(self, network: Network) -> Poses:
@@ -97,7 +97,8 @@ class Evidence:
             at = poses.at(view.t)
             changing = at.means[moving], at.quats[moving], at.scales[moving]
             means, quats, scales = (np.concatenate(pair) for pair in zip(changing, constants, strict=True))
-            frame = shown(Gaussians(means, quats, scales, colors.opacities, colors.sh), view.camera, self.background)
+            drawn = Gaussians(means, quats, scales, colors.opacities, colors.sh)
+            frame = shown(drawn, view.camera, self.background, self.model.rasterizer)
             db = psnr_from_mse(float(np.mean(np.square(frame - self._frames[i], dtype=np.float64))))
             worst = min(worst, db)
             if worst < enough:
@@ -152,21 +153,21 @@ class Evidence:
         peaks, amounts = np.zeros((2, len(poses.still)), np.float32)
         for view in self._views if len(peaks) else ():
             g = poses.at(view.t)
-            weights = blending_weights(g, view)
-            # pixels that a Gaussian of these two largest axes fills; 0.3 px² is what the rasterizer adds
+            weights = blending_weights(g, view, self.model.rasterizer)
+            # pixels that a Gaussian of these two largest axes fills
             sizes = np.sort(g.scales, axis=1)[:, 1:] * self.pixels_a_unit(g.means)[:, None]
-            np.maximum(peaks, weights / (2 * np.pi * (sizes.prod(axis=1) + GSPLAT.eps2d)), out=peaks)
+            np.maximum(peaks, weights / (2 * np.pi * (sizes.prod(axis=1) + self.model.config.eps2d)), out=peaks)
             np.maximum(amounts, weights, out=amounts)
         return np.minimum(peaks, 1), amounts
 
 
-def blending_weights(gaussians: Gaussians, view: View) -> FloatArray:
+def blending_weights(gaussians: Gaussians, view: View, options: RasterizerOptions) -> FloatArray:
     """[N] how much each Gaussian adds to a frame: its alpha times what reaches it, summed over the pixels."""
     means, quats, scales, opacities = (
         torch.from_numpy(array) for array in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     )
     grey = torch.zeros(len(means), 1, 3, requires_grad=True)
-    rgb, _, _ = rasterize(means, quats, scales, opacities, grey, view.camera, torch.zeros(3))
+    rgb, _, _ = rasterize(means, quats, scales, opacities, grey, view.camera, torch.zeros(3), options)
     (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), grey)
     return (gradient[:, 0, 0] / SH_C0).numpy()
 

@@ -335,6 +335,7 @@ class SceneDetail(SceneEntry):
     bounds: tuple[list[float], list[float]] = Field(description="two corners of a box, world")
     background: tuple[float, float, float] = Field(description="sRGB-encoded")
     antialiasing: str
+    eps2d: float = Field(description="px² added to the diagonal of projected covariances")
     delta_space: str
     view: SceneView
     cameras: list[dict[str, Any]] = Field(description="fx, fy, cx, cy, width, height in pixels; OpenCV axes")

@@ -1,6 +1,6 @@
 """Gaussian splats on a CPU: tile-based, exact, deterministic. `rasterize` is the entrance."""
 
 from msdgs_serve.rasterizer.rasterize import Rendering, rasterize
-from msdgs_serve.rasterizer.view import GSPLAT, INRIA, RasterizerOptions
+from msdgs_serve.rasterizer.view import GSPLAT, INRIA, RasterizerOptions, as_trained
 
-__all__ = ["GSPLAT", "INRIA", "RasterizerOptions", "Rendering", "rasterize"]
+__all__ = ["GSPLAT", "INRIA", "RasterizerOptions", "Rendering", "as_trained", "rasterize"]

@@ -7,6 +7,7 @@ import numpy as np
 
 from msdgs_serve.scene.camera import Camera, CameraModel
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.metadata import SceneMetadata
 
 TILE = 16
 """Pixels along a tile's side."""
@@ -25,6 +26,11 @@ class RasterizerOptions(NamedTuple):
 
 GSPLAT = RasterizerOptions(near_plane=0.01, eps2d=0.3, alpha_min=1 / 255, alpha_max=0.999, transmittance_min=1e-4)
 INRIA = RasterizerOptions(near_plane=0.2, eps2d=0.3, alpha_min=1 / 255, alpha_max=0.99, transmittance_min=1e-4)
+
+
+def as_trained(metadata: SceneMetadata, options: RasterizerOptions = GSPLAT) -> RasterizerOptions:
+    """`options` with the anti-aliasing that a scene was trained with."""
+    return options._replace(eps2d=metadata.eps2d, mip=metadata.antialiasing == "mip")
 
 
 PINHOLE, ORTHOGRAPHIC, FISHEYE = range(len(get_args(CameraModel)))

@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,8 @@ class SceneCamera:
 
 @dataclass(frozen=True)
 class SceneMetadata:
-    """`metadata_props` of a scene file. Each value is JSON under the field's own name, and none may be missing."""
+    """`metadata_props` of a scene file. Each value is JSON under the field's own name; only what has a default here may
+    be missing."""
 
     contract: str
     layers: tuple[str, ...]  # the kind of each deformation layer, in order; empty where nothing moves
@@ -53,12 +54,13 @@ class SceneMetadata:
     sh_degree: int  # 0 to 3
     delta_space: str  # where deltas were added in training, e.g. "raw"
     background: tuple[float, float, float]  # sRGB in [0, 1], as trained
-    antialiasing: str  # "dilate": +0.3 px² on the projected covariance; "mip": that, and dimmed by as much
+    antialiasing: str  # "dilate": `eps2d` on the projected covariance; "mip": that, and dimmed by as much
     cameras: tuple[SceneCamera, ...]  # to start from
     left_out: tuple[Any, ...]  # what the export left out of the model
     measured_error: dict[str, Any]  # of the plan, against the model it was made from
     package_version: str
     checkpoint_sha256: str  # of the model file
+    eps2d: float = 0.3  # px², as trained
 
     def to_properties(self) -> dict[str, str]:
         """The `metadata_props` of a file."""
@@ -70,7 +72,10 @@ class SceneMetadata:
     def from_properties(cls, properties: Mapping[str, str], file: str) -> "SceneMetadata":
         """Read and check them; `file` is for messages. Raises `SceneFileInvalid` naming the field."""
         values = {}
+        optional = {field.name for field in fields(cls) if field.default is not MISSING}
         for name, reader in _READERS.items():
+            if name not in properties and name in optional:
+                continue
             if name not in properties:
                 raise SceneFileInvalid(file, name, "is missing from the metadata")
             try:
@@ -160,6 +165,12 @@ def _cameras(value: Any) -> tuple[SceneCamera, ...]:
     return tuple(SceneCamera.from_plain(_mapping(camera)) for camera in _list(value))
 
 
+def _eps2d(value: Any) -> float:
+    if (number := _finite(value)) < 0:
+        raise ValueError(f"{value!r} is below 0")
+    return number
+
+
 def _sha256(value: Any) -> str:
     if not re.fullmatch("[0-9a-f]{64}", _text(value)):
         raise ValueError(f"{value!r} isn't a SHA-256 in lower-case hexadecimal")
@@ -181,4 +192,5 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "measured_error": _mapping,
     "package_version": _text,
     "checkpoint_sha256": _sha256,
+    "eps2d": _eps2d,
 }

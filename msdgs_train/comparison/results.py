@@ -105,7 +105,7 @@ def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
     for i, entry in enumerate([loaded.scene.cameras[0], *loaded.scene.cameras[:TIMED_FRAMES]]):
         camera = camera_of(entry, entry["width"])
         start = time.perf_counter()
-        rasterize(*loaded.model.pose(entry["t"]), camera, background)
+        rasterize(*loaded.model.pose(entry["t"]), camera, background, loaded.model.rasterizer)
         if i:
             took.append(1e3 * (time.perf_counter() - start))
     return statistics.median(took)

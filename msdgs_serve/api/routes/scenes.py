@@ -172,6 +172,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         bounds=(list(low), list(high)),
         background=metadata.background,
         antialiasing=metadata.antialiasing,
+        eps2d=metadata.eps2d,
         delta_space=metadata.delta_space,
         view=_view(served.framing),
         cameras=[camera.to_plain() for camera in metadata.cameras],
