@@ -50,13 +50,11 @@ class TrainConfig:
     settling_fraction: float = 0.025
     """The next part of the run is still without deformation, but on photographs of the middle of the scene's time, in
     which what moves takes shape."""
-    window_start: float = 0.03
-    """These are up to this part of the scene's time away from its middle. What moves is sharp there, and is then
-    followed outwards, photograph by photograph."""
-    second_window_start: float = 0.5
-    """Half-way to `window_until_fraction` the window shrinks to this and grows again: what was blurred where motions
-    weren't known well gets sharp in the middle, and is followed anew along motions nearly right, by photographs that
-    all teach everything. 0.5: it doesn't."""
+    window_starts: tuple[float, ...] = (0.03,)
+    """These are up to the first part of the scene's time away from its middle. What moves is sharp there, and is then
+    followed outwards, photograph by photograph. With more than one part the window shrinks to the next and grows again,
+    in as many steps: what was blurred where motions weren't known well gets sharp in the middle, and is followed anew
+    along motions nearly right, by photographs that all teach everything."""
     window_until_fraction: float = 0.75
     """The part of the run after which all times take part; 0: from the start, and nothing is sown or settles."""
     teach_motion: bool = True
@@ -174,8 +172,8 @@ class TrainConfig:
             if "_rate" in item.name:
                 self._require(item.name, "a finite learning rate above 0", lambda v: 0 < v < math.inf)
         self._require("sown_fraction", "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
-        for name in ("window_start", "second_window_start"):
-            self._require(name, "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
+        self._require("window_starts", "one number or more, in [0, 0.5] each", _are_window_starts)
+        object.__setattr__(self, "window_starts", tuple(self.window_starts))
         more = (
             "blocks_weight",
             "bases_bends_weight",
@@ -255,6 +253,11 @@ class TrainConfig:
         if strange:
             raise InvalidInput("config.model", "made of known settings", f"`{strange[0]}`")
         return cls(**{**values, "model": ModelConfig(**model)})
+
+
+def _are_window_starts(values: Any) -> bool:
+    numbers = isinstance(values, list | tuple) and all(type(v) in (int, float) and 0 <= v <= 0.5 for v in values)
+    return numbers and len(values) > 0
 
 
 RESUMABLE_CHANGES = frozenset({"steps", "threads", "max_minutes", "log_every", "eval_every", "checkpoint_every"})

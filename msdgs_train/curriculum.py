@@ -2,7 +2,7 @@
 
 First all photographs teach a scene that stands still: what does stand still is in place before anything moves. Then
 what moves is followed from the middle of the scene's time outwards, in a window that grows photograph by photograph,
-once or twice. While it grows for the first time, of four lessons
+once or more. While it grows for the first time, of four lessons
 
 - one draws from all photographs of the window alike, and teaches everything;
 - two draw from its outermost ones, which are new, and teach motion alone. Were the Gaussians to learn from these few as
@@ -50,26 +50,21 @@ class Curriculum:
         c = self._config
         if c.window_until_fraction == 0 or not c.model.layers or step < c.warmup_steps:
             return 0.5
-        starts, grown = self._starts, self._growth(step)
-        if grown >= len(starts):
+        grown = self._growth(step)
+        if grown >= len(c.window_starts):
             return 0.5
-        start = starts[int(grown)]
+        start = c.window_starts[int(grown)]
         return start + (0.5 - start) * (grown % 1)
 
     def discovers(self, step: int) -> bool:
         """Whether times that the window takes in now have never been in it."""
         return self._growth(step) <= 1
 
-    @property
-    def _starts(self) -> list[float]:
-        c = self._config
-        return [c.window_start] + ([c.second_window_start] if c.second_window_start < 0.5 else [])
-
     def _growth(self, step: int) -> float:
         """How many times the window has grown to all times."""
         c = self._config
         done = max(step - c.still_steps, 0) / max(c.window_until_fraction * c.steps - c.still_steps, 1e-9)
-        return done * len(self._starts)
+        return done * len(c.window_starts)
 
     def next(self, number: int, generator: torch.Generator) -> Lesson:
         """The lesson of this number, counted from 0: a step takes as many as photographs."""

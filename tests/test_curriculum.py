@@ -1,5 +1,6 @@
 """Which photographs come, and what they teach: of passes, the window, and the three kinds of steps."""
 
+import json
 from collections import Counter
 from copy import deepcopy
 from pathlib import Path
@@ -8,8 +9,10 @@ from typing import Any
 import pytest
 import torch
 
+from msdgs_serve.scene import InvalidInput
 from msdgs_train import trainer as trainer_module
 from msdgs_train.basis_layer import BasisLayer
+from msdgs_train.config import TrainConfig
 from msdgs_train.curriculum import MIDDLE, NEW, Curriculum, Lesson
 from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.trainer import AHEAD, Trainer
@@ -48,7 +51,7 @@ def test_first_and_last_all_photographs_teach_everything(scene: SceneData) -> No
 
 
 def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
-    for step, lesson in enumerate(lessons(scene, range(1000), window_start=0.1)):
+    for step, lesson in enumerate(lessons(scene, range(1000), window_starts=(0.1,))):
         if 100 <= step < 600:
             window = 0.1 + 0.4 * max(step - 200, 0) / 400
             inside = distance(scene, lesson.frame.t) <= window + 1e-9
@@ -57,7 +60,7 @@ def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
 
 
 def test_second_window_grows_as_the_first(scene: SceneData) -> None:
-    changes = {"window_start": 0.1, "second_window_start": 0.3}
+    changes = {"window_starts": (0.1, 0.3)}
     for step, lesson in enumerate(lessons(scene, range(1000), **changes)):
         if 200 <= step < 600:
             window = 0.1 + 0.4 * (step - 200) / 200 if step < 400 else 0.3 + 0.2 * (step - 400) / 200
@@ -66,7 +69,7 @@ def test_second_window_grows_as_the_first(scene: SceneData) -> None:
 
 
 def test_all_photographs_of_the_second_window_teach_everything(scene: SceneData) -> None:
-    changes = {"window_start": 0.1, "second_window_start": 0.3, "window_until_fraction": 0.9, "steps": 2000}
+    changes = {"window_starts": (0.1, 0.3), "window_until_fraction": 0.9, "steps": 2000}
     subjects = Counter(lesson.subject for lesson in lessons(scene, range(480, 800), **changes))
     assert subjects == {"everything": 80, "motion": 160, "stillness": 80}
     second = lessons(scene, range(1101, 1800), **changes)
@@ -83,7 +86,7 @@ def test_second_window_keeps_the_motions_that_the_first_has_found(
     carried = []
     monkeypatch.setattr(BasisLayer, "carry_outwards", lambda _, before, after: carried.append((before, after)))
     changes = {"warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6, "steps": 50}
-    config = small_config(model=SHARED_MOTIONS, window_start=0.1, second_window_start=0.2, **changes)
+    config = small_config(model=SHARED_MOTIONS, window_starts=(0.1, 0.2), **changes)
     trainer = Trainer(config, scene)
     while trainer.step_count < 50:
         trainer.step()
@@ -92,14 +95,14 @@ def test_second_window_keeps_the_motions_that_the_first_has_found(
 
 def test_first_window_discovers_and_the_second_does_not(scene: SceneData) -> None:
     config = small_config(
-        steps=1000, warmup_fraction=0.1, settling_fraction=0.1, window_until_fraction=0.6, second_window_start=0.3
+        steps=1000, warmup_fraction=0.1, settling_fraction=0.1, window_until_fraction=0.6, window_starts=(0.03, 0.3)
     )
     curriculum = Curriculum(config, scene.splits["train"], scene.time_range)
     assert [step for step in range(1000) if curriculum.discovers(step)] == list(range(401))
 
 
 def test_lessons_of_one_step_differ_and_its_window_is_theirs(scene: SceneData) -> None:
-    drawn = lessons(scene, range(400, 1120), photographs=2, window_start=0.1)
+    drawn = lessons(scene, range(400, 1120), photographs=2, window_starts=(0.1,))
     assert [lesson.subject for lesson in drawn[:4]] == ["stillness", "motion", "everything", "motion"]
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 180, "motion": 360, "stillness": 180}
     for number, lesson in enumerate(drawn, 400):
@@ -108,19 +111,19 @@ def test_lessons_of_one_step_differ_and_its_window_is_theirs(scene: SceneData) -
 
 
 def test_of_four_lessons_two_teach_motion_and_one_stillness(scene: SceneData) -> None:
-    drawn = lessons(scene, range(200, 560), window_start=0.1)
+    drawn = lessons(scene, range(200, 560), window_starts=(0.1,))
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 90, "motion": 180, "stillness": 90}
 
 
 def test_switches(scene: SceneData) -> None:
-    drawn = lessons(scene, range(200, 560), window_start=0.1, teach_motion=False)
+    drawn = lessons(scene, range(200, 560), window_starts=(0.1,), teach_motion=False)
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 270, "stillness": 90}
-    drawn = lessons(scene, range(200, 560), window_start=0.1, teach_stillness=False)
+    drawn = lessons(scene, range(200, 560), window_starts=(0.1,), teach_stillness=False)
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 180, "motion": 180}
 
 
 def test_what_is_new_teaches_motion(scene: SceneData) -> None:
-    for step, lesson in enumerate(lessons(scene, range(600), window_start=0.1)):
+    for step, lesson in enumerate(lessons(scene, range(600), window_starts=(0.1,))):
         if lesson.subject == "motion":
             window = 0.1 + 0.4 * (step - 200) / 400
             assert step >= 200
@@ -213,3 +216,27 @@ def test_motions_of_new_photographs_may_bend(scene: SceneData, monkeypatch: pyte
     assert {lesson.subject for lesson in taught} == {"everything", "motion"}
     assert strains == [pytest.approx(lesson.t) for lesson in taught]
     assert bends == [pytest.approx(lesson.t) for lesson in taught if lesson.subject != "motion"]
+
+
+@pytest.mark.parametrize("starts", [(), [0.6], [-0.1], [float("nan")], ["0.1"], [True], 0.1])
+def test_starts_of_windows_that_cannot_be_are_named(starts: object) -> None:
+    with pytest.raises(InvalidInput, match=r"config\.window_starts"):
+        small_config(window_starts=starts)
+
+
+def test_starts_of_windows_read_from_json_are_the_same() -> None:
+    config = small_config(window_starts=(0.1, 0.3, 0.3))
+    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_a_third_window_grows_as_the_second(scene: SceneData) -> None:
+    config = small_config(
+        steps=1000,
+        warmup_fraction=0.1,
+        settling_fraction=0.1,
+        window_until_fraction=0.8,
+        window_starts=(0.1, 0.3, 0.2),
+    )
+    curriculum = Curriculum(config, scene.splits["train"], scene.time_range)
+    windows = [curriculum.window(step) for step in (200, 300, 400, 500, 600, 700, 800)]
+    assert windows == pytest.approx([0.1, 0.3, 0.3, 0.4, 0.2, 0.35, 0.5])

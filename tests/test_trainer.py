@@ -99,7 +99,7 @@ def _assert_same_bits(one: dict[str, Any], other: dict[str, Any]) -> None:
 @pytest.mark.parametrize("stop", [8, 13])
 def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
     """Stopped in the first and in the second window."""
-    config = small_config(model=SHARED_MOTIONS, second_window_start=0.2)
+    config = small_config(model=SHARED_MOTIONS, window_starts=(0.03, 0.2))
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=_StopAfter(stop))
     fit(config, data, tmp_path / "parts", resume=True)
