@@ -3,6 +3,7 @@
 import json
 import struct
 from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ from tests.tolerances import tolerance
 QUIET = Console(quiet=True)
 
 
-def scene_file(folder: Path, plan: str = "network", **config: int) -> Path:
+def scene_file(folder: Path, plan: str = "network", **config: float) -> Path:
     """A moving scene of 300 Gaussians."""
     model = random_model(300, noise=0.02, time_frequencies=2, **config)
     file = folder / "scene.onnx"
@@ -103,6 +104,15 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
     assert np.abs(read.gaussians.means - expected.means).max() < tolerance("splat_values")
     turned = np.abs(to_matrix(read.gaussians.quats) - to_matrix(expected.quats))
     assert turned.max() < tolerance("spz_rotation")
+
+
+@pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it softer"), (0.3, ""), (0.5, "draw it harder")])
+def test_who_converts_is_told_how_others_draw_it(tmp_path: Path, eps2d: float, said: str):
+    printed = StringIO()
+    scene = scene_file(tmp_path, eps2d=eps2d)
+    convert(Settings(scene, tmp_path / "a.ply", 0.0, 30, None), Console(file=printed, soft_wrap=True))
+    assert ("draw it" in printed.getvalue()) == bool(said)
+    assert said in printed.getvalue()
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])

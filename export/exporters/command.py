@@ -67,8 +67,8 @@ def convert(settings: Settings, console: Console) -> None:
         raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD))} or {VISIONARY}", out.name)
     eps2d = session.scene.metadata.eps2d
     if eps2d != GSPLAT.eps2d:
-        wider = "softer" if eps2d < GSPLAT.eps2d else "harder"
-        console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {wider}")
+        drawn = "softer" if eps2d < GSPLAT.eps2d else "harder"
+        console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
 
 
 def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | None) -> float:
