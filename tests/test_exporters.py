@@ -5,6 +5,7 @@ import struct
 from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -35,7 +36,7 @@ from tests.tolerances import tolerance
 QUIET = Console(quiet=True)
 
 
-def scene_file(folder: Path, plan: str = "network", **config: float) -> Path:
+def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
     """A moving scene of 300 Gaussians."""
     model = random_model(300, noise=0.02, time_frequencies=2, **config)
     file = folder / "scene.onnx"
