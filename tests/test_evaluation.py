@@ -13,7 +13,7 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
-from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_train import cli, evaluation_report
@@ -165,6 +165,8 @@ def test_a_centre_travels_by_pixels() -> None:
 
 class _Moving:
     """Two Gaussians, far apart: the second one goes to the right, 1 unit in a unit of time."""
+
+    rasterizer = GSPLAT
 
     def pose(self, t: float) -> Any:
         g = gaussians_of([[-1.0, 0, 4], [0.3 + t, 0, 4]], scales=0.2, opacities=0.9, rgb=[[0.1] * 3, [0.8, 0.1, 0.1]])
