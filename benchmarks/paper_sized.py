@@ -351,7 +351,7 @@ def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
     console.print(f"{len(moving):,} of {len(fit.motion.travel):,} Gaussians move by a pixel", markup=False)
     psnrs = []
     for view in deciding_views(cameras_of(fit.info), fit.info.time_range, 9):
-        frames = [shown(posed(m, view.t), view.camera, fit.info.background) for m in (small, fit.model)]
+        frames = [shown(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
         psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
     console.print(f"pictures against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
 

@@ -17,7 +17,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from msdgs_train.checkpoint import LoadedModel, load_model
 from msdgs_train.datasets import Frame, composite, load_scene
 from msdgs_train.metrics import quality
-from msdgs_train.rasterization import rasterize
 
 
 @dataclass(frozen=True)
@@ -70,11 +69,9 @@ def name(model: LoadedModel) -> str:
     return f"K = {len(kinds)} ({', '.join(sorted(set(kinds)))})"
 
 
-@torch.no_grad()
 def render(model: LoadedModel, frame: Frame) -> torch.Tensor:
     """The model seen from the frame's camera at its time, [H, W, 3] in [0, 1]."""
-    background = torch.tensor(model.scene.background)
-    return rasterize(*model.model.pose(frame.t), frame.camera, background, model.model.rasterizer)[0].clamp(0, 1)
+    return model.render(frame.camera, frame.t).clamp(0, 1)
 
 
 if __name__ == "__main__":

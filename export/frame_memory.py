@@ -17,7 +17,7 @@ if __name__ == "__main__":
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.rasterizer import as_trained, rasterize
 from msdgs_serve.scene.metadata import SceneCamera
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -58,7 +58,7 @@ def _peak(path: str, view: SceneCamera) -> int | None:
 
 def _draw(path: str, view: SceneCamera) -> None:
     session = DeformationSession(path)
-    rasterize(session.gaussians(view.t), view.camera)
+    rasterize(session.gaussians(view.t), view.camera, options=as_trained(session.scene.metadata))
 
 
 def _status(name: str) -> int:

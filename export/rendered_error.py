@@ -139,9 +139,7 @@ def as_gaussians(pose: PosedGaussians) -> Gaussians:
     return Gaussians(*(tensor.detach().numpy() for tensor in pose))
 
 
-def shown(
-    gaussians: Gaussians, camera: Camera, background: Sequence[float], options: RasterizerOptions = GSPLAT
-) -> FloatArray:
+def shown(gaussians: Gaussians, camera: Camera, background: Sequence[float], options: RasterizerOptions) -> FloatArray:
     """[H, W, 3] the frame as a picture shows it, in [0, 1]."""
     return np.clip(rasterize(gaussians, camera, background=background, options=options).rgb, 0, 1)
 

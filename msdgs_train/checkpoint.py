@@ -13,10 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_serve import __version__
+from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.files import replacing
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians, ModelConfig
+from msdgs_train.rasterization import rasterize
 
 FORMAT = "msdgs-model/1"
 
@@ -49,6 +51,12 @@ class LoadedModel(NamedTuple):
     model: DynamicGaussians
     scene: SceneInfo
     step: int
+
+    @torch.no_grad()
+    def render(self, camera: Camera, t: float, steps: int | None = None) -> Tensor:
+        """[H, W, 3] over the scene's background, after all layers or so many."""
+        background = torch.tensor(self.scene.background)
+        return rasterize(*self.model.pose(t, steps=steps), camera, background, self.model.rasterizer)[0]
 
 
 def save_model(path: str | Path, model: DynamicGaussians, scene: SceneInfo, step: int) -> None:

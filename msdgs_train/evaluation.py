@@ -16,7 +16,6 @@ from msdgs_train.fit import BEST, CONFIG, MODEL
 from msdgs_train.metrics import masked_psnr, quality
 from msdgs_train.moving_region import moving_region
 from msdgs_train.perceptual import PerceptualMetrics, perceptual_metrics
-from msdgs_train.rasterization import rasterize
 from msdgs_train.run_record import RECORD, Best, RunInvalid, read_record
 
 FILES = {"last": MODEL, "best": BEST}
@@ -45,11 +44,9 @@ class JudgedModel(NamedTuple):
         columns = [[value for value in column if value is not None] for column in zip(*self.images, strict=True)]
         return Scores(*(statistics.fmean(column) if column else None for column in columns))  # type: ignore[arg-type]
 
-    @torch.no_grad()
     def render(self, frame: Frame) -> Tensor:
         """[H, W, 3] in [0, 1], as the frame's camera sees the model at its time."""
-        model, background = self.loaded.model, torch.tensor(self.loaded.scene.background)
-        return rasterize(*model.pose(frame.t), frame.camera, background, model.rasterizer)[0].clamp(0, 1)
+        return self.loaded.render(frame.camera, frame.t).clamp(0, 1)
 
     def photograph(self, frame: Frame) -> Tensor:
         """[H, W, 3] in [0, 1], over the background that the model was trained with."""

@@ -4,12 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.checkpoint import LoadedModel, load_model
-from msdgs_train.rasterization import rasterize
 from msdgs_train.report import to_bytes
 from msdgs_train.sheets import Panel, draw_sheet
 
@@ -46,12 +44,9 @@ def write_steps(
     return pictures
 
 
-@torch.no_grad()
 def render_steps(loaded: LoadedModel, t: float, camera: Camera) -> list[np.ndarray]:
     """K + 1 pictures, [H, W, 3] uint8: after no layer, after the first, …, after all."""
-    model, background = loaded.model, torch.tensor(loaded.scene.background)
-    states = (model.pose(t, steps=k) for k in range(len(model.deformation) + 1))
-    return [to_bytes(rasterize(*state, camera, background, model.rasterizer)[0].numpy()) for state in states]
+    return [to_bytes(loaded.render(camera, t, k).numpy()) for k in range(len(loaded.model.deformation) + 1)]
 
 
 def _stored_camera(loaded: LoadedModel, t: float, name: str | None) -> dict[str, Any]:

@@ -48,7 +48,7 @@ def unbent(model: DynamicGaussians, info: SceneInfo) -> Unbent:
     for view in deciding_views(cameras_of(info), info.time_range, FRAMES):
         ours = posed(model, view.t)
         theirs, off = bent(model, view.t, ours)
-        frames = [shown(each, view.camera, info.background) for each in (theirs, ours)]
+        frames = [shown(each, view.camera, info.background, model.rasterizer) for each in (theirs, ours)]
         psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
         longest = max(longest, off)
     return Unbent(float(np.mean(psnrs)), min(psnrs), longest, len(model.gaussians))

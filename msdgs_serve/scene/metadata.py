@@ -74,9 +74,9 @@ class SceneMetadata:
         values = {}
         optional = {field.name for field in fields(cls) if field.default is not MISSING}
         for name, reader in _READERS.items():
-            if name not in properties and name in optional:
-                continue
             if name not in properties:
+                if name in optional:
+                    continue
                 raise SceneFileInvalid(file, name, "is missing from the metadata")
             try:
                 values[name] = reader(json.loads(properties[name], parse_constant=_refuse_constant))

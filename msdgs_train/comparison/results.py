@@ -14,7 +14,6 @@ from msdgs_train.checkpoint import LoadedModel, load_model
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.runner import final_metrics, is_finished
 from msdgs_train.fit import CHOOSING_SPLITS, MODEL
-from msdgs_train.rasterization import rasterize
 from msdgs_train.report import read_metrics
 from msdgs_train.steps import camera_of
 
@@ -96,16 +95,14 @@ def _modulation_parameters(loaded: LoadedModel) -> int:
     return embeddings.numel() + sum(p.numel() for p in model.modulation.parameters())
 
 
-@torch.no_grad()
 def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
     """Median over some of the model's cameras, each after one that doesn't count; `threads` of torch."""
     torch.set_num_threads(threads)
-    background = torch.tensor(loaded.scene.background)
     took = []
     for i, entry in enumerate([loaded.scene.cameras[0], *loaded.scene.cameras[:TIMED_FRAMES]]):
         camera = camera_of(entry, entry["width"])
         start = time.perf_counter()
-        rasterize(*loaded.model.pose(entry["t"]), camera, background, loaded.model.rasterizer)
+        loaded.render(camera, entry["t"])
         if i:
             took.append(1e3 * (time.perf_counter() - start))
     return statistics.median(took)
