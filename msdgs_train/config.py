@@ -63,6 +63,13 @@ class TrainConfig:
     teach_stillness: bool = True
     """A quarter of the steps while it first grows, of photographs outside, teach what stands still; else there are
     none."""
+    eps2d_start: float | None = None
+    """What is added to projected covariances, px², until all times take part, when `model.eps2d` takes its place; the
+    same from the start if not given."""
+    average_steps: int = 0
+    """The model that is judged, shown and saved is the mean over about the last so many steps, once all times take part
+    and density control has ended: what the last photographs alone pulled at is evened out. 0: as the last step left
+    it."""
     sh_interval: int = 2000
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
@@ -163,7 +170,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("steps", "photographs", "threads", "init_count", "sh_interval", "max_gaussians", "log_every"):
             self._require(name, "a whole number above 0", lambda v: v >= 1)
-        for name in ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed"):
+        counts = ("densify_every", "densify_from", "opacity_reset_every", "eval_every", "checkpoint_every", "seed")
+        for name in ("average_steps", *counts):
             self._require(name, "0 or above", lambda v: v >= 0)
         parts = ("warmup_fraction", "settling_fraction", "window_until_fraction", "densify_until_fraction")
         for name in ("l1_weight", "squares_part", "prune_opacity", *parts):
@@ -188,6 +196,7 @@ class TrainConfig:
             self._require(name, "finite and 0 or above", lambda v: 0 <= v < math.inf)
         for name in ("densify_gradient", "split_scale", "prune_scale"):
             self._require(name, "finite and above 0", lambda v: 0 < v < math.inf)
+        self._require("eps2d_start", "finite and 0 or above, or left out", lambda v: v is None or 0 <= v < math.inf)
         for name in ("size", "half_extent", "max_minutes"):
             self._require(name, "above 0, or left out", lambda v: v is None or 0 < v < math.inf)
         self._require("max_gaussians", "init_count or more", lambda v: v >= self.init_count)
@@ -224,6 +233,19 @@ class TrainConfig:
     def densify_until(self) -> int:
         """The last step of density control."""
         return round(self.densify_until_fraction * self.steps)
+
+    @property
+    def grown_steps(self) -> int:
+        """Steps after which all times take part."""
+        return round(self.window_until_fraction * self.steps)
+
+    def eps2d_at(self, step: int) -> float:
+        """What is added to projected covariances in this step, counted from 1, px²."""
+        return self.model.eps2d if self.eps2d_start is None or step > self.grown_steps else self.eps2d_start
+
+    def averaged_at(self, step: int) -> int:
+        """How many steps, up to this one, counted from 1, the mean that is kept after it is about; 0: none is kept."""
+        return min(max(step - max(self.grown_steps, self.densify_until), 0), self.average_steps)
 
     def densifies_after(self, step: int) -> bool:
         """Whether a round of density control is due after this step, counted from 1."""

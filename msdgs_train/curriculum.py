@@ -63,7 +63,7 @@ class Curriculum:
     def _growth(self, step: int) -> float:
         """How many times the window has grown to all times."""
         c = self._config
-        done = max(step - c.still_steps, 0) / max(c.window_until_fraction * c.steps - c.still_steps, 1e-9)
+        done = max(step - c.still_steps, 0) / max(c.grown_steps - c.still_steps, 1e-9)
         return done * len(c.window_starts)
 
     def next(self, number: int, generator: torch.Generator) -> Lesson:

@@ -46,7 +46,7 @@ def exponential(start: float, end: float, step: float, steps: float) -> float:
 
 def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
     """The rate of each group of parameters at one step."""
-    grown = config.window_until_fraction * config.steps
+    grown = config.grown_steps
     rates: dict[str, float] = {group: getattr(config, name) for group, name in _CONSTANT_RATES.items()}
     for group, name in _DECAYING_RATES.items():
         start, end = getattr(config, f"{name}_rate_start"), getattr(config, f"{name}_rate_end")

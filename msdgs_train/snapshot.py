@@ -50,7 +50,7 @@ class Snapshot:
 
 def snapshot_of_training(trainer: Trainer) -> Snapshot:
     """A copy of the model after the last step. Not to be called while a step is done."""
-    model = copy.deepcopy(trainer.model)
+    model = copy.deepcopy(trainer.smoothed)
     return Snapshot(model, trainer.config.evaluation_background, *trainer.parts_in_use)
 
 

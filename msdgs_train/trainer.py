@@ -1,8 +1,10 @@
 """One training run in memory: do a step, judge the model, save everything and go on from there."""
 
+import copy
 import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,6 +94,7 @@ class Trainer:
         self.model = _new_model(config, scene, Domain(self._half_extent, scene.time_range))
         self.optimizer = make_optimizer(self.model, config)
         self.density = start_density_control(config, self._extent(), len(self.model.gaussians))
+        self._mean: DynamicGaussians | None = None
         self._pairs_generator = torch.Generator().manual_seed(config.seed + 2)
 
     def step(self) -> StepResult:
@@ -115,6 +118,7 @@ class Trainer:
                     camera = shot.lesson.frame.camera
                     self.density.gather(shot.info.means2d_grads, shot.info.radii, camera.width, camera.height)
         self.density.after_step(self.model.gaussians, self.optimizer, self.step_count)
+        self._keep_mean()
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         return StepResult(
             self.step_count,
@@ -148,7 +152,7 @@ class Trainer:
     @sharing_cores()
     def _shoot(self, lesson: Lesson, background: Tensor, pairs: torch.Generator) -> _Shot:
         truth = self._photograph(lesson.frame, background)
-        posed = self._pose(lesson.t)
+        posed = self._pose(self.model, lesson.t)
         rgb, _, info = rasterize(*posed, lesson.frame.camera, background, self.model.rasterizer)
         c = self.config
         if lesson.subject == "stillness":
@@ -190,7 +194,8 @@ class Trainer:
         background = torch.tensor(self.config.evaluation_background)
         for frame in self.scene.splits[split]:
             truth = self._photograph(frame, background)
-            rgb, _, _ = rasterize(*self._pose(frame.t), frame.camera, background, self.model.rasterizer)
+            posed = self._pose(self.smoothed, frame.t)
+            rgb, _, _ = rasterize(*posed, frame.camera, background, self.smoothed.rasterizer)
             rgb = rgb.clamp(0, 1)
             yield Evaluated(frame, truth, rgb, quality(rgb, truth))
 
@@ -210,6 +215,7 @@ class Trainer:
             "generators": [generator.get_state() for generator in self._generators],
             "order": self._curriculum.order,
             "model": self.model.state_dict(),
+            "mean": self._mean and self._mean.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state(),
         }
@@ -223,6 +229,10 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, self.config)
         self.optimizer.load_state_dict(state["optimizer"])
         self.step_count, self._averages = state["step_count"], state["averages"]
+        self._set_eps2d(self.step_count)
+        self._mean = copy.deepcopy(self.model) if state["mean"] else None
+        if self._mean is not None:
+            self._mean.load_state_dict(state["mean"])
         self._curriculum.order = state["order"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self.rollbacks = state.get("rollbacks", 0)
@@ -256,7 +266,7 @@ class Trainer:
             bounds=self._bounds(),
             cameras=[_camera_entry(frame) for frame in self.scene.splits.get("test") or self.frames[:20]],
         )
-        checkpoint.save_model(path, self.model, info, self.step_count)
+        checkpoint.save_model(path, self.smoothed, info, self.step_count)
 
     @property
     def _generators(self) -> tuple[torch.Generator, ...]:
@@ -294,9 +304,27 @@ class Trainer:
             return 0
         return int((posed.scales <= SMALLEST_SCALE).any(dim=1).sum())
 
-    def _pose(self, t: float) -> PosedGaussians:
+    def _pose(self, model: DynamicGaussians, t: float) -> PosedGaussians:
         deform, sh_degree = self.parts_in_use
-        return self.model.pose(t, deform=deform, sh_degree=sh_degree)
+        return model.pose(t, deform=deform, sh_degree=sh_degree)
+
+    @property
+    def smoothed(self) -> DynamicGaussians:
+        """The model as it is judged, shown and saved: its mean over the last steps, where that is kept."""
+        return self.model if self._mean is None else self._mean
+
+    @torch.no_grad()
+    def _keep_mean(self) -> None:
+        steps = self.config.averaged_at(self.step_count)
+        if steps <= 1 or self._mean is None:
+            self._mean = copy.deepcopy(self.model) if steps else None
+            return
+        for mean, last in zip(self._mean.parameters(), self.model.parameters(), strict=True):
+            if last.requires_grad:
+                mean.lerp_(last, 1 / steps)
+
+    def _set_eps2d(self, step: int) -> None:
+        self.model.config = replace(self.model.config, eps2d=self.config.eps2d_at(step))
 
     @property
     def parts_in_use(self) -> tuple[bool, int]:
@@ -334,8 +362,9 @@ class Trainer:
         return total
 
     def _prepare(self) -> None:
-        """What is due before this step: sowing, placing motions, widening what layers know of time."""
+        """What is due before this step: sowing, placing motions, widening what layers know of time, dilation."""
         step, gaussians = self.step_count, self.model.gaussians
+        self._set_eps2d(step + 1)
         if step == self.config.warmup_steps and self.config.sown:
             sow(gaussians, self.optimizer, self.config, self._half_extent)
             self.density.forget(len(gaussians))
@@ -403,7 +432,7 @@ class Trainer:
         first, last = self.scene.time_range
         boxes = []
         for t in np.linspace(first, last, BOUNDS_TIMES):
-            posed = self._pose(float(t))
+            posed = self._pose(self.smoothed, float(t))
             means = posed.means[posed.opacities >= VISIBLE_OPACITY]
             if len(means):
                 boxes.append(torch.quantile(means, torch.tensor([OUTSIDE_BOUNDS, 1 - OUTSIDE_BOUNDS]), dim=0))
