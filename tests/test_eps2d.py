@@ -1,5 +1,6 @@
 """A model's own eps2d goes with it: whoever draws it, in training, judging, exporting and serving, draws the same."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,18 @@ from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.checkpoint import LoadedModel, load_model, save_model
-from msdgs_train.datasets import Frame
+from msdgs_train.datasets import Frame, load_scene
 from msdgs_train.evaluation import JudgedModel
+from msdgs_train.model_config import ModelConfig
 from msdgs_train.report import to_bytes
 from msdgs_train.snapshot import snapshot_of_file
 from msdgs_train.steps import camera_of, render_steps
+from msdgs_train.trainer import Trainer
 from tests.exports import export_scene
 from tests.models import CAMERA, SCENE, random_model, small_config
 from tests.tolerances import tolerance
+from tests.training_scene import SHARED_MOTIONS, write_scene
+from tests.training_scene import small_config as training_config
 
 T = 0.5
 EPS2D = 0.02
@@ -100,6 +105,29 @@ def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
     helper.set_model_props(contents, kept)
     onnx.save(contents, tmp_path / "scene.onnx")
     assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.eps2d == GSPLAT.eps2d
+
+
+def test_training_may_begin_with_more(tmp_path: Path):
+    """What is saved says what it was trained with, early and late, and going on knows it too."""
+    sizes = ModelConfig(**{**asdict(SHARED_MOTIONS), "eps2d": EPS2D})
+    config = training_config(model=sizes, window_until_fraction=0.5, eps2d_start=0.4)
+    trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))
+    seen = []
+    for _ in range(14):
+        trainer.step()
+        trainer.save_model(tmp_path / "model.pt")
+        seen.append(load_model(tmp_path / "model.pt").model.config.eps2d)
+        if trainer.step_count == 12:
+            trainer.save_checkpoint(tmp_path / "checkpoint.pt", 0.0)
+    assert seen == [0.4] * 12 + [EPS2D] * 2
+    trainer.load_checkpoint(tmp_path / "checkpoint.pt")
+    assert trainer.model.config.eps2d == 0.4
+
+
+@pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+def test_a_start_that_cannot_be_is_named(value: float):
+    with pytest.raises(InvalidInput, match=r"config\.eps2d_start"):
+        training_config(eps2d_start=value)
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf"), "0.3", True])

@@ -387,7 +387,7 @@ def test_learning_rates() -> None:
     ("field", "value"),
     [
         ("steps", 0), ("l1_weight", 1.5), ("l1_weight", float("nan")), ("means_rate_start", 0.0),
-        ("squares_part", 1.1), ("blocks_weight", -1.0),
+        ("squares_part", 1.1), ("blocks_weight", -1.0), ("average_steps", -1),
         ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("densify_every", -1),
         ("quats_rate", float("inf")), ("size", 0), ("densify_strategy", "none"), ("mcmc_noise", -1.0),
     ],
