@@ -53,10 +53,10 @@ class LoadedModel(NamedTuple):
     step: int
 
     @torch.no_grad()
-    def render(self, camera: Camera, t: float, steps: int | None = None) -> Tensor:
-        """[H, W, 3] over the scene's background, after all layers or so many."""
+    def render(self, camera: Camera, t: float, layers: int | None = None) -> Tensor:
+        """[H, W, 3] over the scene's background, after so many `layers` of the deformation; all if not given."""
         background = torch.tensor(self.scene.background)
-        return rasterize(*self.model.pose(t, steps=steps), camera, background, self.model.rasterizer)[0]
+        return rasterize(*self.model.pose(t, steps=layers), camera, background, self.model.rasterizer)[0]
 
 
 def save_model(path: str | Path, model: DynamicGaussians, scene: SceneInfo, step: int) -> None:

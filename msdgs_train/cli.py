@@ -167,7 +167,7 @@ class Compare:
     """Each is a run of its own; the table shows mean and spread."""
     steps: int = 3000
     """The budget of each run in optimiser steps, whatever a preset says. Schedules that are parts of a run shrink with
-    it; those in steps (sh_interval, densify_from, opacity_reset_every) don't."""
+    it; those in steps (sh_interval, densify_from, opacity_reset_every, average_steps) don't."""
     minutes: float | None = None
     """A run also ends after so many minutes. Learning rates fall over --steps, so choose these to be just reached."""
     size: int | None = None

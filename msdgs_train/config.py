@@ -67,9 +67,9 @@ class TrainConfig:
     """What is added to projected covariances, px², until all times take part, when `model.eps2d` takes its place; the
     same from the start if not given."""
     average_steps: int = 0
-    """The model that is judged, shown and saved is the mean over about the last so many steps, once all times take part
-    and density control has ended: what the last photographs alone pulled at is evened out. 0: as the last step left
-    it."""
+    """The model that is judged, shown and saved is an exponential mean over about the last so many steps, once all
+    times take part and density control has ended: each step fits its photographs a little at the cost of the others,
+    the mean suits them all. 0: the model is as the last step left it."""
     sh_interval: int = 2000
     """The degree of the spherical harmonics in use goes up by one each so many steps."""
     l1_weight: float = 0.8
@@ -243,9 +243,9 @@ class TrainConfig:
         """What is added to projected covariances in this step, counted from 1, px²."""
         return self.model.eps2d if self.eps2d_start is None or step > self.grown_steps else self.eps2d_start
 
-    def averaged_at(self, step: int) -> int:
-        """How many steps, up to this one, counted from 1, the mean that is kept after it is about; 0: none is kept."""
-        return min(max(step - max(self.grown_steps, self.densify_until), 0), self.average_steps)
+    def averages_after(self, step: int) -> bool:
+        """Whether the model after this step, counted from 1, is part of the mean."""
+        return self.average_steps > 0 and step > max(self.still_steps, self.grown_steps, self.densify_until)
 
     def densifies_after(self, step: int) -> bool:
         """Whether a round of density control is due after this step, counted from 1."""

@@ -44,7 +44,7 @@ def rasterize(
         sh: [N, (degree + 1)², 3].
         camera: pinhole, OpenCV axes.
         background: [3] colour behind everything.
-        options: rasterizer constants; on CUDA gsplat's own are fixed and others are refused.
+        options: rasterizer constants; on CUDA gsplat's limits of alpha and transmittance are fixed.
 
     Returns:
         rgb [H, W, 3] with the background, alpha [H, W], and what density control needs.

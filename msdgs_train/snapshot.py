@@ -49,8 +49,8 @@ class Snapshot:
 
 
 def snapshot_of_training(trainer: Trainer) -> Snapshot:
-    """A copy of the model after the last step. Not to be called while a step is done."""
-    model = copy.deepcopy(trainer.smoothed)
+    """A copy of the model as it would be judged and saved now. Not to be called while a step is done."""
+    model = copy.deepcopy(trainer.kept_model)
     return Snapshot(model, trainer.config.evaluation_background, *trainer.parts_in_use)
 
 

@@ -1,6 +1,5 @@
 """One training run in memory: do a step, judge the model, save everything and go on from there."""
 
-import copy
 import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from msdgs_train.datasets import Frame, SceneData, composite
 from msdgs_train.density import sow, start_density_control
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.losses import blocks_loss, photometric_loss, still_loss
+from msdgs_train.mean_model import MeanModel
 from msdgs_train.metrics import Quality, mean_quality, psnr_from_mse, quality
 from msdgs_train.model import SMALLEST_SCALE, Domain, DynamicGaussians, PosedGaussians
 from msdgs_train.optimizers import learning_rates, make_optimizer, replace_values, set_learning_rates
@@ -94,7 +94,8 @@ class Trainer:
         self.model = _new_model(config, scene, Domain(self._half_extent, scene.time_range))
         self.optimizer = make_optimizer(self.model, config)
         self.density = start_density_control(config, self._extent(), len(self.model.gaussians))
-        self._mean: DynamicGaussians | None = None
+        self._mean = MeanModel(config.average_steps)
+        self._set_eps2d(1)
         self._pairs_generator = torch.Generator().manual_seed(config.seed + 2)
 
     def step(self) -> StepResult:
@@ -118,7 +119,10 @@ class Trainer:
                     camera = shot.lesson.frame.camera
                     self.density.gather(shot.info.means2d_grads, shot.info.radii, camera.width, camera.height)
         self.density.after_step(self.model.gaussians, self.optimizer, self.step_count)
-        self._keep_mean()
+        if self.config.averages_after(self.step_count):
+            self._mean.add(self.model)
+        else:
+            self._mean.forget()
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         return StepResult(
             self.step_count,
@@ -194,8 +198,8 @@ class Trainer:
         background = torch.tensor(self.config.evaluation_background)
         for frame in self.scene.splits[split]:
             truth = self._photograph(frame, background)
-            posed = self._pose(self.smoothed, frame.t)
-            rgb, _, _ = rasterize(*posed, frame.camera, background, self.smoothed.rasterizer)
+            posed = self._pose(self.kept_model, frame.t)
+            rgb, _, _ = rasterize(*posed, frame.camera, background, self.kept_model.rasterizer)
             rgb = rgb.clamp(0, 1)
             yield Evaluated(frame, truth, rgb, quality(rgb, truth))
 
@@ -215,7 +219,7 @@ class Trainer:
             "generators": [generator.get_state() for generator in self._generators],
             "order": self._curriculum.order,
             "model": self.model.state_dict(),
-            "mean": self._mean and self._mean.state_dict(),
+            "mean": self._mean.state(),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state(),
         }
@@ -230,9 +234,7 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step_count, self._averages = state["step_count"], state["averages"]
         self._set_eps2d(self.step_count)
-        self._mean = copy.deepcopy(self.model) if state["mean"] else None
-        if self._mean is not None:
-            self._mean.load_state_dict(state["mean"])
+        self._mean.load_state(state.get("mean") if self.config.averages_after(self.step_count) else None, self.model)
         self._curriculum.order = state["order"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self.rollbacks = state.get("rollbacks", 0)
@@ -266,7 +268,7 @@ class Trainer:
             bounds=self._bounds(),
             cameras=[_camera_entry(frame) for frame in self.scene.splits.get("test") or self.frames[:20]],
         )
-        checkpoint.save_model(path, self.smoothed, info, self.step_count)
+        checkpoint.save_model(path, self.kept_model, info, self.step_count)
 
     @property
     def _generators(self) -> tuple[torch.Generator, ...]:
@@ -309,19 +311,9 @@ class Trainer:
         return model.pose(t, deform=deform, sh_degree=sh_degree)
 
     @property
-    def smoothed(self) -> DynamicGaussians:
-        """The model as it is judged, shown and saved: its mean over the last steps, where that is kept."""
-        return self.model if self._mean is None else self._mean
-
-    @torch.no_grad()
-    def _keep_mean(self) -> None:
-        steps = self.config.averaged_at(self.step_count)
-        if steps <= 1 or self._mean is None:
-            self._mean = copy.deepcopy(self.model) if steps else None
-            return
-        for mean, last in zip(self._mean.parameters(), self.model.parameters(), strict=True):
-            if last.requires_grad:
-                mean.lerp_(last, 1 / steps)
+    def kept_model(self) -> DynamicGaussians:
+        """The one that is judged, shown and saved: the mean of the last steps, before it begins the last step's."""
+        return self.model if self._mean.model is None else self._mean.model
 
     def _set_eps2d(self, step: int) -> None:
         self.model.config = replace(self.model.config, eps2d=self.config.eps2d_at(step))
@@ -432,7 +424,7 @@ class Trainer:
         first, last = self.scene.time_range
         boxes = []
         for t in np.linspace(first, last, BOUNDS_TIMES):
-            posed = self._pose(self.smoothed, float(t))
+            posed = self._pose(self.kept_model, float(t))
             means = posed.means[posed.opacities >= VISIBLE_OPACITY]
             if len(means):
                 boxes.append(torch.quantile(means, torch.tensor([OUTSIDE_BOUNDS, 1 - OUTSIDE_BOUNDS]), dim=0))

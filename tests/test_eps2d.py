@@ -1,6 +1,6 @@
 """A model's own eps2d goes with it: whoever draws it, in training, judging, exporting and serving, draws the same."""
 
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.checkpoint import LoadedModel, load_model, save_model
 from msdgs_train.datasets import Frame, load_scene
 from msdgs_train.evaluation import JudgedModel
-from msdgs_train.model_config import ModelConfig
 from msdgs_train.report import to_bytes
 from msdgs_train.snapshot import snapshot_of_file
 from msdgs_train.steps import camera_of, render_steps
@@ -109,9 +108,10 @@ def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
 
 def test_training_may_begin_with_more(tmp_path: Path):
     """What is saved says what it was trained with, early and late, and going on knows it too."""
-    sizes = ModelConfig(**{**asdict(SHARED_MOTIONS), "eps2d": EPS2D})
+    sizes = replace(SHARED_MOTIONS, eps2d=EPS2D)
     config = training_config(model=sizes, window_until_fraction=0.5, eps2d_start=0.4)
     trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))
+    assert trainer.model.config.eps2d == 0.4
     seen = []
     for _ in range(14):
         trainer.step()

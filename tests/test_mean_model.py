@@ -1,5 +1,6 @@
 """The mean of the last steps: what it is the mean of, and that it is what is judged, shown, saved and resumed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +9,20 @@ import torch
 
 from msdgs_train import fit as fit_module
 from msdgs_train.checkpoint import LoadedModel, load_model
+from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import load_scene
-from msdgs_train.fit import Observer, fit
+from msdgs_train.fit import fit
+from msdgs_train.report import to_bytes
 from msdgs_train.snapshot import snapshot_of_training
-from msdgs_train.trainer import StepResult, Trainer
-from tests.training_scene import SHARED_MOTIONS, small_config, write_scene
+from msdgs_train.trainer import Trainer
+from tests.training_scene import SHARED_MOTIONS, StopAfter, assert_same_bits, small_config, state_of, write_scene
 
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
     model=SHARED_MOTIONS, window_until_fraction=0.5, densify_until_fraction=BEGINS / STEPS, average_steps=KEPT
+)
+AS_THE_PRESET = replace(
+    CONFIG, photographs=2, window_until_fraction=BEGINS / STEPS, densify_until_fraction=0.5, eps2d_start=0.4
 )
 
 
@@ -35,16 +41,16 @@ def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
     for step in range(1, STEPS + 1):
         trainer.step()
         if step <= BEGINS:
-            assert trainer.smoothed is trainer.model
+            assert trainer.kept_model is trainer.model
             continue
         seen.append(_parameters(trainer.model))
         if len(seen) <= KEPT:
             expected = [np.mean(values, axis=0) for values in zip(*seen, strict=True)]
         else:
             expected = [(1 - 1 / KEPT) * old + last / KEPT for old, last in zip(expected, seen[-1], strict=True)]
-        for mean, value in zip(_parameters(trainer.smoothed), expected, strict=True):
+        for mean, value in zip(_parameters(trainer.kept_model), expected, strict=True):
             np.testing.assert_allclose(mean, value, rtol=1e-5, atol=1e-6)
-    moved = zip(_parameters(trainer.smoothed), seen[-1], strict=True)
+    moved = zip(_parameters(trainer.kept_model), seen[-1], strict=True)
     assert sum(not np.array_equal(mean, last) for mean, last in moved) > 5
 
 
@@ -60,39 +66,79 @@ def test_it_is_judged_shown_and_saved(data: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(saved.render(*view).clamp(0, 1), evaluated.rgb)
         assert not torch.equal(last.render(*view), saved.render(*view))
         shown = snapshot_of_training(trainer).draw(*view, layers=1)
-        np.testing.assert_allclose(shown / 255, evaluated.rgb, atol=1 / 255)
+        np.testing.assert_array_equal(shown, to_bytes(evaluated.rgb.numpy()))
 
 
-class _StopAfter(Observer):
-    def __init__(self, step: int) -> None:
-        self.last, self.limit = 0, step
-
-    def step(self, result: StepResult, seconds: float) -> None:
-        self.last = result.step
-
-    def should_stop(self) -> bool:
-        return self.last >= self.limit
-
-
+@pytest.mark.parametrize("config", [CONFIG, AS_THE_PRESET], ids=["density control last", "windows last"])
 @pytest.mark.parametrize("stop", [BEGINS, BEGINS + 1, BEGINS + 5])
-def test_resuming_changes_no_bit_of_it(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int) -> None:
+def test_resuming_changes_no_bit_of_it(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, config: TrainConfig
+) -> None:
     monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
-    fit(CONFIG, data, tmp_path / "whole")
-    fit(CONFIG, data, tmp_path / "parts", observer=_StopAfter(stop))
-    fit(CONFIG, data, tmp_path / "parts", resume=True)
-    whole, parts = (load_model(tmp_path / name / "model.pt").model.state_dict() for name in ("whole", "parts"))
-    for name, value in whole.items():
-        assert torch.equal(value, parts[name]), name
+    fit(config, data, tmp_path / "whole")
+    fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
+    assert (state_of(tmp_path / "parts")["/mean/count"] if stop > BEGINS else 0) == min(stop - BEGINS, KEPT)
+    fit(config, data, tmp_path / "parts", resume=True)
+    assert_same_bits(*(state_of(tmp_path / name) for name in ("whole", "parts")))
+    saved, best = (load_model(tmp_path / "parts" / name) for name in ("model.pt", "best.pt"))
+    kept = torch.load(tmp_path / "whole/checkpoint.pt", weights_only=True)["mean"]["model"]
+    for name, value in saved.model.state_dict().items():
+        assert torch.equal(value, kept[name]), name
+    if best.step == STEPS:
+        torch.testing.assert_close(best.model.state_dict(), saved.model.state_dict(), rtol=0, atol=0)
 
 
-def test_more_steps_begin_it_anew(data: Path, tmp_path: Path) -> None:
-    """Density control goes on then, and the Gaussians are other ones."""
+def _saved(data: Path, path: Path, steps: int) -> Trainer:
     trainer = Trainer(CONFIG, load_scene(data))
-    for _ in range(STEPS):
+    for _ in range(steps):
         trainer.step()
-    trainer.save_checkpoint(tmp_path / "checkpoint.pt", 0.0)
-    longer = Trainer(small_config(**{**CONFIG.to_dict(), "model": SHARED_MOTIONS, "steps": 2 * STEPS}), trainer.scene)
+    trainer.save_checkpoint(path, 0.0)
+    return trainer
+
+
+def test_with_more_steps_it_begins_anew(data: Path, tmp_path: Path) -> None:
+    """Density control goes on then, and the Gaussians are other ones."""
+    before = _saved(data, tmp_path / "checkpoint.pt", STEPS)
+    longer = Trainer(replace(CONFIG, steps=2 * STEPS), before.scene)
     longer.load_checkpoint(tmp_path / "checkpoint.pt")
-    assert longer.smoothed is not longer.model
+    assert longer.kept_model is longer.model
     longer.step()
-    assert longer.smoothed is longer.model
+    assert longer.kept_model is longer.model
+
+
+def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_path: Path) -> None:
+    before = _saved(data, tmp_path / "checkpoint.pt", 12)
+    shorter = Trainer(replace(CONFIG, steps=14), before.scene)
+    shorter.load_checkpoint(tmp_path / "checkpoint.pt")
+    seen = []
+    for _ in range(2):
+        shorter.step()
+        seen.append(_parameters(shorter.model))
+    for mean, *values in zip(_parameters(shorter.kept_model), *seen, strict=True):
+        np.testing.assert_allclose(mean, np.mean(values, axis=0), rtol=1e-5, atol=1e-6)
+
+
+def test_a_run_from_before_there_were_means_goes_on(data: Path, tmp_path: Path) -> None:
+    before = _saved(data, tmp_path / "checkpoint.pt", BEGINS + 2)
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    del state["mean"]
+    torch.save(state, tmp_path / "checkpoint.pt")
+    trainer = Trainer(CONFIG, before.scene)
+    trainer.load_checkpoint(tmp_path / "checkpoint.pt")
+    assert trainer.kept_model is trainer.model
+    trainer.step()
+    for mean, last in zip(_parameters(trainer.kept_model), _parameters(trainer.model), strict=True):
+        np.testing.assert_array_equal(mean, last)
+
+
+@pytest.mark.parametrize("last", ["still", "windows", "density control"])
+def test_it_begins_when_gaussians_and_motions_stay_what_they_are(last: str) -> None:
+    ends = {"still": 0.25, "windows": 0.25, "density control": 0.25, last: 0.5}
+    config = replace(
+        CONFIG,
+        warmup_fraction=ends["still"],
+        window_until_fraction=ends["windows"],
+        densify_until_fraction=ends["density control"],
+    )
+    assert [step for step in range(1, STEPS + 1) if config.averages_after(step)] == list(range(13, STEPS + 1))
+    assert not any(replace(config, average_steps=0).averages_after(step) for step in range(1, STEPS + 1))

@@ -10,14 +10,14 @@ import torch
 
 from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import load_scene
-from msdgs_train.fit import Observer, fit
+from msdgs_train.fit import fit
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians
 from msdgs_train.optimizers import make_optimizer
 from msdgs_train.relocation import MOST_SHARES, Relocation, share
-from msdgs_train.trainer import StepResult, Trainer
+from msdgs_train.trainer import Trainer
 from tests.tolerances import assert_close
-from tests.training_scene import small_config, write_scene
+from tests.training_scene import StopAfter, small_config, write_scene
 
 OPACITIES = (0.005, 0.1, 0.5, 0.9, 0.999)
 SHARES = (1, 2, 3, 7, 20, 51)
@@ -183,21 +183,10 @@ def test_training_keeps_to_the_budget_at_every_step(data: Path) -> None:
     assert trainer.skipped == 0
 
 
-class _StopAfter(Observer):
-    def __init__(self, step: int) -> None:
-        self.last, self.limit = 0, step
-
-    def step(self, result: StepResult, seconds: float) -> None:
-        self.last = result.step
-
-    def should_stop(self) -> bool:
-        return self.last >= self.limit
-
-
 def test_resuming_changes_no_bit(data: Path, tmp_path: Path) -> None:
     config = small_config(densify_strategy="mcmc", eval_every=0)
     fit(config, data, tmp_path / "whole")
-    fit(config, data, tmp_path / "parts", observer=_StopAfter(11))
+    fit(config, data, tmp_path / "parts", observer=StopAfter(11))
     fit(config, data, tmp_path / "parts", resume=True)
     one, other = (torch.load(tmp_path / run / "checkpoint.pt", weights_only=True) for run in ("whole", "parts"))
     assert len(one["model"]["gaussians.means"]) > config.init_count

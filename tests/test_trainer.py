@@ -4,7 +4,6 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ from msdgs_train.optimizers import exponential, learning_rates
 from msdgs_train.report import MetricsLog, read_metrics
 from msdgs_train.trainer import StepResult, Trainer, TrainingDiverged
 from tests.tolerances import tolerance
-from tests.training_scene import SHARED_MOTIONS, SIZE, small_config, write_scene
+from tests.training_scene import SHARED_MOTIONS, SIZE, StopAfter, assert_same_bits, small_config, state_of, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -60,50 +59,15 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     _steps(trainer, 3)
 
 
-class _StopAfter(Observer):
-    def __init__(self, step: int) -> None:
-        self.last, self.limit = 0, step
-
-    def step(self, result, seconds) -> None:
-        self.last = result.step
-
-    def should_stop(self) -> bool:
-        return self.last >= self.limit
-
-
-def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    if isinstance(tree, dict):
-        items = list(tree.items())
-    elif isinstance(tree, list | tuple):
-        items = list(enumerate(tree))
-    else:
-        return {prefix: tree}
-    return {name: value for key, child in items for name, value in _flat(child, f"{prefix}/{key}").items()}
-
-
-def _state(run: Path) -> dict[str, Any]:
-    state = _flat(torch.load(run / "checkpoint.pt", weights_only=True))
-    return {name: value for name, value in state.items() if name != "/seconds"}
-
-
-def _assert_same_bits(one: dict[str, Any], other: dict[str, Any]) -> None:
-    assert one.keys() == other.keys()
-    for name, value in one.items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, other[name]), name
-        else:
-            assert value == other[name], name
-
-
 @pytest.mark.usefixtures("_no_curve")
 @pytest.mark.parametrize("stop", [8, 13])
 def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
     """Stopped in the first and in the second window."""
     config = small_config(model=SHARED_MOTIONS, window_starts=(0.03, 0.2))
     fit(config, data, tmp_path / "whole")
-    fit(config, data, tmp_path / "parts", observer=_StopAfter(stop))
+    fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
     fit(config, data, tmp_path / "parts", resume=True)
-    _assert_same_bits(*(_state(tmp_path / name) for name in ("whole", "parts")))
+    assert_same_bits(*(state_of(tmp_path / name) for name in ("whole", "parts")))
 
 
 @pytest.mark.usefixtures("_no_curve")
@@ -113,13 +77,13 @@ def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, backgrou
     """Stopped in the warm-up, between and after densifications, in the middle of a pass over the photographs."""
     config = small_config(background=background)
     fit(config, data, tmp_path / "whole")
-    outcome = fit(config, data, tmp_path / "parts", observer=_StopAfter(stop))
+    outcome = fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
     assert (outcome.status, outcome.step, outcome.qualities) == ("interrupted", stop, {})
     torch.manual_seed(stop)
     assert fit(config, data, tmp_path / "parts", resume=True).status == "finished"
-    whole, parts = (_state(tmp_path / name) for name in ("whole", "parts"))
+    whole, parts = (state_of(tmp_path / name) for name in ("whole", "parts"))
     assert len(whole["/density/0"]) != config.init_count, "density control should have taken part"
-    _assert_same_bits(whole, parts)
+    assert_same_bits(whole, parts)
     lines = [[{**line, "seconds": 0} for line in read_metrics(tmp_path / name)] for name in ("whole", "parts")]
     assert lines[0] == lines[1]
 

@@ -6,14 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
 from msdgs_train.config import TrainConfig
 from msdgs_train.datasets.images import write_png
+from msdgs_train.fit import Observer
 from msdgs_train.model import ModelConfig
 from msdgs_train.report import to_bytes
+from msdgs_train.trainer import StepResult
 from tests.scenes import gaussians_of
 
 SIZE = 24
@@ -36,6 +39,44 @@ def small_config(**changes: Any) -> TrainConfig:
         "densify_gradient": 1e-5, "opacity_reset_every": 9, "log_every": 1, "eval_every": 10, "checkpoint_every": 0,
     }  # fmt: skip
     return TrainConfig(**{**values, **changes})
+
+
+class StopAfter(Observer):
+    """Ends a run as Ctrl-C does."""
+
+    def __init__(self, step: int) -> None:
+        self.last, self.limit = 0, step
+
+    def step(self, result: StepResult, seconds: float) -> None:
+        self.last = result.step
+
+    def should_stop(self) -> bool:
+        return self.last >= self.limit
+
+
+def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    if isinstance(tree, dict):
+        items = list(tree.items())
+    elif isinstance(tree, list | tuple):
+        items = list(enumerate(tree))
+    else:
+        return {prefix: tree}
+    return {name: value for key, child in items for name, value in _flat(child, f"{prefix}/{key}").items()}
+
+
+def state_of(run: Path) -> dict[str, Any]:
+    """All that is in its checkpoint but the seconds, by place."""
+    state = _flat(torch.load(run / "checkpoint.pt", weights_only=True))
+    return {name: value for name, value in state.items() if name != "/seconds"}
+
+
+def assert_same_bits(one: dict[str, Any], other: dict[str, Any]) -> None:
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, other[name]), name
+        else:
+            assert value == other[name], name
 
 
 def write_scene(folder: Path, *, train: int = 7, test: int = 2) -> Path:
