@@ -10,11 +10,11 @@ from msdgs_serve import __version__
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.basis_layer import BasisLayer
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.layers import MLPLayer
-from msdgs_train.model import DynamicGaussians, carried, unit_quats
-from msdgs_train.plane_layer import PlaneLayer
+from msdgs_train.gaussians.model import DynamicGaussians, carried, unit_quats
+from msdgs_train.gaussians.model_file import SceneInfo
+from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.layers.plane import PlaneLayer
+from msdgs_train.supports.nodes import BasisLayer
 
 STARTING_CAMERAS = 8
 """Cameras kept in a scene file, evenly spread over those of the training."""

@@ -6,8 +6,8 @@ from onnx import TensorProto
 from export.bake import Moving
 from export.graph import GraphBuilder, to_numpy
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.basis_kernels import LEAST_STRETCH
-from msdgs_train.basis_layer import BasisLayer
+from msdgs_train.supports.nodes import BasisLayer
+from msdgs_train.supports.skinning_kernels import LEAST_STRETCH
 
 KNOTS = 4
 """That a time reads."""

@@ -23,8 +23,8 @@ from export.trim import RULES
 from export.work_precision import Sweep
 from export.write import Exported, write_scene
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.checkpoint import load_model
-from msdgs_train.metrics import MAX_PSNR
+from msdgs_train.evaluation.metrics import MAX_PSNR
+from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:
     from export.photographs import Photographs

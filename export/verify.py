@@ -12,7 +12,7 @@ from export.precision.gap import PosedArrays, half_diagonal, largest_error, pose
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 
 TOLERANCE = 1e-4
 TIMES = 50

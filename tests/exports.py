@@ -9,7 +9,7 @@ from export.plans import build
 from export.precision.assess import assess
 from export.verify import TIMES, TOLERANCE
 from export.write import PLAN, Exported, write_scene
-from msdgs_train.checkpoint import load_model
+from msdgs_train.gaussians.model_file import load_model
 
 STABILITY_TIMES = 8
 

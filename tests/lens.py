@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_train.datasets import Frame
-from msdgs_train.datasets.distortion import distorted
+from msdgs_train.datasets.common.distortion import distorted
 
 SIGMA = 2.0  # of a dot, in pixels
 WINDOW = 9

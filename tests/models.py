@@ -4,9 +4,9 @@ from typing import Any
 
 import torch
 
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.model_file import SceneInfo
 
 torch.set_num_threads(1)
 """The tests themselves run side by side, and OpenMP threads that wait for a core spin."""

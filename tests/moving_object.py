@@ -4,9 +4,9 @@ from typing import Any
 
 import torch
 
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.layers import MLPLayer
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.mlp import MLPLayer
 from tests.models import small_config
 
 GROUND, OBJECT = 200, 40

@@ -22,10 +22,10 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.checkpoint import SceneInfo, load_model, save_model
-from msdgs_train.layers import PositionalEncoding, octaves
-from msdgs_train.model import Domain, DynamicGaussians
-from msdgs_train.rasterization import rasterize as rasterize_for_training
+from msdgs_train.gaussians.model import Domain, DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
+from msdgs_train.layers.mlp import PositionalEncoding, octaves
+from msdgs_train.rendering.rasterize import rasterize as rasterize_for_training
 from tests.exports import export_scene
 from tests.models import CAMERA, SCENE, random_model
 from tests.scene_files import write_scene

@@ -12,7 +12,7 @@ from export.precision.formats import FLOAT32, in_format
 from export.precision.frames import View, image_gap, in_picture
 from export.precision.gap import pose_arrays
 from export.precision.stability_report import StabilityReport
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 from tests.models import SCENE, random_model
 from tests.stability_rows import Row, measured, refused
 from tests.tolerances import tolerance

@@ -9,9 +9,9 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.basis_kernels import FOLLOWED, LEAST_STRETCH
-from msdgs_train.basis_layer import BasisLayer, Carried, cubic_weights, product, rotation_matrices
-from msdgs_train.model_config import ModelConfig
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.supports.nodes import BasisLayer, Carried, cubic_weights, product, rotation_matrices
+from msdgs_train.supports.skinning_kernels import FOLLOWED, LEAST_STRETCH
 from tests.models import random_model
 from tests.tolerances import tolerance
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from msdgs_train.checkpoint import CheckpointInvalid, load, load_model, save_atomic, save_model
+from msdgs_train.gaussians.model_file import CheckpointInvalid, load, load_model, save_atomic, save_model
 from tests.models import SCENE, random_model
 
 

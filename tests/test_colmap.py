@@ -13,7 +13,7 @@ import pytest
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
-from msdgs_train.datasets.images import write_png
+from msdgs_train.datasets.common.images import write_png
 from tests.lens import Lens, centroids, frame_pixels, photograph_of_dots
 from tests.tolerances import assert_close
 

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train import cli
+from msdgs_train.cli import main as cli
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 from msdgs_train.comparison.pools import Ended, processes
 from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
 from msdgs_train.comparison.results import CurvePoint, Result, Spread
 from msdgs_train.comparison.runner import train_all
-from msdgs_train.presets import preset
+from msdgs_train.systems.presets import preset
 from tests.training_scene import write_scene
 
 BUDGET = Budget(steps=6, init_count=60, max_gaussians=90)

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from msdgs_serve.scene import InvalidInput
-from msdgs_train import trainer as trainer_module
-from msdgs_train.basis_layer import BasisLayer
-from msdgs_train.config import TrainConfig
-from msdgs_train.curriculum import MIDDLE, NEW, Curriculum, Lesson
 from msdgs_train.datasets import SceneData, load_scene
-from msdgs_train.trainer import AHEAD, Trainer
+from msdgs_train.engine import trainer as trainer_module
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.curriculum import MIDDLE, NEW, Curriculum, Lesson
+from msdgs_train.engine.trainer import AHEAD, Trainer
+from msdgs_train.supports.nodes import BasisLayer
 from tests.training_scene import SHARED_MOTIONS, small_config, write_scene
 
 

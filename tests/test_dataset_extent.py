@@ -5,7 +5,7 @@ import pytest
 
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import look_at
-from msdgs_train.datasets.extent import half_extent
+from msdgs_train.datasets.common.extent import half_extent
 from tests.tolerances import assert_close
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,7 +7,7 @@ import OpenImageIO as oiio
 import pytest
 
 from msdgs_train.datasets import composite
-from msdgs_train.datasets.images import read_rgba, read_size, resize_area, write_png
+from msdgs_train.datasets.common.images import read_rgba, read_size, resize_area, write_png
 from tests.tolerances import assert_close
 
 

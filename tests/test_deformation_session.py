@@ -14,8 +14,8 @@ from export.bake import bake
 from export.plans import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo
 from tests.models import random_model
 from tests.scene_files import write_scene
 from tests.tolerances import tolerance

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 import torch
 
-from msdgs_train.config import TrainConfig
-from msdgs_train.densification import SPLIT_SHRINK, DensityControl, rotate
-from msdgs_train.model import DynamicGaussians
-from msdgs_train.optimizers import make_optimizer
+from msdgs_train.density.gradient import SPLIT_SHRINK, DensityControl, rotate
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.optimizer import make_optimizer
+from msdgs_train.gaussians.model import DynamicGaussians
 from tests.training_scene import small_config
 
 EXTENT = 4.0
@@ -17,7 +17,7 @@ EXTENT = 4.0
 
 def _setup(count: int = 6, **changes: Any) -> tuple[DynamicGaussians, torch.optim.Adam, DensityControl]:
     """Gaussians of scale 0.001 (to be cloned) and moments that tell the rows apart."""
-    from msdgs_train.gaussians import CanonicalGaussians
+    from msdgs_train.gaussians.canonical import CanonicalGaussians
 
     config: TrainConfig = small_config(init_count=count, max_gaussians=100, densify_gradient=0.5, **changes)
     gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, config.model.embedding_size, 0)

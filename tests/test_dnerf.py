@@ -13,7 +13,7 @@ import pytest
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
-from msdgs_train.datasets.images import write_png
+from msdgs_train.datasets.common.images import write_png
 from tests.tolerances import assert_close
 
 ANGLE = 0.6911112070083618

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from msdgs_serve.scene import Camera, Gaussians
-from msdgs_train.checkpoint import save_model
-from msdgs_train.rasterization import rasterize
+from msdgs_train.gaussians.model_file import save_model
+from msdgs_train.rendering.rasterize import rasterize
 from tests.exports import export_scene
 from tests.images import decode, linear_to_srgb
 from tests.models import CAMERA, SCENE, random_model

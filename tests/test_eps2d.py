@@ -16,13 +16,13 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_train.checkpoint import LoadedModel, load_model, save_model
 from msdgs_train.datasets import Frame, load_scene
-from msdgs_train.evaluation import JudgedModel
-from msdgs_train.report import to_bytes
-from msdgs_train.snapshot import snapshot_of_file
-from msdgs_train.steps import camera_of, render_steps
-from msdgs_train.trainer import Trainer
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.evaluation.evaluate import JudgedModel
+from msdgs_train.evaluation.layer_strip import camera_of, render_steps
+from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
+from msdgs_train.viewer.snapshot import snapshot_of_file
 from tests.exports import export_scene
 from tests.models import CAMERA, SCENE, random_model, small_config
 from tests.tolerances import tolerance

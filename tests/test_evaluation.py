@@ -16,20 +16,21 @@ from scipy.ndimage import correlate1d
 from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
-from msdgs_train import cli, evaluation_report
-from msdgs_train import evaluation as evaluation_module
-from msdgs_train import fit as fit_module
-from msdgs_train.checkpoint import load_model
+from msdgs_train.cli import main as cli
 from msdgs_train.datasets import Frame, load_scene
-from msdgs_train.datasets.images import write_png
-from msdgs_train.evaluation import evaluate_run
-from msdgs_train.fit import fit
-from msdgs_train.metrics import masked_psnr
-from msdgs_train.model import PosedGaussians
-from msdgs_train.moving_region import _identity, moving_region, travels
-from msdgs_train.perceptual import perceptual_metrics
-from msdgs_train.report import read_metrics, to_bytes
-from msdgs_train.sheets import CAPTION, HEADER
+from msdgs_train.datasets.common.images import write_png
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine.metrics_log import read_metrics, to_bytes
+from msdgs_train.engine.run import fit
+from msdgs_train.evaluation import evaluate as evaluation_module
+from msdgs_train.evaluation import report as evaluation_report
+from msdgs_train.evaluation.evaluate import evaluate_run
+from msdgs_train.evaluation.metrics import masked_psnr
+from msdgs_train.evaluation.moving_region import _identity, moving_region, travels
+from msdgs_train.evaluation.perceptual import perceptual_metrics
+from msdgs_train.evaluation.sheets import CAPTION, HEADER
+from msdgs_train.gaussians.model import PosedGaussians
+from msdgs_train.gaussians.model_file import load_model
 from tests.scenes import front_camera, gaussians_of
 from tests.tolerances import assert_close
 from tests.training_scene import SIZE, small_config, write_scene
@@ -312,7 +313,7 @@ def test_an_interrupted_evaluation_leaves_no_half_written_file(
             Path(args[1]).write_bytes(b"\x89PNG, the beginning")
         raise KeyboardInterrupt
 
-    target = "matplotlib.figure.Figure.savefig" if broken == "savefig" else f"msdgs_train.evaluation_report.{broken}"
+    target = "matplotlib.figure.Figure.savefig" if broken == "savefig" else f"msdgs_train.evaluation.report.{broken}"
     monkeypatch.setattr(target, interrupt)
     assert cli.main(["eval", str(run)]) == cli.EXIT_INTERRUPTED
     assert "interrupted" in capsys.readouterr().err

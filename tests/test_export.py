@@ -20,8 +20,8 @@ from export.verify import VerificationFailed, times_to_verify, verify
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.checkpoint import SceneInfo, save_model
-from msdgs_train.model import LOG_SCALE_LIMIT, DynamicGaussians
+from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, save_model
 from tests.exports import export_scene
 from tests.models import SCENE, random_model
 from tests.tolerances import tolerance

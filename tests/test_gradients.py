@@ -11,7 +11,7 @@ import torch
 import msdgs_serve.rasterizer
 from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions
 from msdgs_serve.scene import Camera, Gaussians
-from msdgs_train.rasterization import rasterize
+from msdgs_train.rendering.rasterize import rasterize
 from tests import reference, reference_torch
 from tests.processes import run_python
 from tests.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene, select

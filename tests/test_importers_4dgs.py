@@ -19,7 +19,7 @@ from export.to_onnx import main as to_onnx
 from export.write import properties
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.camera import orbit
-from msdgs_train.checkpoint import load_model
+from msdgs_train.gaussians.model_file import load_model
 from tests import test_importers_runs
 from tests.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.tolerances import tolerance

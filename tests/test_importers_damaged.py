@@ -28,7 +28,7 @@ from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.checkpoint import CheckpointInvalid, load_model, save_model
+from msdgs_train.gaussians.model_file import CheckpointInvalid, load_model, save_model
 from tests import test_importers_4dgs, test_importers_runs
 from tests.models import SCENE, random_model
 from tests.splat_files import (

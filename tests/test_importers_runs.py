@@ -17,8 +17,8 @@ from export.importers.runs import write_model
 from export.importers.unbent import bent
 from export.rendered_error import posed
 from msdgs_serve.scene.quaternion import to_matrix
-from msdgs_train.checkpoint import load_model
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import load_model
 from tests.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.tolerances import tolerance
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.known_motion import JUDGED_TIMES, MOVING, errors_of
 from msdgs_train.comparison.matrix import Budget, read_systems
-from msdgs_train.datasets.synthetic_motion import world_positions
-from msdgs_train.datasets.synthetic_trajectories import surface_points
+from msdgs_train.datasets.synthetic.motion import world_positions
+from msdgs_train.datasets.synthetic.trajectories import surface_points
 
 POINTS = 20
 

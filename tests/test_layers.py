@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_train.deformation import MultiStepDeformation
-from msdgs_train.heads import Heads
-from msdgs_train.layers import MLPLayer, PositionalEncoding, octaves
-from msdgs_train.modulation import Modulation
+from msdgs_train.gaussians.modulation import Modulation
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.heads import Heads
+from msdgs_train.layers.mlp import MLPLayer, PositionalEncoding, octaves
 from tests.tolerances import assert_close, tolerance
 
 PAPER_LAYER_PARAMETERS = 235_561

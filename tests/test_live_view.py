@@ -13,17 +13,17 @@ import torch
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera, Gaussians, quaternion
 from msdgs_serve.scene.camera import look_at
-from msdgs_train import cli
-from msdgs_train import fit as fit_module
-from msdgs_train.checkpoint import LoadedModel, SceneInfo, save_model
+from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
-from msdgs_train.fit import Observer, Observers, Outcome, fit
-from msdgs_train.report import to_bytes
-from msdgs_train.snapshot import Snapshot, snapshot_of_training
-from msdgs_train.stage import stage_of_data, stage_of_file
-from msdgs_train.trainer import StepResult, Trainer
-from msdgs_train.training_view import TrainingView
-from msdgs_train.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.run import Observer, Observers, Outcome, fit
+from msdgs_train.engine.trainer import StepResult, Trainer
+from msdgs_train.gaussians.model_file import LoadedModel, SceneInfo, save_model
+from msdgs_train.viewer.snapshot import Snapshot, snapshot_of_training
+from msdgs_train.viewer.stage import stage_of_data, stage_of_file
+from msdgs_train.viewer.training_view import TrainingView
+from msdgs_train.viewer.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
 from tests.models import SCENE, random_model
 from tests.tolerances import assert_close
 from tests.training_scene import FOV, small_config, write_scene

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from msdgs_train import cli
+from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
-from msdgs_train.snapshot import Snapshot
-from msdgs_train.stage import stage_of_data
-from msdgs_train.viewer import Viewer
+from msdgs_train.viewer.snapshot import Snapshot
+from msdgs_train.viewer.stage import stage_of_data
+from msdgs_train.viewer.viewer import Viewer
 from tests.browser import WEBGL, chromium
 from tests.images import decode
 from tests.models import random_model

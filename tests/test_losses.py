@@ -8,7 +8,7 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from msdgs_serve.scene import InvalidInput
-from msdgs_train.losses import EVEN, RADIUS, blocks_loss, photometric_loss, ssim, still_loss
+from msdgs_train.losses.photometric import EVEN, RADIUS, blocks_loss, photometric_loss, ssim, still_loss
 from tests.tolerances import assert_close, tolerance
 
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_train import fit as fit_module
-from msdgs_train.checkpoint import LoadedModel, load_model
-from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import load_scene
-from msdgs_train.fit import fit
-from msdgs_train.report import to_bytes
-from msdgs_train.snapshot import snapshot_of_training
-from msdgs_train.trainer import Trainer
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.run import fit
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
+from msdgs_train.viewer.snapshot import snapshot_of_training
 from tests.training_scene import SHARED_MOTIONS, StopAfter, assert_same_bits, small_config, state_of, write_scene
 
 STEPS, BEGINS, KEPT = 24, 18, 3

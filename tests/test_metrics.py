@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
-from msdgs_train.metrics import MAX_PSNR, Quality, mean_quality, psnr, quality
+from msdgs_train.evaluation.metrics import MAX_PSNR, Quality, mean_quality, psnr, quality
 from tests.tolerances import assert_close
 
 

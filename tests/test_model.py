@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians import CanonicalGaussians, neighbour_distances
-from msdgs_train.model import SMALLEST_SCALE, DynamicGaussians, ModelConfig, unit_quats
+from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbour_distances
+from msdgs_train.gaussians.model import SMALLEST_SCALE, DynamicGaussians, ModelConfig, unit_quats
 from tests.models import random_model, small_config
 from tests.tolerances import assert_close
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians import neighbour_distances
+from msdgs_train.gaussians.canonical import neighbour_distances
 
 
 @pytest.mark.parametrize("n", [0, 1])

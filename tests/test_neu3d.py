@@ -11,8 +11,9 @@ import pytest
 from av.video.reformatter import Interpolation
 
 from msdgs_serve.scene import InvalidInput
-from msdgs_train.datasets import DatasetInvalid, load_scene, video
-from msdgs_train.datasets.images import resize_area, write_png
+from msdgs_train.datasets import DatasetInvalid, load_scene
+from msdgs_train.datasets.common import video
+from msdgs_train.datasets.common.images import resize_area, write_png
 from tests.lens import frame_pixels
 from tests.tolerances import assert_close, tolerance
 

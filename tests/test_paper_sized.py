@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks.paper_sized import grown, main, split
-from msdgs_train.checkpoint import load_model, save_model
+from msdgs_train.gaussians.model_file import load_model, save_model
 from tests.models import SCENE, random_model
 from tests.tolerances import assert_close
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from msdgs_train.heads import Heads
-from msdgs_train.plane_layer import PlaneGrid, PlaneLayer
+from msdgs_train.layers.heads import Heads
+from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
 
 def layer(dtype: torch.dtype = torch.float64, scales: tuple[int, ...] = (1,)) -> PlaneLayer:

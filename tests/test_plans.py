@@ -15,7 +15,7 @@ from export.plans import Plan, Trajectories, build, parse
 from export.verify import VerificationFailed, times_to_verify, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 from tests.models import SCENE, random_model
 from tests.tolerances import tolerance
 

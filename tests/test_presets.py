@@ -10,13 +10,13 @@ import torch
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli import PresetName
-from msdgs_train.config import TrainConfig
+from msdgs_train.cli.main import PresetName
 from msdgs_train.datasets import load_scene
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import DynamicGaussians, ModelConfig
-from msdgs_train.presets import DEFAULT, PRESETS, preset
-from msdgs_train.trainer import Trainer
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.systems.presets import DEFAULT, PRESETS, preset
 from tests.exports import export_scene
 from tests.tolerances import tolerance
 from tests.training_scene import write_scene

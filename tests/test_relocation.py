@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import load_scene
-from msdgs_train.fit import fit
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import DynamicGaussians
-from msdgs_train.optimizers import make_optimizer
-from msdgs_train.relocation import MOST_SHARES, Relocation, share
-from msdgs_train.trainer import Trainer
+from msdgs_train.density.mcmc import MOST_SHARES, Relocation, share
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.optimizer import make_optimizer
+from msdgs_train.engine.run import fit
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 from tests.tolerances import assert_close
 from tests.training_scene import StopAfter, small_config, write_scene
 

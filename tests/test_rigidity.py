@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from msdgs_train.densification import rotate
-from msdgs_train.rigidity import stretch
+from msdgs_train.density.gradient import rotate
+from msdgs_train.losses.rigidity import stretch
 
 
 def cloud(n: int = 200, scale: float = 1.0) -> Tensor:

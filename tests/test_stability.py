@@ -16,10 +16,10 @@ from export.precision.frames import View, image_gap
 from export.precision.gap import pose_arrays
 from export.precision.stability_report import PlanUnsafe
 from export.stability import UNSTEADY, main
-from msdgs_train.checkpoint import save_model
-from msdgs_train.deformation import MultiStepDeformation
-from msdgs_train.layers import LayerStep
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import save_model
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.mlp import LayerStep
 from tests import stability_extreme, stability_stiff
 from tests.exports import export_scene
 from tests.models import SCENE, random_model

@@ -9,11 +9,11 @@ import pytest
 
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
-from msdgs_train import cli
-from msdgs_train.checkpoint import CheckpointInvalid, save_model
-from msdgs_train.report import to_bytes
-from msdgs_train.sheets import Panel, draw_sheet, panel_corners, sheet_size
-from msdgs_train.steps import write_steps
+from msdgs_train.cli import main as cli
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.evaluation.layer_strip import write_steps
+from msdgs_train.evaluation.sheets import Panel, draw_sheet, panel_corners, sheet_size
+from msdgs_train.gaussians.model_file import CheckpointInvalid, save_model
 from tests.models import CAMERA, SCENE, random_model
 
 WIDTH, HEIGHT = 320, 240

@@ -12,11 +12,11 @@ import pytest
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, load_scene
-from msdgs_train.datasets.synthetic import generate
-from msdgs_train.datasets.synthetic_motion import GROUND_Z, OBJECTS, motion_at, world_positions
-from msdgs_train.datasets.synthetic_rendering import first_hits
-from msdgs_train.datasets.synthetic_shapes import distance_at_rest
-from msdgs_train.datasets.synthetic_trajectories import surface_colors, surface_points
+from msdgs_train.datasets.synthetic.generate import generate
+from msdgs_train.datasets.synthetic.motion import GROUND_Z, OBJECTS, motion_at, world_positions
+from msdgs_train.datasets.synthetic.rendering import first_hits
+from msdgs_train.datasets.synthetic.shapes import distance_at_rest
+from msdgs_train.datasets.synthetic.trajectories import surface_colors, surface_points
 from tests.tolerances import assert_close, tolerance
 
 STILL, MOVING = ("ground", "frame"), ("ball", "ring", "jelly", "pendulum")

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from msdgs_train import cli
-from msdgs_train import fit as fit_module
-from msdgs_train.fit import RENDERS_WHILE_TRAINING, Observer, fit
-from msdgs_train.report import read_metrics
-from msdgs_train.tensorboard_events import EVAL_SCALARS, FOLDER, TRAIN_SCALARS
-from msdgs_train.trainer import StepResult
+from msdgs_train.cli import main as cli
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine.metrics_log import read_metrics
+from msdgs_train.engine.run import RENDERS_WHILE_TRAINING, Observer, fit
+from msdgs_train.engine.tensorboard_events import EVAL_SCALARS, FOLDER, TRAIN_SCALARS
+from msdgs_train.engine.trainer import StepResult
 from tests.tolerances import tolerance
 from tests.training_scene import SIZE, small_config, write_scene
 

@@ -12,7 +12,7 @@ from typing import get_args
 import pytest
 import torch
 
-from msdgs_train import cli
+from msdgs_train.cli import main as cli
 from tests.training_scene import write_scene
 
 SMALL = [
@@ -54,7 +54,7 @@ def test_wrong_input_is_one_line_and_code_2(data: Path, tmp_path: Path, capsys: 
 def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
     """Ctrl-C ends the step, saves, says how to go on; going on takes the settings from the run."""
     run = tmp_path / "run"
-    command = [sys.executable, "-m", "msdgs_train.cli", "fit", str(data), str(run)]
+    command = [sys.executable, "-m", "msdgs_train.cli.main", "fit", str(data), str(run)]
     process = subprocess.Popen(
         [*command, "--steps", "100000", *SMALL], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=_env()
     )

@@ -12,17 +12,17 @@ from torch import Tensor
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_train import fit as fit_module
-from msdgs_train import trainer as trainer_module
-from msdgs_train.checkpoint import load_model
-from msdgs_train.config import TrainConfig
-from msdgs_train.curriculum import Lesson
 from msdgs_train.datasets import load_scene
-from msdgs_train.fit import Observer, fit
-from msdgs_train.model import ModelConfig
-from msdgs_train.optimizers import exponential, learning_rates
-from msdgs_train.report import MetricsLog, read_metrics
-from msdgs_train.trainer import StepResult, Trainer, TrainingDiverged
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine import trainer as trainer_module
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.curriculum import Lesson
+from msdgs_train.engine.metrics_log import MetricsLog, read_metrics
+from msdgs_train.engine.optimizer import exponential, learning_rates
+from msdgs_train.engine.run import Observer, fit
+from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
+from msdgs_train.gaussians.model import ModelConfig
+from msdgs_train.gaussians.model_file import load_model
 from tests.tolerances import tolerance
 from tests.training_scene import SHARED_MOTIONS, SIZE, StopAfter, assert_same_bits, small_config, state_of, write_scene
 
@@ -110,7 +110,7 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
 
 
 def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
-    from msdgs_train.metrics import quality
+    from msdgs_train.evaluation.metrics import quality
 
     trainer = Trainer(small_config(), load_scene(data))
     _steps(trainer, 24)

@@ -16,8 +16,8 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.camera import Camera
-from msdgs_train.checkpoint import SceneInfo, save_model
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, save_model
 from tests.images import psnr
 from tests.models import CAMERA, SCENE, random_model
 from tests.moving_object import GROUND, OBJECT, moving_object

@@ -22,7 +22,7 @@ from export.timing import FrameTime, Milliseconds
 from export.to_onnx import main
 from export.work_precision import Sweep, SweepResult
 from msdgs_serve.deformation import DeformationSession
-from msdgs_train.checkpoint import save_model
+from msdgs_train.gaussians.model_file import save_model
 from tests.models import SCENE, random_model
 from tests.moving_object import GROUND, OBJECT, moving_object
 

@@ -11,12 +11,12 @@ import torch
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
-from msdgs_train.config import TrainConfig
-from msdgs_train.datasets.images import write_png
-from msdgs_train.fit import Observer
-from msdgs_train.model import ModelConfig
-from msdgs_train.report import to_bytes
-from msdgs_train.trainer import StepResult
+from msdgs_train.datasets.common.images import write_png
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.run import Observer
+from msdgs_train.engine.trainer import StepResult
+from msdgs_train.gaussians.model import ModelConfig
 from tests.scenes import gaussians_of
 
 SIZE = 24

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from msdgs_serve.scene import Camera, quaternion
-from msdgs_train import viewer as viewer_module
+from msdgs_train.viewer import viewer as viewer_module
 
 SECONDS = 60.0
 

@@ -8,9 +8,9 @@ import torch
 
 from export.rendered_error import ExactFrames, RenderedError, posed
 from export.views import cameras_of, deciding_views
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo
 
 TIMES = 41
 """That means are taken over."""

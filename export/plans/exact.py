@@ -7,9 +7,9 @@ import numpy.typing as npt
 import torch
 
 from export.bake import Baked
-from msdgs_train.basis_layer import Carried
-from msdgs_train.deformation import MultiStepDeformation, operations
-from msdgs_train.model import SMALLEST_SCALE, activated_scales, unit_quats
+from msdgs_train.gaussians.model import SMALLEST_SCALE, activated_scales, unit_quats
+from msdgs_train.layers.chain import MultiStepDeformation, operations
+from msdgs_train.supports.nodes import Carried
 
 POSE = 10
 """Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""

@@ -9,10 +9,10 @@ from export.basis_graph import basis_deltas
 from export.graph import GraphBuilder, to_numpy
 from export.plane_graph import plane_heads
 from export.plans.scene_graph import finished, new_graph, unit_quats
-from msdgs_train.basis_layer import BasisLayer
-from msdgs_train.layers import MLPLayer
-from msdgs_train.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
-from msdgs_train.plane_layer import PlaneLayer
+from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
+from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.layers.plane import PlaneLayer
+from msdgs_train.supports.nodes import BasisLayer
 
 DELTAS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
 """Columns of the heads, in the order of `Heads.sizes`, whose last column, if there is one, is the weight."""

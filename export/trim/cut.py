@@ -10,11 +10,11 @@ import torch
 from export.rendered_error import as_gaussians
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.deformation import MultiStepDeformation
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.layers import MLPLayer
-from msdgs_train.model import DynamicGaussians
-from msdgs_train.plane_layer import PlaneLayer
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.layers.plane import PlaneLayer
 
 HEADS = ("means", "scales", "quats")
 """What the heads of a layer change, in the order of their columns."""

@@ -8,9 +8,9 @@ from export.trim.cut import Cut, TrimmedModel, trimmed, whole
 from export.trim.evidence import Evidence
 from export.trim.rules import RULES
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.basis_kernels import FOLLOWED
-from msdgs_train.basis_layer import BasisLayer
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.supports.nodes import BasisLayer
+from msdgs_train.supports.skinning_kernels import FOLLOWED
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12
