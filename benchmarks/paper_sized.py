@@ -24,9 +24,9 @@ from scipy.interpolate import BSpline
 from torch import Tensor, nn
 from torch.nn import functional
 
-from export.plans.splines import fitting
-from export.rendered_error import posed, shown
-from export.views import cameras_of, deciding_views
+from export.measure.rendered_error import posed, shown
+from export.measure.views import cameras_of, deciding_views
+from export.trajectories.splines import fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.checkpoint import SceneInfo, load, load_model, save_atomic, save_model
 from msdgs_train.densification import rotate
