@@ -24,9 +24,9 @@ from scipy.interpolate import BSpline
 from torch import Tensor, nn
 from torch.nn import functional
 
-from export.plans.splines import fitting
-from export.rendered_error import posed, shown
-from export.views import cameras_of, deciding_views
+from export.measure.rendered_error import posed, shown
+from export.measure.views import cameras_of, deciding_views
+from export.trajectories.splines import fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.density.gradient import rotate
 from msdgs_train.evaluation.layer_strip import camera_of

@@ -72,7 +72,7 @@ def _report(
     if not 0 < max_error < 100:
         raise InvalidInput("max_error", "between 0 and 100 dB", max_error)
     with errors.status("loading torch and the kernels"):
-        from export.precision.assess import assess  # heavy: seconds, so not before --help
+        from export.measure.stability import assess  # heavy: seconds, so not before --help
         from export.precision.formats import FORMATS
         from export.precision.show import draw, print_report, write_json
         from msdgs_train.gaussians.model_file import load_model

@@ -10,10 +10,10 @@ import numpy as np
 import onnx
 from onnx import helper
 
-from export.bake import Baked, Moving
-from export.importers.splats import Splats
-from export.plans import build
-from export.write import properties
+from export.importers.splats.base import Splats
+from export.jobs.bake import Baked, Moving
+from export.jobs.write import properties
+from export.plans.registry import build
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata

@@ -7,8 +7,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from export.bake import Baked
-from export.graph import GraphBuilder
+from export.jobs.bake import Baked
+from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.gaussians.model import SMALLEST_SCALE

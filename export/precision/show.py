@@ -8,8 +8,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
 
-from export.precision.amplification import UNIT_ROUNDOFF
-from export.precision.stability_report import StabilityReport
+from export.measure.amplification import UNIT_ROUNDOFF
+from export.precision.report import StabilityReport
 from msdgs_train.engine.files import replacing, write_text
 from msdgs_train.evaluation.metrics import MAX_PSNR
 

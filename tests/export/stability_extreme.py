@@ -13,11 +13,11 @@ import numpy as np
 import onnx
 import torch
 
-from export.bake import bake
-from export.plans import build
+from export.jobs.bake import bake
+from export.measure.frames import View, image_gap, in_picture
+from export.measure.gap import half_diagonal, largest_error, pose_arrays, pose_errors
+from export.plans.registry import build
 from export.precision.formats import FLOAT32, in_format
-from export.precision.frames import View, image_gap, in_picture
-from export.precision.gap import half_diagonal, largest_error, pose_arrays, pose_errors
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
@@ -55,8 +55,8 @@ def exported(model: DynamicGaussians, scene: SceneInfo = SCENE) -> DeformationSe
 
 
 def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: DeformationSession | None = None) -> float:
-    """Largest error of the file's poses against the model in float64, at both ends and between, as `export.verify`
-    measures it."""
+    """Largest error of the file's poses against the model in float64, at both ends and between, as
+    `export.measure.verify` measures it."""
     session = session or exported(model, scene)
     double, worst = in_format(model, FLOAT32).double(), 0.0
     for t in (scene.time_range[0], sum(scene.time_range) / 2, scene.time_range[1]):

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from export.precision.amplification import growth
-from export.precision.assess import assess
+from export.measure.amplification import growth
+from export.measure.frames import View, image_gap, in_picture
+from export.measure.gap import pose_arrays
+from export.measure.stability import assess
 from export.precision.formats import FLOAT32, in_format
-from export.precision.frames import View, image_gap, in_picture
-from export.precision.gap import pose_arrays
-from export.precision.stability_report import StabilityReport
+from export.precision.report import StabilityReport
 from msdgs_train.gaussians.model import DynamicGaussians
 from tests.export.stability_rows import Row, measured, refused
 from tests.support.models import SCENE, random_model

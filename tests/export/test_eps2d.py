@@ -9,9 +9,9 @@ import pytest
 import torch
 from onnx import helper
 
-from export.job import Job
-from export.rendered_error import ExactFrames, posed, shown
-from export.views import View
+from export.jobs.job import Job
+from export.measure.rendered_error import ExactFrames, posed, shown
+from export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.renderer import Renderer

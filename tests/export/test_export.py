@@ -13,10 +13,10 @@ import onnxruntime as ort
 import pytest
 import torch
 
-from export.bake import ModelNotExportable, bake, starting_cameras
-from export.plans import build
+from export.jobs.bake import ModelNotExportable, bake, starting_cameras
+from export.measure.verify import VerificationFailed, times_to_verify, verify
+from export.plans.registry import build
 from export.to_onnx import main
-from export.verify import VerificationFailed, times_to_verify, verify
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError

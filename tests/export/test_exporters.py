@@ -14,7 +14,6 @@ from onnx import TensorProto, helper, numpy_helper
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from export.bake import bake
 from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
 from export.exporters.gltf import EXTENSION, read_gltf
 from export.exporters.proof import ConversionFailed, visionary_of
@@ -23,7 +22,8 @@ from export.exporters.visionary import visionary_model
 from export.exporters.visionary_rules import VisionaryInvalid, check_visionary
 from export.importers import read_splats
 from export.importers.sequence import read_sequence, sequence_scene
-from export.plans import build
+from export.jobs.bake import bake
+from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput

@@ -12,7 +12,7 @@ import pytest
 
 from export.exporters.spz import write_spz
 from export.importers import ImportFailed, read_splats, recognise
-from export.importers.recognise import frame_files
+from export.importers.detect import frame_files
 from export.importers.scene import digest, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
 from msdgs_serve.deformation import DeformationSession

@@ -12,11 +12,12 @@ import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor
 
-from export.importers import ImportFailed, fourdgs, recognise
+from export.importers import ImportFailed, recognise
 from export.importers.command import model_or_import
-from export.importers.runs import write_model
+from export.importers.runs import fourdgs
+from export.importers.runs.model import write_model
+from export.jobs.write import properties
 from export.to_onnx import main as to_onnx
-from export.write import properties
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.camera import orbit
 from msdgs_train.gaussians.model_file import load_model

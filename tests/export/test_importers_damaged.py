@@ -19,10 +19,10 @@ from rich.console import Console
 
 from export.exporters.spz import write_spz
 from export.importers import ImportFailed, read_splats
-from export.importers.runs import write_model
+from export.importers.runs.model import write_model
 from export.importers.scene import write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
-from export.rendered_error import as_gaussians
+from export.measure.rendered_error import as_gaussians
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.camera import Camera, orbit

@@ -12,10 +12,11 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from export.importers import ImportFailed, deformgs, recognise
-from export.importers.runs import write_model
-from export.importers.unbent import bent
-from export.rendered_error import posed
+from export.importers import ImportFailed, recognise
+from export.importers.runs import deformgs
+from export.importers.runs.fidelity import bent
+from export.importers.runs.model import write_model
+from export.measure.rendered_error import posed
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import load_model

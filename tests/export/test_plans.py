@@ -10,9 +10,10 @@ import numpy as np
 import onnx
 import pytest
 
-from export.bake import Baked, bake
-from export.plans import Plan, Trajectories, build, parse
-from export.verify import VerificationFailed, times_to_verify, verify
+from export.jobs.bake import Baked, bake
+from export.measure.verify import VerificationFailed, times_to_verify, verify
+from export.plans.registry import Plan, build, parse
+from export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians

@@ -8,14 +8,13 @@ import pytest
 import torch
 from scipy.interpolate import BSpline
 
-from export.bake import Baked, bake
-from export.plans import Trajectories, build
-from export.plans import trajectories as module
-from export.plans.exact import ExactPoses, pixel
-from export.plans.own_poses import fitted, own_poses
-from export.plans.single import SinglePoses
-from export.plans.splines import design, fitting, samples_for
-from export.plans.trajectories import SomeTrajectories
+from export.jobs.bake import Baked, bake
+from export.plans.registry import build
+from export.trajectories import sampling as module
+from export.trajectories.adaptive import fitted, own_poses
+from export.trajectories.poses import ExactPoses, SinglePoses, pixel
+from export.trajectories.sampling import SomeTrajectories, Trajectories
+from export.trajectories.splines import design, fitting, samples_for
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.support.models import SCENE, random_model
@@ -140,7 +139,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
         tried.extend([count] * len(ids))
         return fitted(trajectories, ids, count)
 
-    monkeypatch.setattr("export.plans.own_poses.fitted", counted)
+    monkeypatch.setattr("export.trajectories.adaptive.fitted", counted)
     again, errors_again = own_poses(SomeTrajectories(trajectories, some), np.arange(len(some)), 0.05)
     assert len(tried) == len(some)
     assert_close(errors_again, errors[some], "fitted_beside_others")

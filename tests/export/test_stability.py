@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from export.precision.amplification import growth, spectral_norm
-from export.precision.assess import assess
+from export.measure.amplification import growth, spectral_norm
+from export.measure.frames import View, image_gap
+from export.measure.gap import pose_arrays
+from export.measure.stability import assess
 from export.precision.formats import FLOAT32, FORMATS, in_format
-from export.precision.frames import View, image_gap
-from export.precision.gap import pose_arrays
-from export.precision.stability_report import PlanUnsafe
+from export.precision.report import PlanUnsafe
 from export.stability import UNSTEADY, main
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import save_model

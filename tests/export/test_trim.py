@@ -8,10 +8,10 @@ import onnx
 import pytest
 import torch
 
-from export.job import Candidate, Job
-from export.trim import RULES
-from export.views import cameras_of, deciding_views, measuring_views
-from export.write import write_scene
+from export.jobs.job import Candidate, Job
+from export.jobs.write import write_scene
+from export.measure.views import cameras_of, deciding_views, measuring_views
+from export.pruning import RULES
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
@@ -95,7 +95,7 @@ def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str)
 
 
 def test_layers_whose_trial_would_be_too_dear_stay_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("export.trim.rules.WORK", 0.0)
+    monkeypatch.setattr("export.pruning.rules.WORK", 0.0)
     trimmed = job_of(tmp_path, moving_object()).trimmed(45.0)
     left_out = {entry["rule"] for entry in trimmed.left_out}
     assert "layers" not in left_out

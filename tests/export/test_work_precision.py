@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from export.job import Job
-from export.points import DEFAULT_RASTERIZER, Look, Point, choose, front
-from export.rendered_error import RenderedError
-from export.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.timing import FrameTime, Milliseconds
+from export.jobs.job import Job
+from export.jobs.points import DEFAULT_RASTERIZER, Look, Point, choose, front
+from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
+from export.jobs.sweep import Sweep, SweepResult
+from export.measure.rendered_error import RenderedError
+from export.measure.timing import FrameTime, Milliseconds
 from export.to_onnx import main
-from export.work_precision import Sweep, SweepResult
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.gaussians.model_file import save_model
 from tests.support.models import SCENE, random_model
@@ -93,8 +93,8 @@ def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tup
 def few_candidates() -> Iterator[None]:
     """As many as the tests look at."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("export.work_precision.TRIM_STEPS", (5.0, 1.0, -5.0))
-        patch.setattr("export.work_precision.FITTED", ("keyframes:2.0",))
+        patch.setattr("export.jobs.sweep.TRIM_STEPS", (5.0, 1.0, -5.0))
+        patch.setattr("export.jobs.sweep.FITTED", ("keyframes:2.0",))
         yield
 
 
@@ -252,7 +252,7 @@ def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.Capt
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("place", ["export.command.Sweep.run", "export.command.write_scene"])
+@pytest.mark.parametrize("place", ["export.jobs.command.Sweep.run", "export.jobs.command.write_scene"])
 def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from export.bake import bake
-from export.plans import build
+from export.jobs.bake import bake
+from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_train.gaussians.model import DynamicGaussians

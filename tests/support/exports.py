@@ -4,11 +4,11 @@ import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
-from export.bake import bake
-from export.plans import build
-from export.precision.assess import assess
-from export.verify import TIMES, TOLERANCE
-from export.write import PLAN, Exported, write_scene
+from export.jobs.bake import bake
+from export.jobs.write import PLAN, Exported, write_scene
+from export.measure.stability import assess
+from export.measure.verify import TIMES, TOLERANCE
+from export.plans.registry import build
 from msdgs_train.gaussians.model_file import load_model
 
 STABILITY_TIMES = 8
