@@ -55,7 +55,7 @@ def make_strategy(config: TrainConfig, extent: float, count: int) -> DensityStra
 def reseed(
     gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, config: TrainConfig, scene_half_size: float
 ) -> None:
-    """Add `config.num_reseeded` low-opacity Gaussians, at most as many as there is room for, uniformly in the scene's cube."""
+    """Add `config.num_reseeded` low-opacity Gaussians, as far as there is room, uniformly in the scene's cube."""
     model, count = config.model, min(config.num_reseeded, config.max_gaussians - len(gaussians))
     if count <= 0:
         return

@@ -278,7 +278,7 @@ class Trainer:
 
     @torch.no_grad()
     def _move(self, shots: list[_Shot]) -> None:
-        """A step of the optimiser; the motion of frames that train motion alone moves `NEW_FRAME_LR_MULTIPLIER` times as far.
+        """A step of the optimiser; frames that train motion alone move it `NEW_FRAME_LR_MULTIPLIER` times as far.
 
         Stretches don't: what is out of its place would shrink until nothing pulls at it, before it gets there.
         """
