@@ -16,8 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.service_process import MOMENT, Connection, Running, service
-from benchmarks.service_requests import digest
+from benchmarks.service.process import MOMENT, Connection, Running, service
+from benchmarks.service.requests import digest
 from tests.scene_files import write_scene
 
 ORBIT = {"type": "orbit", "azimuth": 30, "elevation": 20}

@@ -1,8 +1,8 @@
 """What the service promises, measured: a table of bars, what was measured, and whether it is met.
 
-python benchmarks/service.py                          everything, in under 5 minutes
-python benchmarks/service.py --only load --minutes 5  one part; the load as long as one likes
-python benchmarks/service.py --list                   the parts
+python -m benchmarks.service                          everything, in under 5 minutes
+python -m benchmarks.service --only load --minutes 5  one part; the load as long as one likes
+python -m benchmarks.service --list                   the parts
 
 Times mean something on a machine that does nothing else. Clients run on the same machine and take part of it.
 """
@@ -24,15 +24,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks import service_promises as promises
-from benchmarks.service_load import Health, Tally, at_rate, overload, saturate
-from benchmarks.service_process import Connection, Running, make_scenes, service
-from benchmarks.service_requests import Offline, Wanted, digest, mixed, pictures
+from benchmarks.service import promises
+from benchmarks.service.load import Health, Tally, at_rate, overload, saturate
+from benchmarks.service.process import Connection, Running, make_scenes, service
+from benchmarks.service.requests import Offline, Wanted, digest, mixed, pictures
 from msdgs_serve.api.settings import Settings
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 CLIENTS = 32
 CATALOGUE = 96  # different requests of the mixed load
 FIRST = "first"  # of the scenes, the one that single measurements are made with

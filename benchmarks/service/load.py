@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 import uvloop
 
-from benchmarks.service_line import Line, connected
-from benchmarks.service_process import Connection, Running
-from benchmarks.service_requests import Wanted, digest
+from benchmarks.service.line import Line, connected
+from benchmarks.service.process import Connection, Running
+from benchmarks.service.requests import Wanted, digest
 
 HEALTH_PAUSE = 0.05
 MEMORY_PAUSE = 0.5

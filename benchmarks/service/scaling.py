@@ -26,9 +26,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from benchmarks.service_process import Connection, Running, service
+from benchmarks.service.process import Connection, Running, service
 from benchmarks.traffic import Fleet, Outcome, Stages, Trace, heavy_tailed, simulate_arrivals, simulate_clients
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
