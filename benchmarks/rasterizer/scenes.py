@@ -1,8 +1,13 @@
-"""Seeded scenes for the rasterizer's benchmarks: an object of radius 1 with the footprint of a trained one."""
+"""Scenes of the rasterizer's benchmarks: seeded ones with the footprint of a trained object, and files of splats."""
+
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from export.importers import read_splats
 from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene.spherical_harmonics import SH_C0
 
 MEDIAN_SCALES = {10_000: 0.010, 100_000: 0.007, 300_000: 0.005, 1_000_000: 0.0035}
 """Median standard deviation for a number of Gaussians, as part of the object's diameter."""
@@ -10,6 +15,44 @@ MEDIAN_SCALES = {10_000: 0.010, 100_000: 0.007, 300_000: 0.005, 1_000_000: 0.003
 CAMERA_ANGLE_X = 0.6911
 DISTANCE = 4.0
 SH_DEGREE = 3
+SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+"""A record of a .splat file; quaternions wxyz as 128 + 128 q."""
+
+
+class Case(NamedTuple):
+    """One frame to draw."""
+
+    name: str
+    gaussians: Gaussians
+    camera: Camera
+
+    def title(self) -> str:
+        return f"{self.name} {len(self.gaussians):,}"
+
+    def size(self) -> str:
+        return f"{self.camera.width}×{self.camera.height}"
+
+
+def seeded_cases(counts: tuple[int, ...], sizes: tuple[str, ...], seed: int) -> list[Case]:
+    """Every number of Gaussians at every size, WIDTHxHEIGHT in pixels."""
+    cameras = [object_camera(*map(int, size.split("x"))) for size in sizes]
+    return [Case("seeded", scene, camera) for scene in (object_scene(n, seed) for n in counts) for camera in cameras]
+
+
+def file_cases(files: tuple[Path, ...], width: int = 800, height: int = 800) -> list[Case]:
+    """Files that `export/to_onnx.py` reads as one set of Gaussians, each seen from outside."""
+    scenes = [(path.name, read_splats(path).gaussians) for path in files]
+    return [Case(name, gaussians, around(gaussians, width, height)) for name, gaussians in scenes]
+
+
+def write_splat(file: Path, gaussians: Gaussians) -> None:
+    """Rounded to 8 bits for color, opacity and rotation, without harmonics beyond the constant."""
+    records = np.zeros(len(gaussians), SPLAT)
+    records["means"], records["scales"] = gaussians.means, gaussians.scales
+    colors = 0.5 + SH_C0 * gaussians.sh[:, 0]
+    records["rgba"] = np.clip(np.round(255 * np.column_stack([colors, gaussians.opacities])), 0, 255)
+    records["quats"] = np.clip(np.round(gaussians.quats * 128 + 128), 0, 255)
+    records.tofile(file)
 
 
 def object_scene(count: int, seed: int = 0) -> Gaussians:
@@ -46,7 +89,7 @@ def object_camera(width: int, height: int, turn: float = 0.6) -> Camera:
 
 
 def around(gaussians: Gaussians, width: int = 800, height: int = 800) -> Camera:
-    """Along +z, so far away that nine in ten Gaussians are in a picture `CAMERA_ANGLE_X` wide."""
+    """Along +z, so far away that nine in ten Gaussians are in an image `CAMERA_ANGLE_X` wide."""
     target = np.median(gaussians.means, axis=0).astype(float)
     radius = np.quantile(np.linalg.norm(gaussians.means - target, axis=1), 0.9)
     focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)

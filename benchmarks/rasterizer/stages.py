@@ -1,60 +1,35 @@
-"""Where a frame's time goes: stages, work, memory, and the gradient, of seeded scenes or real ones, in turns."""
+"""Where a frame's time goes: stages, work, memory, and the gradient."""
 
-import time
 import tracemalloc
-from collections import defaultdict
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.pair_counts import PairCounts, count_pairs
-from benchmarks.roofline import FLOPS_A_PAIR, Machine
-from msdgs_serve.rasterizer import GSPLAT, rasterize
+from benchmarks.measuring import Times
+from benchmarks.rasterizer.roofline import FLOPS_A_PAIR, Machine
+from benchmarks.rasterizer.scenes import Case
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.rasterizer import GSPLAT, as_trained, rasterize
 from msdgs_serve.rasterizer.compositing import composite
+from msdgs_serve.rasterizer.counts import count_splats
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
-from msdgs_serve.scene import Camera, Gaussians
 
-STAGES = ("project", "bin", "composite")
-
-
-class Subject(NamedTuple):
-    """What is drawn."""
-
-    name: str
-    gaussians: Gaussians
-    camera: Camera
+STAGES = ("project", "bin", "composite", "total")
 
 
-class Times:
-    """Seconds of things that take turns, by name."""
+class Work(NamedTuple):
+    """How much there is to do in one frame, counted exactly and apart from what is timed."""
 
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._clock = clock
-        self.seconds: dict[str, list[float]] = defaultdict(list)
-
-    def add(self, name: str, seconds: float) -> None:
-        self.seconds[name].append(seconds)
-
-    def time(self, name: str, function: Callable, *arguments: Any) -> Any:
-        """What the function returns."""
-        start = self._clock()
-        result = function(*arguments)
-        self.add(name, self._clock() - start)
-        return result
-
-    def milliseconds(self) -> dict[str, dict[str, float]]:
-        """Minimum and median of each."""
-        return {
-            name: {"min": 1e3 * min(seconds), "median": 1e3 * float(np.median(seconds))}
-            for name, seconds in self.seconds.items()
-        }
+    visible: int  # splats
+    tile_entries: int  # splats in tiles
+    lanes: int  # splats in pixels of the 4 × 4 blocks that they touch and that are not done: the arithmetic
+    blended: int  # splats in pixels to which they add
 
 
-def draw_in_stages(subject: Subject, times: Times) -> None:
+def draw_in_stages(case: Case, times: Times) -> None:
     """Once as a whole, once in stages."""
-    gaussians, camera = subject.gaussians, subject.camera
+    gaussians, camera = case.gaussians, case.camera
     size, background = (camera.width, camera.height), np.zeros(3, gaussians.means.dtype)
     times.time("total", rasterize, gaussians, camera)
     splats = times.time("project", project, gaussians, camera, GSPLAT)
@@ -65,16 +40,16 @@ def draw_in_stages(subject: Subject, times: Times) -> None:
 class Gradient:
     """A frame and its gradient as training has them, through autograd."""
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, case: Case) -> None:
         import torch
 
         from msdgs_train.rasterization import rasterize as rasterize_for_training
 
-        g = subject.gaussians
+        g = case.gaussians
         arrays = (g.means, g.quats, g.scales, g.opacities, g.sh)
         self._tensors = [torch.from_numpy(array).requires_grad_() for array in arrays]
         means, quats, scales, opacities, sh = self._tensors
-        scene = (means, quats, scales, opacities, sh, subject.camera, torch.zeros(3))
+        scene = (means, quats, scales, opacities, sh, case.camera, torch.zeros(3))
         self._draw = lambda: rasterize_for_training(*scene)[:2]
         rng = torch.Generator().manual_seed(0)
         self._gradients = [torch.randn(channel.shape, generator=rng) for channel in self._draw()]
@@ -86,34 +61,36 @@ class Gradient:
         times.time("backward", self._autograd, channels, self._tensors, self._gradients)
 
 
-def work_of(subject: Subject) -> PairCounts:
-    """Counted apart from what is timed."""
-    camera = subject.camera
-    splats = project(subject.gaussians, camera, GSPLAT)
+def work_of(case: Case) -> Work:
+    """The decisions of the compositing, counted instead of blended."""
+    camera = case.camera
+    splats = project(case.gaussians, camera, GSPLAT)
     tiles = bin_into_tiles(splats, camera.width, camera.height)
-    return count_pairs(splats, tiles, camera.width, camera.height, GSPLAT)
+    counts = count_splats(splats, tiles, camera.width, camera.height, GSPLAT)
+    return Work(splats.visible, len(tiles.splat_ids), counts.lanes, int(counts.blended.sum(dtype=float)))
 
 
-def memory_of(subject: Subject) -> int:
+def memory_of(case: Case) -> int:
     """Bytes of NumPy's arrays at a frame's peak, beside the Gaussians and the frame itself; threads' scratch, some
     20 kB each, is numba's and not seen."""
-    rasterize(subject.gaussians, subject.camera)
+    rasterize(case.gaussians, case.camera)
     tracemalloc.start()
     try:
-        frame = rasterize(subject.gaussians, subject.camera)
+        frame = rasterize(case.gaussians, case.camera)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     return peak - sum(channel.nbytes for channel in frame)
 
 
-def row_of(subject: Subject, times: Times, work: PairCounts, memory: int, machine: Machine) -> dict[str, Any]:
+def row_of(case: Case, times: Times, work: Work, memory: int, machine: Machine) -> dict[str, Any]:
     """All figures of one scene and size."""
     milliseconds = times.milliseconds()
-    gaussians, camera = subject.gaussians, subject.camera
-    total, floor = milliseconds["total"]["min"], floor_of(subject, work, machine)
+    gaussians, camera = case.gaussians, case.camera
+    total, floor = milliseconds["total"]["min"], floor_of(case, work, machine)
     return {
-        "scene": subject.name,
+        "scene": case.name,
+        "title": case.title(),
         "count": len(gaussians),
         "size": [camera.width, camera.height],
         "milliseconds": milliseconds,
@@ -127,18 +104,30 @@ def row_of(subject: Subject, times: Times, work: PairCounts, memory: int, machin
     }
 
 
-def floor_of(subject: Subject, work: PairCounts, machine: Machine) -> dict[str, float]:
+def floor_of(case: Case, work: Work, machine: Machine) -> dict[str, float]:
     """Milliseconds that the machine needs at least, at the rates that this run has seen.
 
     `arithmetic`: of the pairs that are blended; `lanes`: of all pixels of the 4 × 4 blocks that splats touch; `memory`:
     reading Gaussians, writing and reading records once, tile lists twice, writing the frame.
     """
-    g = subject.gaussians
+    g = case.gaussians
     bytes_in = sum(array.nbytes for array in (g.means, g.quats, g.scales, g.opacities, g.sh))
-    pixels = subject.camera.width * subject.camera.height
+    pixels = case.camera.width * case.camera.height
     moved = bytes_in + 2 * 64 * len(g) + 8 * work.tile_entries + 20 * pixels
     return {
         "arithmetic": work.blended * FLOPS_A_PAIR / machine.gflops / 1e6,
         "lanes": work.lanes * FLOPS_A_PAIR / machine.gflops / 1e6,
         "memory": moved / machine.gigabytes / 1e6,
     }
+
+
+def draw_scene(session: DeformationSession, width: int, part: float, times: Times) -> None:
+    """A frame of a scene file at a part of its time, from its first camera: `pose` and `draw`."""
+    metadata = session.scene.metadata
+    t0, t1 = metadata.time_range
+    stored = metadata.cameras[0].camera
+    camera = stored.resized(width, max(1, round(stored.height * width / stored.width)))
+    gaussians = times.time("pose", session.gaussians, t0 + (t1 - t0) * part)
+    times.time(
+        "draw", lambda: rasterize(gaussians, camera, background=metadata.background, options=as_trained(metadata))
+    )
