@@ -1,25 +1,36 @@
-"""A renderer written by hand for AVX-512, built by the machine's own g++ and called through ctypes."""
+"""A renderer written by hand for AVX-512, built by the machine's own g++ and called through ctypes.
 
+python -m benchmarks.rasterizer.avx512 --check                  that it draws our images
+python -m benchmarks.rasterizer.renderers --avx512 --repeats 20  how long both take
+"""
+
+import argparse
 import ctypes
 import hashlib
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer import RasterizerOptions
+from benchmarks.measuring import psnr
+from benchmarks.rasterizer.scenes import Case, object_camera, object_scene
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
 from msdgs_serve.rasterizer.view import view_of
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.threads import thread_count
 
-SOURCE = Path(__file__).with_name("renderer.cpp")
+SOURCE = Path(__file__).with_suffix(".cpp")
 BUILT = Path(__file__).resolve().parents[2] / "out" / "avx512"
 FLAGS = ("-std=c++20", "-O3", "-march=native", "-ffp-contract=fast", "-shared", "-fPIC", "-pthread")
 NEEDED = {"avx512f", "avx512bw", "avx512dq", "avx512vl"}
-STAGES = ("project", "sort", "bin", "composite")
+STAGES = ("project", "bin", "composite")
+"""Sorting is in `bin`, as in our stages."""
+CHECKED = ((1, 64, 48), (1001, 150, 101), (10_000, 400, 400))  # Gaussians, width, height
+MIN_PSNR = 70  # dB: at thresholds some decisions fall the other way
 
 
 class _Scene(ctypes.Structure):
@@ -87,7 +98,7 @@ class Avx512Renderer:
             raise ValueError("the Gaussians must be float32 in C order")
         view = view_of(camera, options)._asdict() | options._asdict() | {"background": np.zeros(3)}
         values = [view[name] for name, *_ in _View._fields_]
-        rgb, seconds = np.empty((camera.height, camera.width, 3), np.float32), np.empty(len(STAGES))
+        rgb, seconds = np.empty((camera.height, camera.width, 3), np.float32), np.empty(4)
         self._library.draw(
             self._renderer,
             ctypes.byref(_Scene(len(g), *(array.ctypes.data for array in arrays))),
@@ -95,7 +106,8 @@ class Avx512Renderer:
             ctypes.c_void_p(rgb.ctypes.data),
             ctypes.c_void_p(seconds.ctypes.data),
         )
-        return Drawn(rgb, dict(zip(STAGES, seconds.tolist(), strict=True)))
+        project, sort, binned, composite = seconds.tolist()
+        return Drawn(rgb, dict(zip(STAGES, (project, sort + binned, composite), strict=True)))
 
 
 def _built() -> Path:
@@ -107,3 +119,26 @@ def _built() -> Path:
         subprocess.run(["g++", *FLAGS, "-o", str(part), str(SOURCE)], check=True)
         os.replace(part, library)
     return library
+
+
+def main() -> int:
+    """Draw small scenes with both, twice."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", required=True, help="draw small scenes and compare")
+    parser.parse_args()
+    if reason := why_not():
+        print(f"not checked: {reason}")
+        return 0
+    with Avx512Renderer() as renderer:
+        for count, width, height in CHECKED:
+            case = Case("seeded", object_scene(count), object_camera(width, height))
+            image, again = (renderer.draw(case.gaussians, case.camera, GSPLAT).rgb for _ in range(2))
+            agreement = psnr(image, rasterize(case.gaussians, case.camera).rgb)
+            print(f"{case.title()}, {case.size()}: {agreement:.1f} dB to ours")
+            assert agreement >= MIN_PSNR
+            np.testing.assert_array_equal(image, again)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
