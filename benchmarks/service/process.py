@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -14,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tests.processes import free_port
 from tests.scene_files import write_scene
 
 START_SECONDS = 120
@@ -122,13 +122,6 @@ def wait_until_ready(running: Running) -> None:
                 return
         time.sleep(MOMENT)
     raise SystemExit("the service did not become ready")
-
-
-def free_port() -> int:
-    """One that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def make_scenes(folder: Path, scene: Path) -> Path:
