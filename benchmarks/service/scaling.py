@@ -1,245 +1,327 @@
-"""What one core serves, and what many would: measured stages, a simulation held against the measured rate, plots.
+"""What one core serves, what many would, and what replicas and a cluster on this machine do."""
 
-    python benchmarks/scaling.py examples/toybench.onnx --out scaling/
-
-`msdgs-serve` with one thread and one render at a time is kept on one core; its clients are on another. Stages are
-measured with one client, and the rate that the simulation has to reproduce with several at another such service, in
-turns. A simulation that misses it by more than 15 % extrapolates nothing: exit status 1.
-"""
-
-import argparse
+import filecmp
 import os
+import re
 import shutil
-import statistics
+import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
+import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
-from benchmarks.service.process import Connection, Running, service
-from benchmarks.traffic import Fleet, Outcome, Stages, Trace, heavy_tailed, simulate_arrivals, simulate_clients
+from benchmarks.measuring import machine
+from benchmarks.service.process import Connection, Running, service, wait_until_ready
+from benchmarks.service.simulation import Fleet, Routing, Stages, Trace, simulate, zipf_trace
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.render_cli import main as render
 from msdgs_serve.scene.baked import SceneMetadata
+from tests.processes import free_port
 
 SCENES, TIMES = 8, 64  # of the trace that is measured
-CLIENTS = 4
-CACHE_MEGABYTES = 32
 IN_TURN = 25  # frames
 MAX_ERROR = 0.15
 LOAD = 0.7  # of what all cores could draw without any cache
-REPLICAS = (1, 3, 10, 30, 100, 300, 1000)
 CATALOGUE, MOMENTS = 200, 300  # scenes and times of a large service
 LARGE_CACHE = 256  # megabytes
 DOLLARS_CORE_HOUR = 0.04  # an assumption, of rented x86 cores
+NGINX = Path(__file__).parents[2] / "docker" / "nginx" / "nginx.conf"
+SEVERAL = 3  # replicas behind nginx
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Replay a trace of requests, scenes and times with frequency 1 / rank, against services of one core each, and
+    simulate the same.
+
+    python -m benchmarks.service.scaling examples/toybench.onnx
+
+    python -m benchmarks.service.scaling examples/toybench.onnx --parts replicas --size 32 --cache-megabytes 12
+
+    python -m benchmarks.service.scaling examples/toybench.onnx --parts ray --frames 200 --size 800
+
+    `core`: seconds per frame with one client, and in turns with it the rate of four clients at another such service.
+    The simulation has to reproduce that rate within 15 %, or nothing is extrapolated and the exit status is 1; then a
+    table up to a thousand replicas. `replicas`: the hit rates of three replicas behind nginx with docker/nginx's
+    configuration, by affinity and in turns, beside the simulated ones; needs nginx. `ray`: a path drawn by two Ray
+    nodes of one core against drawing it here, byte by byte, and again with a node that is lost midway; needs Ray.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional] = Path("examples/toybench.onnx")
+    parts: tuple[Literal["core", "replicas", "ray"], ...] = ("core",)
+    size: int = 400
+    """Pixels a side."""
+    frames: int = 600
+    """Frames of each measurement."""
+    repeats: int = 3
+    """Turns; the least disturbed counts."""
+    clients: int = 4
+    cache_megabytes: int = 32
+    requests: int = 100_000
+    """Requests that are simulated."""
+    replicas: tuple[int, ...] = (1, 3, 10, 30, 100, 300, 1000)
+    """Numbers of replicas that are simulated."""
+    check: bool = False
+    """Only see that this benchmark works: laws of the simulation, a small measurement."""
+
+
+class Frame(NamedTuple):
+    """One answer."""
+
+    seconds: float
+    hit: bool
+    size: int  # bytes
 
 
 class Measured(NamedTuple):
     """One turn."""
 
     stages: Stages
-    rate: float  # frames a second of `CLIENTS` clients
+    rate: float  # frames a second of several clients
     hit_rate: float
     frame_bytes: float
 
 
-def main() -> int:
-    """Measure, calibrate, extrapolate."""
-    options = parse_arguments()
-    mpl.use("agg")
-    options.out.mkdir(parents=True, exist_ok=True)
-    session = DeformationSession(options.scene)
-    pose_bytes = bytes_of_poses(session)
-    poses = max(1, (CACHE_MEGABYTES << 20) // pose_bytes)
-    trace = heavy_tailed(options.frames, SCENES, TIMES)
-    fleet = Fleet(1, poses=poses)
-    turns = measure(options, session.scene.metadata, trace)
-    best = max(turns, key=lambda turn: turn.rate)  # disturbed least
-    simulated = simulate_clients(trace, fleet, best.stages, CLIENTS)
-    error = simulated.rate / best.rate - 1
-    print(
-        f"{options.scene.name}, {options.size} × {options.size}, JPEG; {poses} poses of {pose_bytes / 1e6:.2f} MB fit"
-    )
-    stages = best.stages
-    print(
-        f"a frame: {1e3 * stages.hit.mean():.1f} ms where it is posed already, {1e3 * stages.miss.mean():.1f} ms else"
-    )
-    print(f"measured {best.rate:.1f} frames a second, hit rate {best.hit_rate:.2f}")
-    print(f"simulated {simulated.rate:.1f} frames a second, hit rate {simulated.hit_rate:.2f}: {100 * error:+.1f} %")
-    if abs(error) > MAX_ERROR:
-        print("the simulation doesn't reproduce what was measured; nothing is extrapolated", file=sys.stderr)
-        return 1
-    trace = heavy_tailed(options.requests, CATALOGUE, MOMENTS)
-    extrapolate(trace, stages, pose_bytes, statistics.mean(turn.frame_bytes for turn in turns), options.out)
-    return 0
+def replay(port: int, scene: SceneMetadata, trace: Trace, numbers: range, size: int, clients: int = 1) -> list[Frame]:
+    """Ask for these frames of the trace, which clients share."""
+    own = threading.local()
+    first, last = scene.time_range
 
-
-def bytes_of_poses(session: DeformationSession) -> int:
-    """That a scene takes in a replica's cache, posed at one time."""
-    return 40 * (session.scene.moving_count + len(session.scene.static_means))
-
-
-def copies(scene: Path, folder: Path) -> Path:
-    """A folder of one scene under the names of the trace's."""
-    folder.mkdir()
-    for number in range(SCENES):
-        shutil.copyfile(scene, folder / f"scene{number}.onnx")
-    return folder
-
-
-def measure(options: argparse.Namespace, metadata: SceneMetadata, trace: Trace) -> list[Measured]:
-    """Each turn with fresh services, whose caches are empty."""
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = copies(options.scene, Path(temporary) / "scenes")
-        cores = sorted(os.sched_getaffinity(0))
-        flags = {"threads": 1, "concurrent_renders": 1, "cache_megabytes": CACHE_MEGABYTES, "queued_renders": 64}
-        turns = []
-        for _ in range(options.repeats):
-            with on_core(cores[0]), service(folder, **flags) as alone, service(folder, **flags) as busy:
-                os.sched_setaffinity(0, {cores[-1]})
-                for running in (alone, busy):
-                    for number in range(SCENES):  # opened, and kernels loaded
-                        ask(Connection(running.port), metadata, trace, number, options.size, scene=number)
-                turns.append(one_turn(alone, busy, metadata, trace, options))
-        return turns
-
-
-def one_turn(
-    alone: Running, busy: Running, metadata: SceneMetadata, trace: Trace, options: argparse.Namespace
-) -> Measured:
-    """A few frames of one client, then of several, and so on, so that what else runs disturbs both alike."""
-    seconds, sizes = dict[str, list[float]](hit=[], miss=[]), list[int]()
-    spent, hits = 0.0, list[bool]()
-    for start in range(0, options.frames, IN_TURN):
-        numbers = range(start, min(start + IN_TURN, options.frames))
-        stages_of(alone, metadata, trace, numbers, options.size, seconds, sizes)
+    def ask(number: int) -> Frame:
+        if not hasattr(own, "connection"):
+            own.connection = Connection(port)
+        t = first + (last - first) * int(trace.times[number]) / TIMES
+        camera = {"type": "orbit", "azimuth": 37 * number % 360, "elevation": 20}
+        body = {"scene": f"scene{int(trace.scenes[number])}", "camera": camera, "t": t, "format": "jpeg"}
         started = time.perf_counter()
-        hits += ask_together(busy.port, metadata, trace, numbers, options.size, CLIENTS)
-        spent += time.perf_counter() - started
-    stages = Stages(np.array(seconds["hit"]), np.array(seconds["miss"]))
-    return Measured(stages, options.frames / spent, statistics.mean(hits), statistics.mean(sizes))
+        answer = own.connection.ask("POST", "/render", {**body, "width": size, "height": size})
+        if answer.status != 200:
+            raise SystemExit(f"the service answered {answer.status}: {answer.body[:200]!r}")
+        seconds = time.perf_counter() - started
+        return Frame(seconds, "miss" not in answer.headers["server-timing"], len(answer.body))
+
+    with ThreadPoolExecutor(clients) as pool:
+        return list(pool.map(ask, numbers))
+
+
+class Bench:
+    """The parts, over one scene under several names."""
+
+    def __init__(self, options: Scaling, folder: Path) -> None:
+        session = DeformationSession(options.scene)
+        self.options, self._folder, self._scene = options, folder, session.scene.metadata
+        self._pose_bytes = 40 * (session.scene.moving_count + len(session.scene.static_means))
+        self._poses = max(1, (options.cache_megabytes << 20) // self._pose_bytes)
+        self._trace = zipf_trace(options.frames, SCENES, TIMES)
+        self._copies = folder / "scenes"
+        self._copies.mkdir()
+        for number in range(SCENES):
+            shutil.copyfile(options.scene, self._copies / f"scene{number}.onnx")
+
+    def core(self) -> int:
+        """Measure, calibrate, extrapolate."""
+        cores = os.sched_getaffinity(0)
+        turns = [self._turn(sorted(cores)) for _ in range(self.options.repeats)]
+        os.sched_setaffinity(0, cores)
+        best = max(turns, key=lambda turn: turn.rate)  # disturbed least
+        simulated = simulate(self._trace, Fleet(1, poses=self._poses), best.stages, clients=self.options.clients)
+        hit, miss = (1e3 * stage.mean() for stage in best.stages)
+        error = simulated.rate / best.rate - 1
+        print(f"one core, JPEG; {self._poses} poses of {self._pose_bytes / 1e6:.2f} MB fit")
+        print(f"a frame: {hit:.1f} ms if it is posed already, {miss:.1f} ms if not")
+        print(f"measured {best.rate:.1f} frames a second, hit rate {best.hit_rate:.2f}")
+        print(f"simulated {simulated.rate:.1f} frames a second, hit rate {simulated.hit_rate:.2f}: {error:+.1%}")
+        if abs(error) > MAX_ERROR:
+            print("the simulation doesn't reproduce what was measured; nothing is extrapolated", file=sys.stderr)
+            return 1
+        self.extrapolate(best)
+        return 0
+
+    def _turn(self, cores: list[int]) -> Measured:
+        """A few frames of one client, then of several, and so on, so that what else runs disturbs both alike. Services
+        are on one core, clients on another."""
+        alone, together, spent = list[Frame](), list[Frame](), 0.0
+        flags = {"concurrent_renders": 1, "queued_renders": 64}
+        os.sched_setaffinity(0, {cores[0]})
+        with self._service(**flags) as one, self._service(**flags) as other:
+            os.sched_setaffinity(0, {cores[-1]})
+            for start in range(0, self.options.frames, IN_TURN):
+                numbers = range(start, min(start + IN_TURN, self.options.frames))
+                alone += replay(one.port, self._scene, self._trace, numbers, self.options.size)
+                started = time.perf_counter()
+                together += replay(
+                    other.port, self._scene, self._trace, numbers, self.options.size, self.options.clients
+                )
+                spent += time.perf_counter() - started
+        hits, misses = ([f.seconds for f in alone if f.hit == hit] for hit in (True, False))
+        stages = Stages(np.array(hits), np.array(misses))
+        rate, hit_rate = self.options.frames / spent, float(np.mean([f.hit for f in together]))
+        return Measured(stages, rate, hit_rate, float(np.mean([f.size for f in alone])))
+
+    @contextmanager
+    def _service(self, **flags: int) -> Iterator[Running]:
+        """One thread; all scenes are open, kernels are loaded."""
+        with service(self._copies, threads=1, cache_megabytes=self.options.cache_megabytes, **flags) as running:
+            opening = Trace(np.arange(SCENES), np.full(SCENES, TIMES))
+            replay(running.port, self._scene, opening, range(SCENES), self.options.size)
+            yield running
+
+    def extrapolate(self, measured: Measured) -> None:
+        """A table from one core to a thousand."""
+        trace, stages = zipf_trace(self.options.requests, CATALOGUE, MOMENTS), measured.stages
+        fleet = Fleet(1, poses=max(1, (LARGE_CACHE << 20) // self._pose_bytes))
+        print(f"\n{CATALOGUE} scenes × {MOMENTS} times, 1/rank; {fleet.poses} poses a replica; {LOAD:.0%} load")
+        print(
+            "replicas | routing | hit rate | frames/s | refused | p50 ms | p99 ms | busiest/mean | Mbit/s | $ a million"
+        )
+        routings: tuple[Routing, ...] = ("round robin", "affinity", "bounded")
+        for count, routing in ((count, routing) for count in self.options.replicas for routing in routings):
+            rate = LOAD * count / float(stages.miss.mean())
+            found = simulate(trace, replace(fleet, replicas=count, routing=routing), stages, rate=rate)
+            p50, p99 = 1e3 * np.quantile(found.latencies, [0.5, 0.99])
+            megabits, dollars = (
+                8e-6 * measured.frame_bytes * found.rate,
+                count * DOLLARS_CORE_HOUR / 3.6e-3 / found.rate,
+            )
+            print(
+                f"{count} | {routing} | {found.hit_rate:.2f} | {found.rate:.0f} | "
+                f"{found.refused / len(trace.scenes):.1%} | {p50:.0f} | {p99:.0f} | {found.busiest:.2f} | "
+                f"{megabits:.0f} | {dollars:.2f}"
+            )
+        one, three = (simulate(trace, replace(fleet, replicas=n), stages, clients=12 * n).rate for n in (1, 3))
+        print(f"three replicas by affinity, all that they can take: {three / one:.2f} × one")
+
+    def replicas(self) -> int:
+        """Both routings, each with fresh replicas."""
+        if shutil.which("nginx") is None:
+            raise SystemExit("needs nginx")
+        numbers, clients = range(self.options.frames), 2 * SEVERAL
+        print(f"{SEVERAL} replicas, {self._poses} poses each, {SCENES} scenes × {TIMES} times")
+        routings: tuple[Routing, ...] = ("affinity", "round robin")
+        for routing in routings:
+            with ExitStack() as stack:
+                ports = [stack.enter_context(self._service(concurrent_renders=1)).port for _ in range(SEVERAL)]
+                proxy = stack.enter_context(nginx(self._folder / routing.replace(" ", "_"), ports, routing))
+                frames = replay(proxy, self._scene, self._trace, numbers, self.options.size, clients)
+            hit_rate, same = float(np.mean([f.hit for f in frames])), np.array([0.01])  # times don't change the routing
+            fleet = Fleet(SEVERAL, routing, poses=self._poses)
+            expected = simulate(self._trace, fleet, Stages(same, same), clients=clients).hit_rate
+            print(f"  {routing:12} hit rate {hit_rate:.3f} (simulated {expected:.3f})")
+        return 0
+
+    def ray(self) -> int:
+        """Overhead in turns, then the loss of a node."""
+        os.environ["RAY_AUTH_MODE"] = "disabled"  # only this machine reaches the nodes
+        from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
+
+        node = {"num_cpus": 1, "object_store_memory": 100 << 20}
+        cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+        second = cluster.add_node(**node)
+        os.environ["RAY_ADDRESS"] = cluster.address
+        seconds = {"here": list[float](), "ray": list[float]()}
+        for _ in range(self.options.repeats + 1):
+            for name in seconds:
+                seconds[name].append(self._draw(name))
+        least = {name: min(taken[1:]) for name, taken in seconds.items()}  # the first starts the workers
+        ratio = least["ray"] / least["here"]
+        print(f"here {least['here']:.1f} s, two nodes of one core {least['ray']:.1f} s: {ratio:.2f} ×")
+        drawing = threading.Thread(target=self._draw, args=("lost",))
+        drawing.start()
+        while drawing.is_alive() and len(list((self._folder / "lost").glob("frame_*"))) < self.options.frames // 3:
+            time.sleep(0.02)
+        there = len(list((self._folder / "lost").glob("frame_*")))
+        cluster.remove_node(second, allow_graceful=False)
+        drawing.join()
+        print(f"one of two nodes lost after {there} frames of {self.options.frames}")
+        return max(self._compare("ray"), self._compare("lost"))
+
+    def _draw(self, name: str) -> float:
+        """Seconds of `msdgs-render` into a new folder, on Ray unless it is called `here`."""
+        out, size = self._folder / name, str(self.options.size)
+        shutil.rmtree(out, ignore_errors=True)
+        line = [
+            str(self.options.scene),
+            str(out),
+            "--frames",
+            str(self.options.frames),
+            "--width",
+            size,
+            "--height",
+            size,
+        ]
+        started = time.perf_counter()
+        assert render(line if name == "here" else [*line, "--ray", "auto"]) == 0
+        return time.perf_counter() - started
+
+    def _compare(self, name: str) -> int:
+        names = sorted(path.name for path in (self._folder / "here").glob("frame_*"))
+        same, *others = filecmp.cmpfiles(self._folder / "here", self._folder / name, names, shallow=False)
+        print(f"  {name}: {len(same)} of {len(names)} files are the same bytes as drawn here")
+        return int(any(others))
 
 
 @contextmanager
-def on_core(core: int) -> Iterator[None]:
-    """Processes begun within it stay on one core."""
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {core})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
+def nginx(folder: Path, ports: list[int], routing: str) -> Iterator[int]:
+    """The proxy of the composition over these ports, without its line `hash` for requests in turns; its own port."""
+    folder.mkdir()
+    port = free_port()
+    text = NGINX.read_text().replace("listen 8080;", f"listen 127.0.0.1:{port};")
+    text = text.replace("/tmp/", f"{folder}/").replace("/dev/stdout", f"{folder}/access.log")
+    if routing != "affinity":
+        text, count = re.subn(r"^\s*hash \$affinity;.*$", "", text, flags=re.MULTILINE)
+        assert count == 1
+    if os.geteuid() == 0:  # or its workers are a user who may not write here
+        text = f"user root;\n{text}"
+    (folder / "nginx.conf").write_text(text)
+    (folder / "replicas.conf").write_text("".join(f"server 127.0.0.1:{each} max_fails=0;\n" for each in ports))
+    command = ["nginx", "-p", str(folder), "-c", str(folder / "nginx.conf"), "-g", "daemon off;"]
+    with subprocess.Popen(command) as process:
+        try:
+            wait_until_ready(Running(port, process))
+            yield port
+        finally:
+            process.terminate()
 
 
-def stages_of(
-    running: Running, metadata: SceneMetadata, trace: Trace, numbers: range, size: int,
-    seconds: dict[str, list[float]], sizes: list[int],
-) -> None:  # fmt: skip
-    """Seconds from call to answer of one client, which has nobody to wait for; bytes of each frame."""
-    connection = Connection(running.port)
-    for number in numbers:
-        started = time.perf_counter()
-        timing, count = ask(connection, metadata, trace, number, size)
-        seconds["miss" if "miss" in timing else "hit"].append(time.perf_counter() - started)
-        sizes.append(count)
+def main(options: Scaling) -> int:
+    """Each part that was asked for."""
+    if options.check:
+        return check()
+    print(f"{machine()}; {options.scene.name}, {options.size} × {options.size}, {options.frames} frames")
+    statuses = []
+    for part in options.parts:
+        with tempfile.TemporaryDirectory() as folder:
+            statuses.append(getattr(Bench(options, Path(folder)), part)())
+    return max(statuses)
 
 
-def ask_together(
-    port: int, metadata: SceneMetadata, trace: Trace, numbers: range, size: int, clients: int
-) -> list[bool]:
-    """Which of these frames were posed already; clients share them. What goes wrong with one is raised."""
-    own = threading.local()
-
-    def was_posed(number: int) -> bool:
-        if not hasattr(own, "connection"):
-            own.connection = Connection(port)
-        return "miss" not in ask(own.connection, metadata, trace, number, size)[0]
-
-    with ThreadPoolExecutor(clients) as pool:
-        return list(pool.map(was_posed, numbers))
-
-
-def ask(
-    connection: Connection, metadata: SceneMetadata, trace: Trace, number: int, size: int, scene: int | None = None
-) -> tuple[str, int]:
-    """`Server-Timing` and the number of bytes of one frame of the trace."""
-    first, last = metadata.time_range
-    t = first + (last - first) * int(trace.times[number]) / TIMES
-    camera = {"type": "orbit", "azimuth": 37 * number % 360, "elevation": 20}
-    name = f"scene{int(trace.scenes[number]) if scene is None else scene}"
-    asked = {"scene": name, "camera": camera, "t": t, "width": size, "height": size, "format": "jpeg"}
-    answer = connection.ask("POST", "/render", asked)
-    if answer.status != 200:
-        raise SystemExit(f"the service answered {answer.status}: {answer.body[:200]!r}")
-    return answer.headers["server-timing"], len(answer.body)
-
-
-def extrapolate(trace: Trace, stages: Stages, pose_bytes: int, frame_bytes: float, out: Path) -> None:
-    """A table and plots from one core to a thousand."""
-    fleet = Fleet(1, poses=max(1, (LARGE_CACHE << 20) // pose_bytes))
-    print(f"\n{CATALOGUE} scenes × {MOMENTS} times, 1/rank; {fleet.poses} poses a replica of one core; {LOAD:.0%} load")
-    print("replicas | routing | hit rate | frames/s | refused | p50 ms | p99 ms | busiest/mean | Mbit/s | $ a million")
-    rows: dict[str, list[tuple[int, Outcome]]] = {}
-    for count in REPLICAS:
-        for routing in ("round robin", "affinity", "bounded"):
-            asked = LOAD * count / float(stages.miss.mean())
-            outcome = simulate_arrivals(trace, replace(fleet, replicas=count, routing=routing), stages, asked)
-            rows.setdefault(routing, []).append((count, outcome))
-            p50, p99 = 1e3 * np.quantile(outcome.latencies, [0.5, 0.99])
-            dollars = count * DOLLARS_CORE_HOUR / 3600 / outcome.rate * 1e6
-            refused, megabits = outcome.refused / len(trace.scenes), 8e-6 * frame_bytes * outcome.rate
-            print(
-                f"{count} | {routing} | {outcome.hit_rate:.2f} | {outcome.rate:.0f} | {refused:.1%} | "
-                f"{p50:.0f} | {p99:.0f} | {outcome.busiest:.2f} | {megabits:.0f} | {dollars:.2f}"
-            )
-    three = full_rate(trace, fleet, stages, 3) / full_rate(trace, fleet, stages, 1)
-    print(f"three replicas by affinity, all that they can take: {three:.2f} × one")
-    plot(rows, out)
-
-
-def full_rate(trace: Trace, fleet: Fleet, stages: Stages, count: int) -> float:
-    """Frames a second where clients never run out."""
-    return simulate_clients(trace, replace(fleet, replicas=count), stages, clients=12 * count).rate
-
-
-def plot(rows: dict[str, list[tuple[int, Outcome]]], out: Path) -> None:
-    """Hit rate, and the slowest answers."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for routing, outcomes in rows.items():
-        counts = [count for count, _ in outcomes]
-        left.plot(counts, [outcome.hit_rate for _, outcome in outcomes], "o-", label=routing)
-        right.plot(counts, [1e3 * np.quantile(outcome.latencies, 0.99) for _, outcome in outcomes], "o-", label=routing)
-    left.set(xscale="log", xlabel="replicas", ylabel="hit rate of posed Gaussians", ylim=(0, 1))
-    right.set(xscale="log", yscale="log", xlabel="replicas", ylabel="99 of 100 answers within, ms")
-    left.legend()
-    path = out / "scaling.png"
-    figure.savefig(path, dpi=120)
-    print(f"wrote {path}")
-
-
-def parse_arguments() -> argparse.Namespace:
-    """What the command line says."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("out/scaling"))
-    parser.add_argument("--size", type=int, default=400, help="pixels a side")
-    parser.add_argument("--frames", type=int, default=600, help="of each measurement")
-    parser.add_argument("--repeats", type=int, default=3, help="turns")
-    parser.add_argument("--requests", type=int, default=100_000, help="that are simulated")
-    return parser.parse_args()
+def check() -> int:
+    """A cache that holds all misses once per pose; affinity adds caches up; a full queue refuses. Then a small run."""
+    trace, one = zipf_trace(2000, SCENES, TIMES), Stages(np.array([0.01]), np.array([0.02]))
+    distinct = len(set(zip(*(column.tolist() for column in trace), strict=True)))
+    alone = simulate(trace, Fleet(1, poses=SCENES * TIMES), one, clients=1)
+    assert (alone.hits, alone.refused) == (2000 - distinct, 0)
+    assert abs(alone.seconds - 0.01 * (2000 + distinct)) < 1e-6
+    affinity, turns = (simulate(trace, Fleet(3, r, poses=40), one, clients=6) for r in ("affinity", "round robin"))
+    assert affinity.hit_rate > turns.hit_rate
+    flooded = simulate(trace, Fleet(1, poses=40), one, rate=500)
+    assert flooded.refused > 500
+    assert flooded.latencies.max() <= 17 * 0.02 + 1e-9
+    small = Scaling(size=32, frames=40, repeats=1, requests=500, replicas=(1, 3))
+    with tempfile.TemporaryDirectory() as folder:
+        Bench(small, Path(folder)).extrapolate(Measured(one, 100.0, 0.5, 1e4))
+    assert main(small) in (0, 1)  # on a busy machine the simulation may miss the rate
+    return main(replace(small, parts=("replicas",))) if shutil.which("nginx") else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(tyro.cli(Scaling)))

@@ -12,36 +12,35 @@ Routing = Literal["affinity", "round robin", "bounded"]
 
 TRIES = 3  # replicas that the proxy asks, as docker/nginx/nginx.conf says
 BOUND = 1.25  # `bounded`: a replica has at most this many times the mean of requests
+RETRY_SECONDS = 1.0  # that a refused client waits
 
 
 class Trace(NamedTuple):
     """Which scene and time each request asks for."""
 
     scenes: np.ndarray  # [N] int
-    times: np.ndarray  # [N] int, of so many moments
+    times: np.ndarray  # [N] int
 
 
-@dataclass(frozen=True)
-class Stages:
-    """Seconds that one core needs for a frame, as samples to draw from."""
+class Stages(NamedTuple):
+    """Seconds that one core needs per frame, as samples to draw from."""
 
-    hit: np.ndarray  # where its pose is in the cache
+    hit: np.ndarray  # its pose is in the cache
     miss: np.ndarray
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """What answers."""
+    """Replicas of one core each."""
 
     replicas: int
     routing: Routing = "affinity"
-    workers: int = 1  # frames at once, of a core each
     poses: int = 64  # that a replica's cache holds
     queue: int = 16  # places for waiting
 
 
 class Outcome(NamedTuple):
-    """Of a simulation."""
+    """What a simulation says."""
 
     served: int
     refused: int
@@ -60,96 +59,89 @@ class Outcome(NamedTuple):
         return self.served / self.seconds
 
 
-def heavy_tailed(count: int, scenes: int, times: int, seed: int = 0, exponent: float = 1.0) -> Trace:
-    """Scenes, and the moments of each in an order of its own, asked for with frequency 1 / rank ** exponent."""
-    chance = np.random.default_rng(seed)
-    scene = chance.choice(scenes, count, p=_zipf(scenes, exponent))
-    rank = chance.choice(times, count, p=_zipf(times, exponent))
-    orders = chance.permuted(np.tile(np.arange(times), (scenes, 1)), axis=1)
+def zipf_trace(count: int, scenes: int, times: int, seed: int = 0) -> Trace:
+    """Scenes, and the times of each in an order of its own, asked for with frequency 1 / rank."""
+    rng = np.random.default_rng(seed)
+    scene, rank = (rng.choice(n, count, p=1 / np.arange(1, n + 1) / _harmonic(n)) for n in (scenes, times))
+    orders = rng.permuted(np.tile(np.arange(times), (scenes, 1)), axis=1)
     return Trace(scene, orders[scene, rank])
 
 
-def _zipf(count: int, exponent: float) -> np.ndarray:
-    weights = 1 / np.arange(1, count + 1) ** exponent
-    return weights / weights.sum()
-
-
-def simulate_clients(trace: Trace, fleet: Fleet, stages: Stages, clients: int, seed: int = 0) -> Outcome:
-    """Clients that ask for the next frame of the trace as soon as they have one."""
-    return _simulate(trace, fleet, stages, None, clients, seed)
-
-
-def simulate_arrivals(trace: Trace, fleet: Fleet, stages: Stages, rate: float, seed: int = 0) -> Outcome:
-    """Requests that come by themselves, `rate` a second, at random moments."""
-    gaps = np.random.default_rng(seed + 1).exponential(1 / rate, len(trace.scenes))
-    return _simulate(trace, fleet, stages, np.cumsum(gaps), 0, seed)
+def _harmonic(count: int) -> float:
+    return float((1 / np.arange(1, count + 1)).sum())
 
 
 class _Replica:
-    def __init__(self, fleet: Fleet) -> None:
-        self.free = [0.0] * fleet.workers  # when each worker has ended what it was given
-        self.ends: list[float] = []  # of all that isn't answered yet
-        self.cache: OrderedDict[int, None] = OrderedDict()
-        self.asked = 0
+    def __init__(self, poses: int) -> None:
+        self.free_at, self.asked, self._poses = 0.0, 0, poses
+        self._ends: list[float] = []  # of all that isn't answered yet
+        self._cache: OrderedDict[int, None] = OrderedDict()
 
-    def waiting(self, now: float) -> int:
-        while self.ends and self.ends[0] <= now:
-            heapq.heappop(self.ends)
-        return len(self.ends)
+    def pending(self, now: float) -> int:
+        while self._ends and self._ends[0] <= now:
+            heapq.heappop(self._ends)
+        return len(self._ends)
+
+    def has_pose(self, key: int) -> bool:
+        """It has it afterwards."""
+        hit = key in self._cache
+        self._cache[key] = None
+        self._cache.move_to_end(key)
+        if len(self._cache) > self._poses:
+            self._cache.popitem(last=False)
+        return hit
+
+    def serve(self, now: float, seconds: float) -> float:
+        """When the answer is there."""
+        self.free_at = max(now, self.free_at) + seconds
+        heapq.heappush(self._ends, self.free_at)
+        self.asked += 1
+        return self.free_at
 
 
-def _simulate(
-    trace: Trace, fleet: Fleet, stages: Stages, arrivals: np.ndarray | None, clients: int, seed: int
+def simulate(
+    trace: Trace, fleet: Fleet, stages: Stages, *, clients: int = 0, rate: float = 0.0, seed: int = 0
 ) -> Outcome:
-    chance = np.random.default_rng(seed)
-    count = len(trace.scenes)
+    """`clients` that ask for the next frame of the trace as soon as they have one, or requests that come at random
+    moments, `rate` a second."""
+    rng, count = np.random.default_rng(seed), len(trace.scenes)
+    arrivals = [] if clients else np.cumsum(rng.exponential(1 / rate, count)).tolist()
     keys = trace.scenes.astype(np.int64) * 1_000_003 + trace.times
-    homes = _spread(keys) % fleet.replicas
-    hit_seconds, miss_seconds = chance.choice(stages.hit, count), chance.choice(stages.miss, count)
-    replicas = [_Replica(fleet) for _ in range(fleet.replicas)]
+    homes = _hashed(keys) % fleet.replicas
+    hit_seconds, miss_seconds = rng.choice(stages.hit, count), rng.choice(stages.miss, count)
+    replicas = [_Replica(fleet.poses) for _ in range(fleet.replicas)]
     ready = [0.0] * clients  # when each client asks next
-    latencies, hits, refused, last = [], 0, 0, 0.0
+    latencies, hits, last = [], 0, 0.0
     for number, key in enumerate(keys.tolist()):
-        now = heapq.heappop(ready) if arrivals is None else float(arrivals[number])
+        now = heapq.heappop(ready) if clients else arrivals[number]
         replica = _choose(replicas, fleet, number, int(homes[number]), now)
-        if replica is None:
-            refused += 1
-            if arrivals is None:
-                heapq.heappush(ready, now + 1.0)
-            continue
-        hit = key in replica.cache
-        replica.cache[key] = None
-        replica.cache.move_to_end(key)
-        if len(replica.cache) > fleet.poses:
-            replica.cache.popitem(last=False)
-        begin = max(now, heapq.heappop(replica.free))
-        end = begin + float((hit_seconds if hit else miss_seconds)[number])
-        heapq.heappush(replica.free, end)
-        heapq.heappush(replica.ends, end)
-        replica.asked += 1
-        hits += hit
-        last = max(last, end)
-        latencies.append(end - now)
-        if arrivals is None:
-            heapq.heappush(ready, end)
+        next_ask = now + RETRY_SECONDS
+        if replica is not None:
+            hit = replica.has_pose(key)
+            next_ask = replica.serve(now, float((hit_seconds if hit else miss_seconds)[number]))
+            hits += hit
+            last = max(last, next_ask)
+            latencies.append(next_ask - now)
+        if clients:
+            heapq.heappush(ready, next_ask)
     asked = [replica.asked for replica in replicas]
     busiest = max(asked) / max(float(np.mean(asked)), 1e-9)
-    return Outcome(count - refused, refused, hits, last, np.array(latencies), busiest)
+    return Outcome(len(latencies), count - len(latencies), hits, last, np.array(latencies), busiest)
 
 
 def _choose(replicas: Sequence[_Replica], fleet: Fleet, number: int, home: int, now: float) -> _Replica | None:
     """The first in turn that has a place, as the proxy sends requests on that were refused."""
     first = number % len(replicas) if fleet.routing == "round robin" else home
-    tries = len(replicas) if fleet.routing == "bounded" else min(TRIES, len(replicas))
-    limit = BOUND * (number + 1) / len(replicas) + 1 if fleet.routing == "bounded" else np.inf
-    for step in range(tries):
+    bounded = fleet.routing == "bounded"
+    limit = BOUND * (number + 1) / len(replicas) + 1 if bounded else np.inf
+    for step in range(len(replicas) if bounded else min(TRIES, len(replicas))):
         replica = replicas[(first + step) % len(replicas)]
-        if replica.waiting(now) < fleet.workers + fleet.queue and replica.asked < limit:
+        if replica.pending(now) <= fleet.queue and replica.asked < limit:
             return replica
     return None
 
 
-def _spread(keys: np.ndarray) -> np.ndarray:
-    """A hash, [N] of [N]."""
+def _hashed(keys: np.ndarray) -> np.ndarray:
+    """[N] of [N]."""
     mixed = keys.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return ((mixed ^ (mixed >> np.uint64(29))) % np.uint64(2**31)).astype(np.int64)
