@@ -8,12 +8,11 @@ drawn by lot.
 
 import math
 import sys
-import time
+import tempfile
 from dataclasses import replace
 from pathlib import Path
+from time import process_time
 from typing import Annotated
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 import torch
@@ -24,11 +23,12 @@ from scipy.interpolate import BSpline
 from torch import Tensor, nn
 from torch.nn import functional
 
+from benchmarks.measuring import machine
 from export.plans.splines import fitting
 from export.rendered_error import posed, shown
 from export.views import cameras_of, deciding_views
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
-from msdgs_train.checkpoint import SceneInfo, load, load_model, save_atomic, save_model
+from msdgs_train.checkpoint import SceneInfo, load_model, save_model
 from msdgs_train.densification import rotate
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.layers import MLPLayer
@@ -36,6 +36,7 @@ from msdgs_train.metrics import psnr_from_mse
 from msdgs_train.model import DynamicGaussians, unit_quats
 from msdgs_train.presets import PRESETS
 from msdgs_train.steps import camera_of
+from tests.models import SCENE, random_model
 
 SHRINK = 0.6
 """Of a part's axes against those of the Gaussian it is a part of. Centres are spread by √(1 − 0.6²) of them, so that
@@ -51,7 +52,6 @@ MOVING_SHARE = 0.75
 """Of a batch, drawn from Gaussians whose motion is more than a pixel."""
 
 RATE, LAST_RATE = 1e-4, 1e-6
-SAVE_SECONDS = 60.0
 OCTAVE_DAMPING = 0.5
 """First weights of each next octave of the encoding, of those before it: a new field is smooth in place and time."""
 
@@ -93,7 +93,7 @@ class SmoothMotion:
 
 
 class Fit:
-    """The large model, and how far its training is. Saved now and then, so that another run goes on with it."""
+    """The large model, and how far its training is."""
 
     def __init__(self, model: DynamicGaussians, motion: SmoothMotion, info: SceneInfo) -> None:
         self.model, self.motion, self.info = model, motion, info
@@ -106,7 +106,7 @@ class Fit:
 
     def step(self, part: float) -> None:
         """One batch; `part` of the training time is over."""
-        start = time.process_time()
+        start = process_time()
         rate = LAST_RATE + (RATE - LAST_RATE) * (1 + math.cos(math.pi * part)) / 2
         self._optimizer.param_groups[0]["lr"] = rate * min(1.0, (self.steps + 1) / 50)
         self._optimizer.zero_grad()
@@ -122,7 +122,7 @@ class Fit:
         self.steps += 1
         pixels = float(error.detach()[:, MEANS].norm(dim=1).median())
         self.pixels = pixels if self.steps == 1 else 0.98 * self.pixels + 0.02 * pixels
-        self.seconds += time.process_time() - start
+        self.seconds += process_time() - start
 
     def errors(self, t: float, ids: Tensor) -> Tensor:
         """[M, 10] pixels that means, axes and ends of turned axes are off."""
@@ -141,53 +141,41 @@ class Fit:
             return any_
         return torch.cat([any_, self._moving[torch.randint(len(self._moving), (moving,), generator=self._generator)]])
 
-    def save(self, path: Path) -> None:
-        """All that a later run needs to go on."""
-        state = {"model": self.model.deformation.state_dict(), "optimizer": self._optimizer.state_dict()}
-        save_atomic(path, state | {"seconds": self.seconds, "steps": self.steps, "pixels": self.pixels})
-
-    def resume(self, path: Path) -> None:
-        """Go on from a saved state."""
-        state = load(path)
-        self.model.deformation.load_state_dict(state["model"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self.seconds, self.steps, self.pixels = state["seconds"], state["steps"], state["pixels"]
-        self._generator.manual_seed(1 + self.steps)
-
 
 def main(
-    model: Annotated[Path, tyro.conf.Positional],
-    output: Annotated[Path, tyro.conf.Positional],
+    model: Annotated[Path, tyro.conf.Positional] = Path("runs/toybench/model.pt"),
+    output: Annotated[Path, tyro.conf.Positional] = Path("runs/paper_sized/model.pt"),
     count: int = 106_500,
     minutes: float = 4.0,
     size: int = 400,
     control: int = 27,
     threads: int = 1,
+    check: bool = False,
 ) -> int:
     """Make a scene of the paper's size from a small trained one, to measure exports on (docs/work_precision.md).
 
     Its Gaussians are split until there are as many as in the paper, 106,500. A field of ten MLP layers of 4 × 256, the
     preset msdgs-mlp, learns how the small one moves them, smoothed in time. How near it came is printed.
 
-    python benchmarks/paper_sized.py runs/toybench/model.pt runs/paper_sized/model.pt
+    python -m benchmarks.export.paper_sized runs/toybench/model.pt runs/paper_sized/model.pt
 
     python export/to_onnx.py runs/paper_sized/model.pt
-
-    It can be stopped at any time; the same command goes on from OUTPUT's .fit.pt, which is removed in the end.
 
     Args:
         model: A trained `model.pt` of MLP layers, as of toybench.
         output: The `model.pt` to write.
         count: Gaussians of the new scene, at least as many as there are.
-        minutes: Processor time to train for, all runs together.
+        minutes: Processor time to train for.
         size: Width in pixels of the new scene's cameras, which are the old ones otherwise.
         control: Control points of the splines that smooth a trajectory.
         threads: Of torch.
+        check: Only see that this works, on a random model of 40 Gaussians.
     """
+    if check:
+        return self_test()
     console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console.print(machine(), markup=False)
     torch.set_num_threads(threads)
-    fit = None
-    saved = output.with_suffix(".fit.pt")
     try:
         small, info, _ = load_model(model)
         if count < len(small.gaussians):
@@ -195,18 +183,9 @@ def main(
         info = replace(info, cameras=[_resized(camera, size) for camera in info.cameras])
         parts = split(small, count, torch.Generator().manual_seed(0))
         fit = Fit(grown(parts), SmoothMotion(parts, info, control), info)
-        if saved.exists():
-            fit.resume(saved)
-            console.print(f"going on after {fit.steps:,} steps, {fit.seconds / 60:.1f} minutes", markup=False)
-        _train(fit, 60 * minutes, saved, console)
+        _train(fit, 60 * minutes, console)
         save_model(output, fit.model, info, fit.steps)
-        saved.unlink(missing_ok=True)
         _describe(fit, small, console)
-    except KeyboardInterrupt:
-        if fit is not None:
-            fit.save(saved)
-        console.print("stopped; the same command goes on from here", markup=False)
-        return 130
     except (MsdgsError, OSError) as error:
         console.print(f"error: {error}", style="red", markup=False)
         return 1
@@ -312,21 +291,14 @@ def _copy(linear: nn.Linear, source: nn.Linear, columns: Tensor) -> None:
     linear.bias[:outputs] = source.bias
 
 
-def _train(fit: Fit, seconds: float, saved: Path, console: Console) -> None:
+def _train(fit: Fit, seconds: float, console: Console) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    last = time.perf_counter()
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("training", total=seconds)
         while fit.seconds < seconds:
             fit.step(fit.seconds / seconds)
-            progress.update(
-                task, completed=fit.seconds, description=f"step {fit.steps:,}, median {fit.pixels:.2f} pixels"
-            )
-            if time.perf_counter() - last > SAVE_SECONDS:
-                fit.save(saved)
-                last = time.perf_counter()
-                if not console.is_terminal:
-                    console.print(progress.tasks[0].description, markup=False)
+            described = f"step {fit.steps:,}, median {fit.pixels:.2f} pixels"
+            progress.update(task, completed=fit.seconds, description=described)
 
 
 @torch.no_grad()
@@ -365,6 +337,27 @@ def _pixel(model: DynamicGaussians, info: SceneInfo) -> float:
 def _resized(entry: dict, width: int) -> dict:
     camera = camera_of(entry, width)
     return entry | {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+
+
+def self_test() -> int:
+    """Larger layers compute what the smaller ones did, to rounding; a short run writes what it should."""
+    small = random_model(40, layers=("mlp", "mlp"))
+    parts = split(small, 100, torch.Generator().manual_seed(0))
+    large = grown(parts).double()
+    parts.double()
+    assert len(large.deformation) == 10
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        for t in (0.0, 0.37, 1.0):
+            expected, found = parts.pose(t), large.pose(t)
+            for part in ("means", "quats", "scales"):
+                torch.testing.assert_close(getattr(found, part), getattr(expected, part), rtol=1e-12, atol=1e-12)
+        source, made = Path(folder) / "small.pt", Path(folder) / "large.pt"
+        save_model(source, random_model(40, layers=("mlp",)), SCENE, 1)
+        with torch.enable_grad():
+            assert main(source, made, count=90, size=64, minutes=0.005) == 0
+        assert len(load_model(made).model.gaussians) == 90
+        assert main(source, made, count=3) == 1
+    return 0
 
 
 if __name__ == "__main__":

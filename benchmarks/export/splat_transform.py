@@ -1,6 +1,7 @@
 """Our PLY and SPZ in the hands of PlayCanvas' splat-transform, and what it writes of them read here again.
 
-python benchmarks/splat_transform.py playbot.onnx; needs Node.js: npx fetches @playcanvas/splat-transform.
+python -m benchmarks.export.splat_transform playbot.onnx; needs Node.js: npx fetches @playcanvas/splat-transform. Ends
+with 1 if a file is refused or comes back as less than it was.
 """
 
 import subprocess
@@ -9,11 +10,10 @@ import tempfile
 from pathlib import Path
 from typing import Annotated
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
 import tyro
 from rich.console import Console
 
+from benchmarks.measuring import machine
 from export.exporters.command import LOSSY, Settings, convert
 from export.exporters.proof import Proof, require
 from export.importers import read_splats
@@ -33,6 +33,7 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
         package: What npx runs.
     """
     console = Console(soft_wrap=True, highlight=False)
+    console.print(machine(), markup=False)
     try:
         session = DeformationSession(scene)
         proof = Proof(session)

@@ -1,8 +1,8 @@
 """Where the time of a training step goes: deformation, projection, tiles, blending, loss, each with its gradient, and
 the optimiser.
 
-python benchmarks/training_step.py --gaussians 10000 --size 200
-python benchmarks/training_step.py data/scene --preset msdgs-mlp --gaussians 30000 --size 400
+python -m benchmarks.training.training_step --gaussians 10000 --size 200
+python -m benchmarks.training.training_step data/scene --preset msdgs-mlp --gaussians 30000 --size 400
 
 Without a folder it trains on a synthetic scene that it makes. The parts are measured one after the other on the same
 step, repeat after repeat; least and median of the repeats are printed, and what the parts add up to beside whole steps.
@@ -10,7 +10,6 @@ In turns with them, steps of several photographs side by side.
 """
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -23,8 +22,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+from benchmarks.measuring import machine
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.compositing_backward import composite_backward
 from msdgs_serve.rasterizer.projection import project
@@ -52,6 +50,7 @@ def main() -> None:
             several.step()
         repeats = [dict(measured(trainer, several)) for _ in range(arguments.repeats)]
     show(repeats, arguments)
+    assert all(set(repeat) == {*FORWARD, *BACKWARD, "whole step", "several"} for repeat in repeats)
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -63,7 +62,11 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--photographs", type=int, default=4, help="side by side, to compare with one after the other")
     parser.add_argument("--repeats", type=int, default=15)
-    return parser.parse_args()
+    parser.add_argument("--check", action="store_true", help="only see that this works, at a small size")
+    arguments = parser.parse_args()
+    if arguments.check:
+        arguments.gaussians, arguments.size, arguments.repeats, arguments.threads = 300, 32, 2, 1
+    return arguments
 
 
 def make_trainer(arguments: argparse.Namespace, made: Path, photographs: int) -> Trainer:
@@ -146,6 +149,7 @@ def show(repeats: list[dict[str, float]], arguments: argparse.Namespace) -> None
     table.add_row("all of these", f"{parts:.1f}", f"{sum(median[name] for name in (*FORWARD, *BACKWARD)):.1f}", "")
     table.add_row("a whole step", f"{least['whole step']:.1f}", f"{median['whole step']:.1f}", "")
     console = Console()
+    console.print(machine())
     console.print(
         f"{arguments.preset}, {arguments.gaussians:,} Gaussians, {arguments.size} pixels wide, "
         f"{arguments.threads} threads, {arguments.repeats} repeats"
