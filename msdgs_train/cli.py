@@ -89,22 +89,26 @@ class Synthetic:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Judge the last and the best model of a run on held-out photographs: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR where
+    """Evaluate the last and the best model of runs on held-out photographs: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR where
     something moves, since a static background hides what is wrong with the motion.
 
     RUN/eval gets numbers for every image (<split>.json), a table (<split>.md) and a contact sheet of photographs,
     renderings and errors (<split>.png). LPIPS and ꟻLIP are left out where their packages or weights are not on this
-    machine; nothing is downloaded.
+    machine; nothing is downloaded. Several runs are also drawn side by side.
 
     Example:  msdgs-train eval runs/first
+
+    Two runs beside the same images:  msdgs-train eval runs/first runs/second --sheet first_and_second.png
     """
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The folder of a run that `msdgs-train fit` has filled."""
-    data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = None
-    """The dataset, where it is not any more where the run found it."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
+    """Folders of runs that `msdgs-train fit` has filled."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
+    """The dataset, if it is not any more where the runs found it."""
     split: Literal["test", "val", "train"] = "test"
-    """Which photographs."""
+    """Which images."""
+    sheet: Path = Path("side_by_side.png")
+    """With several runs, the PNG to write: a row for each of some images, then the rendering of each run."""
 
 
 @dataclass(frozen=True)
@@ -308,24 +312,31 @@ def _synthetic(command: Synthetic) -> int:
 
 def _evaluate(command: Evaluate) -> int:
     from msdgs_train.evaluation import evaluate_run
-    from msdgs_train.evaluation_report import notes, write_evaluation
+    from msdgs_train.evaluation_report import draw_runs, notes, write_evaluation
     from msdgs_train.progress import frame_progress
 
-    with frame_progress(console, 0) as progress:
-        evaluation = evaluate_run(command.run, command.data, command.split, progress)
-    paths = write_evaluation(command.run, evaluation)
-    console.print(_table(evaluation))
-    for note in notes(evaluation):
-        console.print(note, soft_wrap=True, highlight=False)
-    console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+    if not command.runs:
+        raise InvalidInput("RUN", "the folder of one run or more", "none")
+    evaluations = {}
+    for run in command.runs:
+        with frame_progress(console, 0) as progress:
+            evaluation = evaluations[str(run)] = evaluate_run(run, command.data, command.split, progress)
+        paths = write_evaluation(run, evaluation)
+        console.print(_table(str(run), evaluation))
+        for note in notes(evaluation):
+            console.print(note, soft_wrap=True, highlight=False)
+        console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+    if len(evaluations) > 1:
+        draw_runs(command.sheet, evaluations)
+        console.print(f"wrote {command.sheet}", soft_wrap=True)
     return 0
 
 
-def _table(evaluation: "Evaluation") -> "Table":
+def _table(run: str, evaluation: "Evaluation") -> "Table":
     from msdgs_train.evaluation_report import HEADINGS, cells
 
     rows = [[j.name, f"{j.loaded.step:,}", *cells(evaluation, j.mean)] for j in evaluation.models]
-    title = f"{evaluation.split}, mean of {len(evaluation.frames)} images"
+    title = f"{run}: {evaluation.split}, mean of {len(evaluation.frames)} images"
     return _rich_table(["model", "step", *HEADINGS.values()], rows, names=1, title=title)
 
 
