@@ -309,18 +309,15 @@ def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
     errors = torch.cat([fit.errors(t, ids)[:, MEANS].norm(dim=1) for t in np.linspace(t0, t1, 17)])
     quantiles = ", ".join(f"{float(errors.quantile(q)):.2f}" for q in (0.5, 0.9, 0.99))
     console.print(f"pixels off the smoothed motion: {quantiles} (50, 90, 99 % of Gaussians)", markup=False)
-    moving = torch.nonzero(fit.motion.travel > fit.pixel)[:, 0]
-    means = fit.model.gaussians.means[ids]
-    steps = []
+    means, adds = fit.model.gaussians.means[ids], []
     for t in np.linspace(t0, t1, 5):
         at, moved = torch.tensor(t, dtype=means.dtype), torch.zeros_like(means)
         for layer in fit.model.deformation.layers:
             step = layer(means + moved, at)
             moved = moved + step.weight * step.delta_means
-            steps.append((step.weight * step.delta_means).norm(dim=1).mean() / fit.pixel)
-    layers = torch.stack(steps).view(5, -1).mean(0)
+            adds.append((step.weight * step.delta_means).norm(dim=1).mean() / fit.pixel)
+    layers = torch.stack(adds).view(5, -1).mean(0)
     console.print(f"pixels that a layer moves, mean: {', '.join(f'{v:.2f}' for v in layers)}", markup=False)
-    console.print(f"{len(moving):,} of {len(fit.motion.travel):,} Gaussians move by a pixel", markup=False)
     psnrs = []
     for view in deciding_views(cameras_of(fit.info), fit.info.time_range, 9):
         frames = [shown(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]

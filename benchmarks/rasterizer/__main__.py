@@ -12,10 +12,9 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import Progress
-from scipy.optimize import nnls
 
 from benchmarks.measuring import Times, machine
-from benchmarks.rasterizer.report import draw_plot, print_tables
+from benchmarks.rasterizer.report import print_tables
 from benchmarks.rasterizer.roofline import Roofline
 from benchmarks.rasterizer.scenes import Case, file_cases, object_scene, seeded_cases, write_splat
 from benchmarks.rasterizer.stages import Gradient, draw_in_stages, draw_scene, memory_of, row_of, work_of
@@ -38,7 +37,7 @@ class Benchmark:
 
     python -m benchmarks.rasterizer --counts 100000 --sizes 800x800 --repeats 5
 
-    python -m benchmarks.rasterizer --gradient --json out/rasterizer.json --plot out/rasterizer.png
+    python -m benchmarks.rasterizer --gradient --json out/rasterizer.json
 
     python -m benchmarks.rasterizer --splats bonsai.ply guitar.splat
 
@@ -66,8 +65,6 @@ class Benchmark:
     """Widths in pixels of the scene files' frames, from their first camera."""
     json: Path | None = None
     """Write all figures here."""
-    plot: Path | None = None
-    """Draw times over the number of Gaussians into this PNG."""
     check: bool = False
     """Only see that this benchmark works: a small run, and what must hold of its figures."""
 
@@ -87,8 +84,6 @@ class Run:
             self._time_stages("frames", seeded_cases(options.counts, options.sizes, options.seed))
         if options.splats:
             self._time_stages("real", file_cases(options.splats))
-            if options.counts:
-                predict(self.result["real"], self.result["frames"])
         if options.scenes:
             self._time_scenes()
 
@@ -136,19 +131,6 @@ class Run:
             ]
 
 
-def predict(rows: list[dict[str, Any]], seeded: list[dict[str, Any]]) -> None:
-    """Add to real scenes the milliseconds that seeded ones would take with as much work: a fit to these with costs of
-    0 or more per Gaussian, tile entry, lane and pixel."""
-
-    def work(row: dict[str, Any]) -> list[float]:
-        return [row["count"], row["tile_entries"], row["lanes"], row["size"][0] * row["size"][1]]
-
-    took = np.array([row["milliseconds"]["total"]["min"] for row in seeded])
-    costs, _ = nnls(np.array([work(row) for row in seeded]) / took[:, None], np.ones(len(took)))
-    for row in rows:
-        row["predicted_milliseconds"] = float(np.dot(costs, work(row)))
-
-
 def main(options: Benchmark) -> int:
     """Measure, print, write."""
     if options.check:
@@ -169,8 +151,6 @@ def main(options: Benchmark) -> int:
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         write_text(options.json, json.dumps(run.result, indent=1) + "\n")
-    if options.plot and "frames" in run.result:
-        draw_plot(run.result, options.plot)
     if stopped:
         console.print("stopped: not all was measured")
     return 130 if stopped else 0
@@ -192,12 +172,10 @@ def check() -> int:
             scenes=(Path("examples/toybench.onnx"),),
             widths=(32,),
             json=folder / "all.json",
-            plot=folder / "all.png",
         )
         assert main(options) == 0
         assert main(replace(options, splats=(folder / "none.splat",))) == 1
         result = json.loads((folder / "all.json").read_text())
-        assert (folder / "all.png").stat().st_size > 1000
     (row,), (real,), (scene,) = result["frames"], result["real"], result["scenes"]
     assert (row["count"], row["size"], row["repeats"], real["count"], scene["width"]) == (300, [64, 48], 2, 50, 32)
     assert all(0 < times["min"] <= times["median"] for times in row["milliseconds"].values())

@@ -1,9 +1,7 @@
-"""Tables and a plot of what `python -m benchmarks.rasterizer` has measured."""
+"""Tables of what `python -m benchmarks.rasterizer` has measured."""
 
-from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
@@ -25,23 +23,17 @@ def print_tables(result: Row, console: Console) -> None:
             console.print(_stages(result[section], title), _work(result[section]))
     if "scenes" in result:
         console.print(_scenes(result["scenes"]))
-    for line in summary(result):
-        console.print(line)
+    console.print(*growth(result.get("frames", [])), sep="\n")
 
 
-def summary(result: Row) -> list[str]:
-    """What the tables say about growth, and about the seeded scenes as a model of real ones."""
-    rows = {(row["count"], tuple(row["size"])): row for row in result.get("frames", [])}
-    lines = []
-    for size in dict.fromkeys(size for _, size in rows):
-        if (100_000, size) in rows and (1_000_000, size) in rows:
-            growth = _total(rows[1_000_000, size]) / _total(rows[100_000, size])
-            lines.append(f"100k to 1M Gaussians at {_size(size)}: {growth:.2f} times the time")
-    for row in result.get("real", []):
-        if "predicted_milliseconds" in row:
-            ratio = _total(row) / row["predicted_milliseconds"]
-            lines.append(f"{row['scene']}: {ratio:.2f} times what seeded scenes with as much work take")
-    return lines
+def growth(rows: list[Row]) -> list[str]:
+    """From 100,000 to 1,000,000 Gaussians."""
+    totals = {(row["count"], _size(row["size"])): _total(row) for row in rows}
+    return [
+        f"100k to 1M Gaussians at {size}: {total / totals[100_000, size]:.2f} times the time"
+        for (count, size), total in totals.items()
+        if count == 1_000_000 and (100_000, size) in totals
+    ]
 
 
 def _total(row: Row) -> float:
@@ -105,24 +97,3 @@ def _scenes(rows: list[Row]) -> Table:
         cells = minimum_and_median(pose), minimum_and_median(draw), f"{pose['min'] / (pose['min'] + draw['min']):.0%}"
         made.add_row(row["scene"], row["plan"], f"{row['moving']:,}", f"{row['width']}", *cells)
     return made
-
-
-def draw_plot(result: Row, path: Path) -> None:
-    """Times over the number of Gaussians, and the machine's floor for the same work."""
-    figure = Figure(figsize=(7, 5.2), layout="constrained")
-    axes = figure.subplots()
-    for size in dict.fromkeys(tuple(row["size"]) for row in result["frames"]):
-        some = [row for row in result["frames"] if tuple(row["size"]) == size]
-        counts, floors = [row["count"] for row in some], [row["floor_milliseconds"] for row in some]
-        (line,) = axes.plot(counts, [_total(row) for row in some], marker="o", label=_size(size))
-        axes.plot(counts, [each["lanes"] + each["memory"] for each in floors], linestyle=":", color=line.get_color())
-    axes.plot([], [], linestyle=":", color="grey", label="the machine's floor for the same")
-    for row in result.get("real", []):
-        axes.scatter(row["count"], _total(row), marker="x", color="black", zorder=3)
-        place = row["count"], _total(row)
-        axes.annotate(row["scene"], place, xytext=(5, -10), textcoords="offset points", fontsize=7)
-    axes.set(xscale="log", yscale="log", xlabel="Gaussians", ylabel="milliseconds per frame, minimum of all turns")
-    axes.grid(which="both", alpha=0.2)
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, format="png")

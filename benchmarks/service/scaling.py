@@ -1,31 +1,26 @@
-"""What one core serves, what many would, and what replicas and a cluster on this machine do."""
+"""What one core serves, and what many would."""
 
-import filecmp
 import os
-import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
 
 from benchmarks.measuring import machine
-from benchmarks.service.process import Connection, Running, service, wait_until_ready
+from benchmarks.service.process import Connection, Running, service
 from benchmarks.service.simulation import Fleet, Routing, Stages, Trace, simulate, zipf_trace
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.render_cli import main as render
 from msdgs_serve.scene.baked import SceneMetadata
-from tests.processes import free_port
 
 SCENES, TIMES = 8, 64  # of the trace that is measured
 IN_TURN = 25  # frames
@@ -33,9 +28,7 @@ MAX_ERROR = 0.15
 LOAD = 0.7  # of what all cores could draw without any cache
 CATALOGUE, MOMENTS = 200, 300  # scenes and times of a large service
 LARGE_CACHE = 256  # megabytes
-DOLLARS_CORE_HOUR = 0.04  # an assumption, of rented x86 cores
-NGINX = Path(__file__).parents[2] / "docker" / "nginx" / "nginx.conf"
-SEVERAL = 3  # replicas behind nginx
+CORE_HOUR = 0.04  # dollars: an assumption, of rented x86 cores
 
 
 @dataclass(frozen=True)
@@ -45,19 +38,12 @@ class Scaling:
 
     python -m benchmarks.service.scaling examples/toybench.onnx
 
-    python -m benchmarks.service.scaling examples/toybench.onnx --parts replicas --size 32 --cache-megabytes 12
-
-    python -m benchmarks.service.scaling examples/toybench.onnx --parts ray --frames 200 --size 800
-
-    `core`: seconds per frame with one client, and in turns with it the rate of four clients at another such service.
-    The simulation has to reproduce that rate within 15 %, or nothing is extrapolated and the exit status is 1; then a
-    table up to a thousand replicas. `replicas`: the hit rates of three replicas behind nginx with docker/nginx's
-    configuration, by affinity and in turns, beside the simulated ones; needs nginx. `ray`: a path drawn by two Ray
-    nodes of one core against drawing it here, byte by byte, and again with a node that is lost midway; needs Ray.
+    Seconds per frame are those of one client, and in turns with it four clients at another such service give a rate.
+    The simulation has to reproduce that rate within 15 %, or nothing is extrapolated and the exit status is 1; then
+    comes a table up to a thousand replicas.
     """
 
     scene: Annotated[Path, tyro.conf.Positional] = Path("examples/toybench.onnx")
-    parts: tuple[Literal["core", "replicas", "ray"], ...] = ("core",)
     size: int = 400
     """Pixels a side."""
     frames: int = 600
@@ -114,7 +100,7 @@ def replay(port: int, scene: SceneMetadata, trace: Trace, numbers: range, size: 
 
 
 class Bench:
-    """The parts, over one scene under several names."""
+    """A core, over one scene under several names, and its simulation."""
 
     def __init__(self, options: Scaling, folder: Path) -> None:
         session = DeformationSession(options.scene)
@@ -127,7 +113,7 @@ class Bench:
         for number in range(SCENES):
             shutil.copyfile(options.scene, self._copies / f"scene{number}.onnx")
 
-    def core(self) -> int:
+    def run(self) -> int:
         """Measure, calibrate, extrapolate."""
         cores = os.sched_getaffinity(0)
         turns = [self._turn(sorted(cores)) for _ in range(self.options.repeats)]
@@ -149,18 +135,15 @@ class Bench:
     def _turn(self, cores: list[int]) -> Measured:
         """A few frames of one client, then of several, and so on, so that what else runs disturbs both alike. Services
         are on one core, clients on another."""
-        alone, together, spent = list[Frame](), list[Frame](), 0.0
-        flags = {"concurrent_renders": 1, "queued_renders": 64}
+        alone, together, spent, clients = list[Frame](), list[Frame](), 0.0, self.options.clients
         os.sched_setaffinity(0, {cores[0]})
-        with self._service(**flags) as one, self._service(**flags) as other:
+        with self._service() as one, self._service() as other:
             os.sched_setaffinity(0, {cores[-1]})
             for start in range(0, self.options.frames, IN_TURN):
                 numbers = range(start, min(start + IN_TURN, self.options.frames))
                 alone += replay(one.port, self._scene, self._trace, numbers, self.options.size)
                 started = time.perf_counter()
-                together += replay(
-                    other.port, self._scene, self._trace, numbers, self.options.size, self.options.clients
-                )
+                together += replay(other.port, self._scene, self._trace, numbers, self.options.size, clients)
                 spent += time.perf_counter() - started
         hits, misses = ([f.seconds for f in alone if f.hit == hit] for hit in (True, False))
         stages = Stages(np.array(hits), np.array(misses))
@@ -168,9 +151,10 @@ class Bench:
         return Measured(stages, rate, hit_rate, float(np.mean([f.size for f in alone])))
 
     @contextmanager
-    def _service(self, **flags: int) -> Iterator[Running]:
+    def _service(self) -> Iterator[Running]:
         """One thread; all scenes are open, kernels are loaded."""
-        with service(self._copies, threads=1, cache_megabytes=self.options.cache_megabytes, **flags) as running:
+        flags = {"threads": 1, "concurrent_renders": 1, "queued_renders": 64}
+        with service(self._copies, cache_megabytes=self.options.cache_megabytes, **flags) as running:
             opening = Trace(np.arange(SCENES), np.full(SCENES, TIMES))
             replay(running.port, self._scene, opening, range(SCENES), self.options.size)
             yield running
@@ -180,18 +164,13 @@ class Bench:
         trace, stages = zipf_trace(self.options.requests, CATALOGUE, MOMENTS), measured.stages
         fleet = Fleet(1, poses=max(1, (LARGE_CACHE << 20) // self._pose_bytes))
         print(f"\n{CATALOGUE} scenes × {MOMENTS} times, 1/rank; {fleet.poses} poses a replica; {LOAD:.0%} load")
-        print(
-            "replicas | routing | hit rate | frames/s | refused | p50 ms | p99 ms | busiest/mean | Mbit/s | $ a million"
-        )
+        print("replicas | routing | hits | frames/s | refused | p50 ms | p99 ms | busiest/mean | Mbit/s | $ a million")
         routings: tuple[Routing, ...] = ("round robin", "affinity", "bounded")
         for count, routing in ((count, routing) for count in self.options.replicas for routing in routings):
             rate = LOAD * count / float(stages.miss.mean())
             found = simulate(trace, replace(fleet, replicas=count, routing=routing), stages, rate=rate)
             p50, p99 = 1e3 * np.quantile(found.latencies, [0.5, 0.99])
-            megabits, dollars = (
-                8e-6 * measured.frame_bytes * found.rate,
-                count * DOLLARS_CORE_HOUR / 3.6e-3 / found.rate,
-            )
+            megabits, dollars = found.rate * measured.frame_bytes * 8e-6, count * CORE_HOUR / 3.6e-3 / found.rate
             print(
                 f"{count} | {routing} | {found.hit_rate:.2f} | {found.rate:.0f} | "
                 f"{found.refused / len(trace.scenes):.1%} | {p50:.0f} | {p99:.0f} | {found.busiest:.2f} | "
@@ -200,108 +179,14 @@ class Bench:
         one, three = (simulate(trace, replace(fleet, replicas=n), stages, clients=12 * n).rate for n in (1, 3))
         print(f"three replicas by affinity, all that they can take: {three / one:.2f} × one")
 
-    def replicas(self) -> int:
-        """Both routings, each with fresh replicas."""
-        if shutil.which("nginx") is None:
-            raise SystemExit("needs nginx")
-        numbers, clients = range(self.options.frames), 2 * SEVERAL
-        print(f"{SEVERAL} replicas, {self._poses} poses each, {SCENES} scenes × {TIMES} times")
-        routings: tuple[Routing, ...] = ("affinity", "round robin")
-        for routing in routings:
-            with ExitStack() as stack:
-                ports = [stack.enter_context(self._service(concurrent_renders=1)).port for _ in range(SEVERAL)]
-                proxy = stack.enter_context(nginx(self._folder / routing.replace(" ", "_"), ports, routing))
-                frames = replay(proxy, self._scene, self._trace, numbers, self.options.size, clients)
-            hit_rate, same = float(np.mean([f.hit for f in frames])), np.array([0.01])  # times don't change the routing
-            fleet = Fleet(SEVERAL, routing, poses=self._poses)
-            expected = simulate(self._trace, fleet, Stages(same, same), clients=clients).hit_rate
-            print(f"  {routing:12} hit rate {hit_rate:.3f} (simulated {expected:.3f})")
-        return 0
-
-    def ray(self) -> int:
-        """Overhead in turns, then the loss of a node."""
-        os.environ["RAY_AUTH_MODE"] = "disabled"  # only this machine reaches the nodes
-        from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
-
-        node = {"num_cpus": 1, "object_store_memory": 100 << 20}
-        cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-        second = cluster.add_node(**node)
-        os.environ["RAY_ADDRESS"] = cluster.address
-        seconds = {"here": list[float](), "ray": list[float]()}
-        for _ in range(self.options.repeats + 1):
-            for name in seconds:
-                seconds[name].append(self._draw(name))
-        least = {name: min(taken[1:]) for name, taken in seconds.items()}  # the first starts the workers
-        ratio = least["ray"] / least["here"]
-        print(f"here {least['here']:.1f} s, two nodes of one core {least['ray']:.1f} s: {ratio:.2f} ×")
-        drawing = threading.Thread(target=self._draw, args=("lost",))
-        drawing.start()
-        while drawing.is_alive() and len(list((self._folder / "lost").glob("frame_*"))) < self.options.frames // 3:
-            time.sleep(0.02)
-        there = len(list((self._folder / "lost").glob("frame_*")))
-        cluster.remove_node(second, allow_graceful=False)
-        drawing.join()
-        print(f"one of two nodes lost after {there} frames of {self.options.frames}")
-        return max(self._compare("ray"), self._compare("lost"))
-
-    def _draw(self, name: str) -> float:
-        """Seconds of `msdgs-render` into a new folder, on Ray unless it is called `here`."""
-        out, size = self._folder / name, str(self.options.size)
-        shutil.rmtree(out, ignore_errors=True)
-        line = [
-            str(self.options.scene),
-            str(out),
-            "--frames",
-            str(self.options.frames),
-            "--width",
-            size,
-            "--height",
-            size,
-        ]
-        started = time.perf_counter()
-        assert render(line if name == "here" else [*line, "--ray", "auto"]) == 0
-        return time.perf_counter() - started
-
-    def _compare(self, name: str) -> int:
-        names = sorted(path.name for path in (self._folder / "here").glob("frame_*"))
-        same, *others = filecmp.cmpfiles(self._folder / "here", self._folder / name, names, shallow=False)
-        print(f"  {name}: {len(same)} of {len(names)} files are the same bytes as drawn here")
-        return int(any(others))
-
-
-@contextmanager
-def nginx(folder: Path, ports: list[int], routing: str) -> Iterator[int]:
-    """The proxy of the composition over these ports, without its line `hash` for requests in turns; its own port."""
-    folder.mkdir()
-    port = free_port()
-    text = NGINX.read_text().replace("listen 8080;", f"listen 127.0.0.1:{port};")
-    text = text.replace("/tmp/", f"{folder}/").replace("/dev/stdout", f"{folder}/access.log")
-    if routing != "affinity":
-        text, count = re.subn(r"^\s*hash \$affinity;.*$", "", text, flags=re.MULTILINE)
-        assert count == 1
-    if os.geteuid() == 0:  # or its workers are a user who may not write here
-        text = f"user root;\n{text}"
-    (folder / "nginx.conf").write_text(text)
-    (folder / "replicas.conf").write_text("".join(f"server 127.0.0.1:{each} max_fails=0;\n" for each in ports))
-    command = ["nginx", "-p", str(folder), "-c", str(folder / "nginx.conf"), "-g", "daemon off;"]
-    with subprocess.Popen(command) as process:
-        try:
-            wait_until_ready(Running(port, process))
-            yield port
-        finally:
-            process.terminate()
-
 
 def main(options: Scaling) -> int:
-    """Each part that was asked for."""
+    """Measure, calibrate, extrapolate."""
     if options.check:
         return check()
     print(f"{machine()}; {options.scene.name}, {options.size} × {options.size}, {options.frames} frames")
-    statuses = []
-    for part in options.parts:
-        with tempfile.TemporaryDirectory() as folder:
-            statuses.append(getattr(Bench(options, Path(folder)), part)())
-    return max(statuses)
+    with tempfile.TemporaryDirectory() as folder:
+        return Bench(options, Path(folder)).run()
 
 
 def check() -> int:
@@ -320,7 +205,7 @@ def check() -> int:
     with tempfile.TemporaryDirectory() as folder:
         Bench(small, Path(folder)).extrapolate(Measured(one, 100.0, 0.5, 1e4))
     assert main(small) in (0, 1)  # on a busy machine the simulation may miss the rate
-    return main(replace(small, parts=("replicas",))) if shutil.which("nginx") else 0
+    return 0
 
 
 if __name__ == "__main__":
