@@ -23,9 +23,9 @@ from export.exporters.ply import write_ply
 from export.importers import ImportFailed, recognise
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
+from msdgs_train.sheets import Panel, draw_sheet
 
 COLUMNS = 4
-INCHES = 2.6
 BEHIND = 0.1
 CAMERA = {"type": "orbit", "azimuth": -25, "elevation": 15}
 ALONG = (0.0, 0.5)
@@ -65,10 +65,11 @@ def draw(inputs: list[Path], output: Path, size: int) -> int:
                     seen = float((pixels[..., 3] > 0.5).mean())
                     count = len(DeformationSession(scene).scene)
                     print(f"{name}  {kind}  t = {t:g}  {count:,} Gaussians, fill {seen:.0%} of the image")
-                    images.append((f"{name}, {kind}" + (f", t = {t:g}" if t else ""), pixels))
+                    rgb = pixels[..., :3] * pixels[..., 3:] + BEHIND * (1 - pixels[..., 3:])
+                    images.append(Panel((255 * rgb).round().astype(np.uint8), f"{name}, t = {t:g}"))
                     failed += [] if 0.01 < seen < 0.99 else [name]
     output.parent.mkdir(parents=True, exist_ok=True)
-    write(output, images)
+    draw_sheet(output, "Imported files", [images[i : i + COLUMNS] for i in range(0, len(images), COLUMNS)])
     print(f"{len(images)} images; failed: {', '.join(failed) or 'none'}")
     return bool(failed)
 
@@ -96,19 +97,6 @@ def rendered(running: Running, scene: Path, size: int) -> Iterator[tuple[float, 
         if answer.status != 200:
             raise SystemExit(f"{scene.stem}: {answer.status} {answer.body[:200]!r}")
         yield t, plt.imread(io.BytesIO(answer.body))
-
-
-def write(output: Path, images: list[tuple[str, np.ndarray]]) -> None:
-    """The sheet."""
-    rows = -(-len(images) // COLUMNS)
-    figure, axes = plt.subplots(rows, COLUMNS, figsize=(INCHES * COLUMNS, (INCHES + 0.3) * rows), squeeze=False)
-    for axis in axes.flat:
-        axis.axis("off")
-    for axis, (title, pixels) in zip(axes.flat, images, strict=False):
-        axis.imshow(pixels[..., :3] * pixels[..., 3:] + BEHIND * (1 - pixels[..., 3:]))
-        axis.set_title(title, fontsize=6)
-    figure.tight_layout(pad=0.3)
-    figure.savefig(output, dpi=110)
 
 
 def check() -> int:

@@ -1,28 +1,25 @@
 """Where the time of a training step goes: deformation, projection, tiles, blending, loss, each with its gradient, and
-the optimiser.
+the optimizer.
 
 python -m benchmarks.training.training_step --gaussians 10000 --size 200
 python -m benchmarks.training.training_step data/scene --preset msdgs-mlp --gaussians 30000 --size 400
 
 Without a folder it trains on a synthetic scene that it makes. The parts are measured one after the other on the same
-step, repeat after repeat; least and median of the repeats are printed, and what the parts add up to beside whole steps.
-In turns with them, steps of several photographs side by side.
+step, repeat after repeat; minimum and median of the repeats are printed, and the sum of the parts beside whole steps.
+In turns with them, steps of several images side by side.
 """
 
 import argparse
 import tempfile
-import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measuring import machine
+from benchmarks.measuring import Times, machine
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.compositing_backward import composite_backward
 from msdgs_serve.rasterizer.projection import project
@@ -37,30 +34,31 @@ from msdgs_train.presets import preset
 from msdgs_train.trainer import Trainer
 
 FORWARD = ("deformation", "projection", "tiles", "blending", "loss")
-BACKWARD = ("loss gradient", "blending gradient", "projection gradient", "deformation gradient", "optimiser")
+BACKWARD = ("loss gradient", "blending gradient", "projection gradient", "deformation gradient", "optimizer")
 
 
 def main() -> None:
     """Measure and print."""
     arguments = parse_arguments()
     with tempfile.TemporaryDirectory() as made:
-        several, trainer = (make_trainer(arguments, Path(made), n) for n in (arguments.photographs, 1))
+        several, trainer = (make_trainer(arguments, Path(made), n) for n in (arguments.images, 1))
         for _ in range(3):  # compiled, and Adam has its moments
             trainer.step()
             several.step()
-        repeats = [dict(measured(trainer, several)) for _ in range(arguments.repeats)]
-    show(repeats, arguments)
-    assert all(set(repeat) == {*FORWARD, *BACKWARD, "whole step", "several"} for repeat in repeats)
+        times = Times()
+        for _ in range(arguments.repeats):
+            measure(trainer, several, times)
+    show(times, arguments)
 
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, nargs="?", help="a folder of photographs; default: a synthetic scene")
+    parser.add_argument("data", type=Path, nargs="?", help="a dataset folder; default: a synthetic scene")
     parser.add_argument("--preset", default="msdgs-small", help="whose networks are trained")
     parser.add_argument("--gaussians", type=int, default=10_000)
-    parser.add_argument("--size", type=int, default=200, help="width of the photographs in pixels")
+    parser.add_argument("--size", type=int, default=200, help="width of the images in pixels")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--photographs", type=int, default=4, help="side by side, to compare with one after the other")
+    parser.add_argument("--images", type=int, default=4, help="side by side, to compare with one after the other")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--check", action="store_true", help="only see that this works, at a small size")
     arguments = parser.parse_args()
@@ -69,7 +67,7 @@ def parse_arguments() -> argparse.Namespace:
     return arguments
 
 
-def make_trainer(arguments: argparse.Namespace, made: Path, photographs: int) -> Trainer:
+def make_trainer(arguments: argparse.Namespace, made: Path, images: int) -> Trainer:
     """A trainer at a step at which all of the model takes part."""
     data = arguments.data
     if data is None:
@@ -81,7 +79,7 @@ def make_trainer(arguments: argparse.Namespace, made: Path, photographs: int) ->
         preset(arguments.preset),
         init_count=count,
         max_gaussians=count,
-        photographs=photographs,
+        photographs=images,
         threads=arguments.threads,
         warmup_fraction=0.0,
         densify_until_fraction=0.0,
@@ -89,81 +87,57 @@ def make_trainer(arguments: argparse.Namespace, made: Path, photographs: int) ->
     return Trainer(config, load_scene(data, arguments.size))
 
 
-def measured(trainer: Trainer, several: Trainer) -> Iterator[tuple[str, float]]:
-    """Seconds by part of a step of one photograph, then of a whole one, and of one of several."""
+def measure(trainer: Trainer, several: Trainer, times: Times) -> None:
+    """The parts of a step of one image, then a whole one, and one of several images."""
     torch.set_num_threads(trainer.config.threads)
-    model, frame = trainer.model, trainer.frames[0]
-    background = torch.zeros(3)
-    truth = trainer._photograph(frame, background)
-
-    def timed(function: Callable[[], Any]) -> tuple[Any, float]:
-        start = time.perf_counter()
-        return function(), time.perf_counter() - start
-
-    camera = frame.camera
-    posed, seconds = timed(lambda: model.pose(frame.t))
-    yield "deformation", seconds
+    frame = trainer.frames[0]
+    camera, zeros = frame.camera, np.zeros((frame.camera.height, frame.camera.width), np.float32)
+    size, black = (camera.width, camera.height), np.zeros(3, np.float32)
+    truth = trainer._photograph(frame, torch.zeros(3))
+    posed = times.time("deformation", trainer.model.pose, frame.t)
     gaussians = Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
-    splats, seconds = timed(lambda: project(gaussians, camera, GSPLAT))
-    yield "projection", seconds
-    tiles, seconds = timed(lambda: bin_into_tiles(splats, camera.width, camera.height))
-    yield "tiles", seconds
-    drawn, seconds = timed(
-        lambda: composite(splats, tiles, camera.width, camera.height, np.zeros(3, np.float32), GSPLAT)
-    )
-    yield "blending", seconds
+    splats = times.time("projection", project, gaussians, camera, GSPLAT)
+    tiles = times.time("tiles", bin_into_tiles, splats, *size)
+    drawn = times.time("blending", composite, splats, tiles, *size, black, GSPLAT)
     rgb = torch.from_numpy(drawn.rgb).requires_grad_()
-    loss, seconds = timed(lambda: photometric_loss(rgb, truth, trainer.config.l1_weight))
-    yield "loss", seconds
-    _, seconds = timed(loss.backward)
-    yield "loss gradient", seconds
+    loss = times.time("loss", photometric_loss, rgb, truth, trainer.config.l1_weight)
+    times.time("loss gradient", loss.backward)
     assert rgb.grad is not None
-    grad_rgb = rgb.grad.numpy()
-    sums, seconds = timed(
-        lambda: composite_backward(splats, tiles, GSPLAT, drawn, grad_rgb, np.zeros(grad_rgb.shape[:2], np.float32))
-    )
-    yield "blending gradient", seconds
-    grads, seconds = timed(lambda: project_backward(gaussians, splats, sums, camera, GSPLAT))
-    yield "projection gradient", seconds
+    sums = times.time("blending gradient", composite_backward, splats, tiles, GSPLAT, drawn, rgb.grad.numpy(), zeros)
+    grads = times.time("projection gradient", project_backward, gaussians, splats, sums, camera, GSPLAT)
     tensors = [torch.from_numpy(np.ascontiguousarray(array)) for array in grads[:5]]
     trainer.optimizer.zero_grad(set_to_none=True)
-    _, seconds = timed(lambda: torch.autograd.backward(list(posed), tensors))
-    yield "deformation gradient", seconds
-    _, seconds = timed(trainer.optimizer.step)
-    yield "optimiser", seconds
-    _, seconds = timed(trainer.step)
-    yield "whole step", seconds
+    times.time("deformation gradient", torch.autograd.backward, list(posed), tensors)
+    times.time("optimizer", trainer.optimizer.step)
+    times.time("whole step", trainer.step)
     torch.set_num_threads(1)
-    _, seconds = timed(several.step)
-    yield "several", seconds
+    times.time("several", several.step)
 
 
-def show(repeats: list[dict[str, float]], arguments: argparse.Namespace) -> None:
-    """The table, and the two ratios that matter."""
-    least = {name: min(repeat[name] for repeat in repeats) * 1e3 for name in repeats[0]}
-    median = {name: float(np.median([repeat[name] for repeat in repeats])) * 1e3 for name in repeats[0]}
-    parts = sum(least[name] for name in (*FORWARD, *BACKWARD))
-    table = Table("part", "ms, least", "ms, median", "share", box=None)
+def show(times: Times, arguments: argparse.Namespace) -> None:
+    """The table, and the ratios that matter."""
+    found = times.milliseconds()
+    least = {name: each["min"] for name, each in found.items()}
+    total = {kind: sum(found[name][kind] for name in (*FORWARD, *BACKWARD)) for kind in ("min", "median")}
+    table = Table("part", "ms, minimum", "ms, median", "share", box=None)
     for name in (*FORWARD, *BACKWARD):
-        table.add_row(name, f"{least[name]:.1f}", f"{median[name]:.1f}", f"{least[name] / parts:.0%}")
-    table.add_row("all of these", f"{parts:.1f}", f"{sum(median[name] for name in (*FORWARD, *BACKWARD)):.1f}", "")
-    table.add_row("a whole step", f"{least['whole step']:.1f}", f"{median['whole step']:.1f}", "")
-    console = Console()
+        table.add_row(name, f"{least[name]:.1f}", f"{found[name]['median']:.1f}", f"{least[name] / total['min']:.0%}")
+    table.add_row("all of these", f"{total['min']:.1f}", f"{total['median']:.1f}", "")
+    table.add_row("a whole step", f"{least['whole step']:.1f}", f"{found['whole step']['median']:.1f}", "")
+    console = Console(soft_wrap=True)
     console.print(machine())
     console.print(
         f"{arguments.preset}, {arguments.gaussians:,} Gaussians, {arguments.size} pixels wide, "
         f"{arguments.threads} threads, {arguments.repeats} repeats"
     )
     console.print(table)
-    render = least["projection"] + least["tiles"] + least["blending"]
+    forward = least["projection"] + least["tiles"] + least["blending"]
     gradient = least["blending gradient"] + least["projection gradient"]
-    console.print(f"rasterizer: gradient / forward = {gradient / render:.2f}")
-    step = least["whole step"] / (render + least["deformation"])
-    console.print(f"whole step / (forward rendering + deformation) = {step:.2f}")
-    each = least["several"] / arguments.photographs
+    each, step = least["several"] / arguments.images, least["whole step"]
+    console.print(f"rasterizer: gradient / forward = {gradient / forward:.2f}")
+    console.print(f"whole step / (forward rendering + deformation) = {step / (forward + least['deformation']):.2f}")
     console.print(
-        f"{arguments.photographs} photographs side by side: {each:.1f} ms each, "
-        f"{least['whole step'] / each:.2f} times as many a second"
+        f"{arguments.images} images side by side: {each:.1f} ms each, {step / each:.2f} times as many a second"
     )
 
 
