@@ -1,4 +1,4 @@
-// The seeded scenes of benchmarks/splat_scenes.py as a renderer written by hand for AVX-512 draws them: a measure for
+// The seeded scenes of benchmarks/rasterizer/scenes.py as a renderer written by hand for AVX-512 draws them: a measure for
 // the numba kernels of msdgs_serve/rasterizer, whose semantics it has. Colour only, a pinhole camera, harmonics of
 // degree 3, usable numbers. All scratch is kept from frame to frame.
 //

@@ -30,13 +30,13 @@ def f3d(job: dict) -> Drawing:
         "ui.loader_progress": False,
     })  # fmt: skip
     engine.scene.add(job["file"])
-    window = engine.window
-    window.size = tuple(job["size"])
+    engine.window.size = tuple(job["size"])
     view = f3d.CameraState(**{name: tuple(job[name]) for name in ("position", "focal_point", "view_up")})
     view.view_angle = job["view_angle"]
     images = []
 
     def draw() -> float:
+        window = engine.window  # it lives as long as its engine
         window.camera.state = view
         start = time.perf_counter()
         images[:] = [window.render_to_image()]
