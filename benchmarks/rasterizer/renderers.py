@@ -66,13 +66,13 @@ class Compare:
     avx512: bool = False
     """A renderer written by hand for AVX-512; needs g++ and such a processor."""
     against: Path | None = None
-    """Another checkout of this project."""
+    """Another checkout of this project: its times are against those of this one in a process of its own, too."""
     f3d_python: Path | None = None
     """An interpreter that can import f3d."""
     open3d_python: Path | None = None
     """An interpreter that can import open3d."""
     alpha_min: float = GSPLAT.alpha_min
-    """At which alpha our splats end in the image that others are compared with; F3D has no such cut."""
+    """At which alpha our splats end in the image that F3D's and Open3D's are compared with; F3D has no such cut."""
     check: bool = False
     """Only see that this benchmark works: this checkout against itself, and AVX-512 if there is."""
 
@@ -102,14 +102,12 @@ def by_hand(renderer: Avx512Renderer, case: Case) -> Renderer:
 
 
 @contextlib.contextmanager
-def in_a_process(name: str, python: Path | str, case: Case, checkout: Path | None = None) -> Iterator[Renderer]:
-    """F3D, Open3D or a checkout of this project, which draws in a process of its own as renderer_worker.py says."""
+def in_a_process(
+    name: str, python: Path | str, case: Case, file: Path, checkout: Path | None = None
+) -> Iterator[Renderer]:
+    """F3D, Open3D or a checkout of this project, which draws the case's file as renderer_worker.py says."""
     with tempfile.TemporaryDirectory() as temporary, tempfile.TemporaryFile("w+") as errors:
-        file, image = (Path(temporary, n) for n in (("s.npz", "f.npy") if checkout else ("s.splat", "f.png")))
-        if checkout:
-            np.savez(file, **vars(case.gaussians))
-        else:
-            write_splat(file, case.gaussians)
+        image = Path(temporary, "frame.npy" if checkout else "frame.png")
         job = {"renderer": "msdgs" if checkout else name, "file": str(file), "image": str(image), **_view(case)}
         process = subprocess.Popen(
             [str(python), str(WORKER), json.dumps(job)],
@@ -168,36 +166,36 @@ def in_turns(renderers: dict[str, Renderer], repeats: int) -> dict[str, Times]:
 def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterator[dict[str, Any]]:
     """Ours, then the others, of one case."""
     pythons = {"F3D": options.f3d_python, "Open3D": options.open3d_python}
+    checkouts = {"this checkout": ROOT, "the other": options.against.resolve()} if options.against else {}
     with contextlib.ExitStack() as stack:
-        groups: list[tuple[Case, dict[str, Renderer]]] = [(case, {})]
-        if hand:
-            groups[0][1]["by hand"] = by_hand(hand, case)
-        if options.against:  # both in processes, so that they differ in nothing else
-            for name, checkout in (("this checkout", ROOT), ("the other", options.against.resolve())):
-                groups[0][1][name] = stack.enter_context(in_a_process(name, sys.executable, case, checkout))
-        if any(pythons.values()):
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            write_splat(folder / "8 bits.splat", case.gaussians)
-            rounded = file_cases((folder / "8 bits.splat",))[0]._replace(camera=case.camera)
-            started = {n: stack.enter_context(in_a_process(n, p, rounded)) for n, p in pythons.items() if p}
-            groups.append((rounded, started))
-        for drawn, others in groups:
-            if others:
-                yield from _rows(drawn, others, options)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        exact, rounded = folder / "exact.npz", folder / "8 bits.splat"
+        np.savez(exact, **vars(case.gaussians))
+        write_splat(rounded, case.gaussians)
+        others = {"by hand": by_hand(hand, case)} if hand else {}
+        for name, checkout in checkouts.items():  # both in processes, so that they differ in nothing else
+            others[name] = stack.enter_context(in_a_process(name, sys.executable, case, exact, checkout))
+        yield from _rows(case, others, options.repeats)
+        (coarse,) = file_cases((rounded,))
+        coarse = coarse._replace(camera=case.camera)
+        others = {n: stack.enter_context(in_a_process(n, p, coarse, rounded)) for n, p in pythons.items() if p}
+        yield from _rows(coarse, others, options.repeats, options.alpha_min)
 
 
-def _rows(case: Case, others: dict[str, Renderer], options: Compare) -> Iterator[dict[str, Any]]:
-    times = in_turns({"msdgs": ours(case), **others}, options.repeats)
-    base = "this checkout" if "this checkout" in others else "msdgs"
+def _rows(
+    case: Case, others: dict[str, Renderer], repeats: int, alpha_min: float = GSPLAT.alpha_min
+) -> Iterator[dict[str, Any]]:
+    if not others:
+        return
+    times = in_turns({"msdgs": ours(case), **others}, repeats)
     for name, taken in times.items():
-        row = {"name": name, "case": case, "milliseconds": taken.milliseconds()}
-        row["ratio"] = taken.minimum("total") / times["msdgs" if name == "by hand" else base].minimum("total")
+        base = "this checkout" if name == "the other" else "msdgs"
+        ratio = taken.minimum("total") / times[base].minimum("total")
+        row = {"name": name, "case": case, "milliseconds": taken.milliseconds(), "ratio": ratio}
         if name in others:
-            image = rasterize(
-                case.gaussians, case.camera, options=NEAREST.get(name, GSPLAT)._replace(alpha_min=options.alpha_min)
-            ).rgb
-            theirs = others[name].image()
-            row |= {"psnr": psnr(image, theirs), "name": f"{name} {others[name].version}".strip()}
+            nearest = NEAREST.get(name, GSPLAT)._replace(alpha_min=alpha_min)
+            image = rasterize(case.gaussians, case.camera, options=nearest).rgb
+            row |= {"psnr": psnr(image, others[name].image()), "name": f"{name} {others[name].version}".strip()}
         yield row
 
 
