@@ -35,7 +35,7 @@ from tests.stability_rows import Row, measured, refused, relative
 COUNT = 60
 Change = Callable[[DynamicGaussians], object]
 BACKGROUND = (0.2, 0.6, 0.9)
-MOVES, SCALES, PICTURE = "pose from the scene file", "scales from the file, relative", "float32 picture"
+MOVES, SCALES, PICTURE = "pose from the scene file", "scales from the file, relative", "float32 image"
 
 
 def changed(change: Change = lambda model: None, count: int = COUNT, **config: Any) -> DynamicGaussians:
@@ -309,7 +309,7 @@ def broken_files() -> Iterator[Row]:
     for case, data in (
         ("a text", b"not a model"),
         ("a PNG", b"\x89PNG\r\n\x1a\n" + bytes(64)),
-        ("somebody else's checkpoint", _bytes({"state_dict": {"w": torch.zeros(3)}})),
+        ("another program's checkpoint", _bytes({"state_dict": {"w": torch.zeros(3)}})),
         ("a list", _bytes([1, 2, 3])),
         ("a model of a later format", _bytes({**_contents(), "format": "msdgs-model/9"})),
         ("bytes overwritten in the middle", bytes(flipped)),
