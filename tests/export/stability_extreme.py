@@ -309,7 +309,7 @@ def broken_files() -> Iterator[Row]:
     for case, data in (
         ("a text", b"not a model"),
         ("a PNG", b"\x89PNG\r\n\x1a\n" + bytes(64)),
-        ("somebody else's checkpoint", _bytes({"state_dict": {"w": torch.zeros(3)}})),
+        ("another program's checkpoint", _bytes({"state_dict": {"w": torch.zeros(3)}})),
         ("a list", _bytes([1, 2, 3])),
         ("a model of a later format", _bytes({**_contents(), "format": "msdgs-model/9"})),
         ("bytes overwritten in the middle", bytes(flipped)),

@@ -129,7 +129,7 @@ def _foretold(name: str, report: StabilityReport) -> list[Row]:
     s = report.samples
     small = s.predicted < tolerance("stability.first_order")
     ratios = s.distance[small] / np.maximum(s.predicted[small], 1e-300)
-    quantity = f"float32 means, as part of what is foretold, for {small.mean():.0%} of them"
+    quantity = f"float32 means, relative to the predicted error, for {small.mean():.0%} of them"
     return [measured(name, quantity, float(ratios.max()), "stability.foretold")] if small.any() else []
 
 
