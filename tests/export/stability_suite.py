@@ -1,4 +1,4 @@
-"""`python -m tests.export.stability_suite`: all constructed cases as a table; `--write` writes docs/data/stability.csv."""
+"""`python -m tests.export.stability_suite`: all constructed cases as a table; `--write`: docs/data/stability.csv."""
 
 import csv
 import sys

@@ -1,4 +1,4 @@
-"""Take the screenshots of docs/viewer.md: `python -m tests.support.viewer_screenshots docs/images`, from the checkout's root."""
+"""Take the screenshots of docs/viewer.md: `python -m tests.support.viewer_screenshots docs/images`."""
 
 import sys
 from pathlib import Path
