@@ -97,7 +97,7 @@ def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicG
     gray = torch.full_like(canonical, 0.5)
     gaussians = CanonicalGaussians.from_points(canonical, gray, sizes.sh_degree, generator, sizes.attributes())
     for name in ("means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"):
-        gaussians.get_parameter(name).requires_grad_(requires_grad=False)
+        gaussians.get_parameter(name).requires_grad = False
     torch.manual_seed(seed)
     return DynamicGaussians(sizes, gaussians, SceneBounds(HALF_EXTENT))
 
