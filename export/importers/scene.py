@@ -41,8 +41,7 @@ def static_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     g = source.gaussians
     metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped)
     scene = BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
-    three = np.empty((0, 3), np.float32)
-    return build("network", Baked(scene, Moving(three, three, np.empty((0, 4), np.float32), None), ()))
+    return build("network", Baked(scene, Moving.none(), ()))
 
 
 def metadata_of(

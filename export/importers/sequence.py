@@ -174,7 +174,7 @@ def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     poses = np.stack([np.concatenate([f.means, f.scales, f.quats], axis=1)[moving] for f in frames], axis=1)
     give_one_sign(poses)
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
-    baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving], None), ())
+    baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving]), ())
     graph = new_graph(baked)
     activated(graph, of_ids(graph, GriddedPoses.on_one(StoredPoses.of(control)), metadata.time_range))
     return finished(graph, baked, f"keyframes:{count + 2}")
@@ -202,7 +202,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
     scene = BakedScene(
         replace(metadata, plan=plan), len(means), empty, np.empty((0, 4), np.float32), empty, opacities, sh
     ).validate("the imported sequence")
-    baked = Baked(scene, Moving(means, scales, quats, None), ())
+    baked = Baked(scene, Moving(means, scales, quats), ())
     graph = new_graph(baked)
     low, high = np.array(metadata.bounds)
     parked = (low + high) / 2 - PARKED_AT * max(float(np.linalg.norm(high - low)) / 2, 1e-3) * UP

@@ -1,51 +1,77 @@
 """A layer of shared motions as a graph: splines once a call, then one product and a few sums for each Gaussian."""
 
-import numpy as np
-from onnx import TensorProto
+from collections.abc import Mapping
+from typing import cast
 
-from export.jobs.bake import Moving
+import numpy as np
+import torch
+from onnx import TensorProto
+from torch import Tensor, nn
+
+from export.layers.base import LayerInputs
 from export.layers.graph import GraphBuilder, to_numpy
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.basis_kernels import LEAST_STRETCH
-from msdgs_train.basis_layer import BasisLayer
+from msdgs_train.basis_kernels import FOLLOWED, LEAST_STRETCH
+from msdgs_train.basis_layer import BasisLayer, Carried
+from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.model import carried
 
 KNOTS = 4
 """That a time reads."""
 
 
-def basis_deltas(
-    graph: GraphBuilder,
-    name: str,
-    layer: BasisLayer,
-    moving: Moving,
-    means: str,
-    quats: str,
-    time: str,
-    used: list[str],
-    share: str,
-) -> str:
-    """Deltas of the heads `used` of canonical means, [M, 3], and unit quaternions, [M, 4], times the layer's share."""
-    blended = _blended(graph, name, moving, _motions(graph, f"{name}.motions", layer, time))
-    matrices, offsets, turns = graph.split(
-        blended, [f"{name}.{p}" for p in ("matrices", "offsets", "turns")], [9, 3, 4]
-    )
-    parts = {
-        "means": lambda: _moved(graph, name, matrices, offsets, means),
-        "scales": lambda: _stretched(graph, name, matrices, quats),
-        "quats": lambda: _turned(graph, name, turns, quats),
-    }
-    columns = [parts[part]() for part in used]
-    return graph.node("Mul", [graph.node("Concat", columns, f"{name}.raw", axis=1), share], f"{name}.shared")
+class SplineExport:
+    """Of `BasisLayer`."""
+
+    removable_heads: frozenset[str] = frozenset()
+    parameters = frozenset({"basis_logits", "basis_ids"})
+    bytes_per_gaussian = FOLLOWED * (4 + 1)  # a weight in float32 and an id in 8 bits for each motion
+
+    def attributes(self, gaussians: CanonicalGaussians) -> dict[str, np.ndarray]:
+        """`basis_weights`, [N, F], whose rows sum to 1, and `basis_ids`, int64 [N, F]: the motions of a Gaussian."""
+        inputs = carried(gaussians)
+        assert inputs is not None  # the model's configuration has seen to it
+        return {"basis_weights": to_numpy(inputs.basis_weights), "basis_ids": inputs.basis_ids.numpy()}
+
+    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+        """Motions once a call, then for each Gaussian the mean of its motions, applied to its canonical pose."""
+        name, means, quats = inputs.name, inputs.canonical_means, inputs.canonical_quats
+        motions = _motions(graph, f"{name}.motions", cast(BasisLayer, inputs.layer), inputs.time)
+        blended = _blended(graph, name, inputs.attributes, motions)
+        names = [f"{name}.{part}" for part in ("matrices", "offsets", "turns")]
+        matrices, offsets, turns = graph.split(blended, names, [9, 3, 4])
+        parts = {
+            "means": lambda: _moved(graph, name, matrices, offsets, means),
+            "scales": lambda: _stretched(graph, name, matrices, quats),
+            "quats": lambda: _turned(graph, name, turns, quats),
+        }
+        columns = [parts[part]() for part in used]
+        return graph.node("Mul", [graph.node("Concat", columns, f"{name}.raw", axis=1), inputs.gate], f"{name}.shared")
+
+    def inert_heads(self, layer: nn.Module) -> frozenset[str]:
+        """None: a motion moves, scales and rotates."""
+        return frozenset()
+
+    def without_heads(self, layer: nn.Module, names: frozenset[str]) -> nn.Module:
+        """The layer as it is: it has no heads to remove."""
+        return layer
 
 
-def _blended(graph: GraphBuilder, name: str, moving: Moving, motions: str) -> str:
+def skinning_inputs(means: Tensor, quats: Tensor, attributes: Mapping[str, np.ndarray]) -> Carried | None:
+    """What `BasisLayer` reads of canonical Gaussians, in the dtype of `means`; None without its attributes."""
+    if "basis_ids" not in attributes:
+        return None
+    weights = torch.from_numpy(attributes["basis_weights"]).to(means.dtype)
+    return Carried(means, quats, weights, torch.from_numpy(attributes["basis_ids"]))
+
+
+def _blended(graph: GraphBuilder, name: str, attributes: Mapping[str, np.ndarray], motions: str) -> str:
     """[M, 16] the mean of the motions [B, 16] that each Gaussian follows."""
-    assert moving.basis_weights is not None  # `bake` has seen to it
-    assert moving.basis_ids is not None
-    small = np.uint8 if moving.basis_ids.max(initial=0) < 256 else np.int64
-    ids = graph.node("Gather", [graph.constant("basis_ids", moving.basis_ids.astype(small)), "ids"], "ids.basis_ids")
+    basis_ids, basis_weights = attributes["basis_ids"], attributes["basis_weights"]
+    small = np.uint8 if basis_ids.max(initial=0) < 256 else np.int64
+    ids = graph.node("Gather", [graph.constant("basis_ids", basis_ids.astype(small)), "ids"], "ids.basis_ids")
     ids = graph.node("Cast", [ids], f"{name}.followed", to=TensorProto.INT64)
-    weights = graph.node("Gather", [graph.constant("basis_weights", moving.basis_weights), "ids"], "ids.basis_weights")
+    weights = graph.node("Gather", [graph.constant("basis_weights", basis_weights), "ids"], "ids.basis_weights")
     axis = graph.constant(f"{name}.axis", np.array([1], np.int64))
     row = graph.node("Unsqueeze", [weights, axis], f"{name}.row")
     picked = graph.node("Gather", [motions, ids], f"{name}.picked")

@@ -4,19 +4,16 @@ import math
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
+from export.layers import export_of
 from export.pruning.mask import Cut, TrimmedModel, trimmed, whole
 from export.pruning.rules import RULES
 from export.pruning.statistics import Evidence
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.basis_kernels import FOLLOWED
-from msdgs_train.basis_layer import BasisLayer
 from msdgs_train.model import DynamicGaussians
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12
-BASIS_BYTES = FOLLOWED * (4 + 1)
-"""Of a Gaussian in a scene file: pose, opacity, an SH coefficient; and where it moves, its id and its modulation, or
-the motions that it follows and their weights."""
+"""Per Gaussian in a scene file: pose, opacity, an SH coefficient; and if it moves, its id and its modulation."""
 
 
 class LeftOut(NamedTuple):
@@ -86,7 +83,7 @@ def stored_bytes(model: DynamicGaussians, cut: Cut) -> int:
     """About what a cut takes in a file of the plan `network`: Gaussians and layers."""
     gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(cut.sh_degree)
     layers = [model.deformation.layers[k] for k in cut.network.layers] if cut.moves.any() else []
-    follows = any(isinstance(layer, BasisLayer) for layer in layers)
-    moving = MOVING_BYTES + MODULATION_BYTES * cut.network.modulated + BASIS_BYTES * follows
+    attributes = sum(kind.bytes_per_gaussian for kind in {export_of(layer) for layer in layers})
+    moving = MOVING_BYTES + MODULATION_BYTES * cut.network.modulated + attributes
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())
     return gaussian * int(cut.kept.sum()) + moving * int(cut.moves.sum()) + weights

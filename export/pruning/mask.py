@@ -1,25 +1,18 @@
 """What is left of a model after trimming, and the smaller model that this makes."""
 
-import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from export.layers import HEADS, export_of
 from export.measure.rendered_error import as_gaussians
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.deformation import MultiStepDeformation
 from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.layers import MLPLayer
 from msdgs_train.model import DynamicGaussians
-from msdgs_train.plane_layer import PlaneLayer
-
-HEADS = ("means", "scales", "quats")
-"""What the heads of a layer change, in the order of their columns."""
-
-_COLUMNS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
 
 
 @dataclass(frozen=True)
@@ -64,8 +57,8 @@ class TrimmedModel:
 def whole(model: DynamicGaussians) -> Cut:
     """The cut that leaves everything in."""
     count = len(model.gaussians)
-    heads = HEADS if any(kind != "bases" for kind in model.config.layers) else ()
-    network = Network(tuple(range(len(model.deformation))), frozenset(heads), model.modulation is not None)
+    heads = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation.layers))
+    network = Network(tuple(range(len(model.deformation))), heads, model.modulation is not None)
     moves = np.full(count, len(model.deformation) > 0)
     return Cut(network, np.ones(count, bool), moves, model.config.sh_degree)
 
@@ -112,10 +105,11 @@ def _model(model: DynamicGaussians, network: Network, which: slice | torch.Tenso
     tensors["sh_rest"] = tensors["sh_rest"][:, : sh_coefficients(sh_degree) - 1]
     if not network.modulated:
         tensors.pop("embeddings", None)
-    if not any(model.config.layers[k] == "bases" for k in network.layers):
-        tensors.pop("basis_logits", None)
-        tensors.pop("basis_ids", None)
     layers = [model.deformation.layers[k] for k in network.layers]
+    read = frozenset[str]().union(*(export_of(layer).parameters for layer in layers))
+    for layer in model.deformation.layers:
+        for name in export_of(layer).parameters - read:
+            tensors.pop(name, None)
     config = replace(
         model.config,
         layers=tuple(model.config.layers[k] for k in network.layers),
@@ -131,16 +125,5 @@ def _model(model: DynamicGaussians, network: Network, which: slice | torch.Tenso
 
 def _without_heads(layer: torch.nn.Module, heads: frozenset[str]) -> torch.nn.Module:
     """The layer with zeros in place of the heads that are left out; a plan stores no column that is all zeros."""
-    missing = [name for name in HEADS if name not in heads]
-    if not missing:
-        return layer
-    layer = copy.deepcopy(layer)
-    with torch.no_grad():
-        for name in missing:
-            if isinstance(layer, MLPLayer):
-                layer.heads.weight[_COLUMNS[name]] = 0
-                layer.heads.bias[_COLUMNS[name]] = 0
-            elif isinstance(layer, PlaneLayer):
-                for parameter in layer.heads[HEADS.index(name)].parameters():
-                    parameter.zero_()
-    return layer
+    missing = frozenset(HEADS) - heads
+    return export_of(layer).without_heads(layer, missing) if missing else layer

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from export.pruning.mask import HEADS, Cut, Network
+from export.layers import HEADS
+from export.pruning.mask import Cut, Network
 from export.pruning.statistics import Evidence
 
 HALVINGS = 7

@@ -7,16 +7,17 @@ import numpy.typing as npt
 import torch
 
 from export.jobs.bake import Baked
+from export.layers import HEAD_COLUMNS, HEADS
+from export.layers.spline import skinning_inputs
 from export.plans.network import network
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.basis_layer import Carried
 from msdgs_train.deformation import MultiStepDeformation, operations
 from msdgs_train.model import SMALLEST_SCALE, activated_scales, unit_quats
 
 POSE = 10
 """Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""
-MEANS, SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
+MEANS, SCALES, QUATS = HEAD_COLUMNS.values()
 
 Poses = npt.NDArray[np.float64]
 
@@ -29,11 +30,8 @@ class ExactPoses:
         self.count = len(m)
         self._raw = baked.scene.metadata.delta_space == "raw"
         self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
-        factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
-        self._factors = [None if f is None else _double(f) for f in factors]
-        self._carried = None
-        if m.basis_weights is not None and m.basis_ids is not None:
-            self._carried = Carried(self._means, self._quats, _double(m.basis_weights), torch.from_numpy(m.basis_ids))
+        self._factors = {head: _double(factors) for head, factors in m.modulation.items()}
+        self._skinning = skinning_inputs(self._means, self._quats, m.attributes)
         self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
 
     @property
@@ -48,11 +46,11 @@ class ExactPoses:
     @torch.no_grad()
     def _posed(self, t: float, ids: torch.Tensor) -> Poses:
         means, log_scales = self._means[ids], self._log_scales[ids]
-        carried = self._carried.rows(ids) if self._carried else None
-        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64), carried=carried)
+        skinning = self._skinning.rows(ids) if self._skinning else None
+        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64), carried=skinning)
         of_means, of_scales, of_quats = (
-            delta if factors is None else factors[ids] * delta  # equation 12
-            for factors, delta in zip(self._factors, (deltas.means, deltas.scales, deltas.quats), strict=True)
+            self._factors[head][ids] * getattr(deltas, head) if head in self._factors else getattr(deltas, head)
+            for head in HEADS  # equation 12
         )
         if self._raw:
             scales = activated_scales(log_scales + of_scales)

@@ -226,8 +226,9 @@ _recent: dict[bytes, Trajectories] = {}
 def trajectories_of(baked: Baked) -> Trajectories:
     """Those of the scene's moving part, sampled once for all plans; those of the last two scenes are kept."""
     digest = hashlib.sha256(repr((baked.scene.metadata.time_range, pixel(baked))).encode() + layers_digest(baked))
-    for part in vars(baked.moving).values():
-        digest.update(b"" if part is None else part.tobytes())
+    m = baked.moving
+    for values in (m.means, m.log_scales, m.quats, *m.modulation.values(), *m.attributes.values()):
+        digest.update(values.tobytes())
     key = digest.digest()
     kept = _recent.pop(key, None) or Trajectories(baked)
     while len(_recent) >= _KEPT:
@@ -238,7 +239,7 @@ def trajectories_of(baked: Baked) -> Trajectories:
 
 def layers_digest(baked: Baked) -> bytes:
     """Of all that moves a Gaussian, besides its own values."""
-    digest = hashlib.sha256(repr(baked.moving.scale_modulation is None).encode())
+    digest = hashlib.sha256(repr(sorted(baked.moving.modulation)).encode())
     for layer in baked.layers:
         for name, values in layer.state_dict().items():
             digest.update(name.encode() + values.cpu().numpy().tobytes())
