@@ -20,6 +20,7 @@ from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
 from export.jobs.sweep import Sweep, SweepResult
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
+from export.plans.registry import PLANS
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.checkpoint import save_model
@@ -94,7 +95,8 @@ def few_candidates() -> Iterator[None]:
     """As many as the tests look at."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.jobs.sweep.TRIM_STEPS", (5.0, 1.0, -5.0))
-        patch.setattr("export.jobs.sweep.FITTED", ("keyframes:2.0",))
+        for name, texts in (("lowrank", []), ("keyframes", ["keyframes:2.0"])):
+            patch.setitem(PLANS, name, replace(PLANS[name], candidates=lambda layers, texts=texts: texts))
         yield
 
 

@@ -18,6 +18,7 @@ from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
 from export.importers.detect import read_splats
 from export.importers.sequence import is_switched, of_the_moment
+from export.plans.registry import PLANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
@@ -139,7 +140,8 @@ def _visionary(session: DeformationSession, settings: Settings, console: Console
     console.print(f"{scene_json}: the scene.json of a folder for Visionary's editor", markup=False)
     if metadata.antialiasing == "mip":
         console.print("its anti-aliasing isn't in this format: thin parts come out brighter")
-    if session.scene.moving_count and metadata.plan.partition(":")[0] in ("network", "prefix"):
+    plan = PLANS.get(metadata.plan.partition(":")[0])
+    if session.scene.moving_count and plan is not None and not plan.fitted:
         console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a scene that is cheaper")
 
 

@@ -13,6 +13,7 @@ from onnx import helper
 from export.importers.splats.base import Splats
 from export.jobs.bake import Baked, Moving
 from export.jobs.write import properties
+from export.plans.base import BASELINE
 from export.plans.registry import build
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
@@ -41,7 +42,7 @@ def static_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     g = source.gaussians
     metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped)
     scene = BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
-    return build("network", Baked(scene, Moving.none(), ()))
+    return build(BASELINE, Baked(scene, Moving.none(), ()))
 
 
 def metadata_of(
@@ -56,7 +57,7 @@ def metadata_of(
     return SceneMetadata(
         contract=CONTRACT,
         layers=(),
-        plan="network",
+        plan=BASELINE,
         time_range=(0.0, 1.0),
         bounds=(low, high),
         sh_degree=sh_degree,

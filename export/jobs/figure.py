@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullLocator
 
 from export.jobs.points import DEFAULT_RASTERIZER
+from export.plans.registry import PLANS
 
 DB_STEP = 10
 CLOSEST = 100.0
 LABEL_SIZE = np.array([250, 15])
 """Pixels of room for a name."""
 
-COLORS = {"network": "#4269d0", "prefix": "#6cc5b0", "int8": "#ff725c", "lowrank": "#3ca951", "keyframes": "#a463f2"}
 OTHER = "#9498a0"
 
 
@@ -29,7 +29,7 @@ def draw(contents: dict[str, Any], path: Path) -> None:
     for kind in dict.fromkeys(_kind(point) for point in points):
         group = [point for point in points if _kind(point) == kind]
         usual = [point for point in group if point["rasterizer"] == DEFAULT_RASTERIZER]
-        axes.scatter(*_places(usual), s=55, color=COLORS.get(kind, OTHER), label=f"plan {kind}", zorder=3)
+        axes.scatter(*_places(usual), s=55, color=PLANS[kind].color, label=f"plan {kind}", zorder=3)
     others = [point for point in points if point["rasterizer"] != DEFAULT_RASTERIZER]
     if others:
         axes.scatter(*_places(others), s=55, marker="x", color=OTHER, label="other rasterizer options", zorder=3)

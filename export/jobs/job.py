@@ -12,7 +12,7 @@ from export.jobs.bake import Baked
 from export.measure.rendered_error import ExactFrames, RenderedError, posed
 from export.measure.stability import MAX_ERROR, StabilityReport, assess
 from export.measure.views import cameras_of, deciding_views, measuring_views
-from export.plans.registry import build, parse
+from export.plans.registry import build, plan_of
 from export.pruning import RULES, Cut, Evidence, TrimmedModel, trim, trimmed_model, whole
 from export.pruning.bake import bake_trimmed
 from export.pruning.mask import rows, untrimmed, with_sh_degree
@@ -198,7 +198,7 @@ class Job:
         self._files += 1
         path = self.folder / f"{self._files}.onnx"
         baked, sampled = bake_trimmed(trimmed, self.info, self.sha256), None
-        if parse(plan).fitted and len(baked.moving):
+        if plan_of(plan).fitted and len(baked.moving):
             sampled = self._trajectories(baked, trimmed.ids[: len(baked.moving)])
         path.write_bytes(build(plan, baked, sampled).SerializeToString())
         return Candidate(plan, trim_db, trimmed, path, self.model.rasterizer)

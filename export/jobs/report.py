@@ -10,6 +10,7 @@ from export.jobs.figure import draw
 from export.jobs.job import CAMERAS_A_TIME, DECIDING_TIMES, MEASURING_TIMES, Job
 from export.jobs.points import DEFAULT_RASTERIZER, front
 from export.jobs.sweep import SweepResult
+from export.plans.base import BASELINE
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
 from msdgs_train.files import replacing, write_text
@@ -107,7 +108,7 @@ def gain(contents: dict[str, Any]) -> str:
     """One sentence: what the chosen point takes against all layers as trained, where these were measured."""
     points, views = contents["points"], contents["views"]
     chosen = next(point for point in points if point["chosen"])
-    whole = [p for p in points if p["plan"] == "network" and p["trim_db"] is None and not p["chosen"]]
+    whole = [p for p in points if p["plan"] == BASELINE and p["trim_db"] is None and not p["chosen"]]
     took, drawing = (chosen["milliseconds"][part]["min"] for part in ("deformation", "rasterization"))
     text = f"Deformation takes {took:.1f} ms a frame, drawing {drawing:.1f} ms at {views['width']} × {views['height']}"
     if not whole:

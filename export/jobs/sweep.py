@@ -13,7 +13,8 @@ from export.measure.frame_memory import frame_memory
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import REPEATS, time_frames
 from export.measure.views import View
-from export.plans.registry import parse
+from export.plans.base import BASELINE
+from export.plans.registry import PLANS, parse, plan_of
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
@@ -21,10 +22,6 @@ from msdgs_serve.scene.metadata import SceneCamera
 if TYPE_CHECKING:
     from export.measure.images import Photographs
 
-FITTED = ("lowrank:0.5", "lowrank:0.1", "keyframes:2.0", "keyframes:0.5", "keyframes:0.1", "keyframes:0.03")
-"""By the pixels that they may be off by. Besides them `network`, every prefix of it, and `int8` are tried."""
-
-INT8_SPEEDUP = 3.8
 DEAR = 4.0
 """A plan that runs layers isn't tried where they would take so many times a whole frame of one that is close enough."""
 
@@ -78,21 +75,25 @@ class Sweep:
         Raises `Unreachable` where even the whole network in float32 is further from float64 than allowed.
         """
         levels = [self.max_error + step for step in TRIM_STEPS if self.max_error + step >= WORTH_DB]
-        self._reachable(self._look("network", None))
+        self._reachable(self._look(BASELINE, None))
         # the most careful trimming that leaves anything out: plans are fitted to what moves, not to still ground
         careful = next((level for level in levels if self.job.trimmed(level).left_out), None)
-        self._tell("candidates: fitted plans", [(self._look, (text, careful)) for text in FITTED])
-        self._tell("candidates: network", [(self._look, ("network", level)) for level in levels])
-        texts = [f"prefix:{k}" for k in range(1, len(self.job.model.deformation))]
-        self._tell("candidates: other plans", [(self._look, (text, careful)) for text in (*texts, "int8")])
+        self._tell("candidates: fitted plans", [(self._look, (text, careful)) for text in self._texts(fitted=True)])
+        self._tell("candidates: network", [(self._look, (BASELINE, level)) for level in levels])
+        self._tell("candidates: other plans", [(self._look, (text, careful)) for text in self._texts(fitted=False)])
         alone = [look for look in self.looks if look.candidate.trim_db == careful]
         pairs = [pair for level in levels if level != careful for pair in self._pairs(alone, level)]
         self._tell("candidates: plans with trimming", [(self._look, pair) for pair in pairs])
         self._tell("candidates: SH degree", [(self._look, what) for what in self._degrees()])
         return self._measured()
 
+    def _texts(self, fitted: bool) -> list[str]:
+        """What the plans propose for this model."""
+        plans = [plan for plan in PLANS.values() if plan.fitted == fitted]
+        return [text for plan in plans for text in plan.candidates(len(self.job.model.deformation))]
+
     def _look(self, plan: str, trim_db: float | None, sh_degree: int | None = None) -> Look | None:
-        if plan != "network" and not len(self.job.trimmed(trim_db).moving.gaussians):
+        if plan != BASELINE and not len(self.job.trimmed(trim_db).moving.gaussians):
             return None  # nothing moves, so all plans are the same
         if self.looks and (why := self._dear(plan, trim_db)):
             self.refused.append((plan, why))
@@ -113,14 +114,17 @@ class Sweep:
 
     def _dear(self, plan: str, trim_db: float | None) -> str | None:
         """Why a plan that runs layers when a frame is served isn't worth a try, where it isn't."""
-        enough = [look for look in self.looks if look.worst_db >= self.max_error and parse(look.candidate.plan).fitted]
-        fastest = min(enough, key=lambda look: look.cpu, default=None)
-        if fastest is None or parse(plan).fitted:
+        enough = [look for look in self.looks if look.worst_db >= self.max_error]
+        fastest = min(
+            (look for look in enough if plan_of(look.candidate.plan).fitted), key=lambda look: look.cpu, default=None
+        )
+        kind = plan_of(plan)
+        if fastest is None or kind.fitted:
             return None
         whole, model = self.looks[0], self.job.trimmed(trim_db).moving
-        layers = len(model.deformation) if plan in ("network", "int8") else (parse(plan).count or 0)
+        layers = parse(plan).count or len(model.deformation)
         work = len(model.gaussians) * layers / max(len(self.job.model.gaussians) * len(self.job.model.deformation), 1)
-        expected = whole.cpu_deformation * work / (INT8_SPEEDUP if plan == "int8" else 1)
+        expected = whole.cpu_deformation * work / kind.speedup
         if expected < DEAR * fastest.cpu:
             return None
         taken = f"{fastest.candidate.plan} takes {fastest.cpu:.0f} ms for the whole frame"

@@ -11,12 +11,11 @@ import onnx
 from onnx import helper
 
 from export.measure.verify import TIMES, TOLERANCE, verify
+from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_train.files import replacing
 from msdgs_train.model import DynamicGaussians
-
-PLAN = "network"
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def write_scene(
     `rendered` is what is known of its frames, and goes into its metadata. With it, a plan that computes something
     else than the model's own layers isn't held to `tolerance`: its frames have been judged.
     """
-    exact = rendered is None or properties(contents)["plan"] == PLAN
+    exact = rendered is None or properties(contents)["plan"] == BASELINE
     with replacing(output) as temporary:
         temporary.write_bytes(contents.SerializeToString())
         session, allowed = DeformationSession(temporary), tolerance if exact else math.inf

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from export.measure.gap import PosedArrays, half_diagonal, largest_error, pose_arrays, pose_errors
+from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import MsdgsError
@@ -53,7 +54,7 @@ def verify(
     promise is broken. Whether unstable ones can be seen is not asked here: frames tell, before a file is written.
     """
     stated = session.scene.metadata
-    if stated.plan != "network":
+    if stated.plan != BASELINE:
         tolerance = math.inf
     apart = _Apart(stated.measured_error.get("fitted"))
     double = copy.deepcopy(model).double()

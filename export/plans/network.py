@@ -1,4 +1,4 @@
-"""Plan `network`: all layers in float32 as the model computes them."""
+"""Plans `network`, all layers in float32 as the model computes them, and `prefix:k`, the first k of them."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from torch import nn
 from export.jobs.bake import Baked, Moving
 from export.layers import HEAD_COLUMNS, HEADS, LayerInputs, export_of
 from export.layers.graph import GraphBuilder
+from export.plans.base import Plan
 from export.plans.scene_graph import finished, new_graph, unit_quats
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
@@ -89,9 +90,20 @@ def _gate(graph: GraphBuilder, name: str, steps: str, k: int) -> str:
 
 
 def prefix(baked: Baked, count: int) -> onnx.ModelProto:
-    """The scene with its first `count` layers. Raises `InvalidInput` where it hasn't as many."""
+    """The scene with its first `count` layers as trained. Raises `InvalidInput` where it hasn't as many."""
     if count > len(baked.layers):
         raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
     metadata = replace(baked.scene.metadata, layers=baked.scene.metadata.layers[:count])
     scene = replace(baked.scene, metadata=metadata)
     return network(replace(baked, layers=baked.layers[:count], scene=scene), f"prefix:{count}")
+
+
+NETWORK = Plan("network", "network", "#4269d0", lambda baked, spec, sample: network(baked))
+PREFIX = Plan(
+    "prefix",
+    "prefix:k, the first k layers",
+    "#6cc5b0",
+    lambda baked, spec, sample: prefix(baked, spec.count or 0),
+    candidates=lambda layers: [f"prefix:{k}" for k in range(1, layers)],
+    counts=range(1, 1_001),
+)

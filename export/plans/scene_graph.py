@@ -41,7 +41,7 @@ def finished(graph: GraphBuilder, baked: Baked, plan: str, promise: dict[str, An
     )
 
 
-def still(baked: Baked, plan: str) -> onnx.ModelProto:
+def static_graph(baked: Baked, plan: str) -> onnx.ModelProto:
     """A scene in which nothing moves: under any plan a graph of no nodes."""
     graph = new_graph(baked)
     for name, columns in (("means", 3), ("quats", 4), ("scales", 3)):

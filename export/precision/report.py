@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from export.plans.registry import plan_of
 from msdgs_serve.scene.errors import MsdgsError
-
-CHAINED_PLANS = frozenset({"network", "prefix", "int8"})
-"""Plans that run the layers when a frame is served, in float32 or less; others are fitted to float64 poses offline."""
 
 REMEDY = "choose a plan that is fitted to float64 poses when it is written, `lowrank` or `keyframes`"
 
@@ -96,7 +94,7 @@ class StabilityReport:
         """Why `plan` must not be used for this model, with the remedy; None if it may."""
         if self.broken:
             return "; ".join(self.broken)
-        if plan.split(":")[0] in CHAINED_PLANS and self.unsteady:
+        if self.unsteady and not plan_of(plan).fitted:
             return f"the plan `{plan}` computes the layers in float32 or less, and {'; '.join(self.unsteady)}; {REMEDY}"
         return None
 
