@@ -75,7 +75,7 @@ def _report(
         from export.measure.stability import assess  # heavy: seconds, so not before --help
         from export.precision.formats import FORMATS
         from export.precision.show import draw, print_report, write_json
-        from msdgs_train.checkpoint import load_model
+        from msdgs_train.gaussians.model_file import load_model
     loaded = load_model(model)
     with Progress(console=errors, transient=True) as progress:
         task = progress.add_task("comparing with float64", total=times)

@@ -10,8 +10,8 @@ from msdgs_serve import __version__
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.model import DynamicGaussians, unit_quats
+from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
+from msdgs_train.gaussians.model_file import SceneInfo
 
 STARTING_CAMERAS = 8
 """Cameras kept in a scene file, evenly spread over those of the training."""

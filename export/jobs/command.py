@@ -23,8 +23,8 @@ from export.measure.rendered_error import RenderedError
 from export.plans.registry import parse
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.checkpoint import load_model
-from msdgs_train.metrics import MAX_PSNR
+from msdgs_train.evaluation.metrics import MAX_PSNR
+from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:
     from export.measure.images import Photographs

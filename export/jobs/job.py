@@ -22,7 +22,7 @@ from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.checkpoint import load_model
+from msdgs_train.gaussians.model_file import load_model
 
 MEASURING_TIMES, CAMERAS_A_TIME = 16, 3
 DECIDING_TIMES = 33

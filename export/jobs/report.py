@@ -13,7 +13,7 @@ from export.jobs.sweep import SweepResult
 from export.plans.base import BASELINE
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
-from msdgs_train.files import replacing, write_text
+from msdgs_train.engine.files import replacing, write_text
 
 FORMAT = "msdgs-report/1"
 COLUMNS = ("", "plan", "trimmed to", "SH", "rasterizer", "moving", "still", "ms", "median", "deform", "draw", "MB",

@@ -115,9 +115,8 @@ class Sweep:
     def _dear(self, plan: str, trim_db: float | None) -> str | None:
         """Why a plan that runs layers when a frame is served isn't worth a try, where it isn't."""
         enough = [look for look in self.looks if look.worst_db >= self.max_error]
-        fastest = min(
-            (look for look in enough if plan_of(look.candidate.plan).fitted), key=lambda look: look.cpu, default=None
-        )
+        fitted = [look for look in enough if plan_of(look.candidate.plan).fitted]
+        fastest = min(fitted, key=lambda look: look.cpu, default=None)
         kind = plan_of(plan)
         if fastest is None or kind.fitted:
             return None

@@ -14,8 +14,8 @@ from export.measure.verify import TIMES, TOLERANCE, verify
 from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
-from msdgs_train.files import replacing
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.engine.files import replacing
+from msdgs_train.gaussians.model import DynamicGaussians
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import nn
 
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.gaussians import CanonicalGaussians
+from msdgs_train.gaussians.canonical import CanonicalGaussians
 
 HEAD_COLUMNS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
 """Columns of a layer's deltas, in the order of `Heads.sizes`; that of the step weight, if any, is the last one."""

@@ -9,7 +9,7 @@ from torch import nn
 
 from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
 from export.layers.graph import GraphBuilder, to_numpy
-from msdgs_train.layers import MLPLayer
+from msdgs_train.layers.mlp import MLPLayer
 
 
 class MLPExport(FieldLayerExport):

@@ -10,7 +10,7 @@ from torch import nn
 
 from export.layers.base import HEADS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
 from export.layers.graph import GraphBuilder, to_numpy
-from msdgs_train.plane_layer import PlaneGrid, PlaneLayer
+from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
 FIRST_AXES = np.array([0, 0, 1], np.int64)  # of the planes xy, xz, yz
 SECOND_AXES = np.array([1, 2, 2], np.int64)

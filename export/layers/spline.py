@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from export.layers.base import LayerInputs
 from export.layers.graph import GraphBuilder, to_numpy
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.basis_kernels import FOLLOWED, LEAST_STRETCH
-from msdgs_train.basis_layer import BasisLayer, Carried
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import carried
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import carried
+from msdgs_train.supports.nodes import BasisLayer, Carried
+from msdgs_train.supports.skinning_kernels import FOLLOWED, LEAST_STRETCH
 
 KNOTS = 4
 """That a time reads."""

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msdgs_train.basis_layer import Carried
-from msdgs_train.deformation import MultiStepDeformation, step_of
+from msdgs_train.layers.chain import MultiStepDeformation, step_of
+from msdgs_train.supports.nodes import Carried
 
 UNIT_ROUNDOFF = 2.0**-24
 """Of float32: the largest relative error of one rounding."""

@@ -10,8 +10,8 @@ from export.measure.gap import PosedArrays, usable_rows
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.camera import orbit
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.metrics import psnr_from_mse
+from msdgs_train.evaluation.metrics import psnr_from_mse
+from msdgs_train.gaussians.model_file import SceneInfo
 
 NEAR = GSPLAT.near_plane
 VISIBLE_OPACITY = GSPLAT.alpha_min

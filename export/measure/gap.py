@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 
 SMALLEST_VISIBLE = 1e-3
 """Scales below this part of the scene's half diagonal are less than a pixel; their errors are relative to this size."""

@@ -8,9 +8,9 @@ import numpy as np
 from export.measure.rendered_error import Pose, shown
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
-from msdgs_train.checkpoint import SceneInfo
 from msdgs_train.datasets import Frame, composite, load_scene
-from msdgs_train.metrics import psnr_from_mse
+from msdgs_train.evaluation.metrics import psnr_from_mse
+from msdgs_train.gaussians.model_file import SceneInfo
 
 MOST = 24
 """Photographs compared with; of more, evenly spread ones."""

@@ -13,8 +13,8 @@ from export.measure.views import View
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
-from msdgs_train.metrics import psnr_from_mse
-from msdgs_train.model import DynamicGaussians, PosedGaussians
+from msdgs_train.evaluation.metrics import psnr_from_mse
+from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
 
 MEMORY = 768e6
 """Bytes of exact frames and poses that are kept; with larger pictures fewer views are."""

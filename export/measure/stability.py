@@ -15,8 +15,8 @@ from export.precision.formats import FLOAT32, Format, in_format
 from export.precision.limits import limits_met
 from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians
 from msdgs_serve.scene.camera import Camera
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.model import DynamicGaussians, carried
+from msdgs_train.gaussians.model import DynamicGaussians, carried
+from msdgs_train.gaussians.model_file import SceneInfo
 
 MAX_ERROR = 50.0
 """dB. Errors above it are invisible: the export's own default."""

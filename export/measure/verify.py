@@ -13,7 +13,7 @@ from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 
 TOLERANCE = 1e-4
 TIMES = 50

@@ -8,7 +8,7 @@ import numpy as np
 
 from export.measure.verify import times_to_verify
 from msdgs_serve.scene.camera import Camera, orbit
-from msdgs_train.checkpoint import SceneInfo
+from msdgs_train.gaussians.model_file import SceneInfo
 
 FEWEST_CAMERAS = 4
 """With fewer, cameras on a circle about the scene are added: one side says little about the others."""

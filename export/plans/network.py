@@ -12,7 +12,7 @@ from export.layers.graph import GraphBuilder
 from export.plans.base import Plan
 from export.plans.scene_graph import finished, new_graph, unit_quats
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
+from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
 
 
 def network(baked: Baked, plan: str = "network") -> onnx.ModelProto:

@@ -6,7 +6,7 @@ import numpy as np
 
 from export.jobs.bake import Baked, bake
 from export.pruning.mask import TrimmedModel
-from msdgs_train.checkpoint import SceneInfo
+from msdgs_train.gaussians.model_file import SceneInfo
 
 
 def bake_trimmed(trimmed: TrimmedModel, info: SceneInfo, checkpoint_sha256: str) -> Baked:

@@ -9,7 +9,7 @@ from export.pruning.mask import Cut, TrimmedModel, trimmed, whole
 from export.pruning.rules import RULES
 from export.pruning.statistics import Evidence
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12

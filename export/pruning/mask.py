@@ -10,9 +10,9 @@ from export.layers import HEADS, export_of
 from export.measure.rendered_error import as_gaussians
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.deformation import MultiStepDeformation
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.chain import MultiStepDeformation
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_train.deformation import operations
-from msdgs_train.metrics import psnr_from_mse
-from msdgs_train.model import DynamicGaussians
-from msdgs_train.rasterization import rasterize
+from msdgs_train.evaluation.metrics import psnr_from_mse
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.chain import operations
+from msdgs_train.rendering.rasterize import rasterize
 
 MEMORY, POSE_BYTES = 2e9, 40
 """Bytes of poses that are kept of smaller networks, for trimming to other errors, and of one Gaussian at one time."""

@@ -12,8 +12,8 @@ from export.layers.spline import skinning_inputs
 from export.plans.network import network
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.deformation import MultiStepDeformation, operations
-from msdgs_train.model import SMALLEST_SCALE, activated_scales, unit_quats
+from msdgs_train.gaussians.model import SMALLEST_SCALE, activated_scales, unit_quats
+from msdgs_train.layers.chain import MultiStepDeformation, operations
 
 POSE = 10
 """Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""

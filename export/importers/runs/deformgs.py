@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from export.importers.errors import ImportFailed
 from export.importers.runs.state import State
 from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.layers import MLPLayer
-from msdgs_train.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.layers.mlp import MLPLayer
 
 XYZ_FREQUENCIES = 10
 LEAST_LAYERS, MOST_LAYERS = 3, 64

@@ -14,10 +14,10 @@ from export.measure.rendered_error import ExactFrames, RenderedError, posed, sho
 from export.measure.views import cameras_of, deciding_views
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
-from msdgs_train.checkpoint import SceneInfo
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.metrics import psnr_from_mse
-from msdgs_train.model import SMALLEST_SCALE, DynamicGaussians, activated_scales, unit_quats
+from msdgs_train.evaluation.metrics import psnr_from_mse
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import SMALLEST_SCALE, DynamicGaussians, activated_scales, unit_quats
+from msdgs_train.gaussians.model_file import SceneInfo
 
 FRAMES = 12
 """That are compared, each of another camera and time."""

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from export.importers.errors import ImportFailed
 from export.importers.runs.state import State
 from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import DynamicGaussians, ModelConfig
-from msdgs_train.modulation import MAX_LOG_FACTOR
-from msdgs_train.plane_layer import PlaneGrid, PlaneLayer
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.modulation import MAX_LOG_FACTOR
+from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
 DEFAULTS = {"no_dx": False, "no_ds": False, "no_dr": False, "no_do": True, "no_dshs": True}
 """Of its switches, which cfg_args holds: which parts of a Gaussian don't change."""

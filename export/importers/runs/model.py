@@ -22,9 +22,9 @@ from export.importers.splats.base import Splats
 from export.measure.rendered_error import posed
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.checkpoint import SceneInfo, save_model
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, save_model
 
 Reader = Callable[[Path, CanonicalGaussians, int, dict[str, Any]], tuple[DynamicGaussians, list[str]]]
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from export.importers.errors import ImportFailed
-from msdgs_train.checkpoint import CheckpointInvalid, load, refuse_unlike_stored
+from msdgs_train.gaussians.model_file import CheckpointInvalid, load, refuse_unlike_stored
 
 
 class State:
