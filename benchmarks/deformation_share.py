@@ -41,18 +41,18 @@ def main(
     for turn in range(repeats + 1):
         for path, session in sessions.items():
             for size in sizes:
-                lap = _lap(session, size, (turn * GOLDEN) % 1)
-                found[path, size] += [lap] if turn else []  # the first frames load and compile
+                run = _timing_run(session, size, (turn * GOLDEN) % 1)
+                found[path, size] += [run] if turn else []  # the first frames load and compile
     table = Table("scene", "plan", "moving", "picture", "deform ms, min", "median", "draw ms, min", "median", box=None)
-    for (path, size), laps in found.items():
+    for (path, size), runs in found.items():
         scene = sessions[path].scene
-        parts = [f"{f(part):.1f}" for part in zip(*laps, strict=True) for f in (min, statistics.median)]
+        parts = [f"{f(part):.1f}" for part in zip(*runs, strict=True) for f in (min, statistics.median)]
         table.add_row(path.name, scene.metadata.plan, f"{scene.moving_count:,}", f"{size} wide", *parts)
     console.print(table)
     return 0
 
 
-def _lap(session: DeformationSession, width: int, part: float) -> tuple[float, float]:
+def _timing_run(session: DeformationSession, width: int, part: float) -> tuple[float, float]:
     """Milliseconds that posing and drawing a frame at a part of the whole time take."""
     metadata = session.scene.metadata
     t0, t1 = metadata.time_range

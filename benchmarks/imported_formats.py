@@ -18,7 +18,7 @@ import httpx
 import matplotlib.pyplot as plt
 import numpy as np
 
-from export.importers import ImportFailed, recognise
+from export.importers import ImportFailed, detect_format
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from tests.support.service import serving
@@ -63,7 +63,7 @@ def main() -> int:
 def recognised(path: Path) -> Iterator[tuple[Path, str]]:
     """Inputs and what they are."""
     try:
-        yield path, recognise(path)
+        yield path, detect_format(path)
     except ImportFailed as error:
         if not path.is_dir():
             print(error)

@@ -33,7 +33,7 @@ class SideBySide:
     size: int | None = None
     """Width in pixels; the photographs' own if not given."""
     rows: int = 5
-    """Photographs shown, evenly spread over the split."""
+    """HeldOutImages shown, evenly spread over the split."""
 
 
 def main(options: SideBySide) -> None:

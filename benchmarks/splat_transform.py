@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from export.exporters.command import LOSSY, Settings, convert
-from export.exporters.proof import Proof, require
+from export.exporters.round_trip import RoundTrip, require
 from export.importers import read_splats
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
@@ -35,7 +35,7 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
     console = Console(soft_wrap=True, highlight=False)
     try:
         session = DeformationSession(scene)
-        proof = Proof(session)
+        proof = RoundTrip(session)
         t0, _ = session.scene.metadata.time_range
         with tempfile.TemporaryDirectory() as folder:
             for suffix in WRITTEN:

@@ -11,7 +11,7 @@ from rich.progress import Progress, track
 
 from export.exporters.gltf import read_gltf, write_gltf
 from export.exporters.ply import write_ply
-from export.exporters.proof import Proof, require, visionary_of
+from export.exporters.round_trip import RoundTrip, require, visionary_of
 from export.exporters.spz import write_spz
 from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
@@ -82,7 +82,7 @@ def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | No
             (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
         default = LOSSY if file.suffix == ".spz" else LOSSLESS
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
-        psnr = Proof(session).psnr(written, t)
+        psnr = RoundTrip(session).psnr(written, t)
         require(psnr, default if min_psnr is None else min_psnr, file.name)
     return psnr
 
@@ -114,7 +114,7 @@ def _usd(session: DeformationSession, settings: Settings, console: Console) -> N
     if moves and settings.frames < 2:
         raise InvalidInput("frames", "2 or more", settings.frames)
     times = np.linspace(t0, t1, settings.frames).tolist() if moves else [t0 if settings.t is None else settings.t]
-    proof = Proof(session)
+    proof = RoundTrip(session)
     with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
         task = progress.add_task("writing frames", total=len(times))
         write_usd(temporary, lambda t: of_the_moment(session.gaussians(t), plan), times, lambda: progress.advance(task))
@@ -146,6 +146,6 @@ def _visionary(session: DeformationSession, settings: Settings, console: Console
 
 
 def _worst(session: DeformationSession, shown: Callable[[float], Gaussians]) -> float:
-    proof = Proof(session, mip=False)
+    proof = RoundTrip(session, mip=False)
     times = np.linspace(*session.scene.metadata.time_range, COMPARED if session.scene.moving_count else 1)
     return min(proof.psnr(shown(float(np.float32(t))), float(np.float32(t))) for t in times)

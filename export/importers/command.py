@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from export.importers.detect import KINDS_OF_RUNS, READERS, checked_kind, frame_files, read_splats, recognise
+from export.importers.detect import KINDS_OF_RUNS, READERS, checked_format, detect_format, frame_files, read_splats
 from export.importers.runs.model import write_model
 from export.importers.scene import digest, note_left_out, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
@@ -20,12 +20,12 @@ from msdgs_serve.scene.errors import InvalidInput
 def model_or_import(path: Path, kind: str | None, output: Path, console: Console) -> Iterator[Path | None]:
     """The model.pt to export: `path` itself, or one made of another trainer's run, there until the end of the block.
 
-    Splats and sequences are written as scene files at once; then there is None. `kind` is one of `KINDS`, or None to
+    Splats and sequences are written as scene files at once; then there is None. `kind` is one of `FORMATS`, or None to
     look into the files. Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
     """
     if kind is None:
-        kind = "model" if not path.exists() or path.suffix == ".pt" else recognise(path)
-    kind = checked_kind(kind)
+        kind = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
+    kind = checked_format(kind)
     if kind == "model":
         yield path / "model.pt" if path.is_dir() else path
     elif kind in KINDS_OF_RUNS:

@@ -26,14 +26,14 @@ READERS: dict[str, Callable[[Path], Splats]] = {
 """Of one set of Gaussians, by the name of the format."""
 
 KINDS_OF_RUNS = ("deformgs", "4dgs")
-KINDS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *KINDS_OF_RUNS)
+FORMATS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *KINDS_OF_RUNS)
 """All that can be imported: our own model.pt, one set of Gaussians, a folder of them, and runs of other trainers."""
 
 FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat")
 
 
-def recognise(path: Path) -> str:
-    """The kind of `path`, one of `KINDS`. Raises `ImportFailed` saying what can be read where it is none."""
+def detect_format(path: Path) -> str:
+    """The kind of `path`, one of `FORMATS`. Raises `ImportFailed` saying what can be read where it is none."""
     if not path.exists():
         raise ImportFailed(path, "no such file or folder")
     try:
@@ -43,20 +43,20 @@ def recognise(path: Path) -> str:
     if kind is None and path.suffix.lower() == ".onnx":
         raise ImportFailed(path, "is a scene file already; export/convert.py writes it as other formats")
     if kind is None:
-        raise ImportFailed(path, f"isn't recognised; --from says what it is, one of {', '.join(KINDS)}")
+        raise ImportFailed(path, f"isn't recognised; --from says what it is, one of {', '.join(FORMATS)}")
     return kind
 
 
-def checked_kind(text: str) -> str:
-    """One of `KINDS`. Raises `InvalidInput` for anything else."""
-    if text not in KINDS:
-        raise InvalidInput("--from", f"one of {', '.join(KINDS)}", repr(text))
+def checked_format(text: str) -> str:
+    """One of `FORMATS`. Raises `InvalidInput` for anything else."""
+    if text not in FORMATS:
+        raise InvalidInput("--from", f"one of {', '.join(FORMATS)}", repr(text))
     return text
 
 
 def read_splats(path: Path, kind: str | None = None) -> Splats:
     """One set of Gaussians, of a file in any of the formats or of the one named. Raises `ImportFailed`."""
-    kind = kind or recognise(path)
+    kind = kind or detect_format(path)
     if kind not in READERS:
         raise ImportFailed(path, f"is a {kind}, not one set of Gaussians")
     try:

@@ -39,7 +39,7 @@ SAMPLED = 5_000
 PARKED_AT = 1e6
 """Half diagonals of the scene's bounds below its middle."""
 
-MOST = 1 << 26
+MAX_GAUSSIANS = 1 << 26
 """Gaussians of all frames together."""
 
 
@@ -69,8 +69,10 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     read: list[Splats] = []
     for file in files:
         read.append(read_splats(file))
-        if sum(map(len, read)) > MOST:
-            raise ImportFailed(folder, f"has more than {MOST:,} Gaussians in {len(read)} of {len(files)} frames")
+        if sum(map(len, read)) > MAX_GAUSSIANS:
+            raise ImportFailed(
+                folder, f"has more than {MAX_GAUSSIANS:,} Gaussians in {len(read)} of {len(files)} frames"
+            )
         on_frame()
     modes, degrees = {each.antialiasing for each in read}, {each.gaussians.sh_degree for each in read}
     if len(modes) > 1 or len(degrees) > 1:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, Job, Unreachable
+from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
 from export.jobs.sweep import Sweep
 from export.jobs.write import Exported, write_scene
@@ -27,15 +27,15 @@ from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:
-    from export.measure.images import Photographs
+    from export.measure.images import HeldOutImages
 
-LEAST_ERROR = 10.0
+LOWEST_MIN_PSNR = 10.0
 """dB. Under it a frame isn't one of the scene any more."""
 
 WIDE = 180
 """Characters that all columns of the table take."""
 
-TELLING = ("", "plan", "trimmed to", "SH", "moving", "ms", "MB", "worst frame")
+TELLING = ("", "plan", "pruned to", "SH", "moving", "ms", "MB", "worst frame")
 """Columns for narrower terminals."""
 
 
@@ -45,10 +45,10 @@ class Settings:
 
     model: Path
     output: Path
-    max_error: float  # dB on the worst frame
+    min_psnr: float  # dB on the worst frame
     plan: str | None  # None: the sweep chooses
     data: Path | None
-    off: frozenset[str]  # rules of trimming
+    off: frozenset[str]  # rules of pruning
     tolerance: float
     times: int
 
@@ -68,15 +68,15 @@ def export(settings: Settings, console: Console) -> None:
             task = progress.add_task(what, total=steps)
             return lambda: progress.advance(task)
 
-        photographs = _photographs(settings, track)
+        images = _held_out_images(settings, track)
         rules = [rule for rule in RULES if rule not in settings.off]
-        training = photographs.training if photographs else []
-        job = Job(
-            settings.model, Path(folder), max_error=settings.max_error, rules=rules, training=training, progress=track
+        training = images.training if images else []
+        job = ExportJob(
+            settings.model, Path(folder), min_psnr=settings.min_psnr, rules=rules, training=training, progress=track
         )
         contents = None
         if settings.plan is None:
-            result = Sweep(job, settings.max_error, photographs).run()
+            result = Sweep(job, settings.min_psnr, images).run()
             contents = report(job, result)
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
         else:
@@ -84,7 +84,7 @@ def export(settings: Settings, console: Console) -> None:
         exported = write_scene(
             settings.output,
             onnx.load(chosen.path),
-            chosen.trimmed.moving,
+            chosen.pruned.moving,
             rendered=error.to_plain(),
             tolerance=settings.tolerance,
             times=settings.times,
@@ -99,9 +99,9 @@ def export(settings: Settings, console: Console) -> None:
 
 
 def _check(settings: Settings) -> None:
-    error = settings.max_error
-    if not (math.isfinite(error) and LEAST_ERROR <= error <= MAX_PSNR):
-        raise InvalidInput("max_error", f"a PSNR in dB from {LEAST_ERROR:g} to {MAX_PSNR:g}; 50 is invisible", error)
+    error = settings.min_psnr
+    if not (math.isfinite(error) and LOWEST_MIN_PSNR <= error <= MAX_PSNR):
+        raise InvalidInput("min_psnr", f"a PSNR in dB from {LOWEST_MIN_PSNR:g} to {MAX_PSNR:g}; 50 is invisible", error)
     if not settings.tolerance >= 0:
         raise InvalidInput("tolerance", "0 or more", settings.tolerance)
     if settings.times < 2:
@@ -112,34 +112,34 @@ def _check(settings: Settings) -> None:
         raise InvalidInput("output", "in a folder that exists", str(settings.output))
 
 
-def _photographs(settings: Settings, track: Callable[[str, int], Callable[[], object]]) -> Photographs | None:
+def _held_out_images(settings: Settings, track: Callable[[str, int], Callable[[], object]]) -> HeldOutImages | None:
     if settings.data is None:
         return None
     try:
         from export.measure.images import (
-            Photographs,  # of the trainer's own readers, which the export alone doesn't need
+            HeldOutImages,  # of the trainer's own readers, which the export alone doesn't need
         )
     except ModuleNotFoundError as error:
         raise InvalidInput("data", "left out, or pip install '.[train,export]'", f"no module {error.name}") from None
     info = load_model(settings.model).scene
-    return Photographs(settings.data, info, lambda count: track("photographs", count))
+    return HeldOutImages(settings.data, info, lambda count: track("images", count))
 
 
-def _planned(job: Job, settings: Settings) -> tuple[Candidate, RenderedError]:
-    """The plan asked for, trimmed as far as the error allows beside the plan's own."""
+def _planned(job: ExportJob, settings: Settings) -> tuple[Candidate, RenderedError]:
+    """The plan asked for, pruned as far as the error allows beside the plan's own."""
     assert settings.plan is not None
     whole = job.candidate(settings.plan, None)
     best = job.error(whole)
-    if best.psnr_worst < settings.max_error:
+    if best.psnr_worst < settings.min_psnr:
         reachable = f"at most {math.floor(10 * best.psnr_worst) / 10:.1f}, which the plan {settings.plan} reaches"
-        raise Unreachable("max_error", f"{reachable} on its worst frame", settings.max_error)
+        raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", settings.min_psnr)
     if job.rules:
-        left = 10 ** (-settings.max_error / 10) - 10 ** (-best.psnr_worst / 10)
+        left = 10 ** (-settings.min_psnr / 10) - 10 ** (-best.psnr_worst / 10)
         for share in (1.0, 0.5, 0.25) if left > 0 else ():
-            trimmed = job.candidate(settings.plan, -10 * math.log10(share * left))
-            error = job.error(trimmed)
-            if error.psnr_worst >= settings.max_error:
-                return trimmed, error
+            pruned = job.candidate(settings.plan, -10 * math.log10(share * left))
+            error = job.error(pruned)
+            if error.psnr_worst >= settings.min_psnr:
+                return pruned, error
     return whole, best
 
 

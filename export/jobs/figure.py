@@ -22,7 +22,7 @@ def draw(contents: dict[str, Any], path: Path) -> None:
     """Write the diagram of a report as PNG."""
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
-    points, budget = contents["points"], contents["max_error"]
+    points, budget = contents["points"], contents["min_psnr"]
     axes.set_xscale("log")
     axes.set_yscale("log")
     _front_line(axes, points)
@@ -56,7 +56,7 @@ def _front_line(axes: Any, points: list[dict[str, Any]]) -> None:
 def _label(axes: Any, points: list[dict[str, Any]]) -> None:
     """Names of the points on the front, and of the whole network, as far as there is room; the chosen one's first."""
     taken: list[np.ndarray] = []
-    named = [point for point in points if point["front"] or point["trim_db"] is None]
+    named = [point for point in points if point["front"] or point["pruning_db"] is None]
     for point in sorted(named, key=lambda point: not point["chosen"]):
         x, y = _places([point])
         place = axes.transData.transform((x[0], y[0]))
@@ -66,8 +66,8 @@ def _label(axes: Any, points: list[dict[str, Any]]) -> None:
 
 
 def _text(point: dict[str, Any]) -> str:
-    trimmed = "all of it" if point["trim_db"] is None else f"trimmed to {point['trim_db']:g}"
-    return f"{point['plan']}, {trimmed}, SH {point['sh_degree']}"
+    pruned = "all of it" if point["pruning_db"] is None else f"pruned to {point['pruning_db']:g}"
+    return f"{point['plan']}, {pruned}, SH {point['sh_degree']}"
 
 
 def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> None:

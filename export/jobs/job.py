@@ -1,4 +1,4 @@
-"""One model file, and what all its exports share: exact frames, evidence for trimming, and candidates by plan."""
+"""One model file, and what all its exports share: exact frames, statistics for pruning, and candidates by plan."""
 
 import hashlib
 from collections.abc import Callable, Collection, Sequence
@@ -10,12 +10,12 @@ import numpy as np
 
 from export.jobs.bake import Baked
 from export.measure.rendered_error import ExactFrames, RenderedError, posed
-from export.measure.stability import MAX_ERROR, StabilityReport, assess
-from export.measure.views import cameras_of, deciding_views, measuring_views
+from export.measure.stability import MIN_PSNR, StabilityReport, assess
+from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.registry import build, plan_of
-from export.pruning import RULES, Cut, Evidence, TrimmedModel, trim, trimmed_model, whole
-from export.pruning.bake import bake_trimmed
-from export.pruning.mask import rows, untrimmed, with_sh_degree
+from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, prune, pruned_model
+from export.pruning.bake import bake_pruned
+from export.pruning.mask import full_mask, rows, unpruned, with_sh_degree
 from export.trajectories.sampling import SomeTrajectories, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
@@ -24,10 +24,10 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model_file import load_model
 
-MEASURING_TIMES, CAMERAS_A_TIME = 16, 3
-DECIDING_TIMES = 33
+EVALUATION_TIMES, CAMERAS_PER_TIME = 16, 3
+SELECTION_TIMES = 33
 BACK_OFFS = 4
-"""How often trimming is repeated more carefully where its parts together are worse than each promised."""
+"""How often pruning is repeated more carefully where its parts together are worse than each promised."""
 
 BACK_OFF_DB = 0.5
 STABILITY_TIMES = 8
@@ -38,7 +38,7 @@ Progress = Callable[[str, int], Callable[[], object]]
 """Called with what begins and how many steps it has; returns what is to be called after each."""
 
 
-class Unreachable(InvalidInput):
+class TargetNotReached(InvalidInput):
     """No export of this model is as close to it as was asked for."""
 
 
@@ -47,8 +47,8 @@ class Candidate:
     """A scene file that could be the export, and how it was made."""
 
     plan: str
-    trim_db: float | None  # what trimming alone may cost, dB on the worst frame; None: nothing was left out
-    trimmed: TrimmedModel
+    pruning_db: float | None  # what pruning alone may cost, dB on the worst frame; None: nothing was left out
+    pruned: PrunedModel
     path: Path
     options: RasterizerOptions  # what it is drawn with
 
@@ -69,7 +69,7 @@ class Candidate:
     @property
     def sh_degree(self) -> int:
         """Of its colours."""
-        return self.trimmed.moving.config.sh_degree
+        return self.pruned.moving.config.sh_degree
 
     @property
     def size(self) -> int:
@@ -82,7 +82,7 @@ def no_progress(what: str, steps: int) -> Callable[[], object]:
     return lambda: None
 
 
-class Job:
+class ExportJob:
     """Exports of one model file; candidates are written into `folder`."""
 
     def __init__(
@@ -90,21 +90,21 @@ class Job:
         checkpoint: Path,
         folder: Path,
         *,
-        max_error: float = MAX_ERROR,
+        min_psnr: float = MIN_PSNR,
         rules: Collection[str] = tuple(RULES),
         training: Sequence[Camera] = (),
         progress: Progress = no_progress,
     ) -> None:
-        """`training` are the cameras of the training photographs, where at hand. Raises `CheckpointInvalid`."""
-        self.folder, self.max_error, self.rules, self.progress = folder, max_error, rules, progress
+        """`training` are the cameras of the training images, where at hand. Raises `CheckpointInvalid`."""
+        self.folder, self.min_psnr, self.rules, self.progress = folder, min_psnr, rules, progress
         self.model, self.info, _ = load_model(checkpoint)
         with checkpoint.open("rb") as file:
             self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         self.cameras = cameras_of(self.info, training)
         self._files = 0
-        self._trimmed: dict[float | None, TrimmedModel] = {None: untrimmed(self.model)}
+        self._pruned: dict[float | None, PrunedModel] = {None: unpruned(self.model)}
         self._stability: StabilityReport | None = None
-        self._evidence: Evidence | None = None
+        self._statistics: PruningStatistics | None = None
         self._sampled: list[tuple[bytes, np.ndarray, Trajectories]] = []
         self._exact: ExactFrames | None = None
 
@@ -112,46 +112,46 @@ class Job:
     def exact(self) -> ExactFrames:
         """Frames in float64, computed when they are first asked for."""
         if self._exact is None:
-            views = measuring_views(self.cameras, self.info.time_range, MEASURING_TIMES, CAMERAS_A_TIME)
+            views = evaluation_views(self.cameras, self.info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
             on_frame = self.progress("exact frames in float64", len(views))
             self._exact = ExactFrames(self.model, views, self.info.background, on_frame)
         return self._exact
 
     @property
-    def evidence(self) -> Evidence:
-        """What trimming decides by, computed when it is first asked for."""
-        if self._evidence is None:
-            views = deciding_views(self.cameras, self.info.time_range, DECIDING_TIMES)
-            on_time = self.progress("what moves, and what is seen", DECIDING_TIMES)
-            self._evidence = Evidence(self.model, views, self.info.background, on_time)
-        return self._evidence
+    def statistics(self) -> PruningStatistics:
+        """What pruning decides by, computed when it is first asked for."""
+        if self._statistics is None:
+            views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES)
+            on_time = self.progress("what moves, and what is seen", SELECTION_TIMES)
+            self._statistics = PruningStatistics(self.model, views, self.info.background, on_time)
+        return self._statistics
 
-    def trimmed(self, trim_db: float | None) -> TrimmedModel:
-        """The model without what `trim_db` dB on the worst frame allow to leave out.
+    def pruned(self, pruning_db: float | None) -> PrunedModel:
+        """The model without what `pruning_db` dB on the worst frame allow to leave out.
 
         Frames of all rules together, at other times than those that decided, are held to it as well; where they
-        are worse, trimming is repeated more carefully.
+        are worse, pruning is repeated more carefully.
         """
-        if trim_db not in self._trimmed:
-            assert trim_db is not None
-            self._trimmed[trim_db] = self._checked_trim(trim_db) if self.rules else self._trimmed[None]
-        return self._trimmed[trim_db]
+        if pruning_db not in self._pruned:
+            assert pruning_db is not None
+            self._pruned[pruning_db] = self._checked_pruning(pruning_db) if self.rules else self._pruned[None]
+        return self._pruned[pruning_db]
 
-    def candidate(self, plan: str, trim_db: float | None, sh_degree: int | None = None) -> Candidate:
+    def candidate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> Candidate:
         """Write a scene file. Raises `InvalidInput` for a plan that this scene can't have, `PlanUnsafe` for one whose
         round-off would be seen."""
         self.stability.require(plan)
-        trimmed = self.trimmed(trim_db)
+        pruned = self.pruned(pruning_db)
         if sh_degree is not None:
-            trimmed = with_sh_degree(trimmed, sh_degree)
-        return self._written(plan, trim_db, trimmed)
+            pruned = with_sh_degree(pruned, sh_degree)
+        return self._written(plan, pruning_db, pruned)
 
     @property
     def stability(self) -> StabilityReport:
         """How far float32 is from float64 where layers run when a frame is served."""
         if self._stability is None:
             on_time = self.progress("stability of the layers", STABILITY_TIMES)
-            found = assess(self.model, self.info, max_error=self.max_error, times=STABILITY_TIMES, on_time=on_time)
+            found = assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
             self._stability = found
         return self._stability
 
@@ -161,50 +161,50 @@ class Job:
 
     def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
         """How far its frames are from exact ones; all of those kept, or every n-th."""
-        pose, ids = candidate.session.gaussians, candidate.trimmed.ids
+        pose, ids = candidate.session.gaussians, candidate.pruned.ids
         return self.exact.measure(pose, ids, options=candidate.options, every=every)
 
-    def _checked_trim(self, trim_db: float) -> TrimmedModel:
-        least_db = trim_db
+    def _checked_pruning(self, pruning_db: float) -> PrunedModel:
+        min_db = pruning_db
         for _ in range(BACK_OFFS):
-            on_rule = self.progress(f"trimming to {trim_db:g} dB", len(self.rules))
-            cut, left_out = trim(self.evidence, least_db, self.rules, on_rule)
+            on_rule = self.progress(f"pruning to {pruning_db:g} dB", len(self.rules))
+            mask, left_out = prune(self.statistics, min_db, self.rules, on_rule)
             if not left_out:
                 break
-            trimmed = trimmed_model(self.evidence, cut, left_out)
-            worst_db = self._worst_db(cut, trimmed)
-            if worst_db >= trim_db:
-                return trimmed
-            least_db += trim_db - worst_db + BACK_OFF_DB
-        return self._trimmed[None]
+            pruned = pruned_model(self.statistics, mask, left_out)
+            worst_db = self._worst_db(mask, pruned)
+            if worst_db >= pruning_db:
+                return pruned
+            min_db += pruning_db - worst_db + BACK_OFF_DB
+        return self._pruned[None]
 
-    def _worst_db(self, cut: Cut, trimmed: TrimmedModel) -> float:
-        """PSNR of the worst of the measured frames of a trimmed model. Where its layers are all that there were, what
+    def _worst_db(self, mask: PruningMask, pruned: PrunedModel) -> float:
+        """PSNR of the worst of the measured frames of a pruned model. Where its layers are all that there were, what
         moves is where it was in the exact frames, and no layer is run again."""
-        layers_changed = cut.moves.any() and cut.network != whole(self.model).network
-        moving = cut.ids[: len(trimmed.moving.gaussians)]
+        layers_changed = mask.moves.any() and mask.network != full_mask(self.model).network
+        moving = mask.ids[: len(pruned.moving.gaussians)]
 
         def pose(t: float) -> Gaussians:
-            moved = posed(trimmed.moving, t) if layers_changed else rows(self.exact.kept(t), moving, 0)
-            still = trimmed.still
-            colors = rows(self.exact.kept(t), cut.ids, cut.sh_degree)
+            moved = posed(pruned.moving, t) if layers_changed else rows(self.exact.kept(t), moving, 0)
+            static = pruned.static
+            colors = rows(self.exact.kept(t), mask.ids, mask.sh_degree)
             parts = ("means", "quats", "scales")
-            arrays = [np.concatenate([getattr(moved, part), getattr(still, part)]) for part in parts]
+            arrays = [np.concatenate([getattr(moved, part), getattr(static, part)]) for part in parts]
             return Gaussians(*(a.astype(np.float32) for a in (*arrays, colors.opacities, colors.sh)))
 
-        return self.exact.measure(pose, trimmed.ids).psnr_worst
+        return self.exact.measure(pose, pruned.ids).psnr_worst
 
-    def _written(self, plan: str, trim_db: float | None, trimmed: TrimmedModel) -> Candidate:
+    def _written(self, plan: str, pruning_db: float | None, pruned: PrunedModel) -> Candidate:
         self._files += 1
         path = self.folder / f"{self._files}.onnx"
-        baked, sampled = bake_trimmed(trimmed, self.info, self.sha256), None
+        baked, sampled = bake_pruned(pruned, self.info, self.sha256), None
         if plan_of(plan).fitted and len(baked.moving):
-            sampled = self._trajectories(baked, trimmed.ids[: len(baked.moving)])
+            sampled = self._trajectories(baked, pruned.ids[: len(baked.moving)])
         path.write_bytes(build(plan, baked, sampled).SerializeToString())
-        return Candidate(plan, trim_db, trimmed, path, self.model.rasterizer)
+        return Candidate(plan, pruning_db, pruned, path, self.model.rasterizer)
 
     def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
-        """Those of the model's Gaussians `ids`, ascending, sampled once: what is trimmed further moves as before."""
+        """Those of the model's Gaussians `ids`, ascending, sampled once: what is pruned further moves as before."""
         layers = layers_digest(baked)
         for known_layers, known, sampled in self._sampled:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():

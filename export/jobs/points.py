@@ -12,8 +12,8 @@ DEFAULT_RASTERIZER = "default"
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """A quick look at a candidate: some of its frames, and the processor time of one.
+class QuickEstimate:
+    """A quick estimate at a candidate: some of its frames, and the processor time of one.
 
     Processor time is added up over threads; unlike time on the clock it hardly depends on what else a machine does.
     """
@@ -24,15 +24,15 @@ class Look:
     cpu_deformation: float  # of these
     worst_db: float  # PSNR of the worst frame looked at
 
-    def dominates(self, other: "Look", *, time_margin: float, db_margin: float) -> bool:
-        """Whether it is faster and closer than another, by more than looks may be wrong by."""
+    def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
+        """Whether it is faster and closer than another, by more than estimates may be wrong by."""
         faster = self.cpu * time_margin < other.cpu
         return faster and self.worst_db > other.worst_db + db_margin
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
         quick = {"cpu_milliseconds": self.cpu, "psnr_worst": self.worst_db}
-        return named(self.candidate, self.rasterizer) | {"quick_look": quick}
+        return named(self.candidate, self.rasterizer) | {"quick_estimate": quick}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Point:
     time: FrameTime
     error: RenderedError
     memory: int | None  # bytes at the peak of a frame
-    photographs_db: float | None
+    images_psnr: float | None
 
     @property
     def milliseconds(self) -> float:
@@ -62,7 +62,7 @@ class Point:
             "memory_bytes": self.memory,
             "milliseconds": self.time.to_plain(),
             "error": self.error.to_plain(),
-            "photographs_psnr": self.photographs_db,
+            "images_psnr": self.images_psnr,
             "left_out": list(scene.metadata.left_out),
         }
 
@@ -70,7 +70,7 @@ class Point:
 def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
     """What a point is."""
     c = candidate
-    return {"plan": c.plan, "trim_db": c.trim_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
+    return {"plan": c.plan, "pruning_db": c.pruning_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
 
 
 def front(points: Sequence[Point]) -> list[int]:
@@ -87,7 +87,7 @@ def front(points: Sequence[Point]) -> list[int]:
     return kept
 
 
-def choose(points: Sequence[Point], max_error: float) -> int | None:
-    """The index of the fastest point whose worst frame is within `max_error` dB, which lies on the front."""
-    within = [i for i in front(points) if points[i].error.psnr_worst >= max_error]
+def choose(points: Sequence[Point], min_psnr: float) -> int | None:
+    """The index of the fastest point whose worst frame is within `min_psnr` dB, which lies on the front."""
+    within = [i for i in front(points) if points[i].error.psnr_worst >= min_psnr]
     return within[0] if within else None

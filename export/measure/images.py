@@ -1,4 +1,4 @@
-"""Photographs of a scene that training has not seen, to compare an export's frames with."""
+"""HeldOutImages of a scene that training has not seen, to compare an export's frames with."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,12 +12,12 @@ from msdgs_train.datasets import Frame, composite, load_scene
 from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.model_file import SceneInfo
 
-MOST = 24
-"""Photographs compared with; of more, evenly spread ones."""
+MAX_IMAGES = 24
+"""HeldOutImages compared with; of more, evenly spread ones."""
 
 
-class Photographs:
-    """Held-out photographs over the scene's background, and the cameras of those that were trained on."""
+class HeldOutImages:
+    """Held-out images over the scene's background, and the cameras of those that were trained on."""
 
     def __init__(self, folder: Path, info: SceneInfo, begin: Callable[[int], Callable[[], object]]) -> None:
         """Raises `DatasetInvalid` or `InvalidInput` where the folder holds no dataset."""
@@ -25,18 +25,18 @@ class Photographs:
         t0, t1 = info.time_range
         self.training: list[Camera] = [frame.camera for frame in data.splits["train"]]
         held_out = [frame for frame in data.splits["test"] or data.splits["val"] if t0 <= frame.t <= t1]
-        chosen = np.linspace(0, len(held_out) - 1, min(MOST, len(held_out))).round().astype(int)
+        chosen = np.linspace(0, len(held_out) - 1, min(MAX_IMAGES, len(held_out))).round().astype(int)
         self._frames: list[tuple[Frame, np.ndarray]] = []
         self._background = info.background
-        on_photograph = begin(len(chosen))
+        on_image = begin(len(chosen))
         for i in chosen:
             self._frames.append((held_out[i], composite(held_out[i].load_rgba(), info.background)))
-            on_photograph()
+            on_image()
 
     def psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
-        """Mean PSNR in dB over the photographs, as papers report it; None where there are none."""
+        """Mean PSNR in dB over the images, as papers report it; None where there are none."""
         values = []
-        for frame, truth in self._frames:
+        for frame, target in self._frames:
             rgb = shown(pose(frame.t), frame.camera, self._background, options)
-            values.append(psnr_from_mse(float(np.mean(np.square(rgb - truth, dtype=np.float64)))))
+            values.append(psnr_from_mse(float(np.mean(np.square(rgb - target, dtype=np.float64)))))
         return float(np.mean(values)) if values else None

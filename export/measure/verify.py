@@ -17,7 +17,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 
 TOLERANCE = 1e-4
 TIMES = 50
-GAUSSIANS_A_TIME = 5_000
+GAUSSIANS_PER_TIME = 5_000
 """Of a larger scene every n-th Gaussian is compared at a time, beginning with another at each next time."""
 
 UNSTABLE = 0.25
@@ -25,11 +25,11 @@ UNSTABLE = 0.25
 tolerance: a chain of layers multiplies round-off. No file in float32 can be held to the tolerance there."""
 
 
-SMALLEST_PROMISE = 0.01
-"""Pixels: what float32 and 16-bit poses may add to any promise."""
+MIN_BOUND_PIXELS = 0.01
+"""Pixels: what float32 and 16-bit poses may add to any bound."""
 
-BROKEN_ALLOWED = 1e-3
-"""Part of the poses that may break their plan's promise; more only where Gaussians move too fast for any sampling."""
+MAX_VIOLATIONS = 1e-3
+"""Part of the poses that may break their plan's bound; more only where Gaussians move too fast for any sampling."""
 
 
 class VerificationFailed(MsdgsError):
@@ -47,19 +47,19 @@ def verify(
     """The largest errors against the model in float64 and float32, as `measured_error` stores them.
 
     Only the plan `network` is held to `tolerance`. Others are measured, and those that were fitted to trajectories
-    must be as close between the times that they were fitted to as they promise. The file may hold more Gaussians than
+    must be as close between the times that they were fitted to as they bound. The file may hold more Gaussians than
     the model, static ones after all others; they aren't compared. Errors of means are relative to the scene's half
     diagonal or, further out, to the largest coordinate; those of scales to the Gaussian's largest scale; those of
     quaternions are absolute. Raises `VerificationFailed` where one is above `tolerance` for a stable Gaussian, or a
-    promise is broken. Whether unstable ones can be seen is not asked here: frames tell, before a file is written.
+    bound is broken. Whether unstable ones can be seen is not asked here: frames tell, before a file is written.
     """
     stated = session.scene.metadata
     if stated.plan != BASELINE:
         tolerance = math.inf
-    apart = _Apart(stated.measured_error.get("fitted"))
+    displacements = _Displacements(stated.measured_error.get("fitted"))
     double = copy.deepcopy(model).double()
     count = len(model.gaussians)
-    stride = max(1, math.ceil(count / GAUSSIANS_A_TIME))
+    stride = max(1, math.ceil(count / GAUSSIANS_PER_TIME))
     unstable, unstable_worst = np.zeros(count, bool), 0.0
     worst: dict[str, dict[str, float]] = {p: dict.fromkeys(MOVING_OUTPUTS, 0.0) for p in ("float64", "float32")}
     _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # stored as they are under every plan
@@ -68,7 +68,7 @@ def verify(
         posed = {"float64": pose_arrays(double, t, ids), "float32": pose_arrays(model, t, ids)}
         got = _posed_by_file(session, t, ids)
         _give_sign_of(posed["float64"]["quats"], got["quats"])
-        apart.add(got, posed["float64"])
+        displacements.add(got, posed["float64"])
         size = half_diagonal(session.scene.metadata.bounds)
         own = largest_error(pose_errors(posed["float32"], posed["float64"], size))
         stable = own <= UNSTABLE * tolerance
@@ -83,7 +83,7 @@ def verify(
                     raise VerificationFailed(f"{problem}, allowed is {tolerance:g}")
         on_time()
     return {
-        **apart.to_plain(),
+        **displacements.to_plain(),
         **worst["float64"],
         "against": "model in float64",
         "against_float32": worst["float32"],
@@ -92,11 +92,11 @@ def verify(
     }
 
 
-class _Apart:
+class _Displacements:
     """The largest distances between two computations of poses, in units of the scene."""
 
-    def __init__(self, promise: dict[str, Any] | None) -> None:
-        self._promise = promise
+    def __init__(self, bound: dict[str, Any] | None) -> None:
+        self._bound = bound
         self._position = self._displacement = self._degrees = 0.0
         self._compared = self._broken = 0
 
@@ -106,22 +106,22 @@ class _Apart:
         self._position = max(self._position, float(positions.max(initial=0)))
         self._displacement = max(self._displacement, float(displacements.max(initial=0)))
         self._degrees = max(self._degrees, float(np.degrees(turns.max(initial=0))))
-        if self._promise is not None:
-            allowed = 2 * self._promise["error"] + SMALLEST_PROMISE * self._promise["pixel"]
+        if self._bound is not None:
+            allowed = 2 * self._bound["error"] + MIN_BOUND_PIXELS * self._bound["pixel"]
             self._compared += len(displacements)
             self._broken += int(np.count_nonzero(~(displacements <= allowed)))
 
     def _too_fast(self) -> float:
-        """Poses of Gaussians that the plan doesn't promise anything of."""
-        return 0.0 if self._promise is None else self._promise["too_fast_part"] * self._compared
+        """Poses of Gaussians that the plan doesn't bound anything of."""
+        return 0.0 if self._bound is None else self._bound["too_fast_part"] * self._compared
 
     def to_plain(self) -> dict[str, Any]:
-        """Entries of `measured_error`. Raises `VerificationFailed` where a promise is broken."""
-        fitted = {} if self._promise is None else {"fitted": self._promise}
-        if self._promise is not None and self._broken > BROKEN_ALLOWED * self._compared + self._too_fast():
+        """Entries of `measured_error`. Raises `VerificationFailed` where a bound is broken."""
+        fitted = {} if self._bound is None else {"fitted": self._bound}
+        if self._bound is not None and self._broken > MAX_VIOLATIONS * self._compared + self._too_fast():
             raise VerificationFailed(
                 f"{self._broken:,} of {self._compared:,} poses are off by more than twice the "
-                f"{self._promise['error']:.3g} scene units that the plan promises"
+                f"{self._bound['error']:.3g} scene units that the plan promises"
             )
         return {
             "position": self._position,

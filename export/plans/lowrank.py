@@ -17,7 +17,7 @@ from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
 from export.plans.base import Plan, PlanSpec
 from export.plans.scene_graph import activated, finished, new_graph
-from export.trajectories.adaptive import CHUNK, own_poses, worst
+from export.trajectories.adaptive import CHUNK, adaptive_knots, worst
 from export.trajectories.poses import POSE, QUATS
 from export.trajectories.sampling import Ids, Samples, Trajectories
 from export.trajectories.splines import along_time, design, fitting, samples_for, time_weights
@@ -48,7 +48,7 @@ def lowrank(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.Mo
     errors = fit.errors(np.arange(trajectories.count), functions)
     chosen = worst(trajectories, errors, spec.max_pixels)
     most = spec.max_pixels or np.delete(errors, chosen).max(initial=0) / trajectories.pixel
-    own, own_errors = own_poses(trajectories, chosen, most)
+    own, own_errors = adaptive_knots(trajectories, chosen, most)
     errors[chosen] = own_errors
     graph, time_range = new_graph(baked), baked.scene.metadata.time_range
     pose = _product(graph, fit.table(functions), fit.basis(functions), time_range)
@@ -56,7 +56,7 @@ def lowrank(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.Mo
         places = graph.constant("own.places", chosen[own.order][:, None])
         pose = graph.node("ScatterND", [pose, places, at_time(graph, own, time_range)], "own.merged")
     activated(graph, graph.node("Gather", [pose, "ids"], "ids.pose"))
-    return finished(graph, baked, str(spec), trajectories.promise(errors, len(own)))
+    return finished(graph, baked, str(spec), trajectories.error_bound(errors, len(own)))
 
 
 def _cheapest(trajectories: Trajectories, fit: "_Fit", functions: np.ndarray, pixels: float) -> int:

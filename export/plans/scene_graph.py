@@ -21,10 +21,12 @@ def new_graph(baked: Baked) -> GraphBuilder:
     return graph
 
 
-def finished(graph: GraphBuilder, baked: Baked, plan: str, promise: dict[str, Any] | None = None) -> onnx.ModelProto:
+def finished(
+    graph: GraphBuilder, baked: Baked, plan: str, error_bound: dict[str, Any] | None = None
+) -> onnx.ModelProto:
     """The whole scene file of a graph that computes `means`, `quats` and `scales`, or holds them as constants.
 
-    `promise` is what a fitted plan knows of its own errors; it is `measured_error` until the file is measured.
+    `error_bound` is what a fitted plan knows of its own errors; it is `measured_error` until the file is measured.
     """
     scene = baked.scene
     count: int | str = "M" if scene.moving_count else 0
@@ -37,7 +39,7 @@ def finished(graph: GraphBuilder, baked: Baked, plan: str, promise: dict[str, An
     if "steps" in graph.constants:
         inputs["steps"] = (TensorProto.FLOAT, [1])
     return graph.model(
-        inputs, outputs, replace(scene.metadata, plan=plan, measured_error=promise or {}).to_properties()
+        inputs, outputs, replace(scene.metadata, plan=plan, measured_error=error_bound or {}).to_properties()
     )
 
 

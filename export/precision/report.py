@@ -58,12 +58,12 @@ class Samples:
 
 @dataclass(frozen=True)
 class StabilityReport:
-    """What `assess` found. `steady` says whether plans that run the layers may be used."""
+    """What `assess` found. `stable` says whether plans that run the layers may be used."""
 
     gaussians: int
     layers: list[str]
     times: int
-    max_error: float  # dB
+    min_psnr: float  # dB
     median_amplification: float
     worst_amplification: float
     layer_growth: list[list[float]]  # for each layer median, 99.9th percentile and maximum of ‖J_k … J_1‖
@@ -72,30 +72,30 @@ class StabilityReport:
     worst: WorstGaussians | None
     limits: dict[str, int]  # Gaussians that a bound of the model holds back, by what it is
     broken: list[str]  # why no plan at all can show this model
-    unsteady: list[str]  # why float32 layers can't
+    unstable: list[str]  # why float32 layers can't
     samples: Samples = field(repr=False)
 
     @property
-    def steady(self) -> bool:
-        return not (self.broken or self.unsteady)
+    def stable(self) -> bool:
+        return not (self.broken or self.unstable)
 
     @property
     def verdict(self) -> str:
         """One sentence, or several, on what to do."""
         if self.broken:
             return "can't be shown: " + "; ".join(self.broken)
-        if self.unsteady:
-            return "unsteady in float32: " + "; ".join(self.unsteady) + f". {REMEDY[0].upper()}{REMEDY[1:]}"
+        if self.unstable:
+            return "unstable in float32: " + "; ".join(self.unstable) + f". {REMEDY[0].upper()}{REMEDY[1:]}"
         if not self.layers or not self.gaussians:
-            return "steady: nothing moves"
-        return "steady: float32 shows what float64 shows, any plan may be used"
+            return "stable: nothing moves"
+        return "stable: float32 shows what float64 shows, any plan may be used"
 
     def refusal(self, plan: str) -> str | None:
         """Why `plan` must not be used for this model, with the remedy; None if it may."""
         if self.broken:
             return "; ".join(self.broken)
-        if self.unsteady and not plan_of(plan).fitted:
-            return f"the plan `{plan}` computes the layers in float32 or less, and {'; '.join(self.unsteady)}; {REMEDY}"
+        if self.unstable and not plan_of(plan).fitted:
+            return f"the plan `{plan}` computes the layers in float32 or less, and {'; '.join(self.unstable)}; {REMEDY}"
         return None
 
     def require(self, plan: str) -> None:
@@ -107,7 +107,7 @@ class StabilityReport:
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON, without the samples; infinities become None."""
         plain = {k: v for k, v in asdict(self).items() if k != "samples"}
-        return {"steady": self.steady, "verdict": self.verdict, **_without_infinities(plain)}
+        return {"stable": self.stable, "verdict": self.verdict, **_without_infinities(plain)}
 
 
 def _without_infinities(value: Any) -> Any:

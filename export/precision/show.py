@@ -24,14 +24,14 @@ def print_report(report: StabilityReport, console: Console) -> None:
             console.print(f"{gap.name}: {gap.meaning}", style="dim", markup=False)
         console.print(
             "median to largest: relative error of a pose. dB, value: the worst frame, and its worst pixel. "
-            f"Healed: with the worst 0.1 % in float64. Red: under {report.max_error:g} dB",
+            f"Healed: with the worst 0.1 % in float64. Red: under {report.min_psnr:g} dB",
             style="dim",
         )
     if report.worst is not None:
         _print_worst(report, console)
     for what, count in report.limits.items():
         console.print(f"{what}: {count:,} of the Gaussians", markup=False)
-    console.print(report.verdict, style="bold green" if report.steady else "bold red", markup=False)
+    console.print(report.verdict, style="bold green" if report.stable else "bold red", markup=False)
 
 
 def _growth_table(report: StabilityReport) -> Table:
@@ -42,7 +42,7 @@ def _growth_table(report: StabilityReport) -> Table:
 
 
 def _format_table(report: StabilityReport) -> Table:
-    columns = ("median", "99.9 %", "largest", "pixels", "dB", "healed", "value")
+    columns = ("median", "99.9 %", "largest", "pixels", "dB", "without_outliers", "value")
     table = Table(Column("against float64", no_wrap=True), *columns, box=None)
     for gap in report.formats:
         table.add_row(
@@ -52,9 +52,9 @@ def _format_table(report: StabilityReport) -> Table:
             decibels(gap.psnr, ""),
             decibels(gap.psnr_without_worst, ""),
             f"{gap.worst_pixel:.1e}",
-            style="" if gap.psnr >= report.max_error else "red",
+            style="" if gap.psnr >= report.min_psnr else "red",
         )
-    table.add_row("foretold", *[""] * 4, decibels(report.predicted_psnr, ""), "", "")
+    table.add_row("predicted", *[""] * 4, decibels(report.predicted_psnr, ""), "", "")
     return table
 
 
@@ -99,8 +99,8 @@ def draw(report: StabilityReport, path: Path) -> None:
     histogram.set(xscale="log", xlabel="amplification, largest product of Jacobians", ylabel="Gaussians × times")
     shown = np.isfinite(samples.distance) & (samples.distance > 0) & (amplification < 1e30)
     gaps.loglog(amplification[shown], samples.distance[shown], ".", markersize=2, alpha=0.3, label="measured")
-    foretold = shown & np.isfinite(samples.predicted) & (samples.predicted < 1e30)
-    gaps.loglog(amplification[foretold], samples.predicted[foretold], ".", markersize=2, alpha=0.15, label="foretold")
+    known = shown & np.isfinite(samples.predicted) & (samples.predicted < 1e30)
+    gaps.loglog(amplification[known], samples.predicted[known], ".", markersize=2, alpha=0.15, label="predicted")
     ends = np.array([1.0, top])
     gaps.loglog(ends, UNIT_ROUNDOFF * ends, color="black", label="amplification × 2⁻²⁴")
     gaps.set(xlabel="amplification", ylabel="float32 against float64, scene units")

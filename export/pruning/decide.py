@@ -1,13 +1,13 @@
-"""Trimming: rule by rule, each measured in frames of what all rules before it have left."""
+"""Pruning: rule by rule, each measured in frames of what all rules before it have left."""
 
 import math
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 from export.layers import export_of
-from export.pruning.mask import Cut, TrimmedModel, trimmed, whole
+from export.pruning.mask import PrunedModel, PruningMask, full_mask, pruned
 from export.pruning.rules import RULES
-from export.pruning.statistics import Evidence
+from export.pruning.statistics import PruningStatistics
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.model import DynamicGaussians
 
@@ -16,7 +16,7 @@ MOVING_BYTES, MODULATION_BYTES = 8, 12
 """Per Gaussian in a scene file: pose, opacity, an SH coefficient; and if it moves, its id and its modulation."""
 
 
-class LeftOut(NamedTuple):
+class PrunedPart(NamedTuple):
     """What one rule has left out."""
 
     rule: str
@@ -31,59 +31,59 @@ class LeftOut(NamedTuple):
         return f"{self.what}: {self.count:,} of {self.of:,}, {saved}, worst frame {self.worst_frame_db:.1f} dB"
 
 
-def trim(
-    evidence: Evidence,
-    least_db: float,
+def prune(
+    statistics: PruningStatistics,
+    min_db: float,
     rules: Collection[str] = tuple(RULES),
     on_rule: Callable[[], object] = lambda: None,
-) -> tuple[Cut, list[LeftOut]]:
-    """What `rules` leave of the model while the worst deciding frame stays at `least_db` dB or more.
+) -> tuple[PruningMask, list[PrunedPart]]:
+    """What `rules` leave of the model while the worst deciding frame stays at `min_db` dB or more.
 
-    Each rule may use its share of the squared error that this allows, and what the rules before it have not used.
+    Each rule may spend its part of the squared error that this allows, and what the rules before it have not spent.
     """
-    cut, left_out = whole(evidence.model), []
+    mask, left_out = full_mask(statistics.model), []
     for name, rule in RULES.items():
         if name not in rules:
             continue
-        smaller = rule.apply(evidence, cut, least_db - 10 * math.log10(rule.share))
+        smaller = rule.apply(statistics, mask, min_db - 10 * math.log10(rule.error_budget))
         on_rule()
-        count = left_out_count(name, cut, smaller)
+        count = pruned_count(name, mask, smaller)
         if count:
-            saved = stored_bytes(evidence.model, cut) - stored_bytes(evidence.model, smaller)
-            of = out_of(name, cut)
-            left_out.append(LeftOut(name, rule.what, count, of, saved, evidence.worst_db(smaller)))
-            cut = smaller
-    return cut, left_out
+            saved = stored_bytes(statistics.model, mask) - stored_bytes(statistics.model, smaller)
+            of = out_of(name, mask)
+            left_out.append(PrunedPart(name, rule.what, count, of, saved, statistics.worst_db(smaller)))
+            mask = smaller
+    return mask, left_out
 
 
-def trimmed_model(evidence: Evidence, cut: Cut, left_out: list[LeftOut]) -> TrimmedModel:
+def pruned_model(statistics: PruningStatistics, mask: PruningMask, left_out: list[PrunedPart]) -> PrunedModel:
     """The model that is left, with the list that its scene file keeps of what isn't."""
     plain: list[dict[str, Any]] = [entry._asdict() for entry in left_out]
-    return trimmed(evidence.model, cut, evidence.poses(cut.network).still, plain)
+    return pruned(statistics.model, mask, statistics.poses(mask.network).static, plain)
 
 
-def out_of(rule: str, cut: Cut) -> int:
+def out_of(rule: str, mask: PruningMask) -> int:
     """How many there are of what a rule leaves out."""
     return {
-        "modulation": int(cut.network.modulated),
-        "heads": len(cut.network.heads),
-        "layers": len(cut.network.layers),
-        "unseen": int(cut.kept.sum()),
-        "still": int(cut.moves.sum()),
-        "bands": cut.sh_degree,
+        "modulation": int(mask.network.modulated),
+        "heads": len(mask.network.heads),
+        "layers": len(mask.network.layers),
+        "invisible": int(mask.kept.sum()),
+        "static": int(mask.moves.sum()),
+        "sh": mask.sh_degree,
     }[rule]
 
 
-def left_out_count(rule: str, cut: Cut, smaller: Cut) -> int:
-    """How many of them a smaller cut lacks."""
-    return out_of(rule, cut) - out_of(rule, smaller)
+def pruned_count(rule: str, mask: PruningMask, smaller: PruningMask) -> int:
+    """How many of them a smaller mask lacks."""
+    return out_of(rule, mask) - out_of(rule, smaller)
 
 
-def stored_bytes(model: DynamicGaussians, cut: Cut) -> int:
-    """About what a cut takes in a file of the plan `network`: Gaussians and layers."""
-    gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(cut.sh_degree)
-    layers = [model.deformation.layers[k] for k in cut.network.layers] if cut.moves.any() else []
+def stored_bytes(model: DynamicGaussians, mask: PruningMask) -> int:
+    """About what a mask takes in a file of the plan `network`: Gaussians and layers."""
+    gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(mask.sh_degree)
+    layers = [model.deformation.layers[k] for k in mask.network.layers] if mask.moves.any() else []
     attributes = sum(kind.bytes_per_gaussian for kind in {export_of(layer) for layer in layers})
-    moving = MOVING_BYTES + MODULATION_BYTES * cut.network.modulated + attributes
+    moving = MOVING_BYTES + MODULATION_BYTES * mask.network.modulated + attributes
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())
-    return gaussian * int(cut.kept.sum()) + moving * int(cut.moves.sum()) + weights
+    return gaussian * int(mask.kept.sum()) + moving * int(mask.moves.sum()) + weights

@@ -1,4 +1,4 @@
-"""What is left of a model after trimming, and the smaller model that this makes."""
+"""What is left of a model after pruning, and the smaller model that this makes."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,7 +16,7 @@ from msdgs_train.layers.chain import MultiStepDeformation
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkMask:
     """The parts of a deformation that are left."""
 
     layers: tuple[int, ...]  # indices of the model's
@@ -25,82 +25,86 @@ class Network:
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class PruningMask:
     """What is left of a model."""
 
-    network: Network
+    network: NetworkMask
     kept: np.ndarray  # [N] bool
     moves: np.ndarray  # [N] bool, only Gaussians that are kept
     sh_degree: int
 
     @property
     def ids(self) -> np.ndarray:
-        """The model's ids of what is left: moving Gaussians, then still ones."""
+        """The model's ids of what is left: moving Gaussians, then static ones."""
         return np.concatenate([np.flatnonzero(self.moves), np.flatnonzero(self.kept & ~self.moves)])
 
-    def without(self, **changes: Any) -> "Cut":
-        """Another cut; Gaussians that aren't kept don't move."""
+    def without(self, **changes: Any) -> "PruningMask":
+        """Another mask; Gaussians that aren't kept don't move."""
         changed = replace(self, **changes)
         return replace(changed, moves=changed.moves & changed.kept)
 
 
 @dataclass(frozen=True, eq=False)
-class TrimmedModel:
+class PrunedModel:
     """A smaller model of Gaussians that move, beside ones that don't."""
 
     moving: DynamicGaussians
-    still: Gaussians  # float32, activated
-    ids: np.ndarray  # [M + S] int64, the model's id of each: moving ones, then still ones
+    static: Gaussians  # float32, activated
+    ids: np.ndarray  # [M + S] int64, the model's id of each: moving ones, then static ones
     left_out: tuple[dict[str, Any], ...] = ()
 
 
-def whole(model: DynamicGaussians) -> Cut:
-    """The cut that leaves everything in."""
+def full_mask(model: DynamicGaussians) -> PruningMask:
+    """The mask that leaves everything in."""
     count = len(model.gaussians)
     heads = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation.layers))
-    network = Network(tuple(range(len(model.deformation))), heads, model.modulation is not None)
+    network = NetworkMask(tuple(range(len(model.deformation))), heads, model.modulation is not None)
     moves = np.full(count, len(model.deformation) > 0)
-    return Cut(network, np.ones(count, bool), moves, model.config.sh_degree)
+    return PruningMask(network, np.ones(count, bool), moves, model.config.sh_degree)
 
 
-def with_network(model: DynamicGaussians, network: Network) -> DynamicGaussians:
+def with_network(model: DynamicGaussians, network: NetworkMask) -> DynamicGaussians:
     """All Gaussians with what is left of the deformation; parameters are shared with `model`."""
     return _model(model, network, slice(None), model.config.sh_degree)
 
 
-def trimmed(model: DynamicGaussians, cut: Cut, still_poses: Gaussians, left_out: list[dict[str, Any]]) -> TrimmedModel:
-    """The model that a cut leaves; `still_poses` says of all N Gaussians how each would stand still."""
-    network = cut.network if cut.moves.any() else replace(cut.network, layers=())
-    still = np.flatnonzero(cut.kept & ~cut.moves)
-    moving = _model(model, network, torch.from_numpy(cut.moves), cut.sh_degree)
-    return TrimmedModel(moving, rows(still_poses, still, cut.sh_degree), cut.ids, tuple(left_out))
+def pruned(
+    model: DynamicGaussians, mask: PruningMask, mean_poses: Gaussians, left_out: list[dict[str, Any]]
+) -> PrunedModel:
+    """The model that a mask leaves; `mean_poses` says of all N Gaussians how each would stand static."""
+    network = mask.network if mask.moves.any() else replace(mask.network, layers=())
+    static = np.flatnonzero(mask.kept & ~mask.moves)
+    moving = _model(model, network, torch.from_numpy(mask.moves), mask.sh_degree)
+    return PrunedModel(moving, rows(mean_poses, static, mask.sh_degree), mask.ids, tuple(left_out))
 
 
-def untrimmed(model: DynamicGaussians) -> TrimmedModel:
+def unpruned(model: DynamicGaussians) -> PrunedModel:
     """All of a model."""
     every = np.arange(len(model.gaussians))
     with torch.no_grad():
         canonical = as_gaussians(model.pose(0.0, deform=False))
-    return TrimmedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
+    return PrunedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
 
 
-def with_sh_degree(trimmed: TrimmedModel, sh_degree: int) -> TrimmedModel:
-    """The same Gaussians with the SH bands up to `sh_degree` alone."""
-    before = trimmed.moving.config.sh_degree
-    network = whole(trimmed.moving).network
-    still = rows(trimmed.still, np.arange(len(trimmed.still)), sh_degree)
-    entry = {"rule": "sh_degree", "what": "SH bands, as asked for", "count": before - sh_degree, "of": before}
-    moving = _model(trimmed.moving, network, slice(None), sh_degree)
-    return TrimmedModel(moving, still, trimmed.ids, (*trimmed.left_out, entry))
+def with_sh_degree(pruned: PrunedModel, sh_degree: int) -> PrunedModel:
+    """The same Gaussians with the SH sh up to `sh_degree` alone."""
+    before = pruned.moving.config.sh_degree
+    network = full_mask(pruned.moving).network
+    static = rows(pruned.static, np.arange(len(pruned.static)), sh_degree)
+    entry = {"rule": "sh_degree", "what": "SH sh, as asked for", "count": before - sh_degree, "of": before}
+    moving = _model(pruned.moving, network, slice(None), sh_degree)
+    return PrunedModel(moving, static, pruned.ids, (*pruned.left_out, entry))
 
 
 def rows(gaussians: Gaussians, ids: np.ndarray, sh_degree: int) -> Gaussians:
-    """Some Gaussians, with the SH bands up to `sh_degree`."""
+    """Some Gaussians, with the SH sh up to `sh_degree`."""
     g, coefficients = gaussians, sh_coefficients(sh_degree)
     return Gaussians(g.means[ids], g.quats[ids], g.scales[ids], g.opacities[ids], g.sh[ids, :coefficients])
 
 
-def _model(model: DynamicGaussians, network: Network, which: slice | torch.Tensor, sh_degree: int) -> DynamicGaussians:
+def _model(
+    model: DynamicGaussians, network: NetworkMask, which: slice | torch.Tensor, sh_degree: int
+) -> DynamicGaussians:
     tensors = {name: parameter.detach()[which] for name, parameter in model.gaussians.named_parameters()}
     tensors["sh_rest"] = tensors["sh_rest"][:, : sh_coefficients(sh_degree) - 1]
     if not network.modulated:

@@ -1,4 +1,4 @@
-"""What trimming decides by: how much of each Gaussian is seen, how far it moves in pixels, and frames to compare."""
+"""What pruning decides by: how much of each Gaussian is seen, how far it moves in pixels, and frames to compare."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -8,7 +8,7 @@ import torch
 
 from export.measure.rendered_error import as_gaussians, shown
 from export.measure.views import View
-from export.pruning.mask import Cut, Network, rows, whole, with_network
+from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_network
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
@@ -19,14 +19,14 @@ from msdgs_train.layers.chain import operations
 from msdgs_train.rendering.rasterize import rasterize
 
 MEMORY, POSE_BYTES = 2e9, 40
-"""Bytes of poses that are kept of smaller networks, for trimming to other errors, and of one Gaussian at one time."""
+"""Bytes of poses that are kept of smaller networks, for pruning to other errors, and of one Gaussian at one time."""
 
 SAMPLED_GAUSSIANS, SAMPLED_TIMES = 1000, 5
 """For the quick look at what a part of the network does."""
 
 
 class Poses:
-    """All Gaussians at the deciding times, posed when they are first asked for, and as they would best stand still."""
+    """All Gaussians at the deciding times, posed when they are first asked for, and as they would best stand static."""
 
     def __init__(self, model: DynamicGaussians, times: Sequence[float]) -> None:
         self.times, self._model = times, model
@@ -42,13 +42,13 @@ class Poses:
         return self._at[t]
 
     @cached_property
-    def still(self) -> Gaussians:
+    def static(self) -> Gaussians:
         """Where they are on average."""
-        return standing_still([self.at(t) for t in self.times])
+        return mean_pose([self.at(t) for t in self.times])
 
 
-class Evidence:
-    """Frames of the whole model at the deciding views, and what a cut changes in them. All in float32."""
+class PruningStatistics:
+    """Frames of the whole model at the deciding views, and what a mask changes in them. All in float32."""
 
     def __init__(
         self,
@@ -60,16 +60,16 @@ class Evidence:
         self.model, self.background = model, background
         self._views = views
         self._order = list(range(len(views)))
-        self._kept: dict[Network, Poses] = {}
-        network = whole(model).network
+        self._kept: dict[NetworkMask, Poses] = {}
+        network = full_mask(model).network
         self._whole = network, self._posed(network)
         for t in self._whole[1].times:
             self._whole[1].at(t)
             on_time()
         self._frames = [shown(self._whole[1].at(view.t), view.camera, background, model.rasterizer) for view in views]
-        self.peaks, self.amounts = self._seen()
+        self.peaks, self.amounts = self._visibility()
 
-    def poses(self, network: Network) -> Poses:
+    def poses(self, network: NetworkMask) -> Poses:
         """All Gaussians as this part of the network moves them."""
         if network == self._whole[0]:
             return self._whole[1]
@@ -80,17 +80,17 @@ class Evidence:
             self._kept[network] = self._posed(network)
         return self._kept[network]
 
-    def operations(self, network: Network) -> float:
+    def operations(self, network: NetworkMask) -> float:
         """About how many it takes to pose all Gaussians at the deciding times as this part of the network does."""
         layers = [self.model.deformation.layers[k] for k in network.layers]
         return operations(layers) * len(self.model.gaussians) * len(self._whole[1].times)
 
-    def worst_db(self, cut: Cut, enough: float = -np.inf) -> float:
-        """PSNR in dB of the worst deciding frame; where one is under `enough`, that of the first that is."""
-        poses, worst = self.poses(cut.network), np.inf
-        moving, still = np.flatnonzero(cut.moves), np.flatnonzero(cut.kept & ~cut.moves)
-        colors = rows(self._whole[1].still, cut.ids, cut.sh_degree)
-        standing = rows(poses.still if len(still) else self._whole[1].still, still, 0)
+    def worst_db(self, mask: PruningMask, min_db: float = -np.inf) -> float:
+        """PSNR in dB of the worst deciding frame; where one is under `min_db`, that of the first that is."""
+        poses, worst = self.poses(mask.network), np.inf
+        moving, static = np.flatnonzero(mask.moves), np.flatnonzero(mask.kept & ~mask.moves)
+        colors = rows(self._whole[1].static, mask.ids, mask.sh_degree)
+        standing = rows(poses.static if len(static) else self._whole[1].static, static, 0)
         constants = standing.means, standing.quats, standing.scales
         for i in list(self._order):
             view = self._views[i]
@@ -101,26 +101,26 @@ class Evidence:
             frame = shown(drawn, view.camera, self.background, self.model.rasterizer)
             db = psnr_from_mse(float(np.mean(np.square(frame - self._frames[i], dtype=np.float64))))
             worst = min(worst, db)
-            if worst < enough:
+            if worst < min_db:
                 self._order.remove(i)  # most likely the one that decides next time too
                 self._order.insert(0, i)
                 break
         return worst
 
-    def motion(self, network: Network) -> FloatArray:
-        """[N] pixels by which the ends of a Gaussian's axes are at most off where it stands still: its position,
+    def motion(self, network: NetworkMask) -> FloatArray:
+        """[N] pixels by which the ends of a Gaussian's axes are at most off where it stands static: its position,
         rotation and scales, in the nearest camera."""
         poses = self.poses(network)
-        still_axes = half_axes(poses.still)
-        furthest = np.zeros(len(poses.still), np.float32)
+        still_axes = half_axes(poses.static)
+        furthest = np.zeros(len(poses.static), np.float32)
         for at in map(poses.at, poses.times):
-            moved = np.linalg.norm(at.means - poses.still.means, axis=1)
+            moved = np.linalg.norm(at.means - poses.static.means, axis=1)
             turned = np.linalg.norm(half_axes(at) - still_axes, axis=1).max(axis=1, initial=0)
             np.maximum(furthest, moved + turned, out=furthest)
-        return furthest * self.pixels_a_unit(poses.still.means)
+        return furthest * self.pixels_per_unit(poses.static.means)
 
     @torch.no_grad()
-    def change(self, network: Network, smaller: Network) -> float:
+    def change(self, network: NetworkMask, smaller: NetworkMask) -> float:
         """Pixels by which a few Gaussians, at a few times, are elsewhere on average if part of a network is missing;
         faint ones count less."""
         poses = self.poses(network)
@@ -132,11 +132,11 @@ class Evidence:
             after = as_gaussians(model.pose(t, ids=torch.from_numpy(ids)))
             moved = np.linalg.norm(after.means - before.means, axis=1)
             turned = np.linalg.norm(half_axes(after) - half_axes(before), axis=1).max(axis=1, initial=0)
-            pixels = (moved + turned) * self.pixels_a_unit(before.means) * self.peaks[ids]
+            pixels = (moved + turned) * self.pixels_per_unit(before.means) * self.peaks[ids]
             change = max(change, float(pixels.sum() / max(self.peaks[ids].sum(), 1e-12)))
         return change
 
-    def pixels_a_unit(self, means: FloatArray) -> FloatArray:
+    def pixels_per_unit(self, means: FloatArray) -> FloatArray:
         """[N] pixels a scene unit where each point is, in the camera in which that is most."""
         most = np.zeros(len(means), np.float32)
         for camera in {id(view.camera): view.camera for view in self._views}.values():
@@ -144,18 +144,18 @@ class Evidence:
             np.maximum(most, max(camera.fx, camera.fy) / np.maximum(distances, GSPLAT.near_plane), out=most)
         return most
 
-    def _posed(self, network: Network) -> Poses:
+    def _posed(self, network: NetworkMask) -> Poses:
         return Poses(with_network(self.model, network), sorted({view.t for view in self._views}))
 
-    def _seen(self) -> tuple[FloatArray, FloatArray]:
+    def _visibility(self) -> tuple[FloatArray, FloatArray]:
         """[N] the most that a Gaussian covers of a pixel under its middle, and of how many pixels, over the views."""
         poses = self.poses(self._whole[0])
-        peaks, amounts = np.zeros((2, len(poses.still)), np.float32)
+        peaks, amounts = np.zeros((2, len(poses.static)), np.float32)
         for view in self._views if len(peaks) else ():
             g = poses.at(view.t)
             weights = blending_weights(g, view, self.model.rasterizer)
             # pixels that a Gaussian of these two largest axes fills
-            sizes = np.sort(g.scales, axis=1)[:, 1:] * self.pixels_a_unit(g.means)[:, None]
+            sizes = np.sort(g.scales, axis=1)[:, 1:] * self.pixels_per_unit(g.means)[:, None]
             np.maximum(peaks, weights / (2 * np.pi * (sizes.prod(axis=1) + self.model.config.eps2d)), out=peaks)
             np.maximum(amounts, weights, out=amounts)
         return np.minimum(peaks, 1), amounts
@@ -177,7 +177,7 @@ def half_axes(gaussians: Gaussians) -> FloatArray:
     return to_matrix(gaussians.quats) * gaussians.scales[:, None, :]
 
 
-def standing_still(poses: list[Gaussians]) -> Gaussians:
+def mean_pose(poses: list[Gaussians]) -> Gaussians:
     """Each Gaussian where it is on average: means, logarithms of scales, quaternions of one hemisphere."""
     first = poses[0]
     quats = np.zeros_like(first.quats)

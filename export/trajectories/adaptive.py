@@ -10,7 +10,7 @@ from export.trajectories.stored import GriddedPoses, StoredPoses
 COUNTS = (7, 11, 19, 35, 67, 131, 259, 515, FINEST // 2 + 3)
 """Control points of the grids that a Gaussian may have."""
 
-SHARE = 0.05
+MAX_CORRECTED = 0.05
 """Part of the Gaussians that a plan with a given size corrects: those that it gets most wrong."""
 
 VISIBLE = 0.02
@@ -28,10 +28,10 @@ def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) ->
     if most is not None:
         return np.flatnonzero(errors > most * trajectories.pixel)
     over = np.flatnonzero(errors > VISIBLE * trajectories.pixel)
-    return np.sort(over[np.argsort(-errors[over])[: int(np.ceil(SHARE * trajectories.count))]])
+    return np.sort(over[np.argsort(-errors[over])[: int(np.ceil(MAX_CORRECTED * trajectories.count))]])
 
 
-def own_poses(trajectories: Trajectories, ids: Ids, most: float) -> tuple[GriddedPoses, np.ndarray]:
+def adaptive_knots(trajectories: Trajectories, ids: Ids, most: float) -> tuple[GriddedPoses, np.ndarray]:
     """Poses of the Gaussians `ids`, each on the coarsest grid that is within `most` pixels, and their errors [H]."""
     errors, fewest = np.full(len(ids), np.inf), trajectories.fewest_poses(most, ids)
     grids, left = [], np.arange(len(ids))

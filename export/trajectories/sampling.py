@@ -89,7 +89,7 @@ class Trajectories:
             got[rows] = values[:, :: (values.shape[1] - 1) // (times - 1)]
         return got
 
-    def promise(self, errors: npt.NDArray[np.float64], own: int) -> dict[str, Any]:
+    def error_bound(self, errors: npt.NDArray[np.float64], own: int) -> dict[str, Any]:
         """What a fitted plan says of itself, given each Gaussian's error in scene units at all samples."""
         resolved = np.delete(errors, self.unresolved)
         return {
@@ -108,7 +108,7 @@ class Trajectories:
         return self._fewest.get(most, np.zeros(self.count, np.int64))[ids]
 
     def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
-        """What another plan of the same error, of what is trimmed further, need not find again."""
+        """What another plan of the same error, of what is pruned further, need not find again."""
         self._fewest.setdefault(most, np.zeros(self.count, np.int64))[ids] = counts
 
     def distances(self, ids: Ids, differences: np.ndarray) -> npt.NDArray[np.float64]:

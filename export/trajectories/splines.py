@@ -15,7 +15,7 @@ from scipy.linalg import solve
 
 from export.layers.graph import GraphBuilder
 
-FEWEST = 4
+MIN_CONTROL_POINTS = 4
 """Control points of one interval."""
 
 

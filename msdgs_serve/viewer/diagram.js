@@ -17,13 +17,13 @@ const KINDS = ["network", "prefix", "int8", "lowrank", "keyframes"];
 export function drawDiagram(svg, report, tell) {
   const points = report.points.map(pointOf).sort((a, b) => a.milliseconds - b.milliseconds);
   const across = scale(points.map((point) => Math.log(point.milliseconds)), [LEFT + 8, WIDTH - RIGHT - 8]);
-  const upwards = scale([...points.map((point) => point.psnr), report.max_error], [TOP + 8, HEIGHT - BOTTOM - 8]);
+  const upwards = scale([...points.map((point) => point.psnr), report.min_psnr], [TOP + 8, HEIGHT - BOTTOM - 8]);
   const x = (milliseconds) => across(Math.log(milliseconds));
   svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
   svg.replaceChildren(
     ...timeAxis(points, x),
     ...errorAxis(points, upwards),
-    ...allowed(report.max_error, upwards(report.max_error)),
+    ...allowed(report.min_psnr, upwards(report.min_psnr)),
     frontLine(points, x, upwards),
     ...points.map((point) => dot(point, x(point.milliseconds), upwards(point.psnr), tell)),
   );
@@ -36,7 +36,7 @@ function pointOf(point) {
     kind: point.plan.split(":")[0],
     front: point.front,
     chosen: point.chosen,
-    trimmed: point.trim_db,
+    pruned: point.pruning_db,
     milliseconds: point.milliseconds.total.min,
     psnr: Math.min(point.error.psnr_worst ?? HIGHEST, HIGHEST),
     bytes: point.bytes,
@@ -103,10 +103,10 @@ function dot(point, x, y, tell) {
 }
 
 function sentence(point) {
-  const trimmed = point.trimmed === null ? "all of it" : `trimmed to ${point.trimmed} dB`;
+  const pruned = point.pruned === null ? "all of it" : `pruned to ${point.pruned} dB`;
   const error = point.psnr >= HIGHEST ? "exact" : `${point.psnr.toFixed(1)} dB in the worst frame`;
   const served = point.chosen ? "Chosen: " : "";
-  return `${served}${point.plan}, ${trimmed}. ${point.milliseconds.toFixed(1)} ms, ${error}, ${(point.bytes / 1e6).toFixed(2)} MB.`;
+  return `${served}${point.plan}, ${pruned}. ${point.milliseconds.toFixed(1)} ms, ${error}, ${(point.bytes / 1e6).toFixed(2)} MB.`;
 }
 
 function make(kind, attributes, text = "") {

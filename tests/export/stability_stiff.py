@@ -109,7 +109,7 @@ CASES: dict[str, Callable[[], DynamicGaussians]] = {
 
 
 def rows_of(case: str) -> list[Row]:
-    """What is foretold must cover what is measured, and what is accepted must be exact in pictures not looked at."""
+    """What is predicted must cover what is measured, and what is accepted must be exact in pictures not looked at."""
     model = CASES[case]()
     report = assess(model, SCENE, times=TIMES if len(model.deformation) < 16 else 2)
     name = f"{case}: amplified × {report.worst_amplification:.2g}"
@@ -125,12 +125,12 @@ def rows_of(case: str) -> list[Row]:
 
 
 def _foretold(name: str, report: StabilityReport) -> list[Row]:
-    """Where little round-off is foretold, there must be no more; where much is, a chain isn't linear any more."""
+    """Where little round-off is predicted, there must be no more; where much is, a chain isn't linear any more."""
     s = report.samples
     small = s.predicted < tolerance("stability.first_order")
     ratios = s.distance[small] / np.maximum(s.predicted[small], 1e-300)
-    quantity = f"float32 means, as part of what is foretold, for {small.mean():.0%} of them"
-    return [measured(name, quantity, float(ratios.max()), "stability.foretold")] if small.any() else []
+    quantity = f"float32 means, as part of what is predicted, for {small.mean():.0%} of them"
+    return [measured(name, quantity, float(ratios.max()), "stability.predicted")] if small.any() else []
 
 
 def _unseen(model: DynamicGaussians) -> tuple[int, float]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from onnx import helper
 
-from export.jobs.job import Job
+from export.jobs.job import ExportJob
 from export.measure.rendered_error import ExactFrames, posed, shown
 from export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
@@ -88,7 +88,7 @@ def test_exact_frames_of_an_export(
     rows = np.arange(len(loaded.model.gaussians))
     assert exact.measure(exact.pose, rows).psnr_worst == 100.0
     assert exact.measure(exact.pose, rows, options=GSPLAT).psnr_worst < 40.0
-    job = Job(folder / "model.pt", tmp_path)
+    job = ExportJob(folder / "model.pt", tmp_path)
     candidate = job.candidate("network", 50.0)
     assert candidate.options == NARROW
     assert job.error(candidate).psnr_worst > 50.0

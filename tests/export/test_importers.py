@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from export.exporters.spz import write_spz
-from export.importers import ImportFailed, read_splats, recognise
+from export.importers import ImportFailed, detect_format, read_splats
 from export.importers.detect import frame_files
 from export.importers.scene import digest, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
@@ -81,7 +81,7 @@ def drawn(g: Gaussians) -> np.ndarray:
 def test_each_format_shows_what_was_put_into_it(tmp_path: Path, kind: str):
     g = some_gaussians(sh_degree=0 if kind in ("splat", "ksplat") else 2)
     file = made(tmp_path, kind, g)
-    assert recognise(file) == kind.split()[-1 if kind == "compressed ply" else 0]
+    assert detect_format(file) == kind.split()[-1 if kind == "compressed ply" else 0]
     read = read_splats(file)
     assert read.dropped == 0
     assert len(read) == len(g)
@@ -224,7 +224,7 @@ def test_a_sog_is_stored_or_deflated(tmp_path: Path):
 def test_splat_files_of_other_names_are_no_sequence(tmp_path: Path, names: tuple[str, ...]):
     for name in names:
         write(tmp_path, name, POINTS)
-    for read in (recognise, read_sequence):
+    for read in (detect_format, read_sequence):
         with pytest.raises(ImportFailed, match=rf"{names[0]} and .* differ in more than a number"):
             read(tmp_path)
 
@@ -242,7 +242,7 @@ def test_frames_are_in_the_order_of_the_number_that_differs(tmp_path: Path, name
     for name in (*names, "notes_1.txt", ".hidden.ply"):
         write(tmp_path, name, b"")
     assert [file.name for file in frame_files(tmp_path)] == list(names)
-    assert recognise(tmp_path) == "sequence"
+    assert detect_format(tmp_path) == "sequence"
 
 
 def test_a_static_scene_is_the_file_and_can_be_drawn_without_saying_from_where(tmp_path: Path):

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor
 
-from export.importers import ImportFailed, recognise
+from export.importers import ImportFailed, detect_format
 from export.importers.command import model_or_import
 from export.importers.runs import fourdgs
 from export.importers.runs.model import write_model
@@ -101,7 +101,7 @@ def camera(turn: int) -> dict[str, object]:
 def test_the_network_is_theirs(tmp_path: Path, scales: tuple[int, ...], lengths: float):
     state = their_state(scales)
     run = write_run(tmp_path / "run", state, lengths=lengths)
-    assert recognise(run) == "4dgs"
+    assert detect_format(run) == "4dgs"
     assert write_model(run, "4dgs", tmp_path / "model.pt", QUIET) == []
     model, info, step = load_model(tmp_path / "model.pt")
     assert (step, info.background, model.config.delta_space) == (20_000, (1.0, 1.0, 1.0), "raw")
@@ -161,7 +161,11 @@ def test_a_run_is_exported_and_lists_what_is_held(tmp_path: Path):
     assert to_onnx(run, tmp_path / "scene.onnx", quick=True, times=3) == 0
     scene = DeformationSession(tmp_path / "scene.onnx")
     assert scene.scene.metadata.layers == ("plane",)
-    (held,) = (each for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"] if each["rule"] == "frozen")
+    (held,) = (
+        each
+        for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"]
+        if each["rule"] == "static_appearance"
+    )
     assert "opacities and colours" in held["what"]
 
 

@@ -150,7 +150,7 @@ def read_our_model(folder: Path, files: list[Path]) -> Gaussians:
         raise ImportFailed(files[0], str(error)) from error
 
 
-KINDS = {
+FORMATS = {
     "model": Kind(our_model, read_our_model),
     "ply": one("a.ply", lambda g: ply_bytes(inria_columns(g))),
     "text ply": one("a.ply", lambda g: ply_bytes(inria_columns(g), "ascii")),
@@ -171,9 +171,9 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files_are_refused_or_drawn(tmp_path: Path, name: str):
-    kind, rng = KINDS[name], np.random.default_rng(sum(name.encode()))
+    kind, rng = FORMATS[name], np.random.default_rng(sum(name.encode()))
     files = kind.make(tmp_path, some_gaussians(COUNT, sh_degree=1))
     whole = {file: file.read_bytes() for file in files}
     drawn(kind.read(tmp_path, files))  # compiles

@@ -20,7 +20,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import tolerance
 
-KINDS: dict[str, dict[str, Any]] = {
+FORMATS: dict[str, dict[str, Any]] = {
     "mlp": {"noise": 0.02, "time_frequencies": 2},
     "plane": {"layers": ("plane",), "plane_time_nodes": 9},
     "mixed": {"layers": ("mlp", "plane"), "noise": 0.02, "time_frequencies": 2, "plane_time_nodes": 9},
@@ -30,7 +30,7 @@ FITTED = ("lowrank:1", "lowrank:8", "lowrank", "keyframes:4", "keyframes:12", "k
 
 @cache
 def made(kind: str, count: int = 60) -> tuple[DynamicGaussians, Baked, Trajectories]:
-    model = random_model(count, **KINDS[kind])
+    model = random_model(count, **FORMATS[kind])
     baked = bake(model, SCENE, "0" * 64)
     return model, baked, Trajectories(baked)
 
@@ -68,7 +68,7 @@ def test_a_plan_that_this_model_cannot_have_says_what_it_can():
         build("int8", baked, trajectories)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FORMATS)
 @pytest.mark.parametrize("plan", FITTED)
 def test_fitted_plans_are_as_close_as_they_promise_at_times_that_they_have_not_seen(
     tmp_path: Path, kind: str, plan: str
@@ -76,22 +76,22 @@ def test_fitted_plans_are_as_close_as_they_promise_at_times_that_they_have_not_s
     model, baked, trajectories = made(kind)
     session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
     assert session.scene.metadata.plan == plan
-    promise = session.scene.metadata.measured_error["fitted"]
-    assert promise["too_fast"] == 0
-    error = promise["error"] + tolerance("stored_pose") * promise["pixel"]
+    error_bound = session.scene.metadata.measured_error["fitted"]
+    assert error_bound["too_fast"] == 0
+    error = error_bound["error"] + tolerance("stored_pose") * error_bound["pixel"]
     if parse(plan).count is None:
-        assert error <= 0.1 * promise["pixel"] + tolerance("stored_pose") * promise["pixel"]
+        assert error <= 0.1 * error_bound["pixel"] + tolerance("stored_pose") * error_bound["pixel"]
     measured = verify(session, model, times=25)
     assert measured["displacement"] <= tolerance("between_samples.factor") * error
     assert measured["position"] <= measured["displacement"]
-    assert measured["fitted"] == promise
+    assert measured["fitted"] == error_bound
 
 
 @pytest.mark.parametrize("plan", ["lowrank:8", "keyframes:12", "keyframes:0.02"])
 def test_distances_in_the_file_are_those_of_a_plain_comparison_with_the_model(tmp_path: Path, plan: str):
     model, baked, trajectories = made("mlp")
     session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
-    double = random_model(60, **KINDS["mlp"]).double()
+    double = random_model(60, **FORMATS["mlp"]).double()
     worst = 0.0
     for t in times_to_verify(0.0, 1.0, 12):
         means, quats, _ = session.pose(t)
@@ -105,8 +105,8 @@ def test_distances_in_the_file_are_those_of_a_plain_comparison_with_the_model(tm
 def test_a_file_of_another_motion_breaks_its_promise(tmp_path: Path, plan: str):
     _, baked, trajectories = made("mlp")
     session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
-    other = random_model(60, **KINDS["mlp"] | {"seed": 1})
-    other.gaussians = random_model(60, **KINDS["mlp"]).gaussians
+    other = random_model(60, **FORMATS["mlp"] | {"seed": 1})
+    other.gaussians = random_model(60, **FORMATS["mlp"]).gaussians
     with pytest.raises(VerificationFailed, match=r"of 1,500 poses are off by more than twice"):
         verify(session, other, times=25)
 
@@ -176,7 +176,7 @@ def test_one_gaussian(tmp_path: Path, plan: str):
 
 
 def test_a_time_range_of_one_moment(tmp_path: Path):
-    model = random_model(8, **KINDS["mlp"])
+    model = random_model(8, **FORMATS["mlp"])
     baked = bake(model, replace(SCENE, time_range=(0.25, 0.25)), "0" * 64)
     for plan in ("lowrank:2", "keyframes:4"):
         session = opened(tmp_path / "scene.onnx", build(plan, baked))

@@ -15,7 +15,7 @@ from export.measure.gap import pose_arrays
 from export.measure.stability import assess
 from export.precision.formats import FLOAT32, FORMATS, in_format
 from export.precision.report import PlanUnsafe
-from export.stability import UNSTEADY, main
+from export.stability import UNSTABLE, main
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import save_model
 from msdgs_train.layers.chain import MultiStepDeformation
@@ -169,7 +169,7 @@ def test_the_worst_gaussians_are_named_with_what_they_do_to_the_picture():
 @pytest.mark.parametrize(("count", "layers"), [(0, ("mlp",)), (5, ())])
 def test_what_does_not_move_is_steady(count: int, layers: tuple[str, ...]):
     report = assess(random_model(count, layers=layers), SCENE)
-    assert report.steady
+    assert report.stable
     assert report.refusal("network") is None
     assert "nothing moves" in report.verdict
 
@@ -213,10 +213,10 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path, capsys: pytest.Capt
     path = saved(tmp_path, random_model(30))
     assert main(path, tmp_path / "out.json", tmp_path / "out.png", times=3) == 0
     shown = capsys.readouterr().out
-    for text in ("2 (mlp)", "bfloat16", "foretold", "gets most wrong", "steady: "):
+    for text in ("2 (mlp)", "bfloat16", "predicted", "gets most wrong", "stable: "):
         assert text in shown
     report = json.loads((tmp_path / "out.json").read_text())
-    assert report["steady"] is True
+    assert report["stable"] is True
     assert report["formats"][0]["psnr"] >= tolerance("stability.accepted_db")
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
 
@@ -224,14 +224,14 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path, capsys: pytest.Capt
 def test_the_command_flags_a_model_that_overflows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     model = stability_stiff.stiff(stability_stiff.steps_times(64), **stability_stiff.layers(16))
     code = main(saved(tmp_path, model), tmp_path / "out.json", tmp_path / "out.png", times=2)
-    assert code == UNSTEADY
-    assert "unsteady in float32" in capsys.readouterr().out
+    assert code == UNSTABLE
+    assert "unstable in float32" in capsys.readouterr().out
     assert "lowrank" in json.loads((tmp_path / "out.json").read_text())["verdict"]
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"times": 1}, "`times`"), ({"max_error": -1.0}, "`max_error`"), ({"max_error": float("nan")}, "`max_error`")],
+    [({"times": 1}, "`times`"), ({"min_psnr": -1.0}, "`min_psnr`"), ({"min_psnr": float("nan")}, "`min_psnr`")],
 )
 def test_the_command_refuses_settings_that_make_no_sense(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, float], message: str

@@ -29,10 +29,10 @@ REPORT = {
     "format": "msdgs-report/1",
     "checkpoint_sha256": "0" * 64,
     "machine": {"processor": "a processor", "threads": 2},
-    "max_error": 50.0,
+    "min_psnr": 50.0,
     "points": [
         {
-            "plan": plan, "front": True, "chosen": plan == "prefix", "trim_db": None, "bytes": 1e6,
+            "plan": plan, "front": True, "chosen": plan == "prefix", "pruning_db": None, "bytes": 1e6,
             "milliseconds": {"total": {"min": milliseconds}}, "error": {"psnr_worst": decibels},
         }
         for plan, milliseconds, decibels in (("network", 40.0, 95.0), ("prefix", 20.0, 60.0))

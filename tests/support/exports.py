@@ -1,4 +1,4 @@
-"""The shortest way from a model file to a scene file: all layers as trained, nothing trimmed, no sweep."""
+"""The shortest way from a model file to a scene file: all layers as trained, nothing pruned, no sweep."""
 
 import hashlib
 from collections.abc import Callable

@@ -14,10 +14,10 @@ from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
 from msdgs_train.layers.mlp import MLPLayer
 
 XYZ_FREQUENCIES = 10
-LEAST_LAYERS, MOST_LAYERS = 3, 64
+MIN_LAYERS, MAX_LAYERS = 3, 64
 """With two, the heads would read the input once more; ours don't."""
 
-MOST_UNITS, MOST_FREQUENCIES = 4_096, 64
+MAX_UNITS, MAX_FREQUENCIES = 4_096, 64
 """Sixteen times the usual width; what is above 2⁶⁴ turns in unit time is noise in float32."""
 
 
@@ -32,16 +32,16 @@ def read_deformgs(
     if settings.get("is_6dof") or "branch_w.weight" in state:
         raise ImportFailed(file, "was trained with --is_6dof, whose screw motions no layer of this project has")
     depth = sum(name.startswith("linear.") and name.endswith(".weight") for name in state.names())
-    if not LEAST_LAYERS <= depth <= MOST_LAYERS:
-        raise ImportFailed(file, f"has {depth} hidden layers; from {LEAST_LAYERS} to {MOST_LAYERS} can be read")
+    if not MIN_LAYERS <= depth <= MAX_LAYERS:
+        raise ImportFailed(file, f"has {depth} hidden layers; from {MIN_LAYERS} to {MAX_LAYERS} can be read")
     width = len(state.read("linear.0.bias", None))
     by_network = "timenet.0.weight" in state
     time_width, time_features, frequencies = _time_sizes(state, by_network, width)
-    if not all(1 <= size <= MOST_UNITS for size in (width, time_width, time_features)):
+    if not all(1 <= size <= MAX_UNITS for size in (width, time_width, time_features)):
         found = f"{width:,} units a layer, and {time_width:,} and {time_features:,} for time"
-        raise ImportFailed(file, f"has {found}; from 1 to {MOST_UNITS:,} can be read")
-    if not 0 <= frequencies <= MOST_FREQUENCIES:
-        raise ImportFailed(file, f"reads {frequencies:,} frequencies of time; up to {MOST_FREQUENCIES} can be read")
+        raise ImportFailed(file, f"has {found}; from 1 to {MAX_UNITS:,} can be read")
+    if not 0 <= frequencies <= MAX_FREQUENCIES:
+        raise ImportFailed(file, f"reads {frequencies:,} frequencies of time; up to {MAX_FREQUENCIES} can be read")
     config = ModelConfig(
         sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
         layers=("mlp",),

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from export.measure.rendered_error import ExactFrames, RenderedError, posed, shown
-from export.measure.views import cameras_of, deciding_views
+from export.measure.views import cameras_of, selection_views
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
 from msdgs_train.evaluation.metrics import psnr_from_mse
@@ -23,7 +23,7 @@ FRAMES = 12
 """That are compared, each of another camera and time."""
 
 
-class Unbent(NamedTuple):
+class QuaternionFidelity(NamedTuple):
     """How far frames of a model are from those of the program that trained it."""
 
     psnr_mean: float
@@ -34,7 +34,7 @@ class Unbent(NamedTuple):
     def left_out(self) -> dict[str, Any]:
         """As a scene file lists it."""
         n, what = self.gaussians, "lengths of quaternions, which bend shapes, and signs of scales"
-        return {"rule": "unbent", "what": what, "count": n, "of": n, "worst_frame_db": self.psnr_worst}
+        return {"rule": "quaternion_fidelity", "what": what, "count": n, "of": n, "worst_frame_db": self.psnr_worst}
 
     def note(self) -> str:
         """For whoever imports it."""
@@ -44,20 +44,20 @@ class Unbent(NamedTuple):
         )
 
 
-def unbent(model: DynamicGaussians, info: SceneInfo) -> Unbent:
+def quaternion_fidelity(model: DynamicGaussians, info: SceneInfo) -> QuaternionFidelity:
     """Of a model with one layer that adds to scales and to unit quaternions."""
     psnrs, longest = [], 0.0
-    for view in deciding_views(cameras_of(info), info.time_range, FRAMES):
+    for view in selection_views(cameras_of(info), info.time_range, FRAMES):
         ours = posed(model, view.t)
-        theirs, off = bent(model, view.t, ours)
+        theirs, off = as_trained(model, view.t, ours)
         frames = [shown(each, view.camera, info.background, model.rasterizer) for each in (theirs, ours)]
         psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
         longest = max(longest, off)
-    return Unbent(float(np.mean(psnrs)), min(psnrs), longest, len(model.gaussians))
+    return QuaternionFidelity(float(np.mean(psnrs)), min(psnrs), longest, len(model.gaussians))
 
 
 @torch.no_grad()
-def bent(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaussians, float]:
+def as_trained(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaussians, float]:
     """`ours` as the program that trained them draws them, and by how much a quaternion's length is off 1."""
     g = model.gaussians
     step = model.deformation.layers[0](g.means, torch.tensor(t, dtype=g.means.dtype))
@@ -90,7 +90,7 @@ FRAMES = 12
 NEAREST_TO_END = 1e-7
 
 
-class Frozen(NamedTuple):
+class StaticAppearance(NamedTuple):
     """A model whose layers change poses only, and how far its frames are from those of the whole."""
 
     model: DynamicGaussians
@@ -100,7 +100,7 @@ class Frozen(NamedTuple):
         """As a scene file lists it."""
         what = "changes of opacities and colours with time, which are held at their means"
         n = len(self.model.gaussians)
-        return {"rule": "frozen", "what": what, "count": n, "of": n, "worst_frame_db": self.error.psnr_worst}
+        return {"rule": "static_appearance", "what": what, "count": n, "of": n, "worst_frame_db": self.error.psnr_worst}
 
     def note(self) -> str:
         """For whoever imports it."""
@@ -111,7 +111,7 @@ class Frozen(NamedTuple):
         )
 
 
-def frozen(model: DynamicGaussians, info: SceneInfo) -> Frozen:
+def static_appearance(model: DynamicGaussians, info: SceneInfo) -> StaticAppearance:
     """The model without its heads of opacity and SH, each Gaussian as visible and as bright as it is on average.
 
     Colours count as much as the Gaussian is visible while it has them.
@@ -130,9 +130,9 @@ def frozen(model: DynamicGaussians, info: SceneInfo) -> Frozen:
     )
     kept = {name for name in still.state_dict() if not name.startswith("gaussians.")}
     still.load_state_dict({n: v for n, v in model.state_dict().items() if n in kept}, strict=False)
-    views = deciding_views(cameras_of(info), info.time_range, FRAMES)
+    views = selection_views(cameras_of(info), info.time_range, FRAMES)
     exact = ExactFrames(model, views, info.background)
-    return Frozen(still, exact.measure(lambda t: posed(still, t), np.arange(len(g))))
+    return StaticAppearance(still, exact.measure(lambda t: posed(still, t), np.arange(len(g))))
 
 
 @torch.no_grad()

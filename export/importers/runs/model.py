@@ -15,7 +15,7 @@ from rich.console import Console
 from export.importers.detect import read_splats
 from export.importers.errors import ImportFailed
 from export.importers.runs.deformgs import read_deformgs
-from export.importers.runs.fidelity import frozen, unbent
+from export.importers.runs.fidelity import quaternion_fidelity, static_appearance
 from export.importers.runs.fourdgs import read_4dgs
 from export.importers.scene import metadata_of
 from export.importers.splats.base import Splats
@@ -34,7 +34,7 @@ RUNS: dict[str, Reader] = {"deformgs": read_deformgs, "4dgs": read_4dgs}
 WHITE_BY_DEFAULT = {"deformgs": False, "4dgs": True}
 """Backgrounds, of runs without cfg_args."""
 
-MOST_CAMERAS = 1_000
+MAX_CAMERAS = 1_000
 CHECKED_TIMES = 3
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
@@ -69,12 +69,12 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> list[di
     lost = []
     if model.config.opacity_head or model.config.sh_head:
         with console.status("holding opacities and colours"), _usable(run):
-            held = frozen(model, info)
+            held = static_appearance(model, info)
         model, lost = held.model, [held.left_out()]
         notes.append(held.note())
     if kind == "deformgs":
         with console.status("comparing shapes"), _usable(run):
-            shapes = unbent(model, info)
+            shapes = quaternion_fidelity(model, info)
         lost.append(shapes.left_out())
         notes.append(shapes.note())
     save_model(output, model, info, iteration)
@@ -130,7 +130,7 @@ def _cameras(file: Path) -> list[dict[str, Any]]:
         return []
     try:
         cameras = []
-        for stored in json.loads(file.read_text())[:MOST_CAMERAS]:
+        for stored in json.loads(file.read_text())[:MAX_CAMERAS]:
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = stored["rotation"], stored["position"]
             size = int(stored["width"]), int(stored["height"])

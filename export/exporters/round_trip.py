@@ -24,7 +24,7 @@ class ConversionFailed(MsdgsError):
     """What was written doesn't look like the scene."""
 
 
-class Proof:
+class RoundTrip:
     """Pictures of a scene, to compare others with."""
 
     def __init__(self, session: DeformationSession, *, mip: bool = True) -> None:
