@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from export.importers import ImportFailed, detect_format
+from export.options import ExportOptions
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from tests.support.service import serving
@@ -43,7 +44,7 @@ def main() -> int:
         sources = {}
         for i, (source, kind) in enumerate(each for path in options.inputs for each in recognised(path)):
             scene = Path(folder) / f"scene{i}.onnx"
-            if to_onnx(source, scene):
+            if to_onnx(ExportOptions(source, scene)):
                 failed.append(str(source))
             else:
                 sources[scene] = f"{source.parent.name}/{source.name}", kind

@@ -24,13 +24,13 @@ from scipy.interpolate import BSpline
 from torch import Tensor, nn
 from torch.nn import functional
 
-from export.measure.rendered_error import posed, shown
+from export.measure.frames import compare, render
+from export.measure.poses import posed
 from export.measure.views import cameras_of, selection_views
 from export.trajectories.splines import fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.density.gradient import rotate
 from msdgs_train.evaluation.layer_strip import camera_of
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
 from msdgs_train.gaussians.model_file import SceneInfo, load, load_model, save_atomic, save_model
@@ -351,8 +351,8 @@ def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
     console.print(f"{len(moving):,} of {len(fit.motion.travel):,} Gaussians move by a pixel", markup=False)
     psnrs = []
     for view in selection_views(cameras_of(fit.info), fit.info.time_range, 9):
-        frames = [shown(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
-        psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
+        frames = [render(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
+        psnrs.append(compare(*frames).psnr)
     console.print(f"pictures against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
 
 

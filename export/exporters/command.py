@@ -16,8 +16,8 @@ from export.exporters.spz import write_spz
 from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
-from export.importers.detect import read_splats
 from export.importers.sequence import is_switched, of_the_moment
+from export.importers.splats.formats import read_splats
 from export.plans.registry import PLANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT

@@ -8,13 +8,13 @@ import onnxruntime as ort
 
 from export.exporters.visionary import unpacked
 from export.exporters.visionary_rules import COLORS, COUNT, GAUSSIANS
+from export.measure.frames import compare, render
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
-from msdgs_serve.rasterizer import as_trained, rasterize
+from msdgs_serve.rasterizer import as_trained
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.evaluation.metrics import psnr_from_mse
 
 VIEWS, SIZE, ELEVATION = 3, 256, 20.0
 """Cameras about the scene, the pixels of their shorter side, and degrees."""
@@ -45,12 +45,8 @@ class RoundTrip:
         return min(self._psnr(got, expected, camera) for camera in self._cameras)
 
     def _psnr(self, got: Gaussians, expected: Gaussians, camera: Camera) -> float:
-        frames = (
-            rasterize(each, camera, background=self._background, options=self._options).rgb.clip(0, 1)
-            for each in (got, expected)
-        )
-        first, second = (frame.astype(np.float64) for frame in frames)
-        return psnr_from_mse(float(np.square(first - second).mean()))
+        frames = (render(each, camera, self._background, self._options).astype(np.float64) for each in (got, expected))
+        return compare(*frames).psnr
 
 
 def visionary_of(file: Path) -> Callable[[float], Gaussians]:

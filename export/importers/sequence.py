@@ -15,10 +15,11 @@ import onnx
 from onnx import TensorProto
 from scipy.spatial import KDTree
 
-from export.importers.detect import frame_files, read_splats
+from export.importers.detect import frame_files
 from export.importers.errors import ImportFailed
 from export.importers.scene import UP, metadata_of
 from export.importers.splats.base import Splats
+from export.importers.splats.formats import read_splats
 from export.jobs.bake import Baked, Moving
 from export.plans.scene_graph import activated, finished, new_graph
 from export.trajectories.sampling import give_one_sign

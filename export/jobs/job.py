@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from export.jobs.bake import Baked
-from export.measure.rendered_error import ExactFrames, RenderedError, posed
+from export.measure.poses import posed
+from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.registry import build, plan_of
@@ -34,7 +35,7 @@ STABILITY_TIMES = 8
 SAMPLED_KEPT = 2
 """Sets of trajectories that are kept; one takes up to 2 GiB."""
 
-Progress = Callable[[str, int], Callable[[], object]]
+Track = Callable[[str, int], Callable[[], object]]
 """Called with what begins and how many steps it has; returns what is to be called after each."""
 
 
@@ -93,7 +94,7 @@ class ExportJob:
         min_psnr: float = MIN_PSNR,
         rules: Collection[str] = tuple(RULES),
         training: Sequence[Camera] = (),
-        progress: Progress = no_progress,
+        progress: Track = no_progress,
     ) -> None:
         """`training` are the cameras of the training images, where at hand. Raises `CheckpointInvalid`."""
         self.folder, self.min_psnr, self.rules, self.progress = folder, min_psnr, rules, progress

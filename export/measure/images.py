@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from export.measure.rendered_error import Pose, shown
+from export.measure.frames import compare, render
+from export.measure.rendered_error import Pose
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MAX_IMAGES = 24
@@ -37,6 +37,6 @@ class HeldOutImages:
         """Mean PSNR in dB over the images, as papers report it; None where there are none."""
         values = []
         for frame, target in self._frames:
-            rgb = shown(pose(frame.t), frame.camera, self._background, options)
-            values.append(psnr_from_mse(float(np.mean(np.square(rgb - target, dtype=np.float64)))))
+            rgb = render(pose(frame.t), frame.camera, self._background, options)
+            values.append(compare(rgb, target).psnr)
         return float(np.mean(values)) if values else None

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 
-from export.measure.gap import PosedArrays, half_diagonal, largest_error, pose_arrays, pose_errors
+from export.measure.poses import half_diagonal, largest_error, pose_errors, posed
 from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 
 TOLERANCE = 1e-4
@@ -65,15 +65,15 @@ def verify(
     _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # stored as they are under every plan
     for i, t in enumerate(times_to_verify(*session.scene.metadata.time_range, times)):
         ids = np.arange(i % stride, count, stride)
-        posed = {"float64": pose_arrays(double, t, ids), "float32": pose_arrays(model, t, ids)}
+        poses = {"float64": posed(double, t, ids), "float32": posed(model, t, ids)}
         got = _posed_by_file(session, t, ids)
-        _give_sign_of(posed["float64"]["quats"], got["quats"])
-        displacements.add(got, posed["float64"])
+        _give_sign_of(poses["float64"].quats, got.quats)
+        displacements.add(got, poses["float64"])
         size = half_diagonal(session.scene.metadata.bounds)
-        own = largest_error(pose_errors(posed["float32"], posed["float64"], size))
+        own = largest_error(pose_errors(poses["float32"], poses["float64"], size))
         stable = own <= UNSTABLE * tolerance
         unstable[ids[~stable]] = True
-        for precision, reference in posed.items():
+        for precision, reference in poses.items():
             for name, errors in pose_errors(got, reference, size).items():
                 unstable_worst = max(unstable_worst, float(errors[~stable].max(initial=0)))
                 error = float(errors[stable].max(initial=0))
@@ -100,7 +100,7 @@ class _Displacements:
         self._position = self._displacement = self._degrees = 0.0
         self._compared = self._broken = 0
 
-    def add(self, got: PosedArrays, expected: PosedArrays) -> None:
+    def add(self, got: Gaussians, expected: Gaussians) -> None:
         """Compare Gaussians at one time."""
         positions, turns, displacements = _distances(got, expected)
         self._position = max(self._position, float(positions.max(initial=0)))
@@ -131,13 +131,13 @@ class _Displacements:
         }
 
 
-def _distances(got: PosedArrays, expected: PosedArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _distances(got: Gaussians, expected: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[M] of means in scene units; angles in radians; and the largest of means, scales and ends of turned axes."""
-    scales = expected["scales"].astype(np.float64)
-    positions = np.linalg.norm(got["means"] - expected["means"], axis=1)
-    chords = np.linalg.norm(got["quats"] - expected["quats"], axis=1)
+    scales = expected.scales.astype(np.float64)
+    positions = np.linalg.norm(got.means - expected.means, axis=1)
+    chords = np.linalg.norm(got.quats - expected.quats, axis=1)
     axes = 2 * (scales.max(axis=1) - scales.min(axis=1)) * chords
-    sizes = np.abs(got["scales"] - scales).max(axis=1)
+    sizes = np.abs(got.scales - scales).max(axis=1)
     turns = 4 * np.arcsin(np.clip(chords / 2, 0, 1))
     return positions, turns, np.max([positions, axes, sizes], axis=0, initial=0)
 
@@ -156,20 +156,20 @@ def times_to_verify(t0: float, t1: float, count: int) -> list[float]:
     return [t0, *(float(np.float32(t)) for t in times[1:-1]), t1]
 
 
-def _posed_by_file(session: DeformationSession, t: float, ids: np.ndarray) -> PosedArrays:
+def _posed_by_file(session: DeformationSession, t: float, ids: np.ndarray) -> Gaussians:
     scene = session.scene
     moving = ids[ids < scene.moving_count]
     static = ids[ids >= scene.moving_count] - scene.moving_count
     statics = (scene.static_means[static], scene.static_quats[static], scene.static_scales[static])
     parts = zip(session.pose(t, moving), statics, strict=True)
-    return dict(zip(MOVING_OUTPUTS, (np.concatenate(pair) for pair in parts), strict=True))
+    means, quats, scales = (np.concatenate(pair) for pair in parts)
+    return Gaussians(means, quats, scales, scene.opacities[ids], scene.sh[ids])
 
 
 def _check_opacities_and_sh(session: DeformationSession, model: DynamicGaussians, tolerance: float) -> None:
-    with torch.no_grad():
-        expected = model.pose(session.scene.metadata.time_range[0], deform=False)
+    expected = posed(model, session.scene.metadata.time_range[0], deform=False)
     for name in ("opacities", "sh"):
-        reference = getattr(expected, name).numpy()
+        reference = getattr(expected, name)
         got = getattr(session.scene, name)[: len(reference)]
         if not np.allclose(got, reference, rtol=tolerance, atol=tolerance):
             raise VerificationFailed(f"`{name}` differs from the model's")

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from export.layers import HEADS, export_of
-from export.measure.rendered_error import as_gaussians
+from export.measure.poses import posed
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -81,8 +81,7 @@ def pruned(
 def unpruned(model: DynamicGaussians) -> PrunedModel:
     """All of a model."""
     every = np.arange(len(model.gaussians))
-    with torch.no_grad():
-        canonical = as_gaussians(model.pose(0.0, deform=False))
+    canonical = posed(model, 0.0, deform=False)
     return PrunedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
 
 

@@ -6,14 +6,14 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from export.measure.rendered_error import as_gaussians, shown
+from export.measure.frames import compare, render
+from export.measure.poses import posed
 from export.measure.views import View
 from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_network
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import operations
 from msdgs_train.rendering.rasterize import rasterize
@@ -32,11 +32,10 @@ class Poses:
         self.times, self._model = times, model
         self._at: dict[float, Gaussians] = {}
 
-    @torch.no_grad()
     def at(self, t: float) -> Gaussians:
         """The Gaussians at one of the times."""
         if t not in self._at:
-            g = as_gaussians(self._model.pose(t))
+            g = posed(self._model, t)
             shared = next(iter(self._at.values()), g)
             self._at[t] = Gaussians(g.means, g.quats, g.scales, shared.opacities, shared.sh)
         return self._at[t]
@@ -66,7 +65,7 @@ class PruningStatistics:
         for t in self._whole[1].times:
             self._whole[1].at(t)
             on_time()
-        self._frames = [shown(self._whole[1].at(view.t), view.camera, background, model.rasterizer) for view in views]
+        self._frames = [render(self._whole[1].at(view.t), view.camera, background, model.rasterizer) for view in views]
         self.peaks, self.amounts = self._visibility()
 
     def poses(self, network: NetworkMask) -> Poses:
@@ -98,9 +97,8 @@ class PruningStatistics:
             changing = at.means[moving], at.quats[moving], at.scales[moving]
             means, quats, scales = (np.concatenate(pair) for pair in zip(changing, constants, strict=True))
             drawn = Gaussians(means, quats, scales, colors.opacities, colors.sh)
-            frame = shown(drawn, view.camera, self.background, self.model.rasterizer)
-            db = psnr_from_mse(float(np.mean(np.square(frame - self._frames[i], dtype=np.float64))))
-            worst = min(worst, db)
+            frame = render(drawn, view.camera, self.background, self.model.rasterizer)
+            worst = min(worst, compare(frame, self._frames[i]).psnr)
             if worst < min_db:
                 self._order.remove(i)  # most likely the one that decides next time too
                 self._order.insert(0, i)
@@ -119,7 +117,6 @@ class PruningStatistics:
             np.maximum(furthest, moved + turned, out=furthest)
         return furthest * self.pixels_per_unit(poses.static.means)
 
-    @torch.no_grad()
     def change(self, network: NetworkMask, smaller: NetworkMask) -> float:
         """Pixels by which a few Gaussians, at a few times, are elsewhere on average if part of a network is missing;
         faint ones count less."""
@@ -129,7 +126,7 @@ class PruningStatistics:
         model, change = with_network(self.model, smaller), 0.0
         for t in poses.times[:: max(1, len(poses.times) // SAMPLED_TIMES)]:
             before = rows(poses.at(t), ids, self.model.config.sh_degree)
-            after = as_gaussians(model.pose(t, ids=torch.from_numpy(ids)))
+            after = posed(model, t, ids)
             moved = np.linalg.norm(after.means - before.means, axis=1)
             turned = np.linalg.norm(half_axes(after) - half_axes(before), axis=1).max(axis=1, initial=0)
             pixels = (moved + turned) * self.pixels_per_unit(before.means) * self.peaks[ids]

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from export.measure.amplification import growth
-from export.measure.frames import View, image_gap, in_picture
-from export.measure.gap import pose_arrays
+from export.measure.frames import PoseRenderer, compare, in_frame
+from export.measure.poses import posed
 from export.measure.stability import assess
 from export.precision.formats import FLOAT32, in_format
 from export.precision.report import StabilityReport
@@ -135,12 +135,12 @@ def _foretold(name: str, report: StabilityReport) -> list[Row]:
 
 def _unseen(model: DynamicGaussians) -> tuple[int, float]:
     """Gaussians in float32 frames, and dB of the worst, at times that the assessment didn't choose."""
-    double, view = in_format(model, FLOAT32).double(), View(SCENE)
+    double, view = in_format(model, FLOAT32).double(), PoseRenderer(SCENE)
     camera, seen, worst = view.cameras[0], 0, np.inf
     for t in UNSEEN_TIMES:
-        single, exact = pose_arrays(model, t), pose_arrays(double, t)
-        seen = max(seen, int(in_picture(exact["means"], camera).sum()))
-        worst = min(worst, image_gap(view.draw(single, camera), view.draw(exact, camera)).psnr)
+        single, exact = posed(model, t), posed(double, t)
+        seen = max(seen, int(in_frame(exact.means, camera).sum()))
+        worst = min(worst, compare(view.draw(single, camera), view.draw(exact, camera)).psnr)
     return seen, worst
 
 

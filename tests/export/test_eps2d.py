@@ -10,7 +10,9 @@ import torch
 from onnx import helper
 
 from export.jobs.job import ExportJob
-from export.measure.rendered_error import ExactFrames, posed, shown
+from export.measure.frames import render
+from export.measure.poses import posed
+from export.measure.rendered_error import ExactFrames
 from export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, rasterize
@@ -60,8 +62,8 @@ def camera() -> Camera:
 @pytest.fixture
 def expected(loaded: LoadedModel, camera: Camera) -> np.ndarray:
     gaussians = posed(loaded.model, T)
-    narrow = shown(gaussians, camera, SCENE.background, NARROW)
-    assert np.abs(narrow - shown(gaussians, camera, SCENE.background, GSPLAT)).max() > 0.05
+    narrow = render(gaussians, camera, SCENE.background, NARROW)
+    assert np.abs(narrow - render(gaussians, camera, SCENE.background, GSPLAT)).max() > 0.05
     return narrow
 
 

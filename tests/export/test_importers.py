@@ -172,12 +172,13 @@ def test_a_header_that_promises_too_much_takes_no_memory(tmp_path: Path, form: s
         ("a.spz", struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0), r"SH of degree 4"),
         ("a.ksplat", bytes(5000), r"a.ksplat: unsupported version"),
         ("a.onnx", b"scene", r"is a scene file already"),
-        ("a.txt", b"nothing of ours", r"--from says what it is, one of model, ply"),
+        ("a.txt", b"nothing of ours", r"--format names it, one of model, ply"),
     ],
 )
 def test_what_cannot_be_read_says_why(tmp_path: Path, name: str, contents: bytes, message: str):
+    file = write(tmp_path, name, contents)
     with pytest.raises(ImportFailed, match=message):
-        read_splats(write(tmp_path, name, contents))
+        read_splats(file, detect_format(file))
 
 
 def test_a_sog_reads_no_files_outside_of_its_folder(tmp_path: Path):

@@ -17,6 +17,7 @@ from export.importers.command import model_or_import
 from export.importers.runs import fourdgs
 from export.importers.runs.model import write_model
 from export.jobs.write import properties
+from export.options import ExportOptions
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.camera import orbit
@@ -158,7 +159,7 @@ def test_changing_opacities_and_colours_are_held_and_the_cost_is_said(tmp_path: 
 
 def test_a_run_is_exported_and_lists_what_is_held(tmp_path: Path):
     run = write_run(tmp_path / "run", their_state((1,)), SWITCHES + ", no_do=False, no_dshs=True")
-    assert to_onnx(run, tmp_path / "scene.onnx", quick=True, times=3) == 0
+    assert to_onnx(ExportOptions(run, tmp_path / "scene.onnx", quick=True, times=3)) == 0
     scene = DeformationSession(tmp_path / "scene.onnx")
     assert scene.scene.metadata.layers == ("plane",)
     (held,) = (
@@ -184,7 +185,7 @@ def test_what_differs_is_named(tmp_path: Path, change: dict[str, Tensor], messag
     run = write_run(tmp_path / "run", {**their_state((1,)), **change})
     with (
         pytest.raises(ImportFailed, match=message),
-        model_or_import(run, None, tmp_path / "a.onnx", QUIET),
+        model_or_import(run, "detect", tmp_path / "a.onnx", QUIET),
     ):
         pass
 

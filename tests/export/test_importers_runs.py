@@ -16,7 +16,7 @@ from export.importers import ImportFailed, detect_format
 from export.importers.runs import deformgs
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
-from export.measure.rendered_error import posed
+from export.measure.poses import posed
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import load_model

@@ -66,10 +66,10 @@ def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_p
     assert GROUND not in ids  # the hidden one
     assert (ids[: scene.moving_count] > GROUND).all()
     assert (ids[scene.moving_count :] < GROUND).all()
-    assert left_out["still"]["count"] == scene.static_count
+    assert left_out["static"]["count"] == scene.static_count
     assert (left_out["layers"]["count"], left_out["layers"]["of"]) == (1, 2)
     assert (left_out["heads"]["count"], left_out["heads"]["of"]) == (2, 3)
-    assert (left_out["bands"]["count"], left_out["modulation"]["count"]) == (1, 1)
+    assert (left_out["sh"]["count"], left_out["modulation"]["count"]) == (1, 1)
     assert all(entry["worst_frame_db"] >= 50 for entry in left_out.values())
     assert scene.metadata.layers == ("mlp",)
     graph = onnx.load(candidate.path).graph
@@ -84,22 +84,22 @@ def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str)
     candidate = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0)
     scene = candidate.session.scene
     assert rule not in {entry["rule"] for entry in scene.metadata.left_out}
-    if rule == "still":
+    if rule == "static":
         assert scene.static_count == 0
-    if rule == "unseen":
+    if rule == "invisible":
         assert len(scene) == GROUND + OBJECT
     if rule == "layers":
         assert len(scene.metadata.layers) == 2
-    if rule == "bands":
+    if rule == "sh":
         assert scene.metadata.sh_degree == 1
 
 
 def test_layers_whose_trial_would_be_too_dear_stay_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("export.pruning.rules.WORK", 0.0)
+    monkeypatch.setattr("export.pruning.rules.MAX_OPERATIONS", 0.0)
     pruned = job_of(tmp_path, moving_object()).pruned(45.0)
     left_out = {entry["rule"] for entry in pruned.left_out}
     assert "layers" not in left_out
-    assert "still" in left_out
+    assert "static" in left_out
     assert len(pruned.moving.deformation) == 2
 
 
@@ -115,7 +115,7 @@ def test_a_scene_that_does_not_move_has_no_graph_and_the_size_of_its_gaussians(t
     with torch.no_grad():
         for parameter in heads.parameters():
             parameter.zero_()
-    rules = [rule for rule in RULES if rule not in ("unseen", "bands")]
+    rules = [rule for rule in RULES if rule not in ("invisible", "sh")]
     candidate = job_of(tmp_path, model, rules=rules).candidate("network", 50.0)
     assert not onnx.load(candidate.path).graph.node
     assert candidate.session.scene.static_count == 3000
@@ -130,7 +130,7 @@ def test_the_error_allowed_is_kept_in_frames_of_our_own(tmp_path: Path, pruning_
     candidate = job.candidate("network", pruning_db)
     assert job.error(candidate).psnr_worst >= pruning_db
     # at other times a frame may be worse, though not by much
-    assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("prune.other_times_db")
+    assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("pruning.other_times_db")
 
 
 def test_trimming_less_leaves_more_in(tmp_path: Path):

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from export.measure.amplification import growth, spectral_norm
-from export.measure.frames import View, image_gap
-from export.measure.gap import pose_arrays
+from export.measure.frames import PoseRenderer, compare
+from export.measure.poses import posed
 from export.measure.stability import assess
 from export.precision.formats import FLOAT32, FORMATS, in_format
 from export.precision.report import PlanUnsafe
@@ -159,11 +159,11 @@ def test_the_worst_gaussians_are_named_with_what_they_do_to_the_picture():
     assert report.worst.ids[0] == worst
     gap = report.formats[0]
     assert gap.psnr_without_worst >= gap.psnr
-    exact, view = pose_arrays(in_format(model, FLOAT32).double(), report.worst.t), View(SCENE)
+    exact, view = posed(in_format(model, FLOAT32).double(), report.worst.t), PoseRenderer(SCENE)
     others = np.ones(1200, bool)
     others[report.worst.ids] = False
     pictures = [(view.draw(exact, c, keep=others), view.draw(exact, c)) for c in view.cameras]
-    assert report.worst.drawn_psnr in [image_gap(*pair).psnr for pair in pictures]
+    assert report.worst.drawn_psnr in [compare(*pair).psnr for pair in pictures]
 
 
 @pytest.mark.parametrize(("count", "layers"), [(0, ("mlp",)), (5, ())])

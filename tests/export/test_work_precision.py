@@ -20,6 +20,7 @@ from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
 from export.jobs.sweep import Sweep, SweepResult
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
+from export.options import ExportOptions
 from export.plans.registry import PLANS
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
@@ -200,19 +201,19 @@ def saved(folder: Path, **changes: Any) -> Path:
 
 @pytest.mark.parametrize("min_psnr", [float("nan"), float("inf"), -1.0, 0.0, 101.0])
 def test_an_error_that_cannot_be_meant_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], min_psnr: float):
-    assert main(saved(tmp_path), tmp_path / "s.onnx", min_psnr=min_psnr) == 1
+    assert main(ExportOptions(saved(tmp_path), tmp_path / "s.onnx", min_psnr=min_psnr)) == 1
     assert "`min_psnr` must be a PSNR in dB from 10 to 100" in capsys.readouterr().err
     assert not (tmp_path / "s.onnx").exists()
 
 
 def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = saved(tmp_path)
-    assert main(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0) == 1
+    assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0)) == 1
     shown = capsys.readouterr().err
     assert "at most" in shown
     assert "which the plan prefix:1 reaches" in shown
     reachable = float(shown.split("at most ")[1].split(",")[0])
-    assert main(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=reachable) == 0
+    assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=reachable)) == 0
     metadata = DeformationSession(tmp_path / "s.onnx").scene.metadata
     assert metadata.plan == "prefix:1"
     assert metadata.measured_error["rendered"]["psnr_worst"] >= reachable
@@ -233,13 +234,13 @@ def test_wrong_wishes_are_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
 ):
     wishes: dict[str, Any] = {"output": tmp_path / "s.onnx"} | settings
-    assert main(saved(tmp_path), **wishes) == 1
+    assert main(ExportOptions(saved(tmp_path), **wishes)) == 1
     assert message in capsys.readouterr().err
 
 
 def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
-    assert main(tmp_path / "model.pt", min_psnr=45.0, no_bands=True) == 0
+    assert main(ExportOptions(tmp_path / "model.pt", min_psnr=45.0, keep_sh=True)) == 0
     shown = capsys.readouterr().err
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene
@@ -268,14 +269,14 @@ def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.Monke
         (tmp_path / name).write_bytes(contents)
     monkeypatch.setattr(place, interrupt)
     settings: dict[str, Any] = {} if place.endswith("run") else {"quick": True}
-    assert main(checkpoint, **settings) == 130
+    assert main(ExportOptions(checkpoint, **settings)) == 130
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path != checkpoint} == old
 
 
 def test_switched_off_on_the_command_line(tmp_path: Path):
     save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
-    off: dict[str, Any] = {"no_still": True, "no_unseen": True, "no_layers": True}
-    assert main(tmp_path / "model.pt", quick=True, **off) == 0
+    off: dict[str, Any] = {"keep_static": True, "keep_invisible": True, "keep_layers": True}
+    assert main(ExportOptions(tmp_path / "model.pt", quick=True, **off)) == 0
     scene = DeformationSession(tmp_path / "model.onnx").scene
     assert (scene.moving_count, scene.static_count) == (GROUND + OBJECT, 0)
     assert scene.metadata.layers == ("mlp", "mlp")

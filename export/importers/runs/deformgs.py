@@ -7,10 +7,13 @@ import torch
 from torch import Tensor, nn
 
 from export.importers.errors import ImportFailed
+from export.importers.runs.base import Fidelity
+from export.importers.runs.fidelity import quaternion_fidelity
 from export.importers.runs.state import State
 from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.layers.mlp import MLPLayer
 
 XYZ_FREQUENCIES = 10
@@ -21,10 +24,30 @@ MAX_UNITS, MAX_FREQUENCIES = 4_096, 64
 """Sixteen times the usual width; what is above 2⁶⁴ turns in unit time is noise in float32."""
 
 
+class DeformGSImporter:
+    """Of Deformable-3D-Gaussians."""
+
+    white_background = False
+
+    def detects(self, run: Path) -> bool:
+        """Its networks are in files of their own."""
+        return next(run.glob("deform/iteration_*/deform.pth"), None) is not None
+
+    def read(
+        self, run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
+    ) -> tuple[DynamicGaussians, list[str]]:
+        """The model of an iteration, without notes."""
+        return read_deformgs(run, gaussians, iteration, settings), []
+
+    def fidelity(self, model: DynamicGaussians, info: SceneInfo) -> Fidelity:
+        """Its rasterizer doesn't normalise quaternions."""
+        return quaternion_fidelity(model, info)
+
+
 def read_deformgs(
     run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
-) -> tuple[DynamicGaussians, list[str]]:
-    """The model of an iteration, and notes. Raises `ImportFailed` for networks that are built otherwise."""
+) -> DynamicGaussians:
+    """The model of an iteration. Raises `ImportFailed` for networks that are built otherwise."""
     file = run / "deform" / f"iteration_{iteration}" / "deform.pth"
     if not file.is_file():
         raise ImportFailed(run, f"has point_cloud/iteration_{iteration} but no deform/iteration_{iteration}/deform.pth")
@@ -60,7 +83,7 @@ def read_deformgs(
     _fill(shapes_only, state, by_network)  # all tensors must fit before memory is taken for any
     model = DynamicGaussians(config, gaussians)
     _fill(model, state, by_network)
-    return model, []
+    return model
 
 
 def _time_sizes(state: State, by_network: bool, width: int) -> tuple[int, int, int]:

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from export.measure.rendered_error import ExactFrames, RenderedError, posed, shown
+from export.measure.frames import compare, render
+from export.measure.poses import posed
+from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.views import cameras_of, selection_views
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import SMALLEST_SCALE, DynamicGaussians, activated_scales, unit_quats
 from msdgs_train.gaussians.model_file import SceneInfo
@@ -50,8 +51,8 @@ def quaternion_fidelity(model: DynamicGaussians, info: SceneInfo) -> QuaternionF
     for view in selection_views(cameras_of(info), info.time_range, FRAMES):
         ours = posed(model, view.t)
         theirs, off = as_trained(model, view.t, ours)
-        frames = [shown(each, view.camera, info.background, model.rasterizer) for each in (theirs, ours)]
-        psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
+        frames = [render(each, view.camera, info.background, model.rasterizer) for each in (theirs, ours)]
+        psnrs.append(compare(*frames).psnr)
         longest = max(longest, off)
     return QuaternionFidelity(float(np.mean(psnrs)), min(psnrs), longest, len(model.gaussians))
 

@@ -12,6 +12,7 @@ from export.importers.runs.state import State
 from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import MAX_LOG_FACTOR
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
@@ -43,6 +44,25 @@ class _Sizes(NamedTuple):
     nodes: list[int]  # of space, a grid
     time_nodes: int
     width: int
+
+
+class FourDGSImporter:
+    """Of 4DGaussians."""
+
+    white_background = True
+
+    def detects(self, run: Path) -> bool:
+        """Its networks lie beside the Gaussians."""
+        return next(run.glob("point_cloud/iteration_*/deformation.pth"), None) is not None
+
+    def read(
+        self, run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
+    ) -> tuple[DynamicGaussians, list[str]]:
+        """The model of an iteration, and notes."""
+        return read_4dgs(run, gaussians, iteration, settings)
+
+    def fidelity(self, model: DynamicGaussians, info: SceneInfo) -> None:
+        """Its renderer draws the same."""
 
 
 def read_4dgs(
