@@ -14,9 +14,9 @@ from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.registry import build, plan_of
-from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, prune, pruned_model
+from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
 from export.pruning.bake import bake_pruned
-from export.pruning.mask import full_mask, rows, unpruned, with_sh_degree
+from export.pruning.mask import rows, unpruned, with_sh_degree
 from export.trajectories.sampling import SomeTrajectories, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
@@ -142,10 +142,10 @@ class ExportJob:
         """Write a scene file. Raises `InvalidInput` for a plan that this scene can't have, `PlanUnsafe` for one whose
         round-off would be seen."""
         self.stability.require(plan)
-        pruned = self.pruned(pruning_db)
+        model = self.pruned(pruning_db)
         if sh_degree is not None:
-            pruned = with_sh_degree(pruned, sh_degree)
-        return self._written(plan, pruning_db, pruned)
+            model = with_sh_degree(model, sh_degree)
+        return self._written(plan, pruning_db, model)
 
     @property
     def stability(self) -> StabilityReport:
@@ -172,10 +172,11 @@ class ExportJob:
             mask, left_out = prune(self.statistics, min_db, self.rules, on_rule)
             if not left_out:
                 break
-            pruned = pruned_model(self.statistics, mask, left_out)
-            worst_db = self._worst_db(mask, pruned)
+            mean_poses = self.statistics.poses(mask.network).static
+            smaller = pruned(self.model, mask, mean_poses, left_out)
+            worst_db = self._worst_db(mask, smaller)
             if worst_db >= pruning_db:
-                return pruned
+                return smaller
             min_db += pruning_db - worst_db + BACK_OFF_DB
         return self._pruned[None]
 

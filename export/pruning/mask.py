@@ -1,4 +1,4 @@
-"""What is left of a model after pruning, and the smaller model that this makes."""
+"""What pruning leaves of a model, and the smaller model that this makes."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,14 +39,14 @@ class PruningMask:
         return np.concatenate([np.flatnonzero(self.moves), np.flatnonzero(self.kept & ~self.moves)])
 
     def without(self, **changes: Any) -> "PruningMask":
-        """Another mask; Gaussians that aren't kept don't move."""
+        """The mask with changes; Gaussians that aren't kept don't move."""
         changed = replace(self, **changes)
         return replace(changed, moves=changed.moves & changed.kept)
 
 
 @dataclass(frozen=True, eq=False)
 class PrunedModel:
-    """A smaller model of Gaussians that move, beside ones that don't."""
+    """A smaller model of the Gaussians that move, and those that don't."""
 
     moving: DynamicGaussians
     static: Gaussians  # float32, activated
@@ -55,7 +55,7 @@ class PrunedModel:
 
 
 def full_mask(model: DynamicGaussians) -> PruningMask:
-    """The mask that leaves everything in."""
+    """The mask that keeps everything."""
     count = len(model.gaussians)
     heads = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation.layers))
     network = NetworkMask(tuple(range(len(model.deformation))), heads, model.modulation is not None)
@@ -71,7 +71,7 @@ def with_network(model: DynamicGaussians, network: NetworkMask) -> DynamicGaussi
 def pruned(
     model: DynamicGaussians, mask: PruningMask, mean_poses: Gaussians, left_out: list[dict[str, Any]]
 ) -> PrunedModel:
-    """The model that a mask leaves; `mean_poses` says of all N Gaussians how each would stand static."""
+    """The model that a mask leaves; `mean_poses` are the poses of all N Gaussians if they are static."""
     network = mask.network if mask.moves.any() else replace(mask.network, layers=())
     static = np.flatnonzero(mask.kept & ~mask.moves)
     moving = _model(model, network, torch.from_numpy(mask.moves), mask.sh_degree)
@@ -79,24 +79,24 @@ def pruned(
 
 
 def unpruned(model: DynamicGaussians) -> PrunedModel:
-    """All of a model."""
+    """A model as it is."""
     every = np.arange(len(model.gaussians))
     canonical = posed(model, 0.0, deform=False)
     return PrunedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
 
 
 def with_sh_degree(pruned: PrunedModel, sh_degree: int) -> PrunedModel:
-    """The same Gaussians with the SH sh up to `sh_degree` alone."""
+    """The same Gaussians with the SH bands up to `sh_degree` alone."""
     before = pruned.moving.config.sh_degree
     network = full_mask(pruned.moving).network
     static = rows(pruned.static, np.arange(len(pruned.static)), sh_degree)
-    entry = {"rule": "sh_degree", "what": "SH sh, as asked for", "count": before - sh_degree, "of": before}
+    entry = {"rule": "sh_degree", "what": "SH bands, as asked for", "count": before - sh_degree, "of": before}
     moving = _model(pruned.moving, network, slice(None), sh_degree)
     return PrunedModel(moving, static, pruned.ids, (*pruned.left_out, entry))
 
 
 def rows(gaussians: Gaussians, ids: np.ndarray, sh_degree: int) -> Gaussians:
-    """Some Gaussians, with the SH sh up to `sh_degree`."""
+    """Some Gaussians, with the SH bands up to `sh_degree`."""
     g, coefficients = gaussians, sh_coefficients(sh_degree)
     return Gaussians(g.means[ids], g.quats[ids], g.scales[ids], g.opacities[ids], g.sh[ids, :coefficients])
 
@@ -119,7 +119,7 @@ def _model(
         sh_degree=sh_degree,
         embedding_size=model.config.embedding_size if network.modulated else 0,
     )
-    with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are not kept
+    with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are replaced
         smaller = DynamicGaussians(config, CanonicalGaussians(**tensors))
     smaller.deformation = MultiStepDeformation(_without_heads(layer, network.heads) for layer in layers)
     smaller.modulation = model.modulation if network.modulated else None
@@ -127,6 +127,6 @@ def _model(
 
 
 def _without_heads(layer: torch.nn.Module, heads: frozenset[str]) -> torch.nn.Module:
-    """The layer with zeros in place of the heads that are left out; a plan stores no column that is all zeros."""
+    """The layer with zeros in place of the heads that are removed; a plan stores no column that is all zeros."""
     missing = frozenset(HEADS) - heads
     return export_of(layer).without_heads(layer, missing) if missing else layer

@@ -1,4 +1,4 @@
-"""What pruning decides by: how much of each Gaussian is seen, how far it moves in pixels, and frames to compare."""
+"""What pruning decides by: the visibility of each Gaussian, its motion in pixels, and frames to compare."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -19,14 +19,14 @@ from msdgs_train.layers.chain import operations
 from msdgs_train.rendering.rasterize import rasterize
 
 MEMORY, POSE_BYTES = 2e9, 40
-"""Bytes of poses that are kept of smaller networks, for pruning to other errors, and of one Gaussian at one time."""
+"""Bytes of poses of smaller networks that are cached, and bytes of a Gaussian at one time."""
 
 SAMPLED_GAUSSIANS, SAMPLED_TIMES = 1000, 5
-"""For the quick look at what a part of the network does."""
+"""For the quick estimate of what a part of the network contributes."""
 
 
 class Poses:
-    """All Gaussians at the deciding times, posed when they are first asked for, and as they would best stand static."""
+    """All Gaussians at the selection times, posed on first use, and their mean poses."""
 
     def __init__(self, model: DynamicGaussians, times: Sequence[float]) -> None:
         self.times, self._model = times, model
@@ -42,12 +42,12 @@ class Poses:
 
     @cached_property
     def static(self) -> Gaussians:
-        """Where they are on average."""
+        """Their mean poses."""
         return mean_pose([self.at(t) for t in self.times])
 
 
 class PruningStatistics:
-    """Frames of the whole model at the deciding views, and what a mask changes in them. All in float32."""
+    """Frames of the whole model at the selection views, and what a mask changes in them. All in float32."""
 
     def __init__(
         self,
@@ -80,12 +80,12 @@ class PruningStatistics:
         return self._kept[network]
 
     def operations(self, network: NetworkMask) -> float:
-        """About how many it takes to pose all Gaussians at the deciding times as this part of the network does."""
+        """Approximate operations to pose all Gaussians at the selection times with this part of the network."""
         layers = [self.model.deformation.layers[k] for k in network.layers]
         return operations(layers) * len(self.model.gaussians) * len(self._whole[1].times)
 
     def worst_db(self, mask: PruningMask, min_db: float = -np.inf) -> float:
-        """PSNR in dB of the worst deciding frame; where one is under `min_db`, that of the first that is."""
+        """PSNR in dB of the worst selection frame, or of the first that is under `min_db`."""
         poses, worst = self.poses(mask.network), np.inf
         moving, static = np.flatnonzero(mask.moves), np.flatnonzero(mask.kept & ~mask.moves)
         colors = rows(self._whole[1].static, mask.ids, mask.sh_degree)
@@ -100,26 +100,26 @@ class PruningStatistics:
             frame = render(drawn, view.camera, self.background, self.model.rasterizer)
             worst = min(worst, compare(frame, self._frames[i]).psnr)
             if worst < min_db:
-                self._order.remove(i)  # most likely the one that decides next time too
+                self._order.remove(i)  # likely the worst one next time too
                 self._order.insert(0, i)
                 break
         return worst
 
     def motion(self, network: NetworkMask) -> FloatArray:
-        """[N] pixels by which the ends of a Gaussian's axes are at most off where it stands static: its position,
-        rotation and scales, in the nearest camera."""
+        """[N] largest displacement in pixels, in the nearest camera, of the ends of a Gaussian's axes from its mean
+        pose: by position, rotation and scales."""
         poses = self.poses(network)
-        still_axes = half_axes(poses.static)
+        mean_axes = half_axes(poses.static)
         furthest = np.zeros(len(poses.static), np.float32)
         for at in map(poses.at, poses.times):
             moved = np.linalg.norm(at.means - poses.static.means, axis=1)
-            turned = np.linalg.norm(half_axes(at) - still_axes, axis=1).max(axis=1, initial=0)
+            turned = np.linalg.norm(half_axes(at) - mean_axes, axis=1).max(axis=1, initial=0)
             np.maximum(furthest, moved + turned, out=furthest)
         return furthest * self.pixels_per_unit(poses.static.means)
 
     def change(self, network: NetworkMask, smaller: NetworkMask) -> float:
-        """Pixels by which a few Gaussians, at a few times, are elsewhere on average if part of a network is missing;
-        faint ones count less."""
+        """Mean displacement in pixels of a few Gaussians at a few times if part of a network is removed, weighted by
+        their visibility."""
         poses = self.poses(network)
         count = len(self.model.gaussians)
         ids = np.arange(0, count, max(1, count // SAMPLED_GAUSSIANS))
@@ -134,7 +134,7 @@ class PruningStatistics:
         return change
 
     def pixels_per_unit(self, means: FloatArray) -> FloatArray:
-        """[N] pixels a scene unit where each point is, in the camera in which that is most."""
+        """[N] pixels per scene unit at each point, in the camera in which that is largest."""
         most = np.zeros(len(means), np.float32)
         for camera in {id(view.camera): view.camera for view in self._views}.values():
             distances = np.linalg.norm(means - camera.position, axis=1)
@@ -145,13 +145,14 @@ class PruningStatistics:
         return Poses(with_network(self.model, network), sorted({view.t for view in self._views}))
 
     def _visibility(self) -> tuple[FloatArray, FloatArray]:
-        """[N] the most that a Gaussian covers of a pixel under its middle, and of how many pixels, over the views."""
+        """[N] the largest fraction that a Gaussian contributes to a pixel at its center, and to how many pixels, over
+        the views."""
         poses = self.poses(self._whole[0])
         peaks, amounts = np.zeros((2, len(poses.static)), np.float32)
         for view in self._views if len(peaks) else ():
             g = poses.at(view.t)
             weights = blending_weights(g, view, self.model.rasterizer)
-            # pixels that a Gaussian of these two largest axes fills
+            # pixels covered by its two largest axes
             sizes = np.sort(g.scales, axis=1)[:, 1:] * self.pixels_per_unit(g.means)[:, None]
             np.maximum(peaks, weights / (2 * np.pi * (sizes.prod(axis=1) + self.model.config.eps2d)), out=peaks)
             np.maximum(amounts, weights, out=amounts)
@@ -159,7 +160,7 @@ class PruningStatistics:
 
 
 def blending_weights(gaussians: Gaussians, view: View, options: RasterizerOptions) -> FloatArray:
-    """[N] how much each Gaussian adds to a frame: its alpha times what reaches it, summed over the pixels."""
+    """[N] contribution of each Gaussian to a frame: its alpha times the transmittance before it, summed over pixels."""
     means, quats, scales, opacities = (
         torch.from_numpy(array) for array in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     )
@@ -175,7 +176,7 @@ def half_axes(gaussians: Gaussians) -> FloatArray:
 
 
 def mean_pose(poses: list[Gaussians]) -> Gaussians:
-    """Each Gaussian where it is on average: means, logarithms of scales, quaternions of one hemisphere."""
+    """Mean poses over time: of means, of logarithms of scales, and of quaternions in one hemisphere."""
     first = poses[0]
     quats = np.zeros_like(first.quats)
     for pose in poses:

@@ -113,7 +113,7 @@ def rows_of(case: str) -> list[Row]:
     model = CASES[case]()
     report = assess(model, SCENE, times=TIMES if len(model.deformation) < 16 else 2)
     name = f"{case}: amplified × {report.worst_amplification:.2g}"
-    rows = _foretold(name, report)
+    rows = _predicted(name, report)
     if report.refusal("network") is None:
         seen, psnr = _unseen(model)
         quantity = f"float32 frames at other times, {seen} of {COUNT} Gaussians in them"
@@ -124,7 +124,7 @@ def rows_of(case: str) -> list[Row]:
     return [*rows, row]
 
 
-def _foretold(name: str, report: StabilityReport) -> list[Row]:
+def _predicted(name: str, report: StabilityReport) -> list[Row]:
     """Where little round-off is predicted, there must be no more; where much is, a chain isn't linear any more."""
     s = report.samples
     small = s.predicted < tolerance("stability.first_order")

@@ -213,7 +213,7 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path, capsys: pytest.Capt
     path = saved(tmp_path, random_model(30))
     assert main(path, tmp_path / "out.json", tmp_path / "out.png", times=3) == 0
     shown = capsys.readouterr().out
-    for text in ("2 (mlp)", "bfloat16", "predicted", "gets most wrong", "stable: "):
+    for text in ("2 (mlp)", "bfloat16", "predicted", "largest errors", "stable: "):
         assert text in shown
     report = json.loads((tmp_path / "out.json").read_text())
     assert report["stable"] is True
