@@ -1,4 +1,4 @@
-"""Is what was written the scene? It is read back, drawn, and compared with the scene's own pictures."""
+"""Round-trip check: a written file is read back, rendered, and compared with the scene."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,18 +17,18 @@ from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
 
 VIEWS, SIZE, ELEVATION = 3, 256, 20.0
-"""Cameras about the scene, the pixels of their shorter side, and degrees."""
+"""Number of cameras around the scene, pixels of their shorter side, and elevation in degrees."""
 
 
 class ConversionFailed(MsdgsError):
-    """What was written doesn't look like the scene."""
+    """A written file differs visibly from the scene."""
 
 
 class RoundTrip:
-    """Pictures of a scene, to compare others with."""
+    """Frames of a scene to compare a converted one with."""
 
     def __init__(self, session: DeformationSession, *, mip: bool = True) -> None:
-        """`mip`: whether the other format knows the anti-aliasing of Mip-Splatting."""
+        """`mip`: whether the other format has the anti-aliasing of Mip-Splatting."""
         self._session, metadata = session, session.scene.metadata
         options = as_trained(metadata)
         self._options = options._replace(mip=options.mip and mip)
@@ -40,7 +40,7 @@ class RoundTrip:
         self._background = metadata.background
 
     def psnr(self, got: Gaussians, t: float) -> float:
-        """dB of the worst view; pictures are compared as they are shown, cut to [0, 1]."""
+        """PSNR of the worst view, dB; frames are clamped to [0, 1]."""
         expected = self._session.gaussians(t)
         return min(self._psnr(got, expected, camera) for camera in self._cameras)
 
@@ -50,7 +50,7 @@ class RoundTrip:
 
 
 def visionary_of(file: Path) -> Callable[[float], Gaussians]:
-    """What a Visionary model shows."""
+    """The Gaussians of a Visionary model as a function of time."""
     session = ort.InferenceSession(str(file), providers=["CPUExecutionProvider"])
 
     def shown(t: float) -> Gaussians:

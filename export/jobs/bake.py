@@ -1,4 +1,4 @@
-"""From a trained model to what a scene file stores: constants computed once, what only training needs left behind."""
+"""Baking: the constants of a scene file, computed from a trained model in float32."""
 
 from dataclasses import dataclass, field
 
@@ -14,7 +14,7 @@ from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
 from msdgs_train.gaussians.model_file import SceneInfo
 
 STARTING_CAMERAS = 8
-"""Cameras kept in a scene file, evenly spread over those of the training."""
+"""Cameras stored in a scene file, evenly spread over the training cameras."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +109,12 @@ def _metadata(
         checkpoint_sha256=checkpoint_sha256,
         eps2d=float(model.config.eps2d),
     )
-    # through its own reader: what a later reader would refuse is refused here
+    # through the reader of scene files, which refuses invalid values
     return SceneMetadata.from_properties(draft.to_properties(), "the model's scene")
 
 
 def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
-    """At most eight of the training's cameras, evenly spread, the first and the last among them."""
+    """At most eight of the training cameras, evenly spread, the first and the last among them."""
     chosen = np.linspace(0, len(info.cameras) - 1, min(STARTING_CAMERAS, len(info.cameras))).round().astype(int)
     try:
         return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)
@@ -126,7 +126,7 @@ def _refuse_heads(model: DynamicGaussians) -> None:
     for option, stored in (("opacity_head", "opacities"), ("sh_head", "sh")):
         if getattr(model.config, option) and len(model.deformation):
             raise ModelNotExportable(
-                f"model.{option} is on, so `{stored}` change with time, and {CONTRACT} holds them as constants; "
+                f"model.{option} is on, so `{stored}` change with time, but {CONTRACT} stores constants; "
                 "train without that head to export"
             )
 

@@ -1,4 +1,4 @@
-"""The work-precision diagram: milliseconds a frame across, how far frames are from exact ones upwards."""
+"""The work-precision diagram: milliseconds per frame on the x axis, error of the worst frame on the y axis."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from export.plans.registry import PLANS
 DB_STEP = 10
 CLOSEST = 100.0
 LABEL_SIZE = np.array([250, 15])
-"""Pixels of room for a name."""
+"""Pixels reserved for a label."""
 
 OTHER = "#9498a0"
 
@@ -41,20 +41,18 @@ def draw(contents: dict[str, Any], path: Path) -> None:
     )
     _axes(axes, points, contents)
     axes.legend(loc="upper right", framealpha=0.95)
-    figure.draw_without_rendering()  # where labels come to lie is known from here on
+    figure.draw_without_rendering()  # fixes the positions of labels
     _label(axes, points)
     figure.savefig(path, dpi=110, format="png")
 
 
 def _front_line(axes: Any, points: list[dict[str, Any]]) -> None:
     ahead = sorted((p for p in points if p["front"]), key=lambda p: p["milliseconds"]["total"]["min"])
-    axes.plot(
-        *_places(ahead), drawstyle="steps-post", color="black", linewidth=1.5, zorder=2, label="nothing is better"
-    )
+    axes.plot(*_places(ahead), drawstyle="steps-post", color="black", linewidth=1.5, zorder=2, label="Pareto front")
 
 
 def _label(axes: Any, points: list[dict[str, Any]]) -> None:
-    """Names of the points on the front, and of the whole network, as far as there is room; the chosen one's first."""
+    """Label the points on the front and those that aren't pruned, the chosen one first, without overlaps."""
     taken: list[np.ndarray] = []
     named = [point for point in points if point["front"] or point["pruning_db"] is None]
     for point in sorted(named, key=lambda point: not point["chosen"]):
@@ -66,7 +64,7 @@ def _label(axes: Any, points: list[dict[str, Any]]) -> None:
 
 
 def _text(point: dict[str, Any]) -> str:
-    pruned = "all of it" if point["pruning_db"] is None else f"pruned to {point['pruning_db']:g}"
+    pruned = "unpruned" if point["pruning_db"] is None else f"pruned to {point['pruning_db']:g}"
     return f"{point['plan']}, {pruned}, SH {point['sh_degree']}"
 
 
@@ -76,7 +74,7 @@ def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> 
     axes.yaxis.set_major_locator(FixedLocator([_rms(db) for db in ticks]))
     axes.yaxis.set_major_formatter(FixedFormatter([f"{db:.0f} dB\n{100 * _rms(db):.2g} %" for db in ticks]))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylabel("error of the worst frame against the exact one:\nPSNR, and root mean square of full brightness")
+    axes.set_ylabel("error of the worst frame against the exact one:\nPSNR and RMSE")
     times = [point["milliseconds"]["total"]["min"] for point in points]
     low, high = min(times) / 1.15, max(times) * 1.5
     places = [base * 10.0**power for power in range(-3, 6) for base in (1, 1.5, 2, 3, 4, 5, 7)]
@@ -87,9 +85,9 @@ def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> 
     axes.xaxis.set_minor_formatter(NullFormatter())
     machine = contents["machine"]
     axes.set_xlabel(
-        f"milliseconds a frame, deformation and drawing ({machine['processor']}, {machine['threads']} threads)"
+        f"milliseconds per frame, deformation and drawing ({machine['processor']}, {machine['threads']} threads)"
     )
-    axes.set_title("Every dot is a way to store this scene. Further left is faster, further down is closer to exact.")
+    axes.set_title("Each point is one way to store this scene: left is faster, down is more exact.")
     axes.grid(alpha=0.3, which="major")
 
 
@@ -103,5 +101,5 @@ def _places(points: list[dict[str, Any]]) -> tuple[list[float], list[float]]:
 
 
 def _rms(db: float) -> float:
-    """Root mean square error of a PSNR, in parts of full brightness."""
+    """RMSE of a PSNR, values in [0, 1]."""
     return 10 ** (-db / 20)

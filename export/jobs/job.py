@@ -1,4 +1,4 @@
-"""One model file, and what all its exports share: exact frames, statistics for pruning, and candidates by plan."""
+"""The exports of one model file: candidates by plan, exact frames and pruning statistics that all of them use."""
 
 import hashlib
 from collections.abc import Callable, Collection, Sequence
@@ -28,58 +28,58 @@ from msdgs_train.gaussians.model_file import load_model
 EVALUATION_TIMES, CAMERAS_PER_TIME = 16, 3
 SELECTION_TIMES = 33
 BACK_OFFS = 4
-"""How often pruning is repeated more carefully where its parts together are worse than each promised."""
+"""How often pruning is repeated with a smaller error if its rules together cost more than each of them did."""
 
 BACK_OFF_DB = 0.5
 STABILITY_TIMES = 8
 SAMPLED_KEPT = 2
-"""Sets of trajectories that are kept; one takes up to 2 GiB."""
+"""Sets of trajectories in the cache; one takes up to 2 GiB."""
 
 Track = Callable[[str, int], Callable[[], object]]
-"""Called with what begins and how many steps it has; returns what is to be called after each."""
+"""Called with the name of a task and its number of steps; returns a function to call after each step."""
 
 
 class TargetNotReached(InvalidInput):
-    """No export of this model is as close to it as was asked for."""
+    """No export of this model reaches the PSNR that was asked for."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A scene file that could be the export, and how it was made."""
+    """A scene file that may be chosen as the export, and how it was made."""
 
     plan: str
-    pruning_db: float | None  # what pruning alone may cost, dB on the worst frame; None: nothing was left out
+    pruning_db: float | None  # PSNR of the worst frame that pruning alone may lead to, dB; None: not pruned
     pruned: PrunedModel
     path: Path
-    options: RasterizerOptions  # what it is drawn with
+    options: RasterizerOptions  # of its frames
 
     @cached_property
     def session(self) -> DeformationSession:
-        """The file, opened when it is first asked for."""
+        """The file, opened on first use."""
         return DeformationSession(self.path)
 
     @cached_property
     def digest(self) -> bytes:
-        """Of the file."""
+        """SHA-256 of the file."""
         return hashlib.sha256(self.path.read_bytes()).digest()
 
     def close(self) -> None:
-        """Give back the memory of the open file."""
+        """Release the memory of the open file."""
         self.__dict__.pop("session", None)
 
     @property
     def sh_degree(self) -> int:
-        """Of its colours."""
+        """Of its colors."""
         return self.pruned.moving.config.sh_degree
 
     @property
     def size(self) -> int:
-        """Bytes on disk."""
+        """Bytes of the file."""
         return self.path.stat().st_size
 
 
 def no_progress(what: str, steps: int) -> Callable[[], object]:
-    """Tell nobody."""
+    """Ignore progress."""
     return lambda: None
 
 
@@ -96,7 +96,7 @@ class ExportJob:
         training: Sequence[Camera] = (),
         progress: Track = no_progress,
     ) -> None:
-        """`training` are the cameras of the training images, where at hand. Raises `CheckpointInvalid`."""
+        """`training` are the cameras of the training images, if known. Raises `CheckpointInvalid`."""
         self.folder, self.min_psnr, self.rules, self.progress = folder, min_psnr, rules, progress
         self.model, self.info, _ = load_model(checkpoint)
         with checkpoint.open("rb") as file:
@@ -104,34 +104,28 @@ class ExportJob:
         self.cameras = cameras_of(self.info, training)
         self._files = 0
         self._pruned: dict[float | None, PrunedModel] = {None: unpruned(self.model)}
-        self._stability: StabilityReport | None = None
-        self._statistics: PruningStatistics | None = None
         self._sampled: list[tuple[bytes, np.ndarray, Trajectories]] = []
-        self._exact: ExactFrames | None = None
 
-    @property
+    @cached_property
     def exact(self) -> ExactFrames:
-        """Frames in float64, computed when they are first asked for."""
-        if self._exact is None:
-            views = evaluation_views(self.cameras, self.info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
-            on_frame = self.progress("exact frames in float64", len(views))
-            self._exact = ExactFrames(self.model, views, self.info.background, on_frame)
-        return self._exact
+        """Frames in float64, computed on first use."""
+        views = evaluation_views(self.cameras, self.info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
+        return ExactFrames(
+            self.model, views, self.info.background, self.progress("exact frames in float64", len(views))
+        )
 
-    @property
+    @cached_property
     def statistics(self) -> PruningStatistics:
-        """What pruning decides by, computed when it is first asked for."""
-        if self._statistics is None:
-            views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES)
-            on_time = self.progress("what moves, and what is seen", SELECTION_TIMES)
-            self._statistics = PruningStatistics(self.model, views, self.info.background, on_time)
-        return self._statistics
+        """What pruning decides by, computed on first use."""
+        views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES)
+        on_time = self.progress("motion and visibility of the Gaussians", SELECTION_TIMES)
+        return PruningStatistics(self.model, views, self.info.background, on_time)
 
     def pruned(self, pruning_db: float | None) -> PrunedModel:
-        """The model without what `pruning_db` dB on the worst frame allow to leave out.
+        """The model without what can be removed while the worst frame stays at `pruning_db` dB.
 
-        Frames of all rules together, at other times than those that decided, are held to it as well; where they
-        are worse, pruning is repeated more carefully.
+        It is checked again in the evaluation views, at other times than the selection views; if it is worse there,
+        pruning is repeated with a smaller error.
         """
         if pruning_db not in self._pruned:
             assert pruning_db is not None
@@ -140,28 +134,21 @@ class ExportJob:
 
     def candidate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> Candidate:
         """Write a scene file. Raises `InvalidInput` for a plan that this scene can't have, `PlanUnsafe` for one whose
-        round-off would be seen."""
+        round-off would be visible."""
         self.stability.require(plan)
         model = self.pruned(pruning_db)
         if sh_degree is not None:
             model = with_sh_degree(model, sh_degree)
         return self._written(plan, pruning_db, model)
 
-    @property
+    @cached_property
     def stability(self) -> StabilityReport:
-        """How far float32 is from float64 where layers run when a frame is served."""
-        if self._stability is None:
-            on_time = self.progress("stability of the layers", STABILITY_TIMES)
-            found = assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
-            self._stability = found
-        return self._stability
-
-    def exact_pose(self, t: float) -> Gaussians:
-        """All Gaussians of the model in float64."""
-        return self.exact.pose(t)
+        """How far layers in float32 are from float64, computed on first use."""
+        on_time = self.progress("stability of the layers", STABILITY_TIMES)
+        return assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
 
     def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
-        """How far its frames are from exact ones; all of those kept, or every n-th."""
+        """The error of its frames against exact ones; of all of them or of every n-th."""
         pose, ids = candidate.session.gaussians, candidate.pruned.ids
         return self.exact.measure(pose, ids, options=candidate.options, every=every)
 
@@ -181,8 +168,8 @@ class ExportJob:
         return self._pruned[None]
 
     def _worst_db(self, mask: PruningMask, pruned: PrunedModel) -> float:
-        """PSNR of the worst of the measured frames of a pruned model. Where its layers are all that there were, what
-        moves is where it was in the exact frames, and no layer is run again."""
+        """PSNR of the worst evaluation frame of a pruned model. If its network is complete, moving Gaussians take the
+        poses of the exact frames, and no layer is run again."""
         layers_changed = mask.moves.any() and mask.network != full_mask(self.model).network
         moving = mask.ids[: len(pruned.moving.gaussians)]
 
@@ -206,7 +193,7 @@ class ExportJob:
         return Candidate(plan, pruning_db, pruned, path, self.model.rasterizer)
 
     def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
-        """Those of the model's Gaussians `ids`, ascending, sampled once: what is pruned further moves as before."""
+        """Of the model's Gaussians `ids`, ascending; sampled once, since pruning doesn't change their motion."""
         layers = layers_digest(baked)
         for known_layers, known, sampled in self._sampled:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
@@ -216,13 +203,13 @@ class ExportJob:
         return sampled
 
     def _on_time(self, count: int) -> Callable[[int, int], object]:
-        """Tells of sampling; where motion is fast there is more to do than was known, which is another step."""
+        """Progress of sampling; fast motion is sampled more densely, which is shown as another task."""
         known, on_step = 0, self.progress("", 0)
 
         def on_time(done: int, total: int) -> None:
             nonlocal known, on_step
             if total != known:
-                what = f"{count:,} trajectories" if not known else "faster ones, sampled more densely"
+                what = f"{count:,} trajectories" if not known else "fast ones, sampled more densely"
                 known, on_step = total, self.progress(what, total - known)
             on_step()
 

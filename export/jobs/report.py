@@ -1,4 +1,4 @@
-"""What a sweep has found, for people and programs: `model.report.json`, `.md` and `.png` beside the scene file."""
+"""The report of a sweep: `model.report.json`, `.md` and `.png` beside the scene file."""
 
 import json
 import platform
@@ -16,23 +16,23 @@ from msdgs_serve.threads import thread_count
 from msdgs_train.engine.files import replacing, write_text
 
 FORMAT = "msdgs-report/1"
-COLUMNS = ("", "plan", "pruned to", "SH", "rasterizer", "moving", "still", "ms", "median", "deform", "draw", "MB",
-           "memory", "worst frame", "mean", "worst pixel", "position", "px", "images")  # fmt: skip
+COLUMNS = ("", "plan", "pruned to", "SH", "rasterizer", "moving", "static", "ms", "median", "deform", "draw", "MB",
+           "memory", "worst frame", "mean", "worst pixel", "position", "px", "held-out")  # fmt: skip
 LEGEND = """\
-- **◆ on the front**: no other point is both faster and closer. **★ chosen**: the fastest within the error allowed.
-- **pruned to**: dB on the worst frame that leaving things out may cost; "–": nothing was left out.
-- **ms**: a frame, deformation and rasterization together; least and median of interleaved repeats, mean of three views.
-- **memory**: at the peak of loading the file and drawing a frame, above what the process holds anyway.
+- **◆ on the front**: no other point is faster and closer. **★ chosen**: the fastest within the error allowed.
+- **pruned to**: PSNR of the worst frame that pruning alone may lead to; "–": not pruned.
+- **ms**: per frame, deformation and rasterization; minimum and median of interleaved repeats, mean of three views.
+- **memory**: peak while loading the file and drawing a frame, above that of the idle process.
 - **worst frame**, **mean**: PSNR in dB against frames of the exact network, deformation and rasterizer in float64.
-- **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: how far a Gaussian is at most from
-  where it belongs, in scene units and in pixels, faint and hidden ones included.
-- **images**: mean PSNR in dB against images that training has not seen.
-- Points with other rasterizer options show what these would buy; no file asks for them, so none is chosen.
+- **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
+  a Gaussian, in scene units and in pixels, faint and hidden ones included.
+- **held-out**: mean PSNR in dB against held-out images.
+- Points with other rasterizer options show what these would gain; no file can ask for them, so none is chosen.
 """
 
 
 def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
-    """The whole report as plain values. Errors are the same for the same model; times are this machine's."""
+    """The report as plain values. Errors are reproducible; times are those of this machine."""
     ahead = set(front(result.points))
     points = [
         {"front": i in ahead, "chosen": i == result.chosen, **point.to_plain()} for i, point in enumerate(result.points)
@@ -60,7 +60,7 @@ def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
 
 
 def write_report(contents: dict[str, Any], scene: Path) -> list[Path]:
-    """Write the three files beside a scene file, each whole or not at all; returns their paths."""
+    """Write the three files beside a scene file, each atomically; returns their paths."""
     paths = [scene.with_suffix(f".report{ending}") for ending in (".json", ".md", ".png")]
     write_text(paths[0], json.dumps(contents, indent=1, allow_nan=False) + "\n")
     write_text(paths[1], markdown(contents, scene.name, paths[2].name))
@@ -79,14 +79,14 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
         f"{machine['processor']}, {machine['threads']} threads.",
         f"{views['evaluation_frames']} frames of {views['width']} × {views['height']} were compared.",
         f"Allowed: {contents['min_psnr']:g} dB on the worst frame.",
-        f"The exact network has {exact:.2f} dB against the images." if exact is not None else "",
+        f"The exact network has {exact:.2f} dB against held-out images." if exact is not None else "",
     ]
     lines = [
         f"# {scene}: error against run time",
         "",
         " ".join(where).strip(),
         "",
-        f"![error against milliseconds a frame]({figure})",
+        f"![error against milliseconds per frame]({figure})",
         "",
         "| " + " | ".join(COLUMNS) + " |",
         "|" + "---|" * len(COLUMNS),
@@ -95,9 +95,9 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
         LEGEND,
         gain(contents),
         "",
-        f"After a quick estimate {len(contents['dropped'])} more candidates were left: others were faster and closer.",
+        f"After a quick estimate {len(contents['dropped'])} more candidates were dropped: others are better.",
         "",
-        "Left out of the chosen file:" if left_out else "Nothing was left out of the chosen file.",
+        "Pruned from the chosen file:" if left_out else "Nothing was pruned from the chosen file.",
         "",
         *left_out,
     ]
@@ -105,12 +105,14 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
 
 
 def gain(contents: dict[str, Any]) -> str:
-    """One sentence: what the chosen point takes against all layers as trained, where these were measured."""
+    """One sentence: times of the chosen point, and against all layers as trained if these were measured."""
     points, views = contents["points"], contents["views"]
     chosen = next(point for point in points if point["chosen"])
     whole = [p for p in points if p["plan"] == BASELINE and p["pruning_db"] is None and not p["chosen"]]
     took, drawing = (chosen["milliseconds"][part]["min"] for part in ("deformation", "rasterization"))
-    text = f"Deformation takes {took:.1f} ms a frame, drawing {drawing:.1f} ms at {views['width']} × {views['height']}"
+    text = (
+        f"Deformation takes {took:.1f} ms per frame, drawing {drawing:.1f} ms at {views['width']} × {views['height']}"
+    )
     if not whole:
         return f"{text}."
     before = whole[0]["milliseconds"]["deformation"]["min"]
@@ -151,7 +153,7 @@ def _row(point: dict[str, Any]) -> list[str]:
 
 
 def processor() -> str:
-    """The processor's name as the system gives it."""
+    """The name of the processor."""
     cpuinfo = Path("/proc/cpuinfo")
     names = (
         [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")] if cpuinfo.exists() else []

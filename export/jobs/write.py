@@ -1,4 +1,4 @@
-"""A graph in, a proven scene file out."""
+"""Writing and verifying a scene file."""
 
 import json
 import math
@@ -20,7 +20,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """A scene file that was written."""
 
     path: Path
     size: int  # bytes
@@ -53,12 +53,12 @@ def write_scene(
         temporary.write_bytes(contents.SerializeToString())
         session, allowed = DeformationSession(temporary), tolerance if exact else math.inf
         measured = verify(session, model, times=times, tolerance=allowed, on_time=on_time)
-        measured = properties(contents)["measured_error"] | measured  # what a fitted plan knows of itself stays
+        measured = properties(contents)["measured_error"] | measured  # keeps the error bound of a fitted plan
         if rendered is not None:
             measured |= {"rendered": rendered}
         helper.set_model_props(contents, _as_texts(properties(contents) | {"measured_error": measured}))
         temporary.write_bytes(contents.SerializeToString())
-        scene = DeformationSession(temporary).scene  # only its metadata is new, and it must be whole like the first
+        scene = DeformationSession(temporary).scene  # opened again: its metadata has changed
     return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
 
 

@@ -62,7 +62,7 @@ class LayerExport(Protocol):
 
 
 class FieldLayerExport:
-    """What kinds share whose layers read positions as places in a field and have one output for each head."""
+    """Base of kinds whose layers evaluate a field at the means and have one output per head column."""
 
     removable_heads = frozenset(HEADS)
     parameters: frozenset[str] = frozenset()

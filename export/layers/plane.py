@@ -1,4 +1,4 @@
-"""A plane layer as a graph of gathers and interpolations, which run faster than GridSample on a CPU."""
+"""A layer of kind `plane` as a graph of gathers and interpolations, which are faster than GridSample on a CPU."""
 
 import copy
 from typing import cast

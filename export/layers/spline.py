@@ -1,4 +1,4 @@
-"""A layer of shared motions as a graph: splines once a call, then one product and a few sums for each Gaussian."""
+"""A layer of kind `bases` as a graph: motion splines once per call, then linear blend skinning of each Gaussian."""
 
 from collections.abc import Mapping
 from typing import cast
@@ -17,7 +17,7 @@ from msdgs_train.supports.nodes import BasisLayer, Carried
 from msdgs_train.supports.skinning_kernels import FOLLOWED, LEAST_STRETCH
 
 KNOTS = 4
-"""That a time reads."""
+"""Knots that the value at a time depends on."""
 
 
 class SplineExport:

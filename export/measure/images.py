@@ -1,4 +1,4 @@
-"""HeldOutImages of a scene that training has not seen, to compare an export's frames with."""
+"""Held-out images of a dataset, which frames of an export are compared with."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,14 +13,14 @@ from msdgs_train.datasets import Frame, composite, load_scene
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MAX_IMAGES = 24
-"""HeldOutImages compared with; of more, evenly spread ones."""
+"""Images compared with; of more, evenly spread ones."""
 
 
 class HeldOutImages:
     """Held-out images over the scene's background, and the cameras of those that were trained on."""
 
     def __init__(self, folder: Path, info: SceneInfo, begin: Callable[[int], Callable[[], object]]) -> None:
-        """Raises `DatasetInvalid` or `InvalidInput` where the folder holds no dataset."""
+        """Raises `DatasetInvalid` or `InvalidInput` if the folder holds no dataset."""
         data = load_scene(folder, int(info.cameras[0]["width"]) if info.cameras else None)
         t0, t1 = info.time_range
         self.training: list[Camera] = [frame.camera for frame in data.splits["train"]]
@@ -34,7 +34,7 @@ class HeldOutImages:
             on_image()
 
     def psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
-        """Mean PSNR in dB over the images, as papers report it; None where there are none."""
+        """Mean PSNR in dB over the images, as papers report it; None if there are none."""
         values = []
         for frame, target in self._frames:
             rgb = render(pose(frame.t), frame.camera, self._background, options)

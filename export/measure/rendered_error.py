@@ -1,4 +1,4 @@
-"""What an export changed, in rendered pixels: its frames against those of the exact network in float64."""
+"""The rendered error of an export: its frames against those of the exact network in float64."""
 
 import copy
 import itertools
@@ -17,16 +17,16 @@ from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 
 MEMORY = 768e6
-"""Bytes of exact frames and poses that are kept; with larger pictures fewer views are."""
+"""Bytes of exact frames and poses that are stored; with larger images there are fewer views."""
 
 POSE_BYTES = 52
-"""Of a Gaussian at one time: its mean in float64, the rest in float32."""
+"""Per Gaussian and time: its mean in float64, the rest in float32."""
 
 Pose = Callable[[float], Gaussians]
 
 
 class WorstFrame(NamedTuple):
-    """Which frame is furthest off."""
+    """The frame with the largest error."""
 
     camera: str
     t: float
@@ -34,14 +34,14 @@ class WorstFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class RenderedError:
-    """How far frames are from exact ones. Pictures are compared as they are shown, cut to [0, 1]."""
+    """Error of frames against exact ones, both clamped to [0, 1]."""
 
     psnr_mean: float  # dB, mean over frames of their PSNR; at most 100
     psnr_worst: float  # dB, of the worst frame
-    worst_frame: WorstFrame | None  # None where nothing was drawn
+    worst_frame: WorstFrame | None  # None if nothing was drawn
     worst_pixel: float  # largest difference of a channel, in [0, 1]
-    position: float  # largest distance of a Gaussian that is left from where it belongs, scene units
-    position_pixels: float  # the same in a picture, of the Gaussians that lie within it
+    position: float  # largest displacement of a Gaussian, scene units
+    position_pixels: float  # the same in pixels, of Gaussians inside the image
     frames: int
 
     def to_plain(self) -> dict[str, Any]:
@@ -50,7 +50,7 @@ class RenderedError:
 
 
 class ExactFrames:
-    """Frames of the model in float64, deformation and rasterizer, computed once and compared with many times over."""
+    """Frames of the model in float64, deformation and rasterizer, computed once and compared with many candidates."""
 
     def __init__(
         self,
@@ -116,13 +116,13 @@ class ExactFrames:
 
 
 def by_time(views: Sequence[View]) -> Iterator[tuple[float, list[View]]]:
-    """Views that follow each other at one time, together."""
+    """Consecutive views of one time, grouped."""
     for t, group in itertools.groupby(views, key=lambda view: view.t):
         yield t, list(group)
 
 
 def within_memory(views: Sequence[View], gaussians: int) -> list[View]:
-    """As many of the views, evenly spread, as have room for their exact frames and poses."""
+    """As many of the views, evenly spread, as their exact frames and poses fit into `MEMORY`."""
     sizes = [12 * view.camera.width * view.camera.height + POSE_BYTES * gaussians for view in views]
     count = min(len(views), max(2, int(MEMORY / (sum(sizes) / len(sizes)))))
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]

@@ -1,4 +1,4 @@
-"""Milliseconds a frame of many candidates, measured in turns so that a busy moment of the machine hits all alike."""
+"""Milliseconds per frame of many candidates, interleaved so that load on the machine affects all alike."""
 
 import gc
 import statistics
@@ -11,21 +11,21 @@ from export.measure.views import View
 from msdgs_serve.rasterizer import rasterize
 
 REPEATS = 15
-SECONDS_A_CANDIDATE = 6.0
-"""Where frames take longer, there are fewer repeats, though never under `MIN_REPEATS`."""
+SECONDS_PER_CANDIDATE = 6.0
+"""If frames take longer, there are fewer repeats, but at least `MIN_REPEATS`."""
 
 MIN_REPEATS = 2
 
 
 class Milliseconds(NamedTuple):
-    """A time over interleaved repeats, the mean over a few views of what each took."""
+    """Minimum and median over interleaved repeats, averaged over a few views."""
 
     min: float
     median: float
 
 
 class FrameTime(NamedTuple):
-    """How long a frame takes, on this machine and on the service's own pool of threads."""
+    """Time of a frame on this machine, with the service's thread pool."""
 
     deformation: Milliseconds
     rasterization: Milliseconds
@@ -48,9 +48,9 @@ def time_frames(
     on_repeat: Callable[[], object] = lambda: None,
 ) -> list[FrameTime]:
     """Time a frame of each candidate at each of the views, `repeats` times over; the first frames don't count."""
-    firsts = [_timing_run(candidate, views[0], background) for candidate in candidates]
+    firsts = [time_frame(candidate, views[0], background) for candidate in candidates]
     rounds = [
-        max(MIN_REPEATS, min(repeats, int(1e3 * SECONDS_A_CANDIDATE / (first[2] * len(views))))) for first in firsts
+        max(MIN_REPEATS, min(repeats, int(1e3 * SECONDS_PER_CANDIDATE / (first[2] * len(views))))) for first in firsts
     ]
     runs: list[list[list[TimingRun]]] = [[[] for _ in views] for _ in candidates]
     collecting = gc.isenabled()
@@ -59,7 +59,7 @@ def time_frames(
         for turn in range(repeats):
             for place, candidate in enumerate(candidates):
                 for v, view in enumerate(views if turn < rounds[place] else ()):
-                    runs[place][v].append(_timing_run(candidate, view, background))
+                    runs[place][v].append(time_frame(candidate, view, background))
             on_repeat()
     finally:
         if collecting:
@@ -67,12 +67,18 @@ def time_frames(
     return [_frame_time(of_views) for of_views in runs]
 
 
-def _timing_run(candidate: Candidate, view: View, background: Sequence[float]) -> TimingRun:
-    start = time.perf_counter()
+def time_frame(
+    candidate: Candidate,
+    view: View,
+    background: Sequence[float],
+    clock: Callable[[], float] = time.perf_counter,
+) -> TimingRun:
+    """Milliseconds of deformation, of rasterization, and of both, for one frame."""
+    start = clock()
     gaussians = candidate.session.gaussians(view.t)
-    posed = time.perf_counter()
+    posed = clock()
     rasterize(gaussians, view.camera, background=background, options=candidate.options)
-    drawn = time.perf_counter()
+    drawn = clock()
     return 1e3 * (posed - start), 1e3 * (drawn - posed), 1e3 * (drawn - start)
 
 

@@ -1,4 +1,4 @@
-"""Is a written scene file the model it was made from? Both are posed at many times and compared."""
+"""Verification: poses of a written scene file are compared with the model's at many times."""
 
 import copy
 import math
@@ -18,18 +18,18 @@ from msdgs_train.gaussians.model import DynamicGaussians
 TOLERANCE = 1e-4
 TIMES = 50
 GAUSSIANS_PER_TIME = 5_000
-"""Of a larger scene every n-th Gaussian is compared at a time, beginning with another at each next time."""
+"""In a larger scene every n-th Gaussian is compared, starting with another one at each time."""
 
 UNSTABLE = 0.25
-"""A Gaussian is unstable where the model's own float32 is off from its float64 by more than this part of the
-tolerance: a chain of layers multiplies round-off. No file in float32 can be held to the tolerance there."""
+"""A Gaussian is unstable if the model in float32 differs from float64 by more than this fraction of the tolerance: a
+chain of layers multiplies round-off. No file in float32 can be held to the tolerance there."""
 
 
 MIN_BOUND_PIXELS = 0.01
-"""Pixels: what float32 and 16-bit poses may add to any bound."""
+"""Pixels that float32 and 16-bit poses may add to an error bound."""
 
 MAX_VIOLATIONS = 1e-3
-"""Part of the poses that may break their plan's bound; more only where Gaussians move too fast for any sampling."""
+"""Fraction of the poses that may exceed the error bound of their plan; Gaussians that move too fast don't count."""
 
 
 class VerificationFailed(MsdgsError):
@@ -46,12 +46,12 @@ def verify(
 ) -> dict[str, Any]:
     """The largest errors against the model in float64 and float32, as `measured_error` stores them.
 
-    Only the plan `network` is held to `tolerance`. Others are measured, and those that were fitted to trajectories
-    must be as close between the times that they were fitted to as they bound. The file may hold more Gaussians than
-    the model, static ones after all others; they aren't compared. Errors of means are relative to the scene's half
+    Only the plan `network` is held to `tolerance`. Others are measured, and fitted ones are held to their error bound,
+    at times between those that they were fitted to. The file may hold more Gaussians than the model, static ones after
+    all others; they aren't compared. Errors of means are relative to the scene's half
     diagonal or, further out, to the largest coordinate; those of scales to the Gaussian's largest scale; those of
-    quaternions are absolute. Raises `VerificationFailed` where one is above `tolerance` for a stable Gaussian, or a
-    bound is broken. Whether unstable ones can be seen is not asked here: frames tell, before a file is written.
+    quaternions are absolute. Raises `VerificationFailed` if one is above `tolerance` for a stable Gaussian, or an
+    error bound is exceeded. Unstable Gaussians are judged in rendered frames, before a file is written.
     """
     stated = session.scene.metadata
     if stated.plan != BASELINE:
@@ -62,7 +62,7 @@ def verify(
     stride = max(1, math.ceil(count / GAUSSIANS_PER_TIME))
     unstable, unstable_worst = np.zeros(count, bool), 0.0
     worst: dict[str, dict[str, float]] = {p: dict.fromkeys(MOVING_OUTPUTS, 0.0) for p in ("float64", "float32")}
-    _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # stored as they are under every plan
+    _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # constants under every plan
     for i, t in enumerate(times_to_verify(*session.scene.metadata.time_range, times)):
         ids = np.arange(i % stride, count, stride)
         poses = {"float64": posed(double, t, ids), "float32": posed(model, t, ids)}
@@ -112,16 +112,16 @@ class _Displacements:
             self._broken += int(np.count_nonzero(~(displacements <= allowed)))
 
     def _too_fast(self) -> float:
-        """Poses of Gaussians that the plan doesn't bound anything of."""
+        """Poses of Gaussians without an error bound."""
         return 0.0 if self._bound is None else self._bound["too_fast_part"] * self._compared
 
     def to_plain(self) -> dict[str, Any]:
-        """Entries of `measured_error`. Raises `VerificationFailed` where a bound is broken."""
+        """Entries of `measured_error`. Raises `VerificationFailed` if the error bound is exceeded."""
         fitted = {} if self._bound is None else {"fitted": self._bound}
         if self._bound is not None and self._broken > MAX_VIOLATIONS * self._compared + self._too_fast():
             raise VerificationFailed(
-                f"{self._broken:,} of {self._compared:,} poses are off by more than twice the "
-                f"{self._bound['error']:.3g} scene units that the plan promises"
+                f"{self._broken:,} of {self._compared:,} poses exceed twice the plan's error bound of "
+                f"{self._bound['error']:.3g} scene units"
             )
         return {
             "position": self._position,
@@ -143,12 +143,12 @@ def _distances(got: Gaussians, expected: Gaussians) -> tuple[np.ndarray, np.ndar
 
 
 def _give_sign_of(quats: np.ndarray, changed: np.ndarray) -> None:
-    """A quaternion and its negative are one rotation: compare the nearer one."""
+    """Flip the signs of quaternions to those nearer to `quats`: q and −q are one rotation."""
     changed *= np.where((quats * changed).sum(axis=1, keepdims=True) < 0, -1, 1).astype(changed.dtype)
 
 
 def times_to_verify(t0: float, t1: float, count: int) -> list[float]:
-    """`count` float32 times in [t0, t1]: both ends, and between them ones that fall on no grid of frames."""
+    """`count` float32 times in [t0, t1]: both ends, and irregular times between them."""
     golden = (math.sqrt(5) - 1) / 2
     inner = sorted((i * golden) % 1 for i in range(1, count - 1))
     times = [t0 + (t1 - t0) * f for f in [0.0, *inner, 1.0]]

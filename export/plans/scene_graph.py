@@ -1,4 +1,4 @@
-"""What the graphs of all plans share: their inputs, constant outputs and metadata, and how raw values are activated."""
+"""Parts of the graphs of all plans: inputs, constant outputs and metadata, and activations."""
 
 from dataclasses import replace
 from typing import Any
@@ -15,7 +15,7 @@ from msdgs_train.gaussians.model import SMALLEST_SCALE
 
 
 def new_graph(baked: Baked) -> GraphBuilder:
-    """A graph that knows `ids`, all of them by default."""
+    """A graph with the input `ids`, by default all of them."""
     graph = GraphBuilder()
     graph.constant("ids", np.arange(len(baked.moving), dtype=np.int64))
     return graph
@@ -24,9 +24,9 @@ def new_graph(baked: Baked) -> GraphBuilder:
 def finished(
     graph: GraphBuilder, baked: Baked, plan: str, error_bound: dict[str, Any] | None = None
 ) -> onnx.ModelProto:
-    """The whole scene file of a graph that computes `means`, `quats` and `scales`, or holds them as constants.
+    """The scene file of a graph that computes `means`, `quats` and `scales`, or holds them as constants.
 
-    `error_bound` is what a fitted plan knows of its own errors; it is `measured_error` until the file is measured.
+    `error_bound` of a fitted plan is `measured_error` until the file is measured.
     """
     scene = baked.scene
     count: int | str = "M" if scene.moving_count else 0

@@ -1,4 +1,4 @@
-"""The moving Gaussians of a baked scene at any time, in float64: what plans are fitted to."""
+"""Poses of the moving Gaussians of a baked scene, in float64 by torch and in float32 by onnxruntime."""
 
 import copy
 
@@ -36,7 +36,7 @@ class ExactPoses:
 
     @property
     def operations(self) -> int:
-        """About how many a pose takes."""
+        """Approximate operations per Gaussian and pose."""
         return max(operations(self._deformation.layers), 1)
 
     def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
@@ -64,9 +64,9 @@ def _double(array: np.ndarray) -> torch.Tensor:
 
 
 def pixel(baked: Baked) -> float:
-    """What one pixel of the scene's nearest camera spans in scene units at the middle of what moves.
+    """Size in scene units of one pixel of the nearest camera, at the middle of the moving Gaussians.
 
-    Errors of plans are chosen in this unit. Without cameras: of a picture of 400 pixels across the scene's bounds.
+    The unit of error bounds. Without cameras: of an image of 400 pixels across the scene's bounds.
     """
     low, high = np.array(baked.scene.metadata.bounds)
     middle = np.median(baked.moving.means, axis=0) if len(baked.moving) else (low + high) / 2
@@ -79,7 +79,10 @@ def pixel(baked: Baked) -> float:
 
 
 class SinglePoses:
-    """As `ExactPoses`, to round-off. Raises `SceneFileInvalid` where float32 can't hold the scene or its motion."""
+    """As `ExactPoses`, in float32: 0.4 of the processor time of torch, at ten layers of 256 units on two cores.
+
+    Raises `SceneFileInvalid` if float32 can't hold the scene or its motion.
+    """
 
     def __init__(self, baked: Baked) -> None:
         self._session = DeformationSession("network in float32", contents=network(baked).SerializeToString())

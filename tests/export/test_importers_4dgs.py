@@ -167,7 +167,7 @@ def test_a_run_is_exported_and_lists_what_is_held(tmp_path: Path):
         for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"]
         if each["rule"] == "static_appearance"
     )
-    assert "opacities and colours" in held["what"]
+    assert "opacities and colors" in held["what"]
 
 
 @pytest.mark.parametrize(

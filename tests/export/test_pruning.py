@@ -154,7 +154,7 @@ def test_a_change_of_one_gaussian_is_measured(tmp_path: Path):
     moved = 0.125
 
     def pose(t: float) -> Gaussians:
-        g = job.exact_pose(t)
+        g = job.exact.pose(t)
         means = g.means.copy()
         means[-1] += [0, moved, 0]
         return Gaussians(means, g.quats, g.scales, g.opacities, g.sh)

@@ -128,6 +128,7 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
         QuickEstimate(whole, DEFAULT_RASTERIZER, 90_000, 89_000, 90),
         QuickEstimate(fitted, DEFAULT_RASTERIZER, 50, 5, 60),
     ]
+    sweep.baseline = sweep.estimates[0]
     assert sweep._estimate("network", 46.0) is None
     assert sweep._estimate("int8", None) is None
     assert [why for _, why in sweep.refused if "keyframes:9 takes 50 ms" in why] == [why for _, why in sweep.refused]
@@ -156,7 +157,7 @@ def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
     whole = next(p for p in contents["points"] if p["plan"] == "network" and p["pruning_db"] is None)
     chosen = next(p for p in contents["points"] if p["chosen"])
     whole["milliseconds"]["deformation"]["min"], chosen["milliseconds"]["deformation"]["min"] = 1480.0, 3.7
-    assert "Deformation takes 3.7 ms a frame" in gain(contents)
+    assert "Deformation takes 3.7 ms per frame" in gain(contents)
     assert "all layers for all Gaussians take 1,480.0 ms, 400.0 times as long." in gain(contents)
 
 

@@ -1,4 +1,4 @@
-"""Folders of other trainers' runs to a model.pt, which then goes the way of our own."""
+"""Run folders of other trainers to a model.pt, which is then exported as our own."""
 
 import ast
 import json
@@ -36,7 +36,7 @@ BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
 def write_model(run: Path, file_format: str, output: Path, console: Console) -> list[dict[str, Any]]:
-    """Write the last iteration of a run, of one of `RUNS`, as a model.pt; returns what a scene file of it has lost.
+    """Write the last iteration of a run, of one of `RUNS`, as a model.pt; returns entries for `left_out`.
 
     Raises `ImportFailed` naming what is missing or differs.
     """
@@ -77,7 +77,7 @@ def write_model(run: Path, file_format: str, output: Path, console: Console) -> 
 
 
 def _check_poses(run: Path, model: DynamicGaussians) -> None:
-    """Raise `ImportFailed` where a network sends Gaussians to where none can be."""
+    """Raise `ImportFailed` if a network gives poses that aren't finite."""
     for t in np.linspace(0, 1, CHECKED_TIMES).tolist():
         with _usable(run, f" at t = {t:g}"):
             posed(model, t).validate()
@@ -85,7 +85,7 @@ def _check_poses(run: Path, model: DynamicGaussians) -> None:
 
 @contextmanager
 def _usable(run: Path, when: str = "") -> Iterator[None]:
-    """Say of what can't be drawn that it comes from a run: finite weights may be wild ones, at some times only."""
+    """Turn errors of Gaussians that can't be drawn into `ImportFailed`: finite weights may give infinite poses."""
     try:
         yield
     except InvalidInput as error:
@@ -93,7 +93,7 @@ def _usable(run: Path, when: str = "") -> Iterator[None]:
 
 
 def canonical(source: Splats) -> CanonicalGaussians:
-    """Activated Gaussians back in storage space, their quaternions as long as they were stored."""
+    """Activated Gaussians in storage space, with the original lengths of their quaternions."""
     g = source.gaussians
     lengths = np.ones(len(g), np.float32) if source.quat_lengths is None else source.quat_lengths
     opacities = g.opacities.astype(np.float64).clip(1e-7, 1 - 1e-7)
@@ -103,7 +103,7 @@ def canonical(source: Splats) -> CanonicalGaussians:
 
 
 def _settings(file: Path) -> dict[str, Any]:
-    """The plain values of cfg_args, which is the text of a Namespace; nothing of it is run."""
+    """The plain values of cfg_args, the text of a Namespace; it isn't executed."""
     try:
         call = ast.parse(file.read_text(), mode="eval").body
     except FileNotFoundError:
