@@ -24,13 +24,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.measuring import machine
-from export.plans.splines import fitting
-from export.rendered_error import posed, shown
-from export.views import cameras_of, deciding_views
+from export.measure.frames import compare, render
+from export.measure.poses import posed
+from export.measure.views import cameras_of, selection_views
+from export.trajectories.splines import fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.density.gradient import rotate
 from msdgs_train.evaluation.layer_strip import camera_of
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
@@ -47,7 +47,7 @@ MOST_OPACITY = 0.999
 SAMPLES = 257
 """Times at which the small model is asked for its poses."""
 
-TIMES_A_STEP, GAUSSIANS_A_TIME = 4, 384
+TIMES_A_STEP, GAUSSIANS_PER_TIME = 4, 384
 MOVING_SHARE = 0.75
 """Of a batch, drawn from Gaussians whose motion is more than a pixel."""
 
@@ -135,8 +135,8 @@ class Fit:
         return torch.cat([pose.means - wanted[:, MEANS], pose.scales - scales, turned], dim=1) / self.pixel
 
     def _batch(self) -> Tensor:
-        moving = round(MOVING_SHARE * GAUSSIANS_A_TIME) if len(self._moving) else 0
-        any_ = torch.randint(len(self.model.gaussians), (GAUSSIANS_A_TIME - moving,), generator=self._generator)
+        moving = round(MOVING_SHARE * GAUSSIANS_PER_TIME) if len(self._moving) else 0
+        any_ = torch.randint(len(self.model.gaussians), (GAUSSIANS_PER_TIME - moving,), generator=self._generator)
         if not moving:
             return any_
         return torch.cat([any_, self._moving[torch.randint(len(self._moving), (moving,), generator=self._generator)]])
@@ -319,9 +319,9 @@ def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
     layers = torch.stack(adds).view(5, -1).mean(0)
     console.print(f"pixels that a layer moves, mean: {', '.join(f'{v:.2f}' for v in layers)}", markup=False)
     psnrs = []
-    for view in deciding_views(cameras_of(fit.info), fit.info.time_range, 9):
-        frames = [shown(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
-        psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
+    for view in selection_views(cameras_of(fit.info), fit.info.time_range, 9):
+        frames = [render(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
+        psnrs.append(compare(*frames).psnr)
     console.print(f"images against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
 
 

@@ -22,7 +22,7 @@ from export.views import GOLDEN
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import MsdgsError
-from msdgs_train.engine.files import write_text
+from msdgs_train.datasets.common.files import write_text
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Is what was written the scene? It is read back, drawn, and compared with the scene's own images."""
+"""Round-trip check: a written file is read back, rendered, and compared with the scene."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,27 +8,27 @@ import onnxruntime as ort
 
 from export.exporters.visionary import unpacked
 from export.exporters.visionary_rules import COLORS, COUNT, GAUSSIANS
+from export.measure.frames import compare, render
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
-from msdgs_serve.rasterizer import as_trained, rasterize
+from msdgs_serve.rasterizer import as_trained
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.evaluation.metrics import psnr_from_mse
 
 VIEWS, SIZE, ELEVATION = 3, 256, 20.0
-"""Cameras about the scene, the pixels of their shorter side, and degrees."""
+"""Number of cameras around the scene, pixels of their shorter side, and elevation in degrees."""
 
 
 class ConversionFailed(MsdgsError):
-    """What was written doesn't look like the scene."""
+    """A written file differs visibly from the scene."""
 
 
-class Proof:
-    """Images of a scene, to compare others with."""
+class RoundTrip:
+    """Frames of a scene to compare a converted one with."""
 
     def __init__(self, session: DeformationSession, *, mip: bool = True) -> None:
-        """`mip`: whether the other format knows the anti-aliasing of Mip-Splatting."""
+        """`mip`: whether the other format has the anti-aliasing of Mip-Splatting."""
         self._session, metadata = session, session.scene.metadata
         options = as_trained(metadata)
         self._options = options._replace(mip=options.mip and mip)
@@ -40,21 +40,17 @@ class Proof:
         self._background = metadata.background
 
     def psnr(self, got: Gaussians, t: float) -> float:
-        """dB of the worst view; images are compared as they are shown, cut to [0, 1]."""
+        """PSNR of the worst view, dB; frames are clamped to [0, 1]."""
         expected = self._session.gaussians(t)
         return min(self._psnr(got, expected, camera) for camera in self._cameras)
 
     def _psnr(self, got: Gaussians, expected: Gaussians, camera: Camera) -> float:
-        frames = (
-            rasterize(each, camera, background=self._background, options=self._options).rgb.clip(0, 1)
-            for each in (got, expected)
-        )
-        first, second = (frame.astype(np.float64) for frame in frames)
-        return psnr_from_mse(float(np.square(first - second).mean()))
+        frames = (render(each, camera, self._background, self._options).astype(np.float64) for each in (got, expected))
+        return compare(*frames).psnr
 
 
 def visionary_of(file: Path) -> Callable[[float], Gaussians]:
-    """What a Visionary model shows."""
+    """The Gaussians of a Visionary model as a function of time."""
     session = ort.InferenceSession(str(file), providers=["CPUExecutionProvider"])
 
     def shown(t: float) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Trimming: only what moves stays in the graph, each rule can be switched off, and the error allowed is kept."""
+"""Pruning: only what moves stays in the graph, each rule can be switched off, and the error allowed is kept."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -8,9 +8,9 @@ import onnx
 import pytest
 import torch
 
-from export.jobs.job import Candidate, Job
+from export.jobs.job import Candidate, ExportJob
 from export.jobs.write import write_scene
-from export.measure.views import cameras_of, deciding_views, measuring_views
+from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.pruning import RULES
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
@@ -27,10 +27,10 @@ GAUSSIAN_BYTES = 40 + 4
 """Pose and opacity of a static Gaussian; its SH coefficients have 12 each."""
 
 
-def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> Job:
+def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> ExportJob:
     save_model(folder / "model.pt", model, info, 1)
     (folder / "candidates").mkdir()
-    return Job(folder / "model.pt", folder / "candidates", **settings)
+    return ExportJob(folder / "model.pt", folder / "candidates", **settings)
 
 
 def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: SceneInfo) -> float:
@@ -52,7 +52,7 @@ def test_of_a_scene_with_one_moving_object_only_that_stays_in_the_graph(tmp_path
     job = job_of(tmp_path, model)
     candidate = job.candidate("network", 50.0)
     scene = candidate.session.scene
-    moving = candidate.trimmed.ids[: scene.moving_count]
+    moving = candidate.pruned.ids[: scene.moving_count]
     assert 0 < scene.moving_count <= OBJECT
     assert (moving >= GROUND).all()
     assert independent_worst_db(candidate, model, SCENE) >= 50
@@ -60,16 +60,16 @@ def test_of_a_scene_with_one_moving_object_only_that_stays_in_the_graph(tmp_path
 
 def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_path: Path):
     candidate = job_of(tmp_path, with_hidden_one(moving_object())).candidate("network", 50.0)
-    scene, ids = candidate.session.scene, candidate.trimmed.ids
+    scene, ids = candidate.session.scene, candidate.pruned.ids
     left_out = {entry["rule"]: entry for entry in scene.metadata.left_out}
     assert set(left_out) == set(RULES)
     assert GROUND not in ids  # the hidden one
     assert (ids[: scene.moving_count] > GROUND).all()
     assert (ids[scene.moving_count :] < GROUND).all()
-    assert left_out["still"]["count"] == scene.static_count
+    assert left_out["static"]["count"] == scene.static_count
     assert (left_out["layers"]["count"], left_out["layers"]["of"]) == (1, 2)
     assert (left_out["heads"]["count"], left_out["heads"]["of"]) == (2, 3)
-    assert (left_out["bands"]["count"], left_out["modulation"]["count"]) == (1, 1)
+    assert (left_out["sh"]["count"], left_out["modulation"]["count"]) == (1, 1)
     assert all(entry["worst_frame_db"] >= 50 for entry in left_out.values())
     assert scene.metadata.layers == ("mlp",)
     graph = onnx.load(candidate.path).graph
@@ -84,23 +84,23 @@ def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str)
     candidate = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0)
     scene = candidate.session.scene
     assert rule not in {entry["rule"] for entry in scene.metadata.left_out}
-    if rule == "still":
+    if rule == "static":
         assert scene.static_count == 0
-    if rule == "unseen":
+    if rule == "invisible":
         assert len(scene) == GROUND + OBJECT
     if rule == "layers":
         assert len(scene.metadata.layers) == 2
-    if rule == "bands":
+    if rule == "sh":
         assert scene.metadata.sh_degree == 1
 
 
 def test_layers_whose_trial_would_be_too_dear_stay_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("export.pruning.rules.WORK", 0.0)
-    trimmed = job_of(tmp_path, moving_object()).trimmed(45.0)
-    left_out = {entry["rule"] for entry in trimmed.left_out}
+    monkeypatch.setattr("export.pruning.rules.MAX_OPERATIONS", 0.0)
+    pruned = job_of(tmp_path, moving_object()).pruned(45.0)
+    left_out = {entry["rule"] for entry in pruned.left_out}
     assert "layers" not in left_out
-    assert "still" in left_out
-    assert len(trimmed.moving.deformation) == 2
+    assert "static" in left_out
+    assert len(pruned.moving.deformation) == 2
 
 
 def test_without_rules_nothing_is_left_out(tmp_path: Path):
@@ -115,7 +115,7 @@ def test_a_scene_that_does_not_move_has_no_graph_and_the_size_of_its_gaussians(t
     with torch.no_grad():
         for parameter in heads.parameters():
             parameter.zero_()
-    rules = [rule for rule in RULES if rule not in ("unseen", "bands")]
+    rules = [rule for rule in RULES if rule not in ("invisible", "sh")]
     candidate = job_of(tmp_path, model, rules=rules).candidate("network", 50.0)
     assert not onnx.load(candidate.path).graph.node
     assert candidate.session.scene.static_count == 3000
@@ -123,19 +123,19 @@ def test_a_scene_that_does_not_move_has_no_graph_and_the_size_of_its_gaussians(t
     assert stored < candidate.size < 1.05 * stored
 
 
-@pytest.mark.parametrize("trim_db", [30.0, 45.0, 60.0])
-def test_the_error_allowed_is_kept_in_frames_of_our_own(tmp_path: Path, trim_db: float):
+@pytest.mark.parametrize("pruning_db", [30.0, 45.0, 60.0])
+def test_the_error_allowed_is_kept_in_frames_of_our_own(tmp_path: Path, pruning_db: float):
     model = random_model(400, sh_degree=1, noise=0.02)
     job = job_of(tmp_path, model)
-    candidate = job.candidate("network", trim_db)
-    assert job.error(candidate).psnr_worst >= trim_db
+    candidate = job.candidate("network", pruning_db)
+    assert job.error(candidate).psnr_worst >= pruning_db
     # at other times a frame may be worse, though not by much
-    assert independent_worst_db(candidate, model, SCENE) >= trim_db - tolerance("trim.other_times_db")
+    assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("pruning.other_times_db")
 
 
 def test_trimming_less_leaves_more_in(tmp_path: Path):
     job = job_of(tmp_path, random_model(400, sh_degree=1, noise=0.02))
-    sizes = [job.candidate("network", trim_db).size for trim_db in (30.0, 55.0, None)]
+    sizes = [job.candidate("network", pruning_db).size for pruning_db in (30.0, 55.0, None)]
     assert sizes == sorted(sizes)
     assert sizes[0] < sizes[-1]
 
@@ -154,7 +154,7 @@ def test_a_change_of_one_gaussian_is_measured(tmp_path: Path):
     moved = 0.125
 
     def pose(t: float) -> Gaussians:
-        g = job.exact_pose(t)
+        g = job.exact.pose(t)
         means = g.means.copy()
         means[-1] += [0, moved, 0]
         return Gaussians(means, g.quats, g.scales, g.opacities, g.sh)
@@ -169,8 +169,8 @@ def test_a_change_of_one_gaussian_is_measured(tmp_path: Path):
 
 def test_times_that_decide_are_not_the_times_that_are_measured():
     cameras = cameras_of(SCENE)
-    deciding = {view.t for view in deciding_views(cameras, (0.0, 1.0), 33)}
-    measured = {view.t for view in measuring_views(cameras, (0.0, 1.0), 16, 3)}
+    deciding = {view.t for view in selection_views(cameras, (0.0, 1.0), 33)}
+    measured = {view.t for view in evaluation_views(cameras, (0.0, 1.0), 16, 3)}
     assert len(deciding) == 33
     assert len(measured) == 16
     assert deciding & measured == {0.0, 1.0}
@@ -208,14 +208,14 @@ def test_unusual_scenes_are_trimmed_and_written(tmp_path: Path, count: int, chan
     error = job.error(candidate)
     assert error.psnr_worst >= 50
     contents = onnx.load(candidate.path)
-    exported = write_scene(tmp_path / "s.onnx", contents, candidate.trimmed.moving, rendered=error.to_plain(), times=4)
+    exported = write_scene(tmp_path / "s.onnx", contents, candidate.pruned.moving, rendered=error.to_plain(), times=4)
     assert exported.measured_error["rendered"]["psnr_worst"] == error.psnr_worst
-    assert exported.moving_count + exported.static_count == len(candidate.trimmed.ids)
+    assert exported.moving_count + exported.static_count == len(candidate.pruned.ids)
 
 
 def test_shared_motions_have_no_heads_to_leave_out(tmp_path: Path):
     candidate = job_of(tmp_path, random_model(40, layers=("bases",), num_nodes=5), SCENE).candidate("network", 50.0)
-    assert "heads" not in {entry["rule"] for entry in candidate.trimmed.left_out}
+    assert "heads" not in {entry["rule"] for entry in candidate.pruned.left_out}
 
 
 def with_hidden_one(model: DynamicGaussians) -> DynamicGaussians:
