@@ -23,8 +23,7 @@ from msdgs_train.report import to_bytes
 from msdgs_train.snapshot import snapshot_of_file
 from msdgs_train.steps import camera_of, render_steps
 from msdgs_train.trainer import Trainer
-from tests.support.exports import export_scene
-from tests.support.models import CAMERA, SCENE, random_model, small_config
+from tests.support.models import CAMERA, SCENE, export_scene, random_model, small_config
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SHARED_MOTIONS, write_scene
 from tests.support.training_scene import small_config as training_config

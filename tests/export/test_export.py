@@ -22,8 +22,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.checkpoint import SceneInfo, save_model
 from msdgs_train.model import LOG_SCALE_LIMIT, DynamicGaussians
-from tests.support.exports import export_scene
-from tests.support.models import SCENE, random_model
+from tests.support.models import SCENE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
 

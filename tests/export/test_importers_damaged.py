@@ -30,8 +30,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.checkpoint import CheckpointInvalid, load_model, save_model
 from tests.export import test_importers_4dgs, test_importers_runs
-from tests.support.models import SCENE, random_model
-from tests.support.splat_files import (
+from tests.export.splat_files import (
     compressed_ply_bytes,
     inria_columns,
     ksplat_bytes,
@@ -43,6 +42,7 @@ from tests.support.splat_files import (
     write_sog,
     zipped,
 )
+from tests.support.models import SCENE, random_model
 from tests.support.tolerances import tolerance
 
 T = TypeVar("T")

@@ -19,7 +19,7 @@ from export.rendered_error import posed
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.checkpoint import load_model
 from msdgs_train.model import DynamicGaussians
-from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)

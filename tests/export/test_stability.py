@@ -23,8 +23,7 @@ from msdgs_train.model import DynamicGaussians
 from tests.export import stability_extreme, stability_stiff
 from tests.export.stability_rows import FAILS, Row
 from tests.export.stability_suite import PAGE
-from tests.support.exports import export_scene
-from tests.support.models import SCENE, random_model
+from tests.support.models import SCENE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close, tolerance
 

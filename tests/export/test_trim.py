@@ -19,8 +19,7 @@ from msdgs_serve.scene.camera import Camera
 from msdgs_train.checkpoint import SceneInfo, save_model
 from msdgs_train.model import DynamicGaussians
 from tests.support.images import psnr
-from tests.support.models import CAMERA, SCENE, random_model
-from tests.support.moving_object import GROUND, OBJECT, moving_object
+from tests.support.models import CAMERA, GROUND, OBJECT, SCENE, moving_object, random_model
 from tests.support.tolerances import tolerance
 
 GAUSSIAN_BYTES = 40 + 4

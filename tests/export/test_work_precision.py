@@ -23,8 +23,7 @@ from export.to_onnx import main
 from export.work_precision import Sweep, SweepResult
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.checkpoint import save_model
-from tests.support.models import SCENE, random_model
-from tests.support.moving_object import GROUND, OBJECT, moving_object
+from tests.support.models import GROUND, OBJECT, SCENE, moving_object, random_model
 
 pytestmark = pytest.mark.xdist_group("work precision")  # one worker, so that it sweeps once
 

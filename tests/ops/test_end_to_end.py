@@ -9,9 +9,8 @@ import torch
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_train.checkpoint import save_model
 from msdgs_train.rasterization import rasterize
-from tests.support.exports import export_scene
 from tests.support.images import decode, linear_to_srgb
-from tests.support.models import CAMERA, SCENE, random_model
+from tests.support.models import CAMERA, SCENE, export_scene, random_model
 from tests.support.reference import render
 from tests.support.service import serving
 from tests.support.tolerances import tolerance

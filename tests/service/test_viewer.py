@@ -17,8 +17,8 @@ from playwright.sync_api import Browser, Page, Request
 from msdgs_serve.api.routes.viewer import FILES, FOLDER
 from msdgs_serve.imaging import ImageFormat
 from msdgs_serve.scene.camera import orbit
-from tests.support.browser import chromium, forget, wait_until_still
 from tests.support.images import decode
+from tests.support.processes import chromium, forget, wait_until_still
 from tests.support.scene_files import metadata, write_scene
 from tests.support.service import serving
 from tests.support.tolerances import tolerance

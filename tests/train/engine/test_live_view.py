@@ -27,7 +27,7 @@ from msdgs_train.viewer import MOVING_PART, Viewer, camera_of_browser, show_mode
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import FOV, small_config, write_scene
-from tests.support.viewer_page import PageClient, PageServer, page, wait_for
+from tests.train.engine.viewer_page import PageClient, PageServer, page, wait_for
 
 __all__ = ["page"]
 

@@ -19,13 +19,12 @@ from msdgs_train.datasets import load_scene
 from msdgs_train.snapshot import Snapshot
 from msdgs_train.stage import stage_of_data
 from msdgs_train.viewer import Viewer
-from tests.support.browser import WEBGL, chromium
 from tests.support.images import decode
 from tests.support.models import random_model
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, WEBGL, chromium
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import write_scene
-from tests.support.viewer_page import wait_for
+from tests.train.engine.viewer_page import wait_for
 
 pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
 pytestmark = pytest.mark.slow

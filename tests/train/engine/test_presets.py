@@ -17,7 +17,7 @@ from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians, ModelConfig
 from msdgs_train.presets import DEFAULT, PRESETS, preset
 from msdgs_train.trainer import Trainer
-from tests.support.exports import export_scene
+from tests.support.models import export_scene
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import write_scene
 
