@@ -277,7 +277,7 @@ def test_the_script_runs_from_any_folder(tmp_path: Path):
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(ROOT / "export" / "to_onnx.py"), *arguments]
-        return subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, timeout=120)
+        return subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, timeout=600)
 
     done = run("../model.pt", "--quick", "--no-unseen")
     assert done.returncode == 0, done.stderr

@@ -59,7 +59,7 @@ def test_it_says_where_it_listens_and_what_to_paste_and_stops_at_ctrl_c(process:
     assert response.status_code == 200, response.text
     assert decode(response.content, "png")[0].shape == (400, 400, 3)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=20)
+    out, err = process.communicate(timeout=600)
     assert (process.returncode, out.strip(), err) == (0, "Stopped.", "")
 
 

@@ -131,7 +131,7 @@ def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path)
 @own_connection
 def test_a_file_that_stops_coming_is_given_up(client: httpx.Client, folder: Path):
     assert client.base_url.port
-    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
+    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=60) as connection:
         connection.sendall(b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nhalf a scene")
         eventually(lambda: len(files(folder)) == 1)
         assert connection.recv(65536).startswith(b"HTTP/1.1 408 ")
@@ -141,7 +141,7 @@ def test_a_file_that_stops_coming_is_given_up(client: httpx.Client, folder: Path
 @own_connection
 def test_a_client_that_leaves_in_the_middle_leaves_nothing(client: httpx.Client, folder: Path):
     assert client.base_url.port
-    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
+    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=60) as connection:
         connection.sendall(b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nhalf a scene")
         eventually(lambda: len(files(folder)) == 1)
     eventually(lambda: files(folder) == [])

@@ -24,7 +24,7 @@ from tests.support.service import serving
 from tests.support.tolerances import tolerance
 
 KEY = "0123456789abcdef"
-MILLISECONDS = 15_000
+MILLISECONDS = 60_000
 REPORT = {
     "format": "msdgs-report/1",
     "checkpoint_sha256": "0" * 64,
@@ -200,6 +200,10 @@ def test_two_fingers_zoom(browser: Browser, client: httpx.Client):
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, "wider than a phone"
 
 
+def began_again(asked: list[dict[str, Any]]) -> bool:
+    return any(later["t"] < earlier["t"] for earlier, later in itertools.pairwise(asked))
+
+
 def test_it_plays_one_request_at_a_time(opened: Page):
     flying, most, asked = 0, 0, bodies(opened)
 
@@ -213,13 +217,11 @@ def test_it_plays_one_request_at_a_time(opened: Page):
         opened.on(event, lambda request: count(-1) if request.url.endswith("/render") else None)
     opened.select_option("#speed", "2")
     opened.get_by_role("button", name="Play").click()
-    opened.wait_for_timeout(2500)  # a whole run takes 2 s
+    assert in_time(opened, lambda: len({body["t"] for body in asked}) > 5 and began_again(asked))  # a run takes 2 s
     opened.get_by_role("button", name="Pause").click()
     wait_until_still(opened)
     times = [body["t"] for body in asked]
     assert most == 1
-    assert len(set(times)) > 5
-    assert any(later < earlier for earlier, later in itertools.pairwise(times)), "it did not begin again"
     shown = float(opened.locator("#time-text").inner_text().removeprefix("t "))
     assert shown == pytest.approx(times[-1], abs=0.00051)
 
@@ -357,10 +359,10 @@ def strongest_in_the_middle(image: np.ndarray) -> int:
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
-def in_time(page: Page, holds: Callable[[np.ndarray], bool]) -> bool:
-    """Whether the picture comes to be so within ten seconds."""
-    for _ in range(100):
-        if holds(picture(page)):
+def in_time(page: Page, holds: Callable[[], bool]) -> bool:
+    """Whether it comes to be so within a minute."""
+    for _ in range(600):
+        if holds():
             return True
         page.wait_for_timeout(100)
     return False
@@ -371,9 +373,9 @@ def test_a_changed_file_is_shown(page: Page, tmp_path: Path):
     with serving(tmp_path) as client:
         page.goto(str(client.base_url))
         wait_until_still(page)
-        assert in_time(page, lambda image: strongest_in_the_middle(image) == 0)
+        assert in_time(page, lambda: strongest_in_the_middle(picture(page)) == 0)
         write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=False).rename(tmp_path / "ball.onnx")
-        assert in_time(page, lambda image: strongest_in_the_middle(image) == 1)
+        assert in_time(page, lambda: strongest_in_the_middle(picture(page)) == 1)
 
 
 def test_a_service_that_allows_fewer_pixels(page: Page, scenes: Path):

@@ -95,7 +95,7 @@ def test_a_run_is_seen_paused_and_stopped(data: Path, tmp_path: Path, page: Page
         page.wait_for_timeout(1500)
         assert _step(page) == paused
         process.send_signal(signal.SIGINT)
-        output = process.communicate(timeout=60)[0]
+        output = process.communicate(timeout=600)[0]
     assert process.returncode == cli.EXIT_INTERRUPTED, output
     assert "interrupted at step" in output
     assert (tmp_path / "run" / "checkpoint.pt").exists()
@@ -109,7 +109,7 @@ def test_the_page_stays_until_ctrl_c(data: Path, tmp_path: Path, page: Page) -> 
         assert any("Ctrl-C ends it" in line for line in process.stdout)
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+        assert process.wait(600) == 0
 
 
 @pytest.mark.parametrize("opened_early", [True, False])

@@ -62,7 +62,7 @@ def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
     try:
         _wait_for_lines(run / "metrics.jsonl", process)
         process.send_signal(signal.SIGINT)
-        output = process.communicate(timeout=60)[0]
+        output = process.communicate(timeout=600)[0]
     finally:
         process.kill()
     assert process.returncode == cli.EXIT_INTERRUPTED, output

@@ -266,7 +266,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Pat
     process = begin_training(systems_file, data, out)
     try:
         process.send_signal(signal.SIGINT)
-        output = process.communicate(timeout=120)[0]
+        output = process.communicate(timeout=600)[0]
     finally:
         process.kill()
     assert process.returncode == cli.EXIT_INTERRUPTED, output
@@ -281,5 +281,5 @@ def test_where_the_command_is_killed_its_runs_save_and_end(systems_file: Path, d
     out = tmp_path / "out"
     process = begin_training(systems_file, data, out)
     process.kill()
-    process.communicate(timeout=120)  # ends when nobody is left to write
+    process.communicate(timeout=600)  # ends when nobody is left to write
     assert (out / "still" / "scene_0" / "checkpoint.pt").exists()
