@@ -28,6 +28,8 @@ from tests.support.tolerances import tolerance
 from tests.support.training_scene import SHARED_MOTIONS, write_scene
 from tests.support.training_scene import small_config as training_config
 
+pytestmark = pytest.mark.slow
+
 T = 0.5
 EPS2D = 0.02
 NARROW = GSPLAT._replace(eps2d=EPS2D)

@@ -26,6 +26,8 @@ from tests.support.models import SCENE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
 
+pytestmark = pytest.mark.slow
+
 
 def saved(folder: Path, model: DynamicGaussians) -> Path:
     save_model(folder / "model.pt", model, SCENE, 1)

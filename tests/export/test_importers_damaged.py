@@ -45,6 +45,8 @@ from tests.export.splat_files import (
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import tolerance
 
+pytestmark = pytest.mark.slow
+
 T = TypeVar("T")
 QUIET = Console(quiet=True)
 DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "30"))

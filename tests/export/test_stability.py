@@ -27,6 +27,8 @@ from tests.support.models import SCENE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close, tolerance
 
+pytestmark = pytest.mark.slow
+
 
 def assert_none_fails(rows: list[Row]):
     assert rows
@@ -38,7 +40,6 @@ def test_a_stiff_model_is_exact_enough_or_refused(case: str):
     assert_none_fails(stability_stiff.rows_of(case))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("group", stability_extreme.GROUPS, ids=lambda group: group.__name__)
 def test_an_extreme_case_holds_or_is_refused(group):
     assert_none_fails([*group()])

@@ -22,6 +22,8 @@ from tests.support.images import psnr
 from tests.support.models import CAMERA, GROUND, OBJECT, SCENE, moving_object, random_model
 from tests.support.tolerances import tolerance
 
+pytestmark = pytest.mark.slow
+
 GAUSSIAN_BYTES = 40 + 4
 """Pose and opacity of a static Gaussian; its SH coefficients have 12 each."""
 

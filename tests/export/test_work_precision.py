@@ -25,7 +25,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_train.checkpoint import save_model
 from tests.support.models import GROUND, OBJECT, SCENE, moving_object, random_model
 
-pytestmark = pytest.mark.xdist_group("work precision")  # one worker, so that it sweeps once
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that it sweeps once
 
 POINT_FIELDS = {
     "front": bool,

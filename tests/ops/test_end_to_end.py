@@ -25,6 +25,7 @@ def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_service_draws_what_the_trainer_draws(model_file: Path) -> None:
     model = random_model()
     camera = Camera(**{**CAMERA, "camera_to_world": np.array(CAMERA["camera_to_world"])})

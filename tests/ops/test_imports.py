@@ -5,7 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.support.processes import ROOT
+
+pytestmark = pytest.mark.slow
 
 HEAVY = {"numpy", "numba", "onnxruntime", "OpenImageIO", "fastapi", "pydantic", "torch"}
 HTTP = {"fastapi", "starlette", "uvicorn", "pydantic", "pydantic_settings"}

@@ -12,6 +12,8 @@ from msdgs_serve.api.cli import USAGE_ERROR, main
 from msdgs_serve.rasterizer.kernel_files import CheckedFiles, copy_kernels, is_writable
 from tests.support.processes import ROOT, run_python
 
+pytestmark = pytest.mark.slow
+
 KERNEL = """
 from msdgs_serve.rasterizer.jit import kernel
 

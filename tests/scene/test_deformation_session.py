@@ -152,6 +152,7 @@ assert "torch" not in sys.modules and "onnx" not in sys.modules
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from Linux's /proc")
 def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
     count, width = 60_000, 256

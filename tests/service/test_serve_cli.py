@@ -17,6 +17,8 @@ from msdgs_serve.api.settings import Settings
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
 
+pytestmark = pytest.mark.slow
+
 COMMAND = [sys.executable, "-c", "import sys; from msdgs_serve.api.cli import main; sys.exit(main())"]
 
 

@@ -23,6 +23,8 @@ from tests.service.test_api_poison import check_problem
 from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
+pytestmark = pytest.mark.slow
+
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
 AT_MOST = 60.0  # seconds, whatever else the machine does
 FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}

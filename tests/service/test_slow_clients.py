@@ -12,6 +12,8 @@ from msdgs_serve.api.server import Server
 from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 1.0
 SOCKETS = 50
 AT_MOST = 60.0  # whatever else the machine does; a service that never closes takes longer

@@ -23,6 +23,8 @@ from tests.support.scene_files import metadata, write_scene
 from tests.support.service import serving
 from tests.support.tolerances import tolerance
 
+pytestmark = pytest.mark.slow
+
 KEY = "0123456789abcdef"
 MILLISECONDS = 60_000
 REPORT = {

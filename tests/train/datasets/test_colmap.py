@@ -80,6 +80,7 @@ def test_without_points_the_cameras_say_how_large_the_scene_is(tmp_path: Path):
     assert scene.half_extent > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
 def test_a_binary_file_that_is_cut_off_is_refused_wherever_the_cut_is(tmp_path: Path, part: str):
     folder = write_colmap(tmp_path, names=("0.png", "1.png"))

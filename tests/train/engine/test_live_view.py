@@ -29,6 +29,8 @@ from tests.support.tolerances import assert_close
 from tests.support.training_scene import FOV, small_config, write_scene
 from tests.train.engine.viewer_page import PageClient, PageServer, page, wait_for
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["page"]
 
 WIDTH, HEIGHT = 60, 40

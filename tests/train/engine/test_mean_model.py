@@ -24,6 +24,8 @@ from tests.support.training_scene import (
     write_scene,
 )
 
+pytestmark = pytest.mark.slow
+
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
     model=SHARED_MOTIONS,

@@ -21,6 +21,8 @@ from tests.support.models import export_scene
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import write_scene
 
+pytestmark = pytest.mark.slow
+
 
 def sizes(config: ModelConfig, count: int = 3) -> tuple[int, int]:
     """Parameters of the deformation, and of the modulation with its embeddings."""

@@ -19,6 +19,8 @@ from msdgs_train.trainer import StepResult
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SIZE, small_config, write_scene
 
+pytestmark = pytest.mark.slow
+
 accumulator = pytest.importorskip(
     "tensorboard.backend.event_processing.event_accumulator",
     reason="tensorboard isn't installed: pip install 'msdgs[tensorboard]'",

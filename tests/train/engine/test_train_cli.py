@@ -16,6 +16,8 @@ from msdgs_train import cli
 from tests.support.processes import ROOT
 from tests.support.training_scene import write_scene
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     *("--threads=1", "--init-count=60", "--max-gaussians=90", "--log-every=1", "--model.sh-degree=1"),
     *("--model.width=16", "--model.depth=2", "--model.time-width=8", "--model.embedding-size=4"),

@@ -34,6 +34,8 @@ from tests.support.training_scene import (
     write_scene,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:

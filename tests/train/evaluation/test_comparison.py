@@ -24,6 +24,8 @@ from msdgs_train.presets import preset
 from tests.support.processes import ROOT
 from tests.support.training_scene import write_scene
 
+pytestmark = pytest.mark.slow
+
 BUDGET = Budget(steps=6, init_count=60, max_gaussians=90)
 SYSTEMS = """
 [still]
@@ -201,7 +203,6 @@ def arguments(systems_file: Path, data: Path, out: Path, *more: str) -> list[str
     return ["compare", str(systems_file), "--data", str(data), "--out", str(out), *options]
 
 
-@pytest.mark.slow
 def test_from_nothing_to_the_table_and_not_again(
     systems_file: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -260,7 +261,6 @@ def begin_training(systems_file: Path, data: Path, out: Path) -> subprocess.Pope
     return process
 
 
-@pytest.mark.slow
 def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     process = begin_training(systems_file, data, out)
@@ -276,7 +276,6 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Pat
     assert not (out / "k1").exists()
 
 
-@pytest.mark.slow
 def test_where_the_command_is_killed_its_runs_save_and_end(systems_file: Path, data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     process = begin_training(systems_file, data, out)

@@ -16,6 +16,8 @@ from msdgs_train.sheets import Panel, draw_sheet, panel_corners, sheet_size
 from msdgs_train.steps import write_steps
 from tests.support.models import CAMERA, SCENE, random_model
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 320, 240
 
 

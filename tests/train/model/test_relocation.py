@@ -183,6 +183,7 @@ def test_training_keeps_to_the_budget_at_every_step(data: Path) -> None:
     assert trainer.skipped == 0
 
 
+@pytest.mark.slow
 def test_resuming_changes_no_bit(data: Path, tmp_path: Path) -> None:
     config = small_config(densify_strategy="mcmc", eval_every=0)
     fit(config, data, tmp_path / "whole")
