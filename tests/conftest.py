@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 # the pool has two threads wherever the tests run, so that parallel code is tested as parallel code
 os.environ.setdefault("MSDGS_THREADS", "2")
@@ -10,6 +11,7 @@ import hypothesis
 import numpy as np
 import pytest
 
+from tests.support.scene_files import write_scene
 from tests.support.skips import not_tested, unexpected
 
 hypothesis.settings.register_profile(
@@ -23,6 +25,12 @@ def tiny_numbers_stay():
     """A test that makes its process flush denormals would change every test that comes after it on its worker."""
     yield
     assert np.float32(1e-38) * np.float32(1e-2) > 0
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene file of two balls, one of which moves; nobody writes to it."""
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

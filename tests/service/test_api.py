@@ -29,11 +29,6 @@ FRAME = {"camera": LEVEL, "t": 0.0, "width": SIZE, "height": SIZE}
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
-
-
-@pytest.fixture(scope="module")
 def client(scene: Path) -> Iterator[httpx.Client]:
     with serving(scene) as client:
         yield client

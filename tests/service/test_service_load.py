@@ -20,7 +20,6 @@ from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.watch import Interrupted, Watch
 from tests.service.test_api_poison import check_problem
-from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
 pytestmark = pytest.mark.slow
@@ -51,11 +50,6 @@ class SlowPoses(PoseCache):
             if self.begun >= self.last:
                 until(lambda: has_stopped(watch))
         return session.gaussians(t)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera, Gaussians, quaternion
 from msdgs_serve.scene.camera import look_at
 from msdgs_train import cli
-from msdgs_train import fit as fit_module
 from msdgs_train.checkpoint import LoadedModel, SceneInfo, save_model
 from msdgs_train.datasets import load_scene
 from msdgs_train.fit import Observer, Observers, Outcome, fit
@@ -26,27 +25,16 @@ from msdgs_train.training_view import TrainingView
 from msdgs_train.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import FOV, small_config, write_scene
+from tests.support.training_scene import FOV, small_config
 from tests.train.engine.viewer_page import PageClient, PageServer, page, wait_for
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
 
 __all__ = ["page"]
 
 WIDTH, HEIGHT = 60, 40
 VIEW = Camera.from_look_at(np.array([2.0, -3.0, 1.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]), WIDTH, HEIGHT, 50.0)
 CLOSER = Camera.from_look_at(np.array([1.0, -2.0, 1.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]), WIDTH, HEIGHT, 50.0)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture(autouse=True)
-def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
 
 
 @pytest.fixture

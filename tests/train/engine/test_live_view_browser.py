@@ -23,7 +23,6 @@ from tests.support.images import decode
 from tests.support.models import random_model
 from tests.support.processes import ROOT, WEBGL, chromium
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import write_scene
 from tests.train.engine.viewer_page import wait_for
 
 pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
@@ -31,11 +30,6 @@ pytestmark = pytest.mark.slow
 
 SMALL = ["--threads=1", "--init-count=60", "--max-gaussians=90", "--model.width=16", "--model.depth=2"]
 MILLISECONDS = 60_000
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

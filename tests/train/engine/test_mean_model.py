@@ -21,7 +21,6 @@ from tests.support.training_scene import (
     assert_same_bits,
     small_config,
     state_of,
-    write_scene,
 )
 
 pytestmark = pytest.mark.slow
@@ -37,11 +36,6 @@ CONFIG = small_config(
 AS_THE_PRESET = replace(
     CONFIG, photographs=2, window_until_fraction=BEGINS / STEPS, densify_until_fraction=0.5, eps2d_start=0.4
 )
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def _parameters(model: torch.nn.Module) -> list[np.ndarray]:

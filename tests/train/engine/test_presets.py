@@ -19,7 +19,6 @@ from msdgs_train.presets import DEFAULT, PRESETS, preset
 from msdgs_train.trainer import Trainer
 from tests.support.models import export_scene
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import write_scene
 
 pytestmark = pytest.mark.slow
 
@@ -73,11 +72,6 @@ def test_the_command_line_offers_all_of_them() -> None:
 def test_unknown_names_are_refused_with_those_there_are() -> None:
     with pytest.raises(InvalidInput, match=r"msdgs-mlp.*4dgs.*hexplane"):
         preset("hexplane")
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def shrunk(config: TrainConfig) -> TrainConfig:

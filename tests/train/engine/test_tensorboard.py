@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 
 from msdgs_train import cli
-from msdgs_train import fit as fit_module
 from msdgs_train.fit import RENDERS_WHILE_TRAINING, Observer, fit
 from msdgs_train.report import read_metrics
 from msdgs_train.tensorboard_events import EVAL_SCALARS, FOLDER, TRAIN_SCALARS
@@ -19,7 +18,7 @@ from msdgs_train.trainer import StepResult
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SIZE, small_config, write_scene
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
 
 accumulator = pytest.importorskip(
     "tensorboard.backend.event_processing.event_accumulator",
@@ -30,12 +29,6 @@ accumulator = pytest.importorskip(
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("data") / "scene", test=RENDERS_WHILE_TRAINING + 1)
-
-
-@pytest.fixture(autouse=True)
-def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
 
 
 def _events(run: Path) -> Any:

@@ -14,7 +14,6 @@ import torch
 
 from msdgs_train import cli
 from tests.support.processes import ROOT
-from tests.support.training_scene import write_scene
 
 pytestmark = pytest.mark.slow
 
@@ -22,11 +21,6 @@ SMALL = [
     *("--threads=1", "--init-count=60", "--max-gaussians=90", "--log-every=1", "--model.sh-degree=1"),
     *("--model.width=16", "--model.depth=2", "--model.time-width=8", "--model.embedding-size=4"),
 ]
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.mark.parametrize("command", [[], ["fit"], ["synthetic"]])

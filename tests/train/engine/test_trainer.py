@@ -12,7 +12,6 @@ from torch import Tensor
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_train import fit as fit_module
 from msdgs_train import trainer as trainer_module
 from msdgs_train.checkpoint import load_model
 from msdgs_train.config import TrainConfig
@@ -31,21 +30,9 @@ from tests.support.training_scene import (
     assert_same_bits,
     small_config,
     state_of,
-    write_scene,
 )
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture
-def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
 
 
 def _steps(trainer: Trainer, count: int) -> None:
@@ -69,7 +56,7 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     _steps(trainer, 3)
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize("stop", [8, 13])
 def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
     """Stopped in the first and in the second window."""
@@ -80,7 +67,7 @@ def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path,
     assert_same_bits(*(state_of(tmp_path / name) for name in ("whole", "parts")))
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize("stop", [3, 11, 16])
 @pytest.mark.parametrize("background", ["white", "random"])
 def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, background: str) -> None:
@@ -134,13 +121,13 @@ def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
         assert quality(rgb, evaluated.truth) == evaluated.quality
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
     model = ModelConfig(sh_degree=0, layers=(), embedding_size=0)
     assert fit(small_config(model=model), data, tmp_path / "run").status == "finished"
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_time_budget_stops_evaluates_and_saves(data: Path, tmp_path: Path) -> None:
     outcome = fit(small_config(max_minutes=1e-9), data, tmp_path / "run")
     assert (outcome.status, outcome.step) == ("out of time", 1)
@@ -148,7 +135,7 @@ def test_time_budget_stops_evaluates_and_saves(data: Path, tmp_path: Path) -> No
     assert (tmp_path / "run" / "checkpoint.pt").exists()
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: Path) -> None:
     config, run = small_config(steps=2), tmp_path / "run"
     with pytest.raises(InvalidInput, match="with a checkpoint"):
@@ -231,7 +218,7 @@ def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
         monkeypatch.setattr(trainer_module, name, breaking(getattr(trainer_module, name)))
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize(("start", "back_to"), [(13, 10), (25, 20), (4, 0)])
 def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: int, back_to: int
@@ -253,7 +240,7 @@ def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     load_model(run / "model.pt")
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,11 +36,6 @@ from tests.support.training_scene import SIZE, small_config, write_scene
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture(scope="module")
 def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run whose best model is not its last one."""
     run = tmp_path_factory.mktemp("runs") / "run"

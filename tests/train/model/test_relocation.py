@@ -17,7 +17,7 @@ from msdgs_train.optimizers import make_optimizer
 from msdgs_train.relocation import MOST_SHARES, Relocation, share
 from msdgs_train.trainer import Trainer
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import StopAfter, small_config, write_scene
+from tests.support.training_scene import StopAfter, small_config
 
 OPACITIES = (0.005, 0.1, 0.5, 0.9, 0.999)
 SHARES = (1, 2, 3, 7, 20, 51)
@@ -167,11 +167,6 @@ def test_wandering_has_the_size_of_the_formula() -> None:
     control.wander(gaussians, 2e-6)
     std = (gaussians.means.detach() - before).std()
     assert float(std) == pytest.approx(0.5 * 2e-6 * 5e5 * 0.2**2, rel=0.05)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def test_training_keeps_to_the_budget_at_every_step(data: Path) -> None:
