@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_train import fit as fit_module
 from msdgs_train.checkpoint import LoadedModel, load_model
 from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import load_scene
@@ -76,12 +75,10 @@ def test_it_is_judged_shown_and_saved(data: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(shown, to_bytes(evaluated.rgb.numpy()))
 
 
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize("config", [CONFIG, AS_THE_PRESET], ids=["density control last", "windows last"])
 @pytest.mark.parametrize("stop", [BEGINS, BEGINS + 1, BEGINS + 5])
-def test_resuming_changes_no_bit_of_it(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, config: TrainConfig
-) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+def test_resuming_changes_no_bit_of_it(data: Path, tmp_path: Path, stop: int, config: TrainConfig) -> None:
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
     assert (state_of(tmp_path / "parts")["/mean/count"] if stop > BEGINS else 0) == min(stop - BEGINS, KEPT)

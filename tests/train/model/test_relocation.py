@@ -10,14 +10,13 @@ import torch
 
 from msdgs_train.config import TrainConfig
 from msdgs_train.datasets import load_scene
-from msdgs_train.fit import fit
 from msdgs_train.gaussians import CanonicalGaussians
 from msdgs_train.model import DynamicGaussians
 from msdgs_train.optimizers import make_optimizer
 from msdgs_train.relocation import MOST_SHARES, Relocation, share
 from msdgs_train.trainer import Trainer
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import StopAfter, small_config
+from tests.support.training_scene import small_config
 
 OPACITIES = (0.005, 0.1, 0.5, 0.9, 0.999)
 SHARES = (1, 2, 3, 7, 20, 51)
@@ -176,17 +175,3 @@ def test_training_keeps_to_the_budget_at_every_step(data: Path) -> None:
     assert counts[0] == config.init_count
     assert max(counts) == counts[-1] == 67
     assert trainer.skipped == 0
-
-
-@pytest.mark.slow
-def test_resuming_changes_no_bit(data: Path, tmp_path: Path) -> None:
-    config = small_config(densify_strategy="mcmc", eval_every=0)
-    fit(config, data, tmp_path / "whole")
-    fit(config, data, tmp_path / "parts", observer=StopAfter(11))
-    fit(config, data, tmp_path / "parts", resume=True)
-    one, other = (torch.load(tmp_path / run / "checkpoint.pt", weights_only=True) for run in ("whole", "parts"))
-    assert len(one["model"]["gaussians.means"]) > config.init_count
-    for name, tensor in one["model"].items():
-        assert torch.equal(tensor, other["model"][name]), name
-    for a, b in zip(one["generators"], other["generators"], strict=True):
-        assert torch.equal(a, b)
