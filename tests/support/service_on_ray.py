@@ -11,11 +11,10 @@ from pathlib import Path
 
 import httpx
 
-from benchmarks.service_process import free_port
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.cluster import deployment
 from msdgs_serve.scene import InvalidInput
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, free_port
 
 OBJECT_STORE_BYTES = 100 << 20
 CORES = 64  # as Ray counts them: several services are up at once
