@@ -11,7 +11,6 @@ ELSEWHERE = {
     "viser isn't installed": "it wants older versions of what all else is tested with: `make test-viewer`",
     "skipped: no Docker daemon": "a container has none; who builds the image runs docker/check.py",
     "MSDGS_SPLATS names no folder": "files of other programs, which are not ours to pass on",
-    "the processor has no": "AVX-512, which only the renderer that we are measured against needs",
     "reaches into the process of the service": "on Ray Serve it is another process (MSDGS_TEST_SERVICE=ray)",
     "slow connections end at the proxy": "on Ray Serve (MSDGS_TEST_SERVICE=ray)",
 }
@@ -30,7 +29,6 @@ class Lack(NamedTuple):
 LACKS = (
     Lack("no Chromium on this machine", "the page in a browser", debian="chromium"),
     Lack("there is no prometheus to run", "the dashboard's queries", debian="prometheus"),
-    Lack("there is no g++", "the AVX-512 renderer", debian="g++"),
     Lack("kubernetes-validate isn't installed", "the Kubernetes manifests", python="kubernetes-validate"),
 )
 
