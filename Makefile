@@ -12,7 +12,7 @@ SERVE := .venv-serve
 FULL := .venv
 CLUSTER := .venv-cluster
 VIEWER := .venv-viewer
-HTTP_TESTS := tests/service tests/frames/test_video.py
+HTTP_TESTS := tests/service tests/frames/test_video.py --ignore-glob='*/test_viewer*'
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package
 PINS := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt

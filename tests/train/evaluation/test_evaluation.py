@@ -34,6 +34,8 @@ from tests.support.scenes import front_camera, gaussians_of
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import SIZE, small_config, write_scene
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
