@@ -27,8 +27,7 @@ from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.mlp import PositionalEncoding, frequency_matrix
 from msdgs_train.rendering.rasterize import rasterize as rasterize_for_training
 from tests.export.stability_rows import Row, measured, refused, relative
-from tests.support.exports import export_scene
-from tests.support.models import CAMERA, SCENE, random_model
+from tests.support.models import CAMERA, SCENE, export_scene, random_model
 from tests.support.scene_files import write_scene
 from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of
 

@@ -25,11 +25,12 @@ from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
 from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
 from msdgs_train.viewer.snapshot import snapshot_of_file
-from tests.support.exports import export_scene
-from tests.support.models import CAMERA, SCENE, random_model, small_config
+from tests.support.models import CAMERA, SCENE, export_scene, random_model, small_config
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SHARED_MOTIONS, write_scene
 from tests.support.training_scene import small_config as training_config
+
+pytestmark = pytest.mark.slow
 
 T = 0.5
 EPS2D = 0.02

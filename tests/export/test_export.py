@@ -23,10 +23,11 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
-from tests.support.exports import export_scene
-from tests.support.models import SCENE, random_model
+from tests.support.models import SCENE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
+
+pytestmark = pytest.mark.slow
 
 
 def saved(folder: Path, model: DynamicGaussians) -> Path:
@@ -279,7 +280,7 @@ def test_the_script_runs_from_any_folder(tmp_path: Path):
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(ROOT / "export" / "to_onnx.py"), *arguments]
-        return subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, timeout=120)
+        return subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, timeout=600)
 
     done = run("../model.pt", "--quick", "--keep-invisible")
     assert done.returncode == 0, done.stderr

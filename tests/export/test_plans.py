@@ -26,6 +26,8 @@ from msdgs_train.gaussians.model import DynamicGaussians
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import tolerance
 
+pytestmark = pytest.mark.slow
+
 FORMATS: dict[str, dict[str, Any]] = {
     "mlp": {"noise": 0.02, "time_frequencies": 2},
     "plane": {"layers": ("plane",), "plane_time_resolution": 9},

@@ -20,6 +20,8 @@ from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance
 
+pytestmark = pytest.mark.slow
+
 COUNT = 40
 Motion = Callable[[float], np.ndarray]
 

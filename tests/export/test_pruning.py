@@ -19,9 +19,10 @@ from msdgs_serve.scene.camera import Camera
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
 from tests.support.images import psnr
-from tests.support.models import CAMERA, SCENE, random_model
-from tests.support.moving_object import GROUND, OBJECT, moving_object
+from tests.support.models import CAMERA, GROUND, OBJECT, SCENE, moving_object, random_model
 from tests.support.tolerances import tolerance
+
+pytestmark = pytest.mark.slow
 
 GAUSSIAN_BYTES = 40 + 4
 """Pose and opacity of a static Gaussian; its SH coefficients have 12 each."""
