@@ -1,5 +1,6 @@
 """Made models in which one part moves and all else stands still, exactly."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -7,7 +8,7 @@ import torch
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.mlp import MLPLayer
-from tests.support.models import small_config
+from tests.support.models import MLP, small_config
 
 GROUND, OBJECT = 200, 40
 """Gaussians of each, the ground's first."""
@@ -22,14 +23,14 @@ def moving_object(seed: int = 0, moves: bool = True, **config: Any) -> DynamicGa
     Besides what it needs the model has a second layer that does nothing, SH bands of zeros, modulation that is 1, and
     heads of scales and rotations that are zero.
     """
-    settings = small_config(**({"layers": ("mlp", "mlp"), "depth": 1, "sh_degree": 1} | config))
+    settings = small_config(**({"layers": (replace(MLP, depth=1),) * 2, "sh_degree": 1} | config))
     generator = torch.Generator().manual_seed(seed)
     count = GROUND + OBJECT
     points = 2 * torch.rand(count, 3, generator=generator) - 1
     points[:GROUND, 0] = 0.3 - 1.2 * torch.rand(GROUND, generator=generator)
     points[GROUND:, 0] = 0.9 + 0.3 * torch.rand(OBJECT, generator=generator)
     colors = torch.rand(count, 3, generator=generator)
-    gaussians = CanonicalGaussians.from_points(points, colors, settings.sh_degree, settings.embedding_dim, generator)
+    gaussians = CanonicalGaussians.from_points(points, colors, settings.sh_degree, generator, settings.attributes())
     with torch.no_grad():
         gaussians.log_scales.fill_(-2.3)
         gaussians.raw_opacities.fill_(2.0)

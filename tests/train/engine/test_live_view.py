@@ -15,7 +15,6 @@ from msdgs_serve.scene import Camera, Gaussians, quaternion
 from msdgs_serve.scene.camera import look_at
 from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
-from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.run import Observer, Observers, RunResult, fit
 from msdgs_train.engine.trainer import StepResult, Trainer
@@ -26,7 +25,7 @@ from msdgs_train.viewer.training_view import TrainingView
 from msdgs_train.viewer.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import FOV, small_config, write_scene
+from tests.support.training_scene import FOV, small_config
 from tests.support.viewer_page import PageClient, PageServer, page, wait_for
 
 __all__ = ["page"]
@@ -36,24 +35,13 @@ VIEW = Camera.from_look_at(np.array([2.0, -3.0, 1.5]), np.zeros(3), np.array([0.
 CLOSER = Camera.from_look_at(np.array([1.0, -2.0, 1.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]), WIDTH, HEIGHT, 50.0)
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture(autouse=True)
-def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
-
-
 @pytest.fixture
 def loaded() -> LoadedModel:
     return LoadedModel(random_model(noise=0.2), SCENE, 7)
 
 
 def _expected(loaded: LoadedModel, camera: Camera, t: float, layers: int) -> np.ndarray:
-    posed = loaded.model.pose(t, steps=layers)
+    posed = loaded.model.pose(t, num_layers=layers)
     gaussians = Gaussians(*(tensor.detach().numpy() for tensor in posed))
     return to_bytes(rasterize(gaussians, camera, background=loaded.scene.background).rgb)
 

@@ -24,7 +24,6 @@ from tests.support.images import decode
 from tests.support.models import random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import write_scene
 from tests.support.viewer_page import wait_for
 
 pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
@@ -32,11 +31,6 @@ pytestmark = pytest.mark.slow
 
 SMALL = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--model.width=16", "--model.depth=2"]
 MILLISECONDS = 60_000
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

@@ -16,17 +16,16 @@ from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.viewer.snapshot import snapshot_of_training
 from tests.support.training_scene import (
-    SHARED_MOTIONS,
+    MOTION_BASES,
     StopAfter,
     assert_same_bits,
     small_config,
     state_of,
-    write_scene,
 )
 
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
-    model=SHARED_MOTIONS,
+    model=MOTION_BASES,
     window_full_fraction=0.5,
     refine_stop_fraction=BEGINS / STEPS,
     ema_steps=KEPT,
@@ -35,11 +34,6 @@ CONFIG = small_config(
 AS_THE_PRESET = replace(
     CONFIG, batch_size=2, window_full_fraction=BEGINS / STEPS, refine_stop_fraction=0.5, eps2d_init=0.4
 )
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def _parameters(model: torch.nn.Module) -> list[np.ndarray]:

@@ -13,7 +13,6 @@ from torch import Tensor
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.datasets import load_scene
-from msdgs_train.engine import run as fit_module
 from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum import TrainingSample
@@ -21,29 +20,17 @@ from msdgs_train.engine.metrics_log import MetricsLog, read_metrics
 from msdgs_train.engine.optimizer import exponential, learning_rates
 from msdgs_train.engine.run import Observer, fit
 from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
-from msdgs_train.gaussians.model import ModelConfig
+from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model_file import load_model
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import (
-    SHARED_MOTIONS,
+    MOTION_BASES,
     SIZE,
     StopAfter,
     assert_same_bits,
     small_config,
     state_of,
-    write_scene,
 )
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture
-def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
 
 
 def _steps(trainer: Trainer, count: int) -> None:
@@ -67,18 +54,18 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     _steps(trainer, 3)
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize("stop", [8, 13])
 def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
     """Stopped in the first and in the second window."""
-    config = small_config(model=SHARED_MOTIONS, window_start_widths=(0.03, 0.2))
+    config = small_config(model=MOTION_BASES, window_start_widths=(0.03, 0.2))
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
     fit(config, data, tmp_path / "parts", resume=True)
     assert_same_bits(*(state_of(tmp_path / name) for name in ("whole", "parts")))
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize("stop", [3, 11, 16])
 @pytest.mark.parametrize("background", ["white", "random"])
 def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, background: str) -> None:
@@ -86,7 +73,7 @@ def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, backgrou
     config = small_config(background=background)
     fit(config, data, tmp_path / "whole")
     outcome = fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
-    assert (outcome.status, outcome.step, outcome.qualities) == ("interrupted", stop, {})
+    assert (outcome.status, outcome.step, outcome.metrics) == ("interrupted", stop, {})
     torch.manual_seed(stop)
     assert fit(config, data, tmp_path / "parts", resume=True).status == "finished"
     whole, parts = (state_of(tmp_path / name) for name in ("whole", "parts"))
@@ -106,7 +93,7 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     }  # fmt: skip
     first, *_, last = [line for line in read_metrics(run) if line["kind"] == "eval" and line["split"] == "test"]
     assert last["psnr"] > first["psnr"] > 12
-    assert outcome.qualities["test"].psnr == last["psnr"]
+    assert outcome.metrics["test"].psnr == last["psnr"]
     assert json.loads((run / "metrics.json").read_text())["splits"]["test"]["psnr"] == last["psnr"]
     assert TrainConfig.from_dict(json.loads((run / "config.json").read_text())).steps == 150
     loaded = load_model(run / "model.pt")
@@ -118,7 +105,7 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
 
 
 def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
-    from msdgs_train.evaluation.metrics import quality
+    from msdgs_train.evaluation.metrics import image_metrics
 
     trainer = Trainer(small_config(), load_scene(data))
     _steps(trainer, 24)
@@ -129,24 +116,24 @@ def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
         posed = model.pose(evaluated.frame.t)
         with torch.no_grad():
             rgb = trainer_module.rasterize(*posed, evaluated.frame.camera, torch.ones(3))[0]
-        assert quality(rgb, evaluated.target) == evaluated.quality
+        assert image_metrics(rgb, evaluated.target) == evaluated.metrics
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
     model = ModelConfig(sh_degree=0, layers=(), embedding_dim=0)
     assert fit(small_config(model=model), data, tmp_path / "run").status == "finished"
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_time_budget_stops_evaluates_and_saves(data: Path, tmp_path: Path) -> None:
     outcome = fit(small_config(max_minutes=1e-9), data, tmp_path / "run")
     assert (outcome.status, outcome.step) == ("out of time", 1)
-    assert set(outcome.qualities) == {"test", "val"}
+    assert set(outcome.metrics) == {"test", "val"}
     assert (tmp_path / "run" / "checkpoint.pt").exists()
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: Path) -> None:
     config, run = small_config(steps=2), tmp_path / "run"
     with pytest.raises(InvalidInput, match="with a checkpoint"):
@@ -229,7 +216,7 @@ def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
         monkeypatch.setattr(trainer_module, name, breaking(getattr(trainer_module, name)))
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize(("start", "back_to"), [(13, 10), (25, 20), (4, 0)])
 def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: int, back_to: int
@@ -251,7 +238,7 @@ def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     load_model(run / "model.pt")
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -304,8 +291,8 @@ def test_what_is_added_to_the_loss(data: Path, mcmc: bool) -> None:
         if mcmc:
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(trainer.model.plane_grids()) == 2
-        lesson = TrainingSample(trainer.frames[0], 0.3, "everything")
-        assert float(trainer._regularizers(posed, lesson, torch.Generator())) == pytest.approx(
+        sample = TrainingSample(trainer.frames[0], 0.3, "all")
+        assert float(trainer._regularizers(posed, sample, torch.Generator())) == pytest.approx(
             float(expected), rel=tolerance("float32.relative")
         )
 

@@ -37,11 +37,6 @@ from tests.support.training_scene import SIZE, small_config, write_scene
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture(scope="module")
 def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run whose best model is not its last one."""
     run = tmp_path_factory.mktemp("runs") / "run"
@@ -127,7 +122,7 @@ def test_without_val_the_best_is_chosen_on_test(tmp_path: Path, monkeypatch: pyt
     (data / "transforms_val.json").unlink()
     outcome = fit(small_config(steps=4, eval_every=2), data, tmp_path / "run")
     assert outcome.best is not None
-    assert (outcome.best.split, outcome.best.psnr >= outcome.qualities["test"].psnr) == ("test", True)
+    assert (outcome.best.split, outcome.best.psnr >= outcome.metrics["test"].psnr) == ("test", True)
 
 
 def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbour_distances
+from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbor_distances
 from msdgs_train.gaussians.model import MIN_SCALE, DynamicGaussians, ModelConfig, unit_quats
 from tests.support.models import random_model, small_config
 from tests.support.tolerances import assert_close
@@ -245,7 +245,7 @@ def test_random_start_fills_the_cube_and_repeats():
 
 @pytest.mark.parametrize("spread", ["uniform", "clustered", "plane", "line"])
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 300])
-def test_neighbour_distances_against_all_pairs(spread: str, count: int):
+def test_neighbor_distances_against_all_pairs(spread: str, count: int):
     generator = torch.Generator().manual_seed(count)
     points = torch.rand(count, 3, generator=generator)
     points = {
@@ -256,7 +256,7 @@ def test_neighbour_distances_against_all_pairs(spread: str, count: int):
     }[spread]
     pairs = (points[:, None] - points[None]).double().norm(dim=2).sort(dim=1).values
     want = pairs[:, 1 : min(count, 4)].mean(dim=1)
-    assert_close(neighbour_distances(points), want.float(), "neighbour_distances")
+    assert_close(neighbor_distances(points), want.float(), "neighbor_distances")
 
 
 def test_points_in_one_place_have_a_scale():
