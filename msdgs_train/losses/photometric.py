@@ -45,7 +45,10 @@ def pooled_l1(rgb: Tensor, target: Tensor) -> Tensor:
 
 
 def masked_l1(rgb: Tensor, target: Tensor, l1_weight: float) -> Tensor:
-    """λ L1 over the pixels in which two images, [H, W, 3], agree: no pixel at most two away differs by `CHANGE_THRESHOLD` or more."""
+    """λ L1 over the pixels in which two images, [H, W, 3], agree.
+
+    No pixel at most two away from them differs by `CHANGE_THRESHOLD` or more.
+    """
     check_pair(rgb, target)
     error = (rgb - target).abs()
     worst = max_pool2d(error.detach().mean(dim=2)[None], kernel_size=5, stride=1, padding=2)[0]

@@ -1,4 +1,4 @@
-"""Slow, obvious readings of the deformation in NumPy and float64: layers, chains, and linear blend skinning by nodes."""
+"""Slow, obvious readings of the deformation in NumPy and float64: layers, chains, and linear blend skinning."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -134,7 +134,7 @@ def plain_motion(node: np.ndarray, deltas: PlainDeltas, k: int) -> tuple[np.ndar
     """Matrix, offset and unit quaternion of node k: x → matrix x + offset."""
     quat = deltas.quats[k] + [1, 0, 0, 0]
     xx, yy, zz, xy, xz, yz = deltas.scales[k]
-    stretch = np.eye(3) + [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    stretch = np.array([[1 + xx, xy, xz], [xy, 1 + yy, yz], [xz, yz, 1 + zz]])
     matrix = rotation(quat).as_matrix() @ stretch
     return matrix, node + deltas.means[k] - matrix @ node, quat / np.linalg.norm(quat)
 

@@ -78,7 +78,7 @@ TABLE = (
     Row("network.float64", 1e-11, "matrix products in another order, five deep, through frequencies up to 512"),
     Row("share.relative", 1e-9, "alternating float64 sums, the terms up to 500 times the result"),
     Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
-    Row("neighbour_distances", 1e-6, "differences of float32 coordinates of size 5"),
+    Row("neighbor_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
     Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
     Row("grown_layers", 1e-12, "the same products in float64, with zeros between, in another order"),

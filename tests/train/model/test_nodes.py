@@ -1,4 +1,4 @@
-"""Control nodes: that they carry Gaussians as a slow linear blend skinning does, where they begin, and local rigidity."""
+"""Control nodes: against a slow linear blend skinning, where they begin, and local rigidity."""
 
 from dataclasses import replace
 from typing import Any
