@@ -136,10 +136,8 @@ def test_new_images_update_motion(scene: SceneData) -> None:
             window = 0.1 + 0.4 * (step - 200) / 400
             assert step >= 200
             outermost = max(d for f in scene.splits["train"] if (d := distance(scene, f.t)) <= window + 1e-9)
-            assert (
-                distance(scene, sample.frame.t)
-                >= min(outermost, max(window - NEW_FRAME_BORDER, MIN_NEW_FRAME_DISTANCE * window)) - 1e-9
-            )
+            border = max(window - NEW_FRAME_BORDER, MIN_NEW_FRAME_DISTANCE * window)
+            assert distance(scene, sample.frame.t) >= min(outermost, border) - 1e-9
 
 
 def test_a_single_time_leaves_no_window_empty(tmp_path: Path) -> None:
