@@ -125,7 +125,7 @@ def test_without_val_the_best_is_chosen_on_test(tmp_path: Path) -> None:
     (data / "transforms_val.json").unlink()
     outcome = fit(small_config(steps=4, eval_every=2), data, tmp_path / "run")
     assert outcome.best is not None
-    assert (outcome.best.split, outcome.best.psnr >= outcome.qualities["test"].psnr) == ("test", True)
+    assert (outcome.best.split, outcome.best.psnr >= outcome.metrics["test"].psnr) == ("test", True)
 
 
 @pytest.mark.usefixtures("no_curve")
