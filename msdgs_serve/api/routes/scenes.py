@@ -16,18 +16,17 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
 from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.numbers import Name
 from msdgs_serve.api.openapi import SCENE_BODY, problems
 from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList, SceneView
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.framing import Framing
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene_report import read_report, report_path
-from msdgs_serve.store import MAX_NAME_LENGTH, SceneStore
+from msdgs_serve.store import SceneStore
 
-SceneName = Annotated[str, Path(max_length=MAX_NAME_LENGTH, description="as in `GET /scenes`", examples=["toybench"])]
-NewName = Annotated[
-    str, Query(min_length=1, max_length=MAX_NAME_LENGTH, description="plain text, no separators", examples=["walk"])
-]
+SceneName = Annotated[Name, Path(description="as in `GET /scenes`", examples=["toybench"])]
+NewName = Annotated[Name, Query(description="plain text, no separators", examples=["walk"])]
 Sha256 = Annotated[str | None, Query(pattern="^[0-9a-f]{64}$", description="of the file; checked where it is given")]
 
 router = APIRouter(tags=["scenes"])

@@ -79,7 +79,7 @@ def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath
         raise InvalidInput("width", "given together with height", "one of them")
     size = None if body.width is None or body.height is None else (body.width, body.height)
     if body.path is not None:
-        path = read_nerfstudio(body.path, metadata.time_range, size)
+        path = read_nerfstudio(body.path.model_dump(exclude_none=True), metadata.time_range, size)
     else:
         width, height, given = body.width, body.height, body.frames or ()
         requests = [RenderRequest(camera=each.camera, t=each.t, width=width, height=height) for each in given]
