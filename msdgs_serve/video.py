@@ -50,30 +50,51 @@ def check_video(video_format: str) -> None:
         raise VideoUnavailable("films need PyAV: pip install 'msdgs[video]'") from None
 
 
-def write_video(frames: Iterable[np.ndarray], fps: float, video_format: VideoFormat, file: BinaryIO) -> int:
-    """Write sRGB frames, [H, W, 3] uint8 of one size, to a seekable file; returns how many there were.
+class FilmWriter:
+    """Encodes sRGB frames, [H, W, 3] uint8 of one size, one after the other into a file that needs no `seek`.
 
-    An odd row or column at the lower or right edge is left out: the codecs want even sizes.
+    An odd row or column at the lower or right edge is left out: the codecs want even sizes. Not safe to use from two
+    threads at once.
     """
-    import av
 
-    traits = VIDEO_FORMATS[video_format]
-    count = 0
-    with av.open(file, "w", format=video_format, options=FRAGMENTS[video_format]) as container:
-        stream = None
-        for pixels in frames:
-            height, width = (side - side % 2 for side in pixels.shape[:2])
-            if stream is None:
-                if min(height, width) < 2:
-                    raise InvalidInput("height" if height < width else "width", "at least 2 for a film", pixels.shape)
-                rate = Fraction(fps).limit_denominator(1001)
-                stream = cast(
-                    "VideoStream", container.add_stream(traits.codec, rate=rate, options=dict(traits.options))
-                )
-                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels[:height, :width]), format="rgb24")
-            container.mux(stream.encode(frame))
-            count += 1
-        if stream is not None:
-            container.mux(stream.encode())
+    def __init__(self, file: BinaryIO, fps: float, video_format: VideoFormat) -> None:
+        import av
+
+        self._traits = VIDEO_FORMATS[video_format]
+        self._rate = Fraction(fps).limit_denominator(1001)
+        self._container = av.open(file, "w", format=video_format, options=FRAGMENTS[video_format])
+        self._stream: VideoStream | None = None
+
+    def add(self, pixels: np.ndarray) -> None:
+        """Encode the next frame. The encoder holds back some, about which it may still decide."""
+        import av
+
+        height, width = (side - side % 2 for side in pixels.shape[:2])
+        if self._stream is None:
+            self._stream = self._begun(width, height)
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels[:height, :width]), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Write what is held back, and the end of the file."""
+        if self._stream is not None:
+            self._container.mux(self._stream.encode())
+        self._container.close()
+
+    def _begun(self, width: int, height: int) -> "VideoStream":
+        if min(height, width) < 2:
+            raise InvalidInput("height" if height < width else "width", "at least 2 for a film", min(height, width))
+        options = dict(self._traits.options)
+        stream = cast("VideoStream", self._container.add_stream(self._traits.codec, rate=self._rate, options=options))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        return stream
+
+
+def write_video(frames: Iterable[np.ndarray], fps: float, video_format: VideoFormat, file: BinaryIO) -> int:
+    """Write frames to a file; returns how many there were. See `FilmWriter`."""
+    writer, count = FilmWriter(file, fps, video_format), 0
+    for pixels in frames:
+        writer.add(pixels)
+        count += 1
+    writer.close()
     return count

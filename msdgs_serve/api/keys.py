@@ -15,6 +15,18 @@ from msdgs_serve.scene import InvalidInput
 OPEN_PATHS = ("/live", "/ready", "/")
 OPEN_FOLDER = "/viewer/"
 SHORTEST_KEY = 16
+CLIENT = "msdgs.client"
+"""Key of an ASGI scope: whose key was used."""
+
+
+def client_of(scope: Scope) -> str:
+    """Who calls, for what is shared out among clients: a key, or else an address."""
+    return scope.get(CLIENT) or address_of(scope.get("client"))
+
+
+def address_of(client: tuple[str, int] | None) -> str:
+    """Of a connection, or of whom a trusted proxy names."""
+    return client[0] if client else "unknown"
 
 
 class KeyCheck:

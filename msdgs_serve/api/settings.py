@@ -53,13 +53,15 @@ class Settings(BaseSettings):
     concurrent_renders: int = Field(
         default_factory=cores, ge=1, le=64, description="frames in work at once; others wait"
     )
-    queued_renders: int = Field(default=16, ge=0, le=10_000, description="frames that may wait; others get a 503")
+    queued_renders: int = Field(
+        default=32, ge=0, le=10_000, description="frames that may wait, of one client at most half; others get a 503"
+    )
     render_seconds: float = Field(default=30.0, gt=0, le=3600, description="time limit of a frame, waiting included")
     cache_megabytes: int = Field(default=256, ge=0, description="memory for Gaussians posed before")
     max_samples: int = Field(default=64, ge=1, description="most moments of a frame's motion blur")
     max_batch: int = Field(default=256, ge=1, le=1000, description="most frames of a batch, and times of a frame")
     max_video_frames: int = Field(default=300, ge=1, le=1000, description="most frames of a film")
-    max_video_pixels: int = Field(default=1 << 28, ge=1, description="largest width × height × frames of a film")
+    max_video_pixels: int = Field(default=1 << 30, ge=1, description="largest width × height × frames of a film")
     max_scene_megabytes: int = Field(default=1024, ge=1, description="largest scene file that is taken in")
     uploads: CliImplicitFlag[bool] = Field(
         default=False, description="let clients add and delete scenes, in the first folder given"

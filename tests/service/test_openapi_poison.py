@@ -25,7 +25,8 @@ WRITTEN = {HUGE: "1e999", DEEP: "[" * 400 + "]" * 400, DEEPER: "[" * 3000 + "]" 
 # fields that have a meaning only beside others
 PARTNERS: dict[str, dict[str, Any]] = {
     "dt": {"channels": ["motion"]}, "depth_range": {"channels": ["depth"]}, "quality": {"format": "jpeg"},
-    "distortion": {"fx": 16.0, "model": "fisheye"}, **dict.fromkeys(("fy", "cx", "cy", "axes", "model"), {"fx": 16.0}),
+    "distortion": {"fx": 16.0, "model": "fisheye"}, "fy": {"fx": 16.0}, "cx": {"fx": 16.0},
+    "cy": {"fx": 16.0}, "axes": {"fx": 16.0}, "model": {"fx": 16.0},
 }  # fmt: skip
 SIZE = {"width": 16, "height": 16}
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
@@ -96,7 +97,7 @@ def leaves(value: Any, at: Leaf = ()) -> Iterator[Leaf]:
 def replaced(value: Any, at: Leaf, new: Any) -> Any:
     if not at:
         return new
-    copy = dict(value) if isinstance(value, dict) else list(value)
+    copy: Any = dict(value) if isinstance(value, dict) else list(value)
     copy[at[0]] = replaced(value[at[0]], at[1:], new)
     return copy
 
