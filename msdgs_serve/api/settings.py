@@ -38,7 +38,12 @@ class Settings(BaseSettings):
     """
 
     model_config = SettingsConfigDict(
-        env_prefix="MSDGS_", cli_prog_name=PROGRAM, cli_kebab_case=True, cli_hide_none_type=True, extra="ignore"
+        env_prefix="MSDGS_",
+        cli_prog_name=PROGRAM,
+        cli_kebab_case=True,
+        cli_hide_none_type=True,
+        extra="ignore",
+        env_ignore_empty=True,
     )
 
     scenes: CliPositionalArg[list[Path]] = Field(
@@ -72,7 +77,12 @@ class Settings(BaseSettings):
     drain_seconds: float = Field(default=30.0, ge=0, description="how long a stopping service finishes what it has")
     watch_seconds: float = Field(default=1.0, gt=0, description="how often files are looked at for changes")
     frame_max_age: int = Field(default=0, ge=0, description="seconds that caches may keep a frame without asking")
-    api_keys_file: Path | None = Field(default=None, description="keys, one a line; without one no request is answered")
+    api_keys_file: Path | None = Field(
+        default=None, description="`scopes key` a line, of read, write, operate; without a key no request is answered"
+    )
+    proxies: str = Field(
+        default="127.0.0.1", description="addresses whose X-Forwarded-For is believed, joined by commas; or *"
+    )
     cors_origins: list[str] = Field(default=[], description="web pages that may call, as https://example.org; or *")
     compile: CliImplicitFlag[bool] = Field(
         default=False, description="store compiled kernels for this kind of processor and stop; needs no scene"
