@@ -68,6 +68,11 @@ class Settings(BaseSettings):
     max_video_frames: int = Field(default=300, ge=1, le=1000, description="most frames of a film")
     max_video_pixels: int = Field(default=1 << 30, ge=1, description="largest width × height × frames of a film")
     max_scene_megabytes: int = Field(default=1024, ge=1, description="largest scene file that is taken in")
+    max_scenes: int = Field(default=1000, ge=1, description="most scenes in the folder for uploads")
+    max_scenes_megabytes: int = Field(default=1 << 16, ge=1, description="most that they take together")
+    max_key_scenes: int = Field(default=100, ge=1, description="most scenes there of one key")
+    max_key_megabytes: int = Field(default=1 << 13, ge=1, description="most that they take together")
+    min_free_megabytes: int = Field(default=1024, ge=0, description="of the disk, what uploads leave free")
     uploads: CliImplicitFlag[bool] = Field(
         default=False, description="let clients add and delete scenes, in the first folder given"
     )

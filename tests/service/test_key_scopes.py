@@ -64,9 +64,7 @@ def test_every_call_of_the_document_says_which_scope_it_needs(client: httpx.Clie
     for path, calls in document["paths"].items():
         for method, call in calls.items():
             scope = scope_of(method.upper(), path)
-            assert list(call.get("security", ())) == (
-                [] if scope is None else [{"bearer": [scope]}, {"key": [scope]}]
-            )
+            assert list(call.get("security", ())) == ([] if scope is None else [{"bearer": [scope]}, {"key": [scope]}])
             assert scope is None or {"401", "403"} <= call["responses"].keys()
 
 
