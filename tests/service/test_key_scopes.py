@@ -7,6 +7,7 @@ import httpx
 import pytest
 
 from msdgs_serve.api.keys import SCOPES, read_keys, scope_of
+from msdgs_serve.api.settings import Settings
 from msdgs_serve.scene import InvalidInput
 from tests.scene_files import write_scene
 from tests.service import serving
@@ -99,3 +100,9 @@ def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
     for path in (tmp_path / "keys", tmp_path / "missing", tmp_path):
         with pytest.raises(InvalidInput, match="a text file"):
             read_keys(path)
+
+
+def test_a_variable_that_is_empty_is_as_if_it_were_not_there(monkeypatch: pytest.MonkeyPatch):
+    """A composition sets it whether or not there are keys."""
+    monkeypatch.setenv("MSDGS_API_KEYS_FILE", "")
+    assert Settings().api_keys_file is None
