@@ -137,6 +137,7 @@ def _numbers(value: Any, count: int, name: str) -> np.ndarray:
     good = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
     if not good or any(isinstance(each, bool) or not isinstance(each, int | float) for each in value):
         raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", "something else")
-    if not all(-LARGEST <= each <= LARGEST for each in value):
+    numbers: list[float] = list(value)
+    if not all(-LARGEST <= each <= LARGEST for each in numbers):
         raise InvalidInput(name, f"finite and at most {LARGEST:g}", "NaN, infinity or more")
-    return np.array(value, dtype=np.float64)
+    return np.array(numbers, dtype=np.float64)

@@ -7,11 +7,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from export.bake import Baked
-from export.graph import GraphBuilder
+from export.jobs.bake import Baked
+from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.model import SMALLEST_SCALE
+from msdgs_train.gaussians.model import MIN_SCALE
 
 
 def new_graph(baked: Baked) -> GraphBuilder:
@@ -52,12 +52,12 @@ def still(baked: Baked, plan: str) -> onnx.ModelProto:
 def activated(graph: GraphBuilder, pose: str) -> None:
     """All outputs of raw poses, [M, 10]: means, scales that may have come out negative, quaternions of any length."""
     graph.split(pose, ["means", "raw_scales", "raw_quats"], [3, 3, 4])
-    graph.node("Max", ["raw_scales", graph.constant("scales.min", np.array(SMALLEST_SCALE, np.float32))], "scales")
+    graph.node("Max", ["raw_scales", graph.constant("scales.min", np.array(MIN_SCALE, np.float32))], "scales")
     unit_quats(graph, "raw_quats")
 
 
 def unit_quats(graph: GraphBuilder, raw: str) -> None:
-    """The output `quats`: unit length; identity where the norm is under 1e-8, as `msdgs_train.model.unit_quats`.
+    """The output `quats`: unit length; identity where the norm is under 1e-8, as the trainer's `unit_quats`.
 
     Sums of squares and the identity are products with constants: of 106,500 rows in 1 ms, where ReduceL2 takes 7 and
     Where 3.

@@ -26,8 +26,8 @@ from msdgs_serve.imaging import Image
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 from msdgs_serve.watch import Watch
-from tests.scene_files import write_scene
-from tests.service import in_this_process, serving
+from tests.support.scene_files import write_scene
+from tests.support.service import in_this_process, serving
 
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
 FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}

@@ -9,9 +9,9 @@ import pytest
 from msdgs_serve.api.keys import SCOPES, read_keys, scope_of
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.scene import InvalidInput
-from tests.scene_files import write_scene
-from tests.service import serving
-from tests.test_api_poison import check_problem
+from tests.service.test_api_poison import check_problem
+from tests.support.scene_files import write_scene
+from tests.support.service import serving
 
 KEYS = {scope: f"{scope}-0123456789abcdef" for scope in SCOPES}
 FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}

@@ -14,9 +14,9 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.scene_files import write_scene
-from tests.service import serving
-from tests.test_api_poison import check_problem
+from tests.service.test_api_poison import check_problem
+from tests.support.scene_files import write_scene
+from tests.support.service import serving
 
 EVERY_DAY = 400
 ALLOWED = {501, 503, 504, 507}

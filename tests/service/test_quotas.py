@@ -11,9 +11,9 @@ import pytest
 
 from msdgs_serve.api import uploads
 from msdgs_serve.api.server import Server
-from tests.scene_files import write_scene
-from tests.service import in_this_process, serving
-from tests.test_api_poison import check_problem
+from tests.service.test_api_poison import check_problem
+from tests.support.scene_files import write_scene
+from tests.support.service import in_this_process, serving
 
 ONE, TWO = "one-0123456789abcdef", "two-0123456789abcdef"
 MIB = 1 << 20

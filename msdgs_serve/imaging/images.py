@@ -1,0 +1,69 @@
+"""A channel of an image as an image that people look at."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.imaging.formats import Channel
+from msdgs_serve.imaging.image import Image
+from msdgs_serve.scene import InvalidInput
+
+FARTHEST_GREY = 0.15
+"""Of the farthest depth, so that it differs from nothing at all, which is black."""
+
+
+class DepthRange(NamedTuple):
+    """The depths that are drawn white and darkest."""
+
+    near: float
+    far: float
+
+
+def display_image(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
+    """0 to 1, where it isn't beyond what can be shown: [H, W, 3], [H, W, 4] with straight alpha for transparent color,
+    or [H, W, 1] for all of one number.
+
+    Motion is black where nothing moves; the hue is its direction, and the brightest is the fastest of this very image.
+
+    Depth is lighter the nearer it is, over `depth_range` or, where None, over the depths of this very image.
+
+    These two are darker where the image is thin (alpha below 1), so that what is hardly seen in color is hardly seen
+    here.
+
+    Numbers of Gaussians are white where they are highest in this very image.
+    """
+    if channel == "rgb":
+        return image.as_shown()
+    if channel == "alpha":
+        return image.alpha[..., None]
+    if channel == "motion":
+        return _motion_colors(channel_of(image, "motion") * image.alpha[..., None])
+    if channel == "gaussians":
+        counts = channel_of(image, "gaussians")
+        return (counts / max(float(counts.max(initial=0.0)), 1.0))[..., None]
+    depth = channel_of(image, "depth")
+    near, far = depth_range or depths_of(depth)
+    seen = np.isfinite(depth)
+    place = np.clip((np.where(seen, depth, far) - near) / max(far - near, 1e-12), 0, 1)
+    return (np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0) * image.alpha)[..., None]
+
+
+def channel_of(image: Image, channel: Channel) -> np.ndarray:
+    """The numbers of a channel. Raises `InvalidInput` for one that the image was drawn without."""
+    values = getattr(image, channel)
+    if values is None:
+        raise InvalidInput("channels", f"without {channel}, which was not drawn", channel)
+    return values
+
+
+def _motion_colors(motion: np.ndarray) -> np.ndarray:
+    speed = np.hypot(motion[..., 0], motion[..., 1])
+    brightness = speed / max(float(speed.max(initial=0.0)), 1e-12)
+    angles = np.arctan2(motion[..., 1], motion[..., 0])[..., None] + np.radians([0, 240, 120])
+    return brightness[..., None] * (0.5 + 0.5 * np.cos(angles))
+
+
+def depths_of(depth: np.ndarray) -> DepthRange:
+    """The nearest and farthest depth of an image; 0 and 1 where there is nothing."""
+    seen = depth[np.isfinite(depth)]
+    return DepthRange(float(seen.min()), float(seen.max())) if seen.size else DepthRange(0.0, 1.0)

@@ -1,0 +1,87 @@
+"""Lens distortion by the Brown–Conrady model, as OpenCV, COLMAP and nerfstudio number it, and how it is taken out."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.scene import Camera
+
+FOLD_GRID = 33
+
+
+class Distortion(NamedTuple):
+    """Radial (`k`) and tangential (`p`) coefficients; they act on x / z and y / z in OpenCV camera axes."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def folds(self, camera: Camera) -> bool:
+        """Whether two places in the image of the pinhole `camera` would be the same place in its image.
+
+        No lens does so: the coefficients are wrong, or were fitted to less than the whole image.
+        """
+        x = (np.linspace(0, camera.width, FOLD_GRID) - camera.cx) / camera.fx
+        y = (np.linspace(0, camera.height, FOLD_GRID) - camera.cy) / camera.fy
+        with np.errstate(all="ignore"):
+            u, v = distorted(x[None, :], y[:, None], self)
+            u_y, u_x = np.gradient(u, y, x)
+            v_y, v_x = np.gradient(v, y, x)
+            return not bool(np.all(u_x * v_y - u_y * v_x > 0))
+
+
+def undistort(rgba: np.ndarray, camera: Camera, distortion: Distortion) -> np.ndarray:
+    """What the pinhole `camera` would have captured: uint8 [H, W, 4], straight alpha, like `rgba`.
+
+    `camera` has the intrinsics of the distorted image and its size, H×W. Pixels are interpolated bilinearly,
+    colors weighted by alpha. A place that the image doesn't show gets the nearest one on its edge.
+    """
+    result = np.empty_like(rgba)
+    _resample(np.ascontiguousarray(rgba), (camera.fx, camera.fy, camera.cx, camera.cy), distortion, result)
+    return result
+
+
+def distorted(x: Any, y: Any, distortion: Distortion) -> tuple[Any, Any]:
+    """Where the ray to (x, y, 1) meets the plane z = 1 after the lens; scalars or arrays."""
+    k1, k2, p1, p2, k3 = distortion
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return u, v
+
+
+_distorted = kernel(distorted)
+
+
+@kernel
+def _resample(source: np.ndarray, intrinsics: tuple, distortion: tuple, out: np.ndarray) -> None:
+    fx, fy, cx, cy = intrinsics
+    height, width, _ = source.shape
+    for row in range(height):
+        for column in range(width):
+            x, y = _distorted((column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, distortion)
+            x = min(max(fx * x + cx - 0.5, 0.0), width - 1.0)
+            y = min(max(fy * y + cy - 0.5, 0.0), height - 1.0)
+            left, top = int(x), int(y)
+            right, bottom = min(left + 1, width - 1), min(top + 1, height - 1)
+            across, down = x - left, y - top
+            a = (1 - across) * (1 - down) * source[top, left, 3]
+            b = across * (1 - down) * source[top, right, 3]
+            c = (1 - across) * down * source[bottom, left, 3]
+            d = across * down * source[bottom, right, 3]
+            alpha = a + b + c + d
+            out[row, column, 3] = int(alpha + 0.5)
+            for channel in range(3):
+                mean = 0.0
+                if alpha > 0:
+                    mean = (
+                        a * source[top, left, channel]
+                        + b * source[top, right, channel]
+                        + c * source[bottom, left, channel]
+                        + d * source[bottom, right, channel]
+                    ) / alpha
+                out[row, column, channel] = int(mean + 0.5)

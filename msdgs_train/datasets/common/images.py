@@ -1,0 +1,115 @@
+"""Images as 8-bit RGBA with straight alpha: reading, reducing and laying over a background."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import OpenImageIO as oiio
+
+EXTENSIONS = (".png", ".jpg", ".jpeg")
+
+
+class ImageUnreadable(Exception):
+    """A file is no image that can be used; the message says why."""
+
+
+class ImageSize(NamedTuple):
+    """In pixels."""
+
+    width: int
+    height: int
+
+    def __str__(self) -> str:
+        return f"{self.width}×{self.height}"
+
+    def has_shape_of(self, other: "ImageSize") -> bool:
+        """Whether one is the other in another size; copies are rounded to whole pixels, so 1 % may be missing."""
+        across, down = self.width * other.height, self.height * other.width
+        return min(*self, *other) > 0 and 100 * abs(across - down) <= down
+
+
+def read_size(path: Path) -> ImageSize:
+    """The size that an image's header states. Raises `ImageUnreadable`."""
+    reader = _open(path)
+    spec = reader.spec()
+    reader.close()
+    return ImageSize(spec.width, spec.height)
+
+
+def read_rgba(path: Path) -> np.ndarray:
+    """[H, W, 4] uint8, straight alpha; grey becomes RGB, and what has no alpha is opaque. Raises `ImageUnreadable`."""
+    reader = _open(path)
+    pixels = reader.read_image("uint8")
+    problem = reader.geterror()
+    reader.close()
+    if pixels is None:
+        raise ImageUnreadable(problem.splitlines()[0] if problem else "no pixels")
+    channels = pixels.shape[2]
+    rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+    rgba[..., :3] = pixels[..., :3] if channels >= 3 else pixels[..., :1]
+    if channels in (2, 4):
+        rgba[..., 3] = pixels[..., -1]
+    return rgba
+
+
+def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Reduce uint8 [H, W, 4] to [height, width, 4]: each new pixel is the mean over the area it covers.
+
+    Colors are weighted by alpha, so that what is behind transparent pixels does not bleed in; where nothing is
+    opaque, the color is black. For halves this is the exact 2×2 box.
+    """
+    if rgba.shape[:2] == (height, width):
+        return rgba
+    means = rgba.astype(np.float64)
+    means[..., :3] *= means[..., 3:]
+    means = _cell_means(_cell_means(means, height).swapaxes(0, 1), width).swapaxes(0, 1)
+    alpha = means[..., 3:]
+    means[..., :3] /= np.where(alpha > 0, alpha, 1)
+    return np.floor(means + 0.5).astype(np.uint8)
+
+
+def composite(rgba: np.ndarray, background: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """Lay uint8 [H, W, 4] with straight alpha over an RGB background in [0, 1]; returns float32 [H, W, 3]."""
+    scaled = rgba.astype(np.float32) * np.float32(1 / 255)
+    rgb, alpha = scaled[..., :3], scaled[..., 3:]
+    background = np.asarray(background, np.float32)
+    return background + alpha * (rgb - background)
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write uint8 [H, W, 3 or 4], sRGB, straight alpha. Equal pixels give equal files. Raises `OSError`."""
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, "uint8")
+    spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    writer = oiio.ImageOutput.create(str(path))
+    written = writer is not None and writer.open(str(path), spec) and writer.write_image(pixels) and writer.close()
+    if not written:
+        raise OSError(f"{path}: can't be written: {writer.geterror() if writer else oiio.geterror()}")
+
+
+def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
+    """[count, …] means over `count` equal cells of float64 [length, …]; cells may cut rows.
+
+    Differences of running sums, which cost the same whatever the size of a cell.
+    """
+    length = len(rows)
+    sums = np.zeros((length + 1, *rows.shape[1:]))
+    np.cumsum(rows, axis=0, out=sums[1:])
+    edges = np.arange(count + 1) * (length / count)
+    below = np.minimum(edges.astype(np.int64), length - 1)
+    cut = (edges - below).reshape(-1, *[1] * (rows.ndim - 1)) * rows[below]
+    return np.diff(sums[below] + cut, axis=0) * (count / length)
+
+
+def _open(path: Path) -> oiio.ImageInput:
+    straight = oiio.ImageSpec()
+    straight.attribute("oiio:UnassociatedAlpha", 1)
+    reader = oiio.ImageInput.open(str(path), straight)
+    if reader is None:
+        raise ImageUnreadable(oiio.geterror().splitlines()[0])
+    spec = reader.spec()
+    if spec.format.basetype not in (oiio.UINT8, oiio.UINT16) or spec.nchannels > 4:
+        reader.close()
+        raise ImageUnreadable(f"{spec.nchannels} channels of {spec.format}; 1 to 4 of 8 or 16 bits are understood")
+    return reader

@@ -1,0 +1,208 @@
+"""Splat files of each format, made small and by hand: what the importers' tests read."""
+
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import zstandard
+
+from msdgs_serve.scene.gaussians import Gaussians
+
+COUNT = 300
+"""More than one chunk of a compressed PLY."""
+
+
+def some_gaussians(count: int = COUNT, sh_degree: int = 1, seed: int = 0) -> Gaussians:
+    """In a cube of one unit, every value different."""
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(count, 4))
+    return Gaussians(
+        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+        (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        np.exp(rng.uniform(-4, -2, (count, 3))).astype(np.float32),
+        rng.uniform(0.05, 0.95, count).astype(np.float32),
+        (0.3 * rng.normal(size=(count, (sh_degree + 1) ** 2, 3))).astype(np.float32),
+    )
+
+
+def inria_columns(g: Gaussians) -> dict[str, np.ndarray]:
+    """The properties of INRIA's PLY by name, one loop at a time; no normals."""
+    columns: dict[str, np.ndarray] = {axis: g.means[:, i] for i, axis in enumerate("xyz")}
+    for channel in range(3):
+        columns[f"f_dc_{channel}"] = g.sh[:, 0, channel]
+        for k in range(1, g.sh.shape[1]):
+            columns[f"f_rest_{channel * (g.sh.shape[1] - 1) + k - 1}"] = g.sh[:, k, channel]
+    columns["opacity"] = np.log(g.opacities / (1 - g.opacities))
+    columns |= {f"scale_{i}": np.log(g.scales[:, i]) for i in range(3)}
+    return columns | {f"rot_{i}": g.quats[:, i] for i in range(4)}
+
+
+def ply_bytes(columns: dict[str, np.ndarray], form: str = "binary_little_endian", count: int | None = None) -> bytes:
+    """A PLY of float columns, in the order given; `count` is what its header says."""
+    rows = len(next(iter(columns.values())))
+    lines = ["ply", f"format {form} 1.0", f"element vertex {rows if count is None else count}"]
+    lines += [f"property float {name}" for name in columns] + ["end_header", ""]
+    table = np.stack(list(columns.values()), axis=1).astype("<f4")
+    if form == "ascii":
+        body = "\n".join(" ".join(repr(float(v)) for v in row) for row in table).encode() + b"\n"
+    else:
+        body = (table.astype(">f4") if form == "binary_big_endian" else table).tobytes()
+    return "\n".join(lines).encode() + body
+
+
+def compressed_ply_bytes(g: Gaussians) -> bytes:
+    """SuperSplat's: one chunk a 256 Gaussians, bytes of -4 to 4 for harmonics beyond degree 0."""
+    chunks, packed = [], []
+    colors = g.sh[:, 0] * 0.28209479177387814 + 0.5
+    for start in range(0, len(g), 256):
+        part = slice(start, start + 256)
+        ranges = [(a[part].min(0), a[part].max(0)) for a in (g.means, np.log(g.scales), colors)]
+        chunks.append(np.concatenate([np.concatenate(each) for each in ranges]))
+        for i in range(*part.indices(len(g))):
+            quat = g.quats[i]
+            largest = int(np.argmax(np.abs(quat)))
+            small = np.delete(quat * np.sign(quat[largest]), largest) / np.sqrt(2) + 0.5
+            rotation = largest
+            for value in small:
+                rotation = rotation << 10 | round(float(value) * 1023)
+            words = [_field(g.means[i], ranges[0], (11, 10, 11)), rotation]
+            words.append(_field(np.log(g.scales[i]), ranges[1], (11, 10, 11)))
+            words.append(_field(colors[i], ranges[2], (8, 8, 8)) << 8 | round(255 * float(g.opacities[i])))
+            packed.append(words)
+    ends = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
+    sizes = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
+    names = ends + sizes + [f"{end}_{axis}" for end in ("min", "max") for axis in "rgb"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
+    lines += [f"property float {name}" for name in names] + [f"element vertex {len(g)}"]
+    lines += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)  # a channel's come together
+    if rest.size:
+        lines += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
+    header = "\n".join([*lines, "end_header", ""]).encode()
+    body = np.array(chunks, "<f4").tobytes() + np.array(packed, "<u4").tobytes()
+    return header + body + ((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).tobytes()
+
+
+def _field(values: np.ndarray, ends: tuple[np.ndarray, np.ndarray], bits: tuple[int, ...]) -> int:
+    packed = 0
+    for value, low, high, size in zip(values, *ends, bits, strict=True):
+        part = 0.0 if high == low else (float(value) - float(low)) / (float(high) - float(low))
+        packed = packed << size | round(part * (2**size - 1))
+    return packed
+
+
+def splat_bytes(g: Gaussians) -> bytes:
+    """`.splat`, degree 0."""
+    body = b""
+    for i in range(len(g)):
+        rgb = (g.sh[i, 0] * 0.28209479177387814 + 0.5) * 255
+        color = np.append(rgb, 255 * g.opacities[i]).round().clip(0, 255).astype(np.uint8)
+        quat = (g.quats[i] * 128 + 128).round().clip(0, 255).astype(np.uint8)
+        body += struct.pack("<6f", *g.means[i], *g.scales[i]) + color.tobytes() + quat.tobytes()
+    return body
+
+
+def ksplat_bytes(g: Gaussians) -> bytes:
+    """`.ksplat` 0.1 of one section, degree 0, compression level 0: nothing but colors is rounded."""
+    header, section = bytearray(4096), bytearray(1024)
+    header[:2] = (0, 1)
+    struct.pack_into("<4I", header, 4, 1, 1, len(g), len(g))
+    struct.pack_into("<2I", section, 0, len(g), len(g))
+    body = b""
+    for i in range(len(g)):
+        rgb = (g.sh[i, 0] * 0.28209479177387814 + 0.5) * 255
+        color = np.append(rgb, 255 * g.opacities[i]).round().clip(0, 255).astype(np.uint8)
+        body += struct.pack("<10f", *g.means[i], *g.scales[i], *g.quats[i]) + color.tobytes()
+    struct.pack_into("<I", section, 28, len(body))
+    return bytes(header + section) + body
+
+
+def spz2_bytes(version3: bytes, quats: np.ndarray) -> bytes:
+    """Version 2 of an unpacked version 3 stream: bytes of x, y and z of rotations, whose axes are right, up, back."""
+    _, _, count, *rest = struct.unpack_from("<4sIIBBBB", version3)
+    xyz = quats[:, 1:] * np.where(quats[:, :1] < 0, -1, 1) * np.array([1, -1, -1])
+    rotations = np.round((xyz + 1) * 127.5).astype(np.uint8).tobytes()
+    header = struct.pack("<4sIIBBBB", b"NGSP", 2, count, *rest)
+    return header + version3[16 : 16 + 16 * count] + rotations + version3[16 + 20 * count :]
+
+
+def spz4_bytes(version3: bytes) -> bytes:
+    """Version 4 of an unpacked version 3 stream: the same parts, each in a zstd stream."""
+    _, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", version3)
+    sizes = [9 * count, count, 3 * count, 3 * count, 4 * count, 3 * ((degree + 1) ** 2 - 1) * count]
+    parts, at = [], 16
+    for size in sizes[: 6 if degree else 5]:
+        parts.append(version3[at : at + size])
+        at += size
+    packed = [zstandard.compress(part) for part in parts]
+    header = struct.pack("<4sIIBBBB", b"NGSP", 4, count, degree, bits, flags, len(parts)) + struct.pack("<I12x", 32)
+    table = b"".join(struct.pack("<QQ", len(small), len(part)) for small, part in zip(packed, parts, strict=True))
+    return header + table + b"".join(packed)
+
+
+def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
+    """A SOG folder: codebooks of evenly spread numbers. Harmonics beyond degree 0 are those of the first `palette`
+    Gaussians in turns, or each its own."""
+    folder.mkdir()
+    logs = np.sign(g.means) * np.log1p(np.abs(g.means))
+    mins, maxs = logs.min(0), logs.max(0)
+    fixed = np.round((logs - mins) / (maxs - mins) * 65535).astype(np.int64)
+    scales = np.linspace(-5, -1, 256)
+    colors = np.linspace(-2, 2, 256)
+    largest = np.abs(g.quats).argmax(axis=1)
+    small = np.array([np.delete(q * np.sign(q[k]), k) for q, k in zip(g.quats, largest, strict=True)])
+    textures = {
+        "means_l.webp": fixed & 255,
+        "means_u.webp": fixed >> 8,
+        "scales.webp": np.round((np.log(g.scales) + 5) / 4 * 255),
+        "quats.webp": np.column_stack([np.round((small * np.sqrt(2) + 1) / 2 * 255), 252 + largest]),
+        "sh0.webp": np.column_stack([np.round((g.sh[:, 0] + 2) / 4 * 255), np.round(255 * g.opacities)]),
+    }
+    for name, values in textures.items():
+        _write_webp(folder / name, values)
+    meta = {
+        "version": 2,
+        "count": len(g),
+        "means": {"mins": mins.tolist(), "maxs": maxs.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
+    }
+    if g.sh.shape[1] > 1:
+        entries, files = palette or len(g), ["shN_centroids.webp", "shN_labels.webp"]
+        labels, wide = np.arange(len(g)) % entries, 64 * (g.sh.shape[1] - 1)  # 64 entries side by side
+        _write_webp(folder / files[0], np.round((g.sh[:entries, 1:].reshape(-1, 3) + 2) / 4 * 255), wide)
+        _write_webp(folder / files[1], np.column_stack([labels & 255, labels >> 8]))
+        bands = int(np.sqrt(g.sh.shape[1])) - 1
+        meta["shN"] = {"bands": bands, "count": entries, "codebook": colors.tolist(), "files": files}
+    (folder / "meta.json").write_text(json.dumps(meta))
+    return folder
+
+
+def zipped(folder: Path) -> bytes:
+    """The files of a folder."""
+    contents = io.BytesIO()
+    with zipfile.ZipFile(contents, "w") as archive:
+        for file in sorted(folder.iterdir()):
+            archive.write(file, file.name)
+    return contents.getvalue()
+
+
+def _write_webp(file: Path, values: np.ndarray, width: int | None = None) -> None:
+    """Lossless, a row of values a pixel; square where no width is given."""
+    width = width or int(np.ceil(np.sqrt(len(values))))
+    height = -(-len(values) // width)
+    pixels = np.full((height * width, 4), 255, np.uint8)
+    pixels[: len(values), : values.shape[1]] = values.clip(0, 255)
+    spec = oiio.ImageSpec(width, height, 4, oiio.UINT8)
+    spec.attribute("compression", "lossless:100")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    writer = oiio.ImageOutput.create(str(file))
+    assert writer is not None
+    assert writer.open(str(file), spec), writer.geterror()
+    assert writer.write_image(pixels.reshape(height, width, 4))
+    writer.close()

@@ -1,0 +1,150 @@
+"""Every numeric tolerance of the tests: one row a quantity, with the reason for its size.
+
+A test says `assert_close(got, want, "rotation")` or `tolerance("rgb.float32")`; it never writes a number of its own.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Row(NamedTuple):
+    """`value` is an absolute bound unless the name ends in `.relative`, or in `_db`, which is a lower bound."""
+
+    name: str
+    value: float
+    reason: str
+
+
+TABLE = (
+    # scene vocabulary, float64
+    Row("rotation", 1e-12, "a few dozen float64 operations on numbers of size 1"),
+    Row("sh_basis", 1e-12, "polynomials of degree 3 in float64; published constants carry 16 digits"),
+    Row("sh_basis.float32", 2e-6, "the same in float32"),
+    Row("sh_basis.gsplat", 1e-12, "as sh_basis; gsplat keeps some constants to 14 digits"),
+    Row("float32.relative", 1e-6, "a handful of float32 operations"),
+    Row("pixel", 1e-9, "projecting a known point through float64 matrices, in pixels"),
+    # 16 numbers at once
+    Row("lanes.float32", 3e-5, "some roundings of numbers and sums up to 100; NumPy rounds products first"),
+    Row("lanes.float64", 2e-14, "as in float32"),
+    Row("exp2.float32", 4e-7, "the polynomial's own 2e-7, and some roundings of float32"),
+    Row("exp2.float64", 2e-15, "some roundings of float64"),
+    Row("log2.float32", 8e-6, "a rounding of 100"),
+    Row("log2.float64", 3e-14, "a rounding of 100, and a series of 11 terms"),
+    # rasterizer against the float64 oracle, pixels where no decision is in doubt; colors are of size 1
+    Row("rgb.float32", 5e-6, "hundreds of blended splats, each alpha off by a few 1e-6 from the rounding of sigma"),
+    Row("alpha.float32", 5e-6, "as rgb"),
+    Row("depth.float32.relative", 3e-5, "a quotient of two such sums, both small at the faint edge of a splat"),
+    Row("rgb.float32_8192", 5e-4, "a mean near pixel 8192 is rounded to 2e-4 px in float32; slopes are up to 1 / px"),
+    Row("alpha.float32_8192", 5e-4, "as rgb"),
+    Row("depth.float32_8192.relative", 3e-5, "as in smaller images: a splat's depth doesn't depend on its place"),
+    Row("avx512_renderer_db", 70, "the hand-written one takes some decisions at thresholds the other way"),
+    Row("rgb.float64", 1e-10, "the same in float64, sigma of needles loses six digits"),
+    Row("alpha.float64", 1e-10, "as rgb"),
+    Row("depth.float64.relative", 1e-10, "as rgb"),
+    # projected splats against gsplat's reference, run in float64
+    Row("projection.float32.relative", 1e-6, "stored as float32 after float64 arithmetic; relative to the image"),
+    Row("projection.float64.relative", 1e-12, "the same formulas, a few dozen roundings"),
+    Row("conic.float32.relative", 3e-6, "products of two entries of a root that is stored as float32"),
+    Row("conic.float64.relative", 1e-9, "gsplat's determinant, a difference of products, loses 7 digits for needles"),
+    Row("projection.gsplat_fisheye", 1e-5, "pixels; gsplat adds 1e-7 to the distance from the axis"),
+    Row("conic.finite_differences", 1e-7, "central differences with a step of 1e-6: 1e-13 / 1e-6"),
+    Row("color.float32", 2e-6, "16 products of size 1, stored as float32"),
+    Row("color.float64", 1e-12, "the same in float64"),
+    # gradients, relative to the largest entry of their kind
+    Row(
+        "gradient.finite_differences",
+        1e-6,
+        "central differences with a step of 1e-6: 1e-10 / 1e-3 of the largest entry",
+    ),
+    Row("gradient.autograd", 1e-9, "the same derivative in another order of operations, float64"),
+    Row("gradient.float32", 1e-4, "sums over thousands of pixels of terms of both signs, each off by some 1e-6"),
+    Row("gradient.second_order", 1e-5, "what a linear step of 2e-4 leaves out: its square times curvatures up to 100"),
+    Row("oracle_db", 70.0, "whole image, threshold pixels included: one step in 1 of 5,000 at every pixel"),
+    Row("motion_vector", 2e-3, "pixels; a displacement of 30, stored and blended in float32, over a sum of weights"),
+    Row("hammer.growth", 64e6, "bytes that 16 threads keep; a frame lost each time would be gigabytes"),
+    Row("kernel_coverage", 95.0, "per cent of the kernels' lines; what is left needs the compiler"),
+    # losses
+    Row("ssim.float32", 1e-5, "variances are differences of blurred squares; torch blurs in another order"),
+    Row("ssim.float64", 1e-12, "as ssim.float32"),
+    Row("psnr.relative", 1e-6, "torchmetrics adds in float32"),
+    Row("flip.relative", 1e-5, "the same program; in the rendering it is given, the last bits may differ"),
+    Row("loss_gradient", 1e-7, "central differences with steps of 1e-7 and 1e-6 of a loss of size 1"),
+    # the deformation network
+    Row("motion_gradient", 1e-8, "central differences with a step of 1e-5: 1e-16 / 1e-5, and the third derivative"),
+    Row("encoding.float64", 1e-12, "sines of phases up to 1024, each rounded once"),
+    Row("encoding.float32", 1e-5, "phases are exact products; what is left is the sine's own rounding"),
+    Row("network.float64", 1e-11, "matrix products in another order, five deep, through frequencies up to 512"),
+    Row("share.relative", 1e-9, "alternating float64 sums, the terms up to 500 times the result"),
+    Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
+    Row("neighbour_distances", 1e-6, "differences of float32 coordinates of size 5"),
+    Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
+    Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
+    Row("grown_layers", 1e-12, "the same products in float64, with zeros between, in another order"),
+    Row("fitted_beside_others", 1e-6, "float32 positions of size 1; how products round depends on how many there are"),
+    Row("between_samples.factor", 2.0, "times a promise made at samples: between them a cubic is off by as much again"),
+    Row("int8.relative", 0.2, "of the largest motion; 8 bits are 0.4 % of a range, and layers multiply it"),
+    Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),
+    Row("cubic_between", 1e-5, "fourth derivative 1,296 · h⁴ · 3/128 with h = 1/64, more at the ends"),
+    Row("spline_fit", 1e-9, "a pseudo-inverse of a well-conditioned band of up to 129 rows, float64"),
+    Row("browser_camera", 1e-5, "entries of a pose near 4; through orbit controls and messages of a page in float32"),
+    Row("served_frame", 1e-3, "of a float pixel; onnxruntime's exponentials and products are not torch's to the bit"),
+    # stability: made cases, docs/stability.md
+    Row(
+        "stability.accepted_db", 50.0, "what the export promises by default; a model let through must keep it anywhere"
+    ),
+    Row(
+        "stability.foretold",
+        2.0,
+        "a first-order bound, each layer's error measured once; roundings of the sum of deltas come on top",
+    ),
+    Row("stability.spectral_norm.relative", 1e-12, "a root of a cubic in float64, of matrices whose entries are alike"),
+    Row("stability.none", 0.0, "a count of what must not be there"),
+    Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
+    Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
+    Row("export.float32_db", 90.0, "worst frame, float32 against float64: at a few pixels a splat is at its cut-off"),
+    Row("trim.other_times_db", 2.0, "a quarter more error at times that trimming has not looked at"),
+    # files of other programs
+    Row("splat_values", 3e-6, "float32 logarithms and logits of size 10, back through exp"),
+    Row("splat_file_db", 60.0, "stored as float32: what is called lossless"),
+    Row("quantised_splat_file_db", 45.0, "bytes of color and opacity, 8 to 16 bits of everything else: lossy"),
+    Row("stored_frame", 1e-4, "16 bits over a motion of half the scene, relative to the scene"),
+    Row("spz_position", 3e-4, "scene units; 12 fractional bits"),
+    Row("spz_rotation", 2e-2, "entries of a matrix; 10 bits a component of one file, 10 of the other"),
+    Row("damaged_file.seconds", 20.0, "small files take milliseconds; a busy machine may halt a test for seconds"),
+    Row("damaged_file.megabytes", 8.0, "beside twice the sound file's: what the allocator keeps from call to call"),
+    Row("import.network", 1e-5, "a network of 8 layers in float32, its sums in another order"),
+    Row("import.mean_over_time", 2e-3, "a mean over 41 times against one over 401 of what bends at 12 nodes of time"),
+    Row("visionary.relative", 2e-5, "products of float32 rotations and scales, relative to the largest covariance"),
+    # datasets
+    Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
+    Row("composite_of_8bit", 1.001 / 255, "half a step of color and half a step of alpha, each rounded once"),
+    Row("video_color", 4.0, "of 255, even colors: YCbCr has 219 steps for 255, and is rounded on both ways"),
+    Row("video_picture.mean", 1.0, "of 255, waves: as video_color, on average; FFmpeg's fast way is 1.4 to 2 off"),
+    Row("ray_hit", 1e-3, "scene units; a ray stops 2e-4 before a surface, earlier in a bent one or along a wall"),
+    Row("material_point", 1e-6, "scene units; trajectories are written with 7 digits"),
+    Row("picture_offset", 0.1, "pixels; estimated from colors at 96×96, where half a pixel would be a wrong centre"),
+    Row("dot_centroid", 0.05, "pixels; a dot of 2 pixels in 8 bits, stretched unevenly over its width by the lens"),
+    Row(
+        "silent_places",
+        0.02,
+        "part of the places at which a new layer can't learn; 0.4 % for the smallest layer tested",
+    ),
+)
+
+_ROWS = {row.name: row for row in TABLE}
+assert len(_ROWS) == len(TABLE), "a quantity has two rows"
+
+
+def tolerance(name: str) -> float:
+    """The bound of one row of the table."""
+    return _ROWS[name].value
+
+
+def assert_close(got: object, want: object, name: str) -> None:
+    """Shapes agree and no element is further off than the row allows."""
+    got, want = np.asarray(got), np.asarray(want)
+    assert got.shape == want.shape, f"{got.shape} instead of {want.shape}"
+    relative = name.endswith(".relative")
+    rtol, atol = (tolerance(name), 0.0) if relative else (0.0, tolerance(name))
+    np.testing.assert_allclose(got, want, rtol=rtol, atol=atol)
