@@ -22,7 +22,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.engine.files import replacing
+from msdgs_train.files import replacing
 
 LOSSLESS, LOSSY = 60.0, 45.0
 """dB that what was written must have by default."""

@@ -20,7 +20,7 @@ from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMeta
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
-from msdgs_train.engine.files import replacing
+from msdgs_train.files import replacing
 
 WITHIN = (0.01, 0.99)
 """Parts of the Gaussians below and above which, along each axis, their centres may lie outside of the bounds: strays of

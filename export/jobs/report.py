@@ -12,7 +12,7 @@ from export.jobs.points import DEFAULT_RASTERIZER, front
 from export.jobs.sweep import SweepResult
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
-from msdgs_train.engine.files import replacing, write_text
+from msdgs_train.files import replacing, write_text
 
 FORMAT = "msdgs-report/1"
 COLUMNS = ("", "plan", "trimmed to", "SH", "rasterizer", "moving", "still", "ms", "median", "deform", "draw", "MB",

@@ -13,7 +13,7 @@ from onnx import helper
 from export.measure.verify import TIMES, TOLERANCE, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
-from msdgs_train.engine.files import replacing
+from msdgs_train.files import replacing
 from msdgs_train.gaussians.model import DynamicGaussians
 
 PLAN = "network"

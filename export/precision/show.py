@@ -10,7 +10,7 @@ from rich.table import Column, Table
 
 from export.measure.amplification import UNIT_ROUNDOFF
 from export.precision.report import StabilityReport
-from msdgs_train.engine.files import replacing, write_text
+from msdgs_train.files import replacing, write_text
 from msdgs_train.evaluation.metrics import MAX_PSNR
 
 
