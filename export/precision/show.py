@@ -10,8 +10,8 @@ from rich.table import Column, Table
 
 from export.measure.amplification import UNIT_ROUNDOFF
 from export.precision.report import StabilityReport
-from msdgs_train.files import replacing, write_text
 from msdgs_train.evaluation.metrics import MAX_PSNR
+from msdgs_train.files import replacing, write_text
 
 
 def print_report(report: StabilityReport, console: Console) -> None:
