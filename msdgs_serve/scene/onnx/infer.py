@@ -46,7 +46,7 @@ def infer(
         except ShapeInvalid as error:
             raise ModelInvalid(node.name, f"({node.operator}) {error}") from None
         varies = any(operand.varies for operand in operands)
-        element = operator.result or operands[operator.result_of].element
+        element = _element(node, operator, operands)
         for name, shape in zip(node.outputs, result.shapes, strict=True):
             if not name or name in values:
                 raise ModelInvalid(node.name, f"writes `{name}`, which is there already or has no name")
@@ -77,6 +77,12 @@ def _operands(node: Node, operator: Operator, values: Mapping[str, Value]) -> li
             raise ModelInvalid(node.name, f"({node.operator}) reads `{name}`, which must be a constant of the file")
         found.append(value)
     return found
+
+
+def _element(node: Node, operator: Operator, operands: list[Value]) -> int:
+    if operator.result is None:
+        return operands[operator.like].element
+    return node.attributes[operator.result] if isinstance(operator.result, str) else operator.result
 
 
 def _check_attributes(node: Node, operator: Operator) -> None:

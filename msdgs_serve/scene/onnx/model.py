@@ -173,8 +173,10 @@ def _dimension(fields: dict[str, Any]) -> int | str:
 def _by_name(parts: list[Any], what: str) -> dict[str, Any]:
     named: dict[str, Any] = {}
     for part in parts:
-        if not part.name or part.name in named:
-            raise ModelInvalid(part.name or "file", f"names more than one {what}" if part.name else f"has a nameless {what}")
+        if not part.name:
+            raise _invalid(f"it has a nameless {what}")
+        if part.name in named:
+            raise ModelInvalid(part.name, f"names more than one {what}")
         named[part.name] = part
     return named
 

@@ -26,15 +26,15 @@ class Operand:
 
 @dataclass(frozen=True)
 class Operator:
-    """A row of the table. The result is of the first input's element type unless `result` names another, or
-    `result_of` the input whose it is."""
+    """A row of the table. Results are of the first input's element type, unless `result` is another, or the attribute
+    that says it; `like` is the input whose type they have otherwise."""
 
     operands: tuple[Operand, ...]
     rule: Callable[[Call], Result] = rules.elementwise
     attributes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # and the values that each may have
     needed: tuple[str, ...] = ()  # attributes that may not be missing
-    result: int | None = None
-    result_of: int = 0
+    result: int | str | None = None
+    like: int = 0
     repeated: bool = False  # whether the last operand may come several times
     work: int = 1  # operations for each element of the result
 
@@ -54,7 +54,9 @@ def _function(work: int = FUNCTION) -> Operator:
 
 OPERATORS: Mapping[str, Operator] = {
     "Add": Operator((_NUMBER, _NUMBER)),
-    "Cast": Operator((Operand((FLOAT, UINT8, INT16, INT64, BOOL)),), rules.alike, {"to": (FLOAT, INT64)}, ("to",)),
+    "Cast": Operator(
+        (Operand((FLOAT, UINT8, INT16, INT64, BOOL)),), rules.alike, {"to": (FLOAT, INT64)}, ("to",), "to"
+    ),
     "Clip": Operator((_FLOAT, _FLOAT, _FLOAT), rules.clip),
     "Concat": Operator((_FLOAT,), rules.concat, _AXIS, ("axis",), repeated=True),
     "Cos": _function(),
@@ -82,9 +84,7 @@ OPERATORS: Mapping[str, Operator] = {
     "Min": Operator((_FLOAT, _FLOAT)),
     "Mul": Operator((_NUMBER, _NUMBER)),
     "Pow": Operator((_FLOAT, _FLOAT), work=FUNCTION),
-    "QuantizeLinear": Operator(
-        (_FLOAT, _FACTOR, Operand((UINT8, INT8), constant=True)), rules.quantize, _AXIS, result_of=2
-    ),
+    "QuantizeLinear": Operator((_FLOAT, _FACTOR, Operand((UINT8, INT8), constant=True)), rules.quantize, _AXIS, like=2),
     "ReduceProd": Operator((_FLOAT, _LENGTHS), rules.reduce, {"keepdims": (0, 1)}),
     "Relu": _function(1),
     "Reshape": Operator((_NUMBER, _LENGTHS), rules.reshape),
@@ -96,5 +96,5 @@ OPERATORS: Mapping[str, Operator] = {
     "Squeeze": Operator((_FLOAT, _LENGTHS), rules.squeeze),
     "Sub": Operator((_FLOAT, _FLOAT)),
     "Unsqueeze": Operator((Operand((FLOAT, BOOL)), _LENGTHS), rules.unsqueeze),
-    "Where": Operator((Operand((BOOL,)), _FLOAT, _FLOAT), result_of=1),
+    "Where": Operator((Operand((BOOL,)), _FLOAT, _FLOAT), like=1),
 }

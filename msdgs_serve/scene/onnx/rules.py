@@ -58,8 +58,8 @@ def alike(call: Call) -> Result:
 
 def clip(call: Call) -> Result:
     """Limits are single numbers."""
-    if call.shapes[1] or call.shapes[2]:
-        raise ShapeInvalid(f"clips to limits of shapes {text(call.shapes[1])} and {text(call.shapes[2])}, not []")
+    if not {call.shapes[1], call.shapes[2]} <= {(), (ONE,)}:
+        raise ShapeInvalid(f"clips to limits of shapes {text(call.shapes[1])} and {text(call.shapes[2])}, not [1]")
     return alike(call)
 
 
@@ -84,7 +84,7 @@ def scatter(call: Call) -> Result:
     rows = call.constant(1)
     if len(indices) != 2 or indices[1] != ONE or not data or updates != (indices[0], *data[1:]) or data[0].per_id:
         raise ShapeInvalid(f"replaces rows {text(indices)} of {text(data)} by {text(updates)}")
-    if rows.size and not (0 <= rows.min() and rows.max() < data[0].fixed):
+    if rows.size and not (rows.min() >= 0 and rows.max() < data[0].fixed):
         raise ShapeInvalid(f"replaces rows {rows.min()} to {rows.max()} of {data[0]}")
     return Result([data])
 

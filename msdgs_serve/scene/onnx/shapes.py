@@ -1,4 +1,4 @@
-"""Shapes that are known before a graph runs: each dimension is a fixed number, or some for each id that is asked for."""
+"""Shapes that are known before a graph runs: each dimension is a fixed number, or some for each id asked for."""
 
 import math
 from collections.abc import Iterable, Sequence

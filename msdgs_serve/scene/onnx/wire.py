@@ -53,7 +53,7 @@ Schema = Mapping[int, Field]
 def read_message(message: memoryview, schema: Schema, what: str) -> dict[str, Any]:
     """Values by name of field: lists of those that may be repeated, single values of those that are present.
 
-    Nothing is copied: bytes are parts of `message`. Raises `ModelInvalid` about `file`, `what` being the message's name.
+    Nothing is copied: bytes are parts of `message`, whose name is `what`. Raises `ModelInvalid` about `file`.
     """
     values: dict[str, Any] = {field.name: [] for field in schema.values() if field.most > 1}
     position, counts = 0, dict[int, int]()
@@ -92,7 +92,7 @@ def _value(message: memoryview, position: int, wire_type: int, field: Field, wha
     else:
         raise _invalid(f"{what} has a field of wire type {wire_type}, which is unknown")
     if length > len(message) - position:
-        raise _invalid("is cut off")
+        raise _invalid("it is cut off")
     part = message[position : position + length]
     if field.kind in (Kind.NAME, Kind.TEXT):
         return _text(part, field, what), position + length
@@ -121,15 +121,15 @@ def _varint(message: memoryview, position: int) -> tuple[int, int]:
     result = 0
     for shift in range(0, 70, 7):
         if position >= len(message):
-            raise _invalid("is cut off")
+            raise _invalid("it is cut off")
         byte = message[position]
         position += 1
         result |= (byte & 0x7F) << shift
         if byte < 0x80:
             if (byte == 0 and shift) or result >= 1 << 64:
-                raise _invalid("has a number that is written in more bytes than it needs")
+                raise _invalid("it has a number that is written in more bytes than it needs")
             return result, position
-    raise _invalid("has a number of more than 64 bits")
+    raise _invalid("it has a number of more than 64 bits")
 
 
 def _invalid(problem: str) -> ModelInvalid:

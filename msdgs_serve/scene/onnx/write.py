@@ -13,7 +13,9 @@ _VARINT, _LENGTH = 0, 2
 Parts = list[bytes | memoryview]
 
 
-def write_model(model: Model, outputs: Sequence[str], inputs: Mapping[str, Value], values: Mapping[str, Value]) -> bytes:
+def write_model(
+    model: Model, outputs: Sequence[str], inputs: Mapping[str, Value], values: Mapping[str, Value]
+) -> bytes:
     """The graph that computes `outputs` from `inputs`, none of which has a default. Large constants are copied once."""
     nodes, names = _needed(model, outputs)
     graph = _Message()
