@@ -16,7 +16,7 @@ from msdgs_serve.scene.scene_file import CHUNK, SceneFile, read_scene_file
 from msdgs_serve.threads import run_parallel, sharing_cores, thread_count
 
 _SIZES = {"means": 3, "quats": 4, "scales": 3}
-_MAX_MESSAGE = 300
+_MAX_DETAILS = 500
 
 
 class DeformationSession:
@@ -179,4 +179,4 @@ class DeformationSession:
         return [np.asarray(array) for array in arrays]
 
     def _refused(self, what: str, error: Exception) -> SceneFileInvalid:
-        return SceneFileInvalid(self._file, "file", f"{what} by onnxruntime: {str(error)[:_MAX_MESSAGE]}")
+        return SceneFileInvalid(self._file, "file", f"{what} by onnxruntime", str(error)[:_MAX_DETAILS])

@@ -15,6 +15,8 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.threads import thread_count
 
 PROGRAM = "msdgs-serve"
@@ -61,6 +63,15 @@ class Settings(BaseSettings):
     max_video_frames: int = Field(default=300, ge=1, le=1000, description="most frames of a film")
     max_video_pixels: int = Field(default=1 << 28, ge=1, description="largest width × height × frames of a film")
     max_scene_megabytes: int = Field(default=1024, ge=1, description="largest scene file that is taken in")
+    max_scene_memory_megabytes: int = Field(
+        default=2048, ge=1, description="most memory for the values of one call of a scene's graph"
+    )
+    max_scene_operations: float = Field(
+        default=1e13, gt=0, description="most operations of a scene's graph for one frame"
+    )
+    trial_seconds: float = Field(
+        default=60.0, gt=0, le=3600, description="time limit for opening and posing an uploaded scene once"
+    )
     uploads: CliImplicitFlag[bool] = Field(
         default=False, description="let clients add and delete scenes, in the first folder given"
     )
@@ -82,6 +93,15 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="warning", description="`info` logs every request"
     )
+
+    @property
+    def graph_limits(self) -> GraphLimits:
+        """What the graph of a scene may take."""
+        return GraphLimits(self.max_scene_memory_megabytes << 20, self.max_scene_operations)
+
+    def open_scene(self, path: Path) -> DeformationSession:
+        """A scene file within these limits. Raises `SceneFileInvalid`."""
+        return DeformationSession(path, limits=self.graph_limits)
 
     @classmethod
     def settings_customise_sources(

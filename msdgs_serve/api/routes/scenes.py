@@ -17,12 +17,24 @@ from starlette.requests import ClientDisconnect
 
 from msdgs_serve.api.errors import ClientGone, Refused
 from msdgs_serve.api.openapi import SCENE_BODY, problems
-from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList, SceneView
+from msdgs_serve.api.schemas import (
+    GaussianCounts,
+    GraphCost,
+    GraphLimit,
+    SceneAdded,
+    SceneDetail,
+    SceneEntry,
+    SceneList,
+    SceneView,
+)
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.framing import Framing
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.scene.scene_file import SceneCost
 from msdgs_serve.scene_report import read_report, report_path
-from msdgs_serve.store import MAX_NAME_LENGTH, SceneStore
+from msdgs_serve.store import MAX_NAME_LENGTH, SceneStatus, SceneStore
+
+MAX_REASON = 300
 
 SceneName = Annotated[str, Path(max_length=MAX_NAME_LENGTH, description="as in `GET /scenes`", examples=["toybench"])]
 NewName = Annotated[
@@ -37,9 +49,7 @@ router = APIRouter(tags=["scenes"])
 def list_scenes(service: SharedService) -> SceneList:
     """Names, without loading anything."""
     statuses = service.store.statuses()
-    return SceneList(
-        scenes=[SceneEntry(name=each.name, loaded=each.loaded, problem=each.problem is not None) for each in statuses]
-    )
+    return SceneList(scenes=[SceneEntry(name=each.name, loaded=each.loaded, **_problem(each)) for each in statuses])
 
 
 @router.get(
@@ -89,18 +99,18 @@ async def add_scene(
     replace: Annotated[bool, Query(description="whether a scene of this name may be replaced")] = False,
     sha256: Sha256 = None,
 ) -> SceneAdded:
-    """Takes a scene file as the body. It is opened and checked before it takes its place; who draws the scene that it
-    replaces is not disturbed. Only where the service was started with `--uploads`."""
+    """Takes a scene file as the body. It is checked, and posed in a process of its own, before it takes its place; who draws
+    the scene that it replaces is not disturbed. Only where the service was started with `--uploads`."""
     service.check_uploads()
     incoming = service.store.incoming(uuid.uuid4().hex)
     try:
         digest = await _receive(request, incoming, service)
         if sha256 is not None and not hmac.compare_digest(digest, sha256):
             raise InvalidInput("sha256", "that of the file", "another")
-        added = await anyio.to_thread.run_sync(lambda: service.store.add(name, incoming, replace=replace))
+        added = await anyio.to_thread.run_sync(lambda: service.add_scene(name, incoming, replace=replace))
     except SceneFileInvalid as error:
         service.log_problem(error)
-        detail = f"The file breaks the contract msdgs/1 at `{error.field}`; docs/contract.md says what belongs there."
+        detail = f"The file breaks the contract msdgs/1: `{error.field}` {error.problem}"
         raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
@@ -161,7 +171,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
     return SceneDetail(
         name=name,
         loaded=status.loaded,
-        problem=status.problem is not None,
+        **_problem(status),
         contract=metadata.contract,
         plan=metadata.plan,
         layers=list(metadata.layers),
@@ -182,7 +192,18 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         package_version=metadata.package_version,
         checkpoint_sha256=metadata.checkpoint_sha256,
         sha256=served.sha256,
+        cost=_cost(served.session.cost),
     )
+
+
+def _problem(status: SceneStatus) -> dict[str, Any]:
+    reason = None if status.problem is None else f"`{status.problem.field}` {status.problem.problem}"
+    return {"problem": reason is not None, "reason": reason and reason[:MAX_REASON]}
+
+
+def _cost(cost: SceneCost) -> GraphCost:
+    limits = GraphLimit(memory_bytes=cost.limits.memory_bytes, operations=cost.limits.operations)
+    return GraphCost(memory_bytes=cost.memory_bytes, operations=cost.operations, calls=cost.calls, limits=limits)
 
 
 def _view(seen: Framing) -> SceneView:

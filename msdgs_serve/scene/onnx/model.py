@@ -105,7 +105,7 @@ def _opset(parts: list[memoryview]) -> int:
     for opset in opsets:
         if opset.get("domain", ""):
             raise _invalid(f"it needs operators of the domain `{opset['domain']}`, not of ONNX alone")
-    versions = [opset.get("version") for opset in opsets]
+    versions = [opset.get("version", 0) for opset in opsets]
     if len(versions) != 1 or versions[0] not in OPSETS:
         raise _invalid(f"it needs operator sets {versions}, not one of {_span(OPSETS)}")
     return versions[0]
