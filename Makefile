@@ -12,8 +12,7 @@ SERVE := .venv-serve
 FULL := .venv
 CLUSTER := .venv-cluster
 VIEWER := .venv-viewer
-HTTP_TESTS := $(addprefix tests/test_,$(addsuffix .py,api api_poison batch client motion openapi service_answers \
-	service_load slow_clients uploads video fuzz))
+HTTP_TESTS := tests/service tests/frames/test_video.py
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package
 PINS := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt
@@ -39,11 +38,11 @@ test: lint  ## install everything, check style, types and imports, run the tests
 	$(FULL)/bin/python -m pytest $(ARGS)
 
 test-cluster: $(CLUSTER)/.installed  ## Ray beside everything: the tests on a cluster of this machine, HTTP ones on Ray Serve
-	$(CLUSTER)/bin/python -m pytest -n 0 tests/test_ray.py $(ARGS)
+	$(CLUSTER)/bin/python -m pytest -n 0 tests/ops/test_ray.py $(ARGS)
 	MSDGS_TEST_SERVICE=ray $(CLUSTER)/bin/python -m pytest -n 0 -p no:randomly $(HTTP_TESTS) $(ARGS)
 
 test-viewer: $(VIEWER)/.installed  ## the live view of a training in a browser, with viser
-	$(VIEWER)/bin/python -m pytest -n 0 tests/test_live_view.py tests/test_live_view_browser.py $(ARGS)
+	$(VIEWER)/bin/python -m pytest -n 0 tests/train/engine/test_live_view.py tests/train/engine/test_live_view_browser.py $(ARGS)
 
 lint: $(FULL)/.installed-dev  ## ruff, pyright and the import contracts
 	$(FULL)/bin/ruff check

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from export.views import GOLDEN
+from export.measure.views import GOLDEN
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained, rasterize
 from msdgs_serve.scene.errors import MsdgsError

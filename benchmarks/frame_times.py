@@ -68,7 +68,7 @@ class Gradient:
     def __init__(self, subject: Subject) -> None:
         import torch
 
-        from msdgs_train.rasterization import rasterize as rasterize_for_training
+        from msdgs_train.rendering.rasterize import rasterize as rasterize_for_training
 
         g = subject.gaussians
         arrays = (g.means, g.quats, g.scales, g.opacities, g.sh)

@@ -21,7 +21,7 @@ import numpy as np
 from export.importers import ImportFailed, recognise
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
-from tests.service import serving
+from tests.support.service import serving
 
 COLUMNS = 4
 INCHES = 2.6

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Budget, System, read_systems
-from msdgs_train.datasets.synthetic_motion import OBJECTS, world_positions
-from msdgs_train.datasets.synthetic_trajectories import surface_points
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.model import Domain, DynamicGaussians
-from msdgs_train.optimizers import learning_rates, make_optimizer, set_learning_rates
+from msdgs_train.datasets.synthetic.motion import OBJECTS, world_positions
+from msdgs_train.datasets.synthetic.trajectories import surface_points
+from msdgs_train.engine.optimizer import learning_rates, make_optimizer, set_learning_rates
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import Domain, DynamicGaussians
 
 MOVING = OBJECTS[2:]
 HALF_EXTENT = 1.3  # scene units

@@ -24,18 +24,18 @@ from scipy.interpolate import BSpline
 from torch import Tensor, nn
 from torch.nn import functional
 
-from export.plans.splines import fitting
-from export.rendered_error import posed, shown
-from export.views import cameras_of, deciding_views
+from export.measure.rendered_error import posed, shown
+from export.measure.views import cameras_of, deciding_views
+from export.trajectories.splines import fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
-from msdgs_train.checkpoint import SceneInfo, load, load_model, save_atomic, save_model
-from msdgs_train.densification import rotate
-from msdgs_train.gaussians import CanonicalGaussians
-from msdgs_train.layers import MLPLayer
-from msdgs_train.metrics import psnr_from_mse
-from msdgs_train.model import DynamicGaussians, unit_quats
-from msdgs_train.presets import PRESETS
-from msdgs_train.steps import camera_of
+from msdgs_train.density.gradient import rotate
+from msdgs_train.evaluation.layer_strip import camera_of
+from msdgs_train.evaluation.metrics import psnr_from_mse
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
+from msdgs_train.gaussians.model_file import SceneInfo, load, load_model, save_atomic, save_model
+from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.systems.presets import PRESETS
 
 SHRINK = 0.6
 """Of a part's axes against those of the Gaussian it is a part of. Centres are spread by √(1 − 0.6²) of them, so that

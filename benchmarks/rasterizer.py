@@ -30,7 +30,7 @@ from benchmarks.splat_scenes import around, object_camera, object_scene
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera
 from msdgs_serve.threads import thread_count
-from msdgs_train.files import write_text
+from msdgs_train.engine.files import write_text
 
 KNOB_COUNT, OTHERS_COUNTS, SQUARE = 100_000, (100_000, 300_000), "800x800"
 

@@ -19,7 +19,7 @@ from msdgs_serve.rasterizer.projection import RED, ROOT_A, ROOT_B, ROOT_C, ROOT_
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.scene import Camera, Gaussians
-from tests.reference import render
+from tests.support.reference import render
 
 WITHOUT_THRESHOLDS = GSPLAT._replace(alpha_min=1e-6, transmittance_min=0.0)
 FLOAT16 = {"all numbers": int(X), "all but the place": int(ROOT_A), "colour and depth": int(RED)}

@@ -29,7 +29,9 @@ def print_tables(result: Row, console: Console) -> None:
     if "no_avx512" in result:
         console.print(f"no renderer written by hand for AVX-512: {result['no_avx512']}")
     if "oracle_agreement" in result:
-        console.print(f"float64 against tests/reference.py on a small scene: {result['oracle_agreement']:.1e} at most")
+        console.print(
+            f"float64 against tests/support/reference.py, a small scene: {result['oracle_agreement']:.1e} at most"
+        )
     for line in summary(result):
         console.print(line)
 

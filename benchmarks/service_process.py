@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.scene_files import write_scene
+from tests.support.scene_files import write_scene
 
 START_SECONDS = 120
 MOMENT = 0.01

@@ -18,7 +18,7 @@ from typing import Any
 
 from benchmarks.service_process import MOMENT, Connection, Running, service
 from benchmarks.service_requests import digest
-from tests.scene_files import write_scene
+from tests.support.scene_files import write_scene
 
 ORBIT = {"type": "orbit", "azimuth": 30, "elevation": 20}
 SMALL = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from msdgs_train.checkpoint import LoadedModel, load_model
 from msdgs_train.datasets import Frame, composite, load_scene
-from msdgs_train.metrics import quality
+from msdgs_train.evaluation.metrics import quality
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,10 @@ from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT
 from msdgs_serve.scene import Gaussians
 from msdgs_train.datasets import load_scene
-from msdgs_train.datasets.synthetic import generate
-from msdgs_train.losses import photometric_loss
-from msdgs_train.presets import preset
-from msdgs_train.trainer import Trainer
+from msdgs_train.datasets.synthetic.generate import generate
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.losses.photometric import photometric_loss
+from msdgs_train.systems.presets import preset
 
 FORWARD = ("deformation", "projection", "tiles", "blending", "loss")
 BACKWARD = ("loss gradient", "blending gradient", "projection gradient", "deformation gradient", "optimiser")

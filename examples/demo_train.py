@@ -18,9 +18,9 @@ import torch
 
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
-from msdgs_train.datasets.images import read_rgba
-from msdgs_train.metrics import mean_quality, quality
-from msdgs_train.report import write_png
+from msdgs_train.datasets.common.images import read_rgba
+from msdgs_train.engine.metrics_log import write_png
+from msdgs_train.evaluation.metrics import mean_quality, quality
 from serving import get, render, say, serving, stay_up
 
 ROOT = Path(__file__).resolve().parents[1]

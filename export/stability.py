@@ -72,10 +72,10 @@ def _report(
     if not 0 < max_error < 100:
         raise InvalidInput("max_error", "between 0 and 100 dB", max_error)
     with errors.status("loading torch and the kernels"):
-        from export.precision.assess import assess  # heavy: seconds, so not before --help
+        from export.measure.stability import assess  # heavy: seconds, so not before --help
         from export.precision.formats import FORMATS
         from export.precision.show import draw, print_report, write_json
-        from msdgs_train.checkpoint import load_model
+        from msdgs_train.gaussians.model_file import load_model
     loaded = load_model(model)
     with Progress(console=errors, transient=True) as progress:
         task = progress.add_task("comparing with float64", total=times)

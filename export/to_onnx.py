@@ -93,8 +93,8 @@ def main(
     }
     try:
         with console.status("loading torch and onnxruntime"):
-            from export.command import Settings, export  # heavy: a second or more, so not before --help
             from export.importers.command import model_or_import
+            from export.jobs.command import Settings, export  # heavy: a second or more, so not before --help
         off = frozenset(rule for rule, is_off in switched_off.items() if is_off)
         plan = "network" if quick and plan is None else plan
         with model_or_import(model, kind, output, console) as source:

@@ -6,7 +6,7 @@ import sys
 def main() -> int:
     """Entry point; returns the exit code."""
     try:
-        from msdgs_train.cli import main
+        from msdgs_train.cli.main import main
     except ModuleNotFoundError as error:
         print(
             f"msdgs-train needs {error.name}, which serving alone does not: pip install 'msdgs[train]'", file=sys.stderr

@@ -16,13 +16,13 @@ from export.exporters.spz import write_spz
 from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
-from export.importers.recognise import read_splats
+from export.importers.detect import read_splats
 from export.importers.sequence import is_switched, of_the_moment
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.files import replacing
+from msdgs_train.engine.files import replacing
 
 LOSSLESS, LOSSY = 60.0, 45.0
 """dB that what was written must have by default."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from export.importers.axes import from_right_up_back
+from export.importers.splats.axes import from_right_up_back
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 

@@ -14,7 +14,7 @@ from msdgs_serve.rasterizer import as_trained, rasterize
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.metrics import psnr_from_mse
+from msdgs_train.evaluation.metrics import psnr_from_mse
 
 VIEWS, SIZE, ELEVATION = 3, 256, 20.0
 """Cameras about the scene, the pixels of their shorter side, and degrees."""

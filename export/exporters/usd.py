@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from export.importers.axes import from_right_up_back
+from export.importers.splats.axes import from_right_up_back
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 

@@ -22,7 +22,7 @@ from export.exporters.visionary_rules import (
     QUANTISED,
     check_visionary,
 )
-from export.graph import GraphBuilder
+from export.layers.graph import GraphBuilder
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput

@@ -4,8 +4,8 @@ One file a format. Each reader takes what it is given as hostile: sizes are chec
 a file is run, and what is wrong is said with the file's name.
 """
 
+from export.importers.detect import KINDS, READERS, read_splats, recognise
 from export.importers.errors import ImportFailed
-from export.importers.recognise import KINDS, READERS, read_splats, recognise
-from export.importers.splats import Splats
+from export.importers.splats.base import Splats
 
 __all__ = ["KINDS", "READERS", "ImportFailed", "Splats", "read_splats", "recognise"]

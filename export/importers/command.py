@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from export.importers.recognise import KINDS_OF_RUNS, READERS, checked_kind, frame_files, read_splats, recognise
-from export.importers.runs import write_model
+from export.importers.detect import KINDS_OF_RUNS, READERS, checked_kind, frame_files, read_splats, recognise
+from export.importers.runs.model import write_model
 from export.importers.scene import digest, note_left_out, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
 from msdgs_serve.scene.baked import BakedScene

@@ -10,17 +10,17 @@ import numpy as np
 import onnx
 from onnx import helper
 
-from export.bake import Baked, Moving
-from export.importers.splats import Splats
-from export.plans import build
-from export.write import properties
+from export.importers.splats.base import Splats
+from export.jobs.bake import Baked, Moving
+from export.jobs.write import properties
+from export.plans.registry import build
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
-from msdgs_train.files import replacing
+from msdgs_train.engine.files import replacing
 
 WITHIN = (0.01, 0.99)
 """Parts of the Gaussians below and above which, along each axis, their centres may lie outside of the bounds: strays of

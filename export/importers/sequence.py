@@ -15,18 +15,18 @@ import onnx
 from onnx import TensorProto
 from scipy.spatial import KDTree
 
-from export.bake import Baked, Moving
+from export.importers.detect import frame_files, read_splats
 from export.importers.errors import ImportFailed
-from export.importers.recognise import frame_files, read_splats
 from export.importers.scene import UP, metadata_of
-from export.importers.splats import Splats
+from export.importers.splats.base import Splats
+from export.jobs.bake import Baked, Moving
 from export.plans.scene_graph import activated, finished, new_graph
-from export.plans.splines import design
-from export.plans.stored_poses import GriddedPoses, StoredPoses, of_ids
-from export.plans.trajectories import give_one_sign
+from export.trajectories.sampling import give_one_sign
+from export.trajectories.splines import design
+from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.model import SMALLEST_SCALE
+from msdgs_train.gaussians.model import SMALLEST_SCALE
 
 CONSTANT = 0.02
 """Opacities and SH coefficients may differ by this between frames that are blended: two steps of 8 bits."""

@@ -4,8 +4,3 @@ One file a plan. A graph of layers deforms the ids that it is given in one go; t
 memory independent of the scene's size, is in the reader (`msdgs_serve.deformation`), where the chunks also run side by
 side. A graph of fitted trajectories blends those of all Gaussians and picks the ids.
 """
-
-from export.plans.registry import POSSIBLE, Plan, build, parse
-from export.plans.trajectories import Trajectories
-
-__all__ = ["POSSIBLE", "Plan", "Trajectories", "build", "parse"]

@@ -17,9 +17,9 @@ import onnxruntime
 from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-from export.bake import Baked
+from export.jobs.bake import Baked
+from export.measure.verify import times_to_verify
 from export.plans.network import network
-from export.verify import times_to_verify
 from msdgs_serve.scene.errors import InvalidInput
 
 TIMES, GAUSSIANS = 16, 2048

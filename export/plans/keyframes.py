@@ -8,12 +8,12 @@ with an error, each keeps as few as it needs.
 import numpy as np
 import onnx
 
-from export.bake import Baked
-from export.plans.own_poses import fitted, own_poses, worst
+from export.jobs.bake import Baked
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.size import Size
-from export.plans.stored_poses import GriddedPoses, StoredPoses, of_ids
-from export.plans.trajectories import Ids, Trajectories
+from export.trajectories.adaptive import fitted, own_poses, worst
+from export.trajectories.sampling import Ids, Trajectories
+from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 
 
 def keyframes(baked: Baked, trajectories: Trajectories, size: Size) -> onnx.ModelProto:

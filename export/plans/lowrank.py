@@ -13,15 +13,15 @@ import numpy as np
 import onnx
 from scipy.linalg import eigh
 
-from export.bake import Baked
-from export.graph import GraphBuilder
-from export.plans.exact import POSE, QUATS
-from export.plans.own_poses import CHUNK, own_poses, worst
+from export.jobs.bake import Baked
+from export.layers.graph import GraphBuilder
 from export.plans.scene_graph import activated, finished, new_graph
 from export.plans.size import Size
-from export.plans.splines import along_time, design, fitting, samples_for, time_weights
-from export.plans.stored_poses import at_time
-from export.plans.trajectories import Ids, Samples, Trajectories
+from export.trajectories.adaptive import CHUNK, own_poses, worst
+from export.trajectories.poses import POSE, QUATS
+from export.trajectories.sampling import Ids, Samples, Trajectories
+from export.trajectories.splines import along_time, design, fitting, samples_for, time_weights
+from export.trajectories.stored import at_time
 
 KNOTS = 131
 """Control points of each function of time."""

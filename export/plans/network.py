@@ -1,18 +1,21 @@
 """Plan `network`: all layers in float32 as the model computes them."""
 
+from dataclasses import replace
+
 import numpy as np
 import onnx
 import torch
 
-from export.bake import Baked, Layer, Moving
-from export.basis_graph import basis_deltas
-from export.graph import GraphBuilder, to_numpy
-from export.plane_graph import plane_heads
+from export.jobs.bake import Baked, Layer, Moving
+from export.layers.graph import GraphBuilder, to_numpy
+from export.layers.plane import plane_heads
+from export.layers.spline import basis_deltas
 from export.plans.scene_graph import finished, new_graph, unit_quats
-from msdgs_train.basis_layer import BasisLayer
-from msdgs_train.layers import MLPLayer
-from msdgs_train.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
-from msdgs_train.plane_layer import PlaneLayer
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
+from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.layers.plane import PlaneLayer
+from msdgs_train.supports.nodes import BasisLayer
 
 DELTAS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
 """Columns of the heads, in the order of `Heads.sizes`, whose last column, if there is one, is the weight."""
@@ -179,3 +182,12 @@ def _linear(graph: GraphBuilder, name: str, linear: torch.nn.Module, value: str)
     weight = graph.constant(f"{name}.weight", to_numpy(linear.weight))
     bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
     return graph.node("Gemm", [value, weight, bias], f"{name}.out", transB=1)
+
+
+def prefix(baked: Baked, count: int) -> onnx.ModelProto:
+    """The scene with its first `count` layers. Raises `InvalidInput` where it hasn't as many."""
+    if count > len(baked.layers):
+        raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
+    metadata = replace(baked.scene.metadata, layers=baked.scene.metadata.layers[:count])
+    scene = replace(baked.scene, metadata=metadata)
+    return network(replace(baked, layers=baked.layers[:count], scene=scene), f"prefix:{count}")

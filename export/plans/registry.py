@@ -6,17 +6,16 @@ from dataclasses import dataclass
 
 import onnx
 
-from export.bake import Baked
+from export.jobs.bake import Baked
 from export.plans.int8 import int8
 from export.plans.keyframes import keyframes
 from export.plans.lowrank import RANKS, lowrank
-from export.plans.network import network
-from export.plans.own_poses import COUNTS
-from export.plans.prefix import prefix
+from export.plans.network import network, prefix
 from export.plans.scene_graph import still
 from export.plans.size import Size
-from export.plans.splines import FEWEST
-from export.plans.trajectories import Trajectories, trajectories_of
+from export.trajectories.adaptive import COUNTS
+from export.trajectories.sampling import Trajectories, trajectories_of
+from export.trajectories.splines import FEWEST
 from msdgs_serve.scene.errors import InvalidInput
 
 PIXELS = 0.1

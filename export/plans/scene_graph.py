@@ -7,11 +7,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from export.bake import Baked
-from export.graph import GraphBuilder
+from export.jobs.bake import Baked
+from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.model import SMALLEST_SCALE
+from msdgs_train.gaussians.model import SMALLEST_SCALE
 
 
 def new_graph(baked: Baked) -> GraphBuilder:
@@ -57,7 +57,7 @@ def activated(graph: GraphBuilder, pose: str) -> None:
 
 
 def unit_quats(graph: GraphBuilder, raw: str) -> None:
-    """The output `quats`: unit length; identity where the norm is under 1e-8, as `msdgs_train.model.unit_quats`.
+    """The output `quats`: unit length; identity where the norm is under 1e-8, as the trainer's `unit_quats`.
 
     Sums of squares and the identity are products with constants: of 106,500 rows in 1 ms, where ReduceL2 takes 7 and
     Where 3.

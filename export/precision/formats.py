@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from msdgs_train.basis_layer import Carried
-from msdgs_train.deformation import Deltas, MultiStepDeformation
-from msdgs_train.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.chain import Deltas, MultiStepDeformation
+from msdgs_train.supports.nodes import Carried
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
 
-from export.precision.amplification import UNIT_ROUNDOFF
-from export.precision.stability_report import StabilityReport
-from msdgs_train.files import replacing, write_text
-from msdgs_train.metrics import MAX_PSNR
+from export.measure.amplification import UNIT_ROUNDOFF
+from export.precision.report import StabilityReport
+from msdgs_train.engine.files import replacing, write_text
+from msdgs_train.evaluation.metrics import MAX_PSNR
 
 
 def print_report(report: StabilityReport, console: Console) -> None:

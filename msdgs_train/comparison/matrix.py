@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.config import TrainConfig
-from msdgs_train.presets import DEFAULT, PRESETS, preset
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.systems.presets import DEFAULT, PRESETS, preset
 
 EVALUATIONS = 10  # of the held-out photographs while training: points of a curve
 LOG_LINES = 100

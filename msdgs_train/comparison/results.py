@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.checkpoint import LoadedModel, load_model
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.runner import final_metrics, is_finished
-from msdgs_train.fit import CHOOSING_SPLITS, MODEL
-from msdgs_train.report import read_metrics
-from msdgs_train.steps import camera_of
+from msdgs_train.engine.metrics_log import read_metrics
+from msdgs_train.engine.run import CHOOSING_SPLITS, MODEL
+from msdgs_train.evaluation.layer_strip import camera_of
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
 
 TIMED_FRAMES = 8
 FIRST_SPLIT = "test"

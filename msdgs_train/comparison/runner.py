@@ -11,7 +11,7 @@ from typing import Any
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import Ended, Pool
-from msdgs_train.fit import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
+from msdgs_train.engine.run import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
 
 
 def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, Ended], None]) -> bool:

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from msdgs_train.datasets.colmap import LAST_NUMBER, SPARSE, load_colmap
+from msdgs_train.datasets.colmap.loader import LAST_NUMBER, SPARSE, load_colmap
+from msdgs_train.datasets.common.images import composite
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
 from msdgs_train.datasets.hypernerf import DATASET_FILE, load_hypernerf
-from msdgs_train.datasets.images import composite
 from msdgs_train.datasets.nerfstudio import TRANSFORMS_FILE, load_nerfstudio
 from msdgs_train.datasets.neu3d import CAMERAS, load_neu3d
-from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, SceneData
 
 __all__ = ["DatasetInvalid", "Frame", "SceneData", "composite", "load_scene"]
 

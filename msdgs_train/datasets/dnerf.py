@@ -8,8 +8,8 @@ they are used instead of the angle. The time range of the scene runs from the fi
 
 from pathlib import Path
 
-from msdgs_train.datasets.scene_data import SPLITS, Frame, SceneData
-from msdgs_train.datasets.transforms import Entry, check_times, read_entries, read_frame
+from msdgs_train.datasets.common.scene_data import SPLITS, Frame, SceneData
+from msdgs_train.datasets.common.transforms import Entry, check_times, read_entries, read_frame
 
 TRAIN_FILE = "transforms_train.json"
 HALF_EXTENT = 1.3

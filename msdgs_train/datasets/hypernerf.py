@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_train.datasets.distortion import Distortion
-from msdgs_train.datasets.extent import half_extent
-from msdgs_train.datasets.images import ImageSize
-from msdgs_train.datasets.json_file import read_json
-from msdgs_train.datasets.npy import read_table
-from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
+from msdgs_train.datasets.common.distortion import Distortion
+from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.images import ImageSize
+from msdgs_train.datasets.common.json_file import read_json
+from msdgs_train.datasets.common.npy import read_table
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
 
 DATASET_FILE = "dataset.json"
 METADATA_FILE = "metadata.json"

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from msdgs_train.datasets.distortion import Distortion
-from msdgs_train.datasets.extent import half_extent
-from msdgs_train.datasets.ply_points import read_ply_points
-from msdgs_train.datasets.scene_data import SPLITS, DatasetInvalid, Frame, SceneData, hold_out
-from msdgs_train.datasets.transforms import Entry, check_times, read_entries, read_frame
+from msdgs_train.datasets.common.distortion import Distortion
+from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.ply_points import read_ply_points
+from msdgs_train.datasets.common.scene_data import SPLITS, DatasetInvalid, Frame, SceneData, hold_out
+from msdgs_train.datasets.common.transforms import Entry, check_times, read_entries, read_frame
 
 TRANSFORMS_FILE = "transforms.json"
 CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")

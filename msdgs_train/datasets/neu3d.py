@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_train.datasets.extent import half_extent
-from msdgs_train.datasets.images import EXTENSIONS, ImageSize
-from msdgs_train.datasets.npy import read_table
-from msdgs_train.datasets.ply_points import read_ply_points
-from msdgs_train.datasets.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
-from msdgs_train.datasets.video import VideoFrame, read_info
+from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize
+from msdgs_train.datasets.common.npy import read_table
+from msdgs_train.datasets.common.ply_points import read_ply_points
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
+from msdgs_train.datasets.common.video import VideoFrame, read_info
 
 POSES_FILE = "poses_bounds.npy"
 CAMERAS = "cam0*"

@@ -1,0 +1,1 @@
+"""Folders of other trainers' runs, one module a trainer."""

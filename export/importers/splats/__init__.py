@@ -1,0 +1,1 @@
+"""Files that hold one set of Gaussians, one module a format."""

@@ -1,0 +1,176 @@
+"""SOG version 2: a folder, or a zip of it, with meta.json and lossless WebP textures of one pixel a Gaussian."""
+
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from export.importers.errors import ImportFailed
+from export.importers.splats.base import Splats, smallest_three, splats
+from export.importers.splats.webp import read_texture
+
+META = "meta.json"
+LARGEST_META = 1 << 24
+MOST = 1 << 26
+"""Gaussians in one file: a texture has 16,383 pixels a side at most."""
+
+SLACK = 1 << 13
+"""Pixels that a texture may have too many: it is made nearly square, and multiples of four."""
+
+COEFFICIENTS = {1: 3, 2: 8, 3: 15}
+"""Of each channel beyond degree 0, by number of bands."""
+
+A_ROW = 64
+"""Entries of the palette of harmonics side by side."""
+
+ZIP_PROBLEMS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    RuntimeError,
+    UnicodeDecodeError,  # names of files
+    OverflowError,  # places beyond 2⁶³
+)
+"""What zipfile raises for damaged files."""
+
+
+def read_sog(path: Path) -> Splats:
+    """The Gaussians of a SOG folder, its meta.json or a zip. Raises `ImportFailed`."""
+    if path.is_dir() or path.name == META:
+        folder = path if path.is_dir() else path.parent
+        return _decoded(path, lambda name, most: _from_folder(path, folder / name, most))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _decoded(path, lambda name, most: _from_zip(path, archive, name, most))
+    except ZIP_PROBLEMS as error:
+        raise ImportFailed(path, f"isn't a whole zip: {error}") from error
+
+
+def _from_folder(path: Path, file: Path, most: int) -> bytes:
+    try:
+        size = file.stat().st_size
+        if size > most:
+            raise ImportFailed(path, f"its {file.name} has {size:,} bytes where {most:,} would do")
+        return file.read_bytes()
+    except OSError as error:
+        raise ImportFailed(path, f"lacks {file.name}: {error.strerror}") from error
+
+
+def _from_zip(path: Path, archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    found = [entry for entry in archive.infolist() if entry.filename.rsplit("/", 1)[-1] == name]
+    if len(found) != 1:
+        raise ImportFailed(path, f"holds {len(found)} files named {name}, not one")
+    if found[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ImportFailed(path, f"its {name} is packed in a way that no SOG is: {found[0].compress_type}")
+    if found[0].file_size > most:
+        raise ImportFailed(path, f"its {name} has {found[0].file_size:,} bytes where {most:,} would do")
+    with archive.open(found[0]) as member:
+        contents = member.read(most + 1)
+    if len(contents) > most:
+        raise ImportFailed(path, f"its {name} unpacks to more than it says")
+    return contents
+
+
+class _Meta:
+    """meta.json, whose every value may be missing or something else."""
+
+    def __init__(self, path: Path, contents: bytes) -> None:
+        self._path = path
+        try:
+            self._values = json.loads(contents)
+        except (ValueError, RecursionError) as error:
+            raise ImportFailed(path, f"its {META} isn't JSON: {error}") from error
+        if not isinstance(self._values, dict):
+            raise self.wrong("", "an object")
+
+    def wrong(self, name: str, expected: str) -> ImportFailed:
+        return ImportFailed(self._path, f"its {META}: `{name}` must be {expected}")
+
+    def get(self, name: str) -> Any:
+        """The value at a dotted name, None where there is none."""
+        value = self._values
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        return value
+
+    def whole(self, name: str, most: int) -> int:
+        value = self.get(name)
+        if type(value) is not int or not 1 <= value <= most:
+            raise self.wrong(name, f"a whole number from 1 to {most:,}")
+        return value
+
+    def numbers(self, name: str, count: int) -> np.ndarray:
+        value = self.get(name)
+        good = isinstance(value, list) and len(value) == count and all(type(each) in (int, float) for each in value)
+        if not good or not all(math.isfinite(float(each)) for each in value if abs(each) < 1e300):
+            raise self.wrong(name, f"a list of {count} numbers")
+        array = np.array([float(each) if abs(each) < 1e300 else np.nan for each in value])
+        if not np.isfinite(array).all():
+            raise self.wrong(name, f"a list of {count} numbers")
+        return array
+
+    def files(self, name: str, count: int) -> list[str]:
+        value = self.get(f"{name}.files")
+        if not isinstance(value, list) or len(value) != count or not all(_is_plain(each) for each in value):
+            raise self.wrong(f"{name}.files", f"a list of {count} names of files beside it")
+        return value
+
+
+def _is_plain(name: Any) -> bool:
+    return isinstance(name, str) and bool(name) and not set(name) & set("/\\\0") and name not in (".", "..")
+
+
+def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
+    """`read` gives a file's bytes by name, or fails where they are more than a number."""
+    meta = _Meta(path, read(META, LARGEST_META))
+    if meta.get("version") != 2:
+        problem = "of version 1" if meta.get("version") is None else f"of version {meta.get('version')}"
+        raise ImportFailed(path, f"is SOG {problem}; version 2 can be read")
+    count = meta.whole("count", MOST)
+
+    def texture(name: str, least: int) -> np.ndarray:
+        pixels = least + least // 8 + SLACK
+        shown = read_texture(path, name, read(name, 8 * pixels), pixels)
+        if len(shown) < least:
+            raise ImportFailed(path, f"its texture {name} has {len(shown):,} pixels for {least:,} numbers")
+        return shown[:least]
+
+    low, high = (texture(name, count)[:, :3].astype(np.int64) for name in meta.files("means", 2))
+    first, last = meta.numbers("means.mins", 3), meta.numbers("means.maxs", 3)
+    logs = first + (last - first) * (low | high << 8) / 65535
+    with np.errstate(over="ignore"):
+        means = np.sign(logs) * np.expm1(np.abs(logs))
+    scales = texture(meta.files("scales", 1)[0], count)[:, :3]
+    colors = texture(meta.files("sh0", 1)[0], count)
+    sh = meta.numbers("sh0.codebook", 256)[colors[:, None, :3]]
+    if meta.get("shN") is not None:
+        sh = np.concatenate([sh, _harmonics(path, meta, count, texture)], axis=1)
+    quats = texture(meta.files("quats", 1)[0], count)
+    return splats(path, means, meta.numbers("scales.codebook", 256)[scales], _quats(quats), colors[:, 3] / 255, sh)
+
+
+def _quats(stored: np.ndarray) -> np.ndarray:
+    """[N, 4] wxyz: three components in bytes, and in the fourth 252 and the place of the largest."""
+    small = (stored[:, :3] / 255 - 0.5) * np.sqrt(2)
+    quats = smallest_three(small, stored[:, 3].astype(np.int64) - 252)
+    quats[stored[:, 3] < 252] = (1, 0, 0, 0)  # as other readers have it
+    return quats
+
+
+def _harmonics(path: Path, meta: _Meta, count: int, texture: Callable[[str, int], np.ndarray]) -> np.ndarray:
+    """[N, C − 1, 3]: each Gaussian names an entry of a palette, whose bytes name numbers of a codebook."""
+    bands = meta.whole("shN.bands", 3)
+    palette = meta.whole("shN.count", 1 << 16)
+    centroids, labels = meta.files("shN", 2)
+    wide = A_ROW * COEFFICIENTS[bands]
+    entries = texture(centroids, wide * -(-palette // A_ROW))[:, :3].reshape(-1, COEFFICIENTS[bands], 3)
+    stored = texture(labels, count).astype(np.int64)
+    label = stored[:, 0] | stored[:, 1] << 8
+    if label.max() >= palette:
+        raise ImportFailed(path, f"a Gaussian has harmonics {label.max():,} of a palette of {palette:,}")
+    return meta.numbers("shN.codebook", 256)[entries[label]]

@@ -1,0 +1,24 @@
+"""`.splat`, 32 bytes a Gaussian: position and linear scales as float32, colour, opacity and rotation as bytes."""
+
+from pathlib import Path
+
+import numpy as np
+
+from export.importers.errors import ImportFailed
+from export.importers.splats.base import Splats, splats
+from msdgs_serve.scene.spherical_harmonics import SH_C0
+
+RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+
+
+def read_splat(file: Path) -> Splats:
+    """The Gaussians of a `.splat` file, which has no header. Raises `ImportFailed` where its length isn't whole."""
+    size = file.stat().st_size
+    if size % RECORD.itemsize or not size:
+        raise ImportFailed(file, f"is cut off: {size:,} bytes are no whole number of 32 a Gaussian")
+    records = np.fromfile(file, RECORD)
+    rgba = records["rgba"] / 255
+    quats = (records["quats"].astype(np.float64) - 128) / 128
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales = np.log(records["scales"].astype(np.float64))
+    return splats(file, records["means"], log_scales, quats, rgba[:, 3], ((rgba[:, :3] - 0.5) / SH_C0)[:, None])

@@ -1,0 +1,216 @@
+"""`.spz`, versions 2 and 3 (one gzip stream) and 4 (a zstd stream for each attribute). Axes are right, up, back."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import zstandard
+
+from export.importers.errors import ImportFailed, cut_off
+from export.importers.splats.axes import from_right_up_back
+from export.importers.splats.base import Splats, smallest_three, splats
+
+MAGIC = b"NGSP"
+GZIP = b"\x1f\x8b"
+HEADER = struct.Struct("<4sIIBBBB")
+MIP = 1
+"""Bit of the header's flags: trained with the anti-aliasing of Mip-Splatting."""
+
+COLOR_SCALE = 0.15
+"""Degree-0 coefficients are stored as 0.15 c + 0.5 in a byte."""
+
+DEFLATE_LIMIT = 1_032
+"""Deflate makes nothing smaller than by this."""
+
+
+class Header(NamedTuple):
+    """The first 16 bytes, without the magic."""
+
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+    flags: int
+    streams: int  # of version 4
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
+        rotation, rest = (3 if self.version == 2 else 4), 3 * ((self.sh_degree + 1) ** 2 - 1)
+        return [self.count * each for each in (9, 1, 3, 3, rotation, rest)]
+
+
+def read_spz(file: Path, *, turned: bool = True) -> Splats:
+    """The Gaussians of an SPZ file, turned from its axes to those of a PLY, or as they are.
+
+    Raises `ImportFailed` for other versions, SH above degree 3 and cut-off files.
+    """
+    contents = file.read_bytes()
+    if contents.startswith(GZIP):
+        header, parts = _one_stream(file, _Gzip(file, contents))
+    elif contents.startswith(MAGIC):
+        header = _header(file, contents[: HEADER.size])
+        if header.version == 4:
+            parts = _streams(file, header, contents)
+        else:
+            header, parts = _one_stream(file, _Plain(file, contents))
+    else:
+        raise ImportFailed(file, "isn't an SPZ file: it begins neither as gzip nor with NGSP")
+    return _decoded(file, header, parts, turned)
+
+
+class _Plain:
+    """Bytes from the first on, as many as are asked for."""
+
+    def __init__(self, file: Path, contents: bytes) -> None:
+        self._file, self._contents, self._at = file, contents, 0
+
+    def possible(self) -> int:
+        """The most bytes that there may be in all."""
+        return len(self._contents)
+
+    def take(self, count: int, what: str) -> bytes:
+        found = self._contents[self._at : self._at + count]
+        self._at += len(found)
+        if len(found) < count:
+            raise cut_off(self._file, what, count, len(found))
+        return found
+
+    def finish(self) -> None:
+        """Nothing comes after the data."""
+
+
+class _Gzip:
+    """The same from a gzip stream, of which no more is unpacked than is asked for."""
+
+    def __init__(self, file: Path, contents: bytes) -> None:
+        self._file, self._packed, self._unpacker = file, contents, zlib.decompressobj(wbits=31)
+
+    def possible(self) -> int:
+        return DEFLATE_LIMIT * len(self._packed)
+
+    def take(self, count: int, what: str) -> bytes:
+        found = bytearray()
+        try:
+            while len(found) < count and not self._unpacker.eof:
+                piece = self._unpacker.decompress(self._packed, count - len(found))
+                self._packed = self._unpacker.unconsumed_tail
+                if not piece and not self._packed:
+                    break
+                found += piece
+        except zlib.error as error:
+            raise ImportFailed(self._file, f"has a damaged gzip stream: {error}") from error
+        if len(found) < count:
+            raise cut_off(self._file, what, count, len(found))
+        return bytes(found)
+
+    def finish(self) -> None:
+        """See that the stream's end, which has its checksum, is there; more data than was asked for may come first."""
+        try:
+            more = self._unpacker.decompress(self._packed, 1)
+        except zlib.error as error:
+            raise ImportFailed(self._file, f"has a damaged gzip stream: {error}") from error
+        if not more and not self._unpacker.eof:
+            raise ImportFailed(self._file, "is cut off: its gzip stream has no end")
+
+
+def _header(file: Path, start: bytes) -> Header:
+    if len(start) < HEADER.size:
+        raise cut_off(file, "the header", HEADER.size, len(start))
+    magic, version, count, sh_degree, fractional_bits, flags, streams = HEADER.unpack(start)
+    if magic != MAGIC:
+        raise ImportFailed(file, f"isn't an SPZ file: NGSP expected, found {magic!r}")
+    if version not in (2, 3, 4):
+        raise ImportFailed(file, f"is SPZ version {version}; versions 2, 3 and 4 can be read")
+    if sh_degree > 3:
+        raise ImportFailed(file, f"has SH of degree {sh_degree}; up to 3 can be read")
+    if fractional_bits > 24:
+        raise ImportFailed(file, f"has positions with {fractional_bits} fractional bits, of 24 in all")
+    return Header(version, count, sh_degree, fractional_bits, flags, streams)
+
+
+def _one_stream(file: Path, stream: _Plain | _Gzip) -> tuple[Header, list[bytes]]:
+    header = _header(file, stream.take(HEADER.size, "the header"))
+    if header.version == 4:
+        raise ImportFailed(file, "is SPZ version 4 inside gzip, which has streams of its own")
+    if sum(header.sizes) > stream.possible():
+        raise cut_off(file, f"{header.count:,} Gaussians", sum(header.sizes), stream.possible())
+    parts = [stream.take(size, f"{header.count:,} Gaussians") for size in header.sizes]
+    stream.finish()
+    return header, parts
+
+
+def _streams(file: Path, header: Header, contents: bytes) -> list[bytes]:
+    """Of version 4: 32 bytes of header with the place of the table, which has two sizes a stream, then the streams."""
+    if len(contents) < 32:
+        raise cut_off(file, "the header", 32, len(contents))
+    (table,) = struct.unpack_from("<I", contents, 16)
+    sizes = header.sizes if header.sh_degree else header.sizes[:5]
+    if header.streams < len(sizes):
+        raise ImportFailed(file, f"has {header.streams} streams; SH of degree {header.sh_degree} needs {len(sizes)}")
+    at = table + 16 * header.streams
+    if not table >= 32 or at > len(contents):
+        raise cut_off(file, "the table of streams", at, len(contents))
+    parts = []
+    for i, size in enumerate(sizes):
+        packed, unpacked = struct.unpack_from("<QQ", contents, table + 16 * i)
+        if unpacked != size:
+            raise ImportFailed(file, f"stream {i} says {unpacked:,} bytes; {header.count:,} Gaussians need {size:,}")
+        if at + packed > len(contents):
+            raise cut_off(file, f"stream {i}", packed, len(contents) - at)
+        parts.append(_zstd(file, i, contents[at : at + packed], size))
+        at += packed
+    return [*parts, b""][: len(header.sizes)]
+
+
+def _zstd(file: Path, number: int, packed: bytes, size: int) -> bytes:
+    if not size:
+        return b""
+    try:
+        stated = zstandard.frame_content_size(packed)
+        if stated not in (-1, size):
+            raise ImportFailed(file, f"stream {number} holds {stated:,} bytes instead of {size:,}")
+        found = bytearray()
+        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed) as reader:
+            while len(found) < size and (piece := reader.read(min(size - len(found), 1 << 24))):
+                found += piece
+    except zstandard.ZstdError as error:
+        raise ImportFailed(file, f"has a damaged zstd stream {number}: {error}") from error
+    if len(found) < size:
+        raise cut_off(file, f"stream {number}", size, len(found))
+    return bytes(found)
+
+
+def _decoded(file: Path, header: Header, parts: list[bytes], turned: bool) -> Splats:
+    positions, opacities, colors, scales, rotations, rest = (np.frombuffer(part, np.uint8) for part in parts)
+    n = header.count
+    low, middle, high = positions.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
+    fixed = ((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000  # two's complement of 24 bits
+    dc = (colors.reshape(n, 1, 3) / 255 - 0.5) / COLOR_SCALE
+    sh = np.concatenate([dc, (rest.reshape(n, -1, 3).astype(np.float64) - 128) / 128], axis=1)
+    means, quats = fixed / 2**header.fractional_bits, _quats(header, rotations)
+    if turned:
+        means, quats, sh = from_right_up_back(means, quats, sh)
+    return splats(
+        file,
+        means,
+        scales.reshape(n, 3) / 16 - 10,
+        quats,
+        opacities / 255,
+        sh,
+        "mip" if header.flags & MIP else "dilate",
+    )
+
+
+def _quats(header: Header, rotations: np.ndarray) -> np.ndarray:
+    """[N, 4] wxyz. Version 2 has x, y, z in bytes; later ones 10 bits of the three smallest, a sign and 9 bits."""
+    if header.version == 2:
+        xyz = rotations.reshape(-1, 3) / 127.5 - 1
+        w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(axis=1)))
+        return np.concatenate([w[:, None], xyz], axis=1)
+    packed = rotations.view("<u4")
+    fields = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
+    small = (fields & 511) * np.where(fields & 512, -1, 1) * (np.sqrt(0.5) / 511)
+    return smallest_three(small, packed >> 30)[:, [3, 0, 1, 2]]

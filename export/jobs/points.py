@@ -1,0 +1,93 @@
+"""Points of a work-precision diagram: how long a frame takes against how far it is from the exact one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from export.jobs.job import Candidate
+from export.measure.rendered_error import RenderedError
+from export.measure.timing import FrameTime
+
+DEFAULT_RASTERIZER = "default"
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A quick look at a candidate: some of its frames, and the processor time of one.
+
+    Processor time is added up over threads; unlike time on the clock it hardly depends on what else a machine does.
+    """
+
+    candidate: Candidate
+    rasterizer: str
+    cpu: float  # milliseconds a frame, the least of a few
+    cpu_deformation: float  # of these
+    worst_db: float  # PSNR of the worst frame looked at
+
+    def dominates(self, other: "Look", *, time_margin: float, db_margin: float) -> bool:
+        """Whether it is faster and closer than another, by more than looks may be wrong by."""
+        faster = self.cpu * time_margin < other.cpu
+        return faster and self.worst_db > other.worst_db + db_margin
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        quick = {"cpu_milliseconds": self.cpu, "psnr_worst": self.worst_db}
+        return named(self.candidate, self.rasterizer) | {"quick_look": quick}
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A candidate, measured in full."""
+
+    candidate: Candidate
+    rasterizer: str
+    time: FrameTime
+    error: RenderedError
+    memory: int | None  # bytes at the peak of a frame
+    photographs_db: float | None
+
+    @property
+    def milliseconds(self) -> float:
+        """Of a whole frame, the least of the repeats."""
+        return self.time.total.min
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        scene = self.candidate.session.scene
+        return named(self.candidate, self.rasterizer) | {
+            "moving": scene.moving_count,
+            "static": scene.static_count,
+            "layers": len(scene.metadata.layers),
+            "bytes": self.candidate.size,
+            "memory_bytes": self.memory,
+            "milliseconds": self.time.to_plain(),
+            "error": self.error.to_plain(),
+            "photographs_psnr": self.photographs_db,
+            "left_out": list(scene.metadata.left_out),
+        }
+
+
+def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
+    """What a point is."""
+    c = candidate
+    return {"plan": c.plan, "trim_db": c.trim_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
+
+
+def front(points: Sequence[Point]) -> list[int]:
+    """Indices of the points that no other is both faster than and at least as close as, the fastest first.
+
+    Only those drawn as the service draws them: no file can ask for other rasterizer options.
+    """
+    usual = [i for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
+    best, kept = -1.0, []
+    for i in sorted(usual, key=lambda i: (points[i].milliseconds, -points[i].error.psnr_worst)):
+        if points[i].error.psnr_worst > best:
+            best = points[i].error.psnr_worst
+            kept.append(i)
+    return kept
+
+
+def choose(points: Sequence[Point], max_error: float) -> int | None:
+    """The index of the fastest point whose worst frame is within `max_error` dB, which lies on the front."""
+    within = [i for i in front(points) if points[i].error.psnr_worst >= max_error]
+    return within[0] if within else None

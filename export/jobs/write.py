@@ -1,0 +1,72 @@
+"""A graph in, a proven scene file out."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import onnx
+from onnx import helper
+
+from export.measure.verify import TIMES, TOLERANCE, verify
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.baked import SceneMetadata
+from msdgs_train.engine.files import replacing
+from msdgs_train.gaussians.model import DynamicGaussians
+
+PLAN = "network"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    path: Path
+    size: int  # bytes
+    moving_count: int
+    static_count: int
+    metadata: SceneMetadata
+
+    @property
+    def measured_error(self) -> dict[str, Any]:
+        return self.metadata.measured_error
+
+
+def write_scene(
+    output: Path,
+    contents: onnx.ModelProto,
+    model: DynamicGaussians,
+    *,
+    rendered: dict[str, Any] | None = None,
+    tolerance: float = TOLERANCE,
+    times: int = TIMES,
+    on_time: Callable[[], object] = lambda: None,
+) -> Exported:
+    """Write a scene file beside `output`, compare it with the model of its moving part, and only then move it there.
+
+    `rendered` is what is known of its frames, and goes into its metadata. With it, a plan that computes something
+    else than the model's own layers isn't held to `tolerance`: its frames have been judged.
+    """
+    exact = rendered is None or properties(contents)["plan"] == PLAN
+    with replacing(output) as temporary:
+        temporary.write_bytes(contents.SerializeToString())
+        session, allowed = DeformationSession(temporary), tolerance if exact else math.inf
+        measured = verify(session, model, times=times, tolerance=allowed, on_time=on_time)
+        measured = properties(contents)["measured_error"] | measured  # what a fitted plan knows of itself stays
+        if rendered is not None:
+            measured |= {"rendered": rendered}
+        helper.set_model_props(contents, _as_texts(properties(contents) | {"measured_error": measured}))
+        temporary.write_bytes(contents.SerializeToString())
+        scene = DeformationSession(temporary).scene  # only its metadata is new, and it must be whole like the first
+    return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
+
+
+def properties(contents: onnx.ModelProto) -> dict[str, Any]:
+    """The metadata of a scene file, plain values by name."""
+    return {entry.key: json.loads(entry.value) for entry in contents.metadata_props}
+
+
+def _as_texts(values: dict[str, Any]) -> dict[str, str]:
+    return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}

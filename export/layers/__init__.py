@@ -1,0 +1,1 @@
+"""Each kind of deformation layer as part of an ONNX graph."""

@@ -1,0 +1,71 @@
+"""Memory that one frame of a scene file takes, measured in a process that loads what serving needs and no more.
+
+`frame_memory` runs this file as that process: it reads a request on standard input and prints a list of bytes.
+"""
+
+import gc
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+if __name__ == "__main__":
+    folder = Path(__file__).resolve().parent
+    sys.path[:] = [str(folder.parents[1]), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
+
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.rasterizer import as_trained, rasterize
+from msdgs_serve.scene.metadata import SceneCamera
+
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+RESET_PEAK = "5"
+EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALLOC_ARENA_MAX": "1"}
+"""Makes glibc give back at once what is freed; else a file would be drawn in memory that another one has left."""
+
+
+def frame_memory(paths: Sequence[Path], view: SceneCamera) -> list[int | None]:
+    """Bytes at the peak of loading each file and drawing a frame of it, above what the process holds before."""
+    request = {"paths": [str(path) for path in paths], "view": view.to_plain()}
+    command = [sys.executable, str(Path(__file__).resolve())]
+    done = subprocess.run(
+        command, input=json.dumps(request), env=os.environ | EAGER, capture_output=True, text=True, check=False
+    )
+    return json.loads(done.stdout) if done.returncode == 0 else [None] * len(paths)
+
+
+def main() -> None:
+    """Answer the request on standard input."""
+    request: dict[str, Any] = json.load(sys.stdin)
+    view = SceneCamera.from_plain(request["view"])
+    for path in request["paths"][:1]:
+        _draw(path, view)  # what is loaded and compiled once belongs to no file
+    print(json.dumps([_peak(path, view) for path in request["paths"]]))
+
+
+def _peak(path: str, view: SceneCamera) -> int | None:
+    gc.collect()
+    try:
+        CLEAR.write_text(RESET_PEAK)
+        before = _status("VmRSS")
+        _draw(path, view)
+        return max(0, _status("VmHWM") - before)
+    except (OSError, KeyError):  # another system than Linux
+        return None
+
+
+def _draw(path: str, view: SceneCamera) -> None:
+    session = DeformationSession(path)
+    rasterize(session.gaussians(view.t), view.camera, options=as_trained(session.scene.metadata))
+
+
+def _status(name: str) -> int:
+    """Bytes of a line of the process's status."""
+    lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
+    return 1024 * int(lines[name].split()[0])
+
+
+if __name__ == "__main__":
+    main()

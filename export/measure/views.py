@@ -1,0 +1,82 @@
+"""Where and when errors are measured: the training's cameras, at many times that need not be theirs."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from export.measure.verify import times_to_verify
+from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_train.gaussians.model_file import SceneInfo
+
+FEWEST_CAMERAS = 4
+"""With fewer, cameras on a circle about the scene are added: one side says little about the others."""
+
+ADDED_CAMERAS = 6
+ADDED_SIZE, ADDED_FOV, ADDED_ELEVATION = 256, 40.0, 25.0
+"""Pixels and degrees of an added camera where no camera is stored that it could be like."""
+
+GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+class View(NamedTuple):
+    """One camera at one time."""
+
+    camera: Camera
+    t: float
+    name: str
+
+
+def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[str, Camera]]:
+    """The cameras of a scene by name: `training`'s where given, else those in the model file, and more where too few.
+
+    Raises `InvalidInput` for a stored camera that can't be used.
+    """
+    cameras = [(f"training {i}", camera) for i, camera in enumerate(training)]
+    cameras = cameras or [(str(stored["name"]), _camera(stored)) for stored in info.cameras]
+    return cameras if len(cameras) >= FEWEST_CAMERAS else [*cameras, *_around(info, cameras)]
+
+
+def measuring_views(
+    cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int, cameras_a_time: int
+) -> list[View]:
+    """Views at `times` times, both ends and between frames, at each of which other cameras look."""
+    views = []
+    for i, t in enumerate(dict.fromkeys(times_to_verify(*time_range, times))):
+        chosen = {int((i * cameras_a_time + j) * GOLDEN % 1 * len(cameras)) for j in range(cameras_a_time)}
+        views += [View(cameras[c][1], t, cameras[c][0]) for c in sorted(chosen)]
+    return views
+
+
+def deciding_views(cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int) -> list[View]:
+    """Views at evenly spread times, a camera each; none of the times between the ends is one of `measuring_views`."""
+    t0, t1 = time_range
+    spread = dict.fromkeys(float(t) for t in np.linspace(t0, t1, times))
+    chosen = [int((i * GOLDEN + 0.5) % 1 * len(cameras)) for i in range(len(spread))]
+    return [View(cameras[c][1], t, cameras[c][0]) for c, t in zip(chosen, spread, strict=True)]
+
+
+def _camera(stored: dict) -> Camera:
+    numbers = {name: stored[name] for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    return Camera(**numbers, camera_to_world=np.asarray(stored["camera_to_world"], float))
+
+
+def _around(info: SceneInfo, cameras: Sequence[tuple[str, Camera]]) -> list[tuple[str, Camera]]:
+    low, high = np.array(info.bounds, float)
+    centre, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    up = np.array([0.0, 0.0, 1.0])
+    distance, like = 2.5 * reach, None
+    if cameras:
+        like = cameras[0][1]
+        distance = max(float(np.linalg.norm(like.position - centre)), 1e-3 * reach)
+        up = -like.camera_to_world[:3, 1]
+    added = []
+    for i in range(ADDED_CAMERAS):
+        pose = orbit(centre, distance, 360 * i / ADDED_CAMERAS, ADDED_ELEVATION if i % 2 else 0.0, up)
+        if like is None:
+            camera = Camera.from_fov(pose, ADDED_SIZE, ADDED_SIZE, ADDED_FOV)
+        else:
+            camera = Camera(like.fx, like.fy, like.cx, like.cy, like.width, like.height, pose)
+        added.append((f"added {i}", camera))
+    return added

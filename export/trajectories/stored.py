@@ -1,0 +1,99 @@
+"""Spline control points of poses in 16 bits, and the part of a graph that blends four of them for each Gaussian."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from onnx import TensorProto
+
+from export.layers.graph import GraphBuilder
+from export.trajectories.poses import POSE
+from export.trajectories.splines import time_weights
+
+LEVELS = 2**15 - 1
+
+
+@dataclass(frozen=True)
+class StoredPoses:
+    """Control points [M, n, 10] as integers: each column of each Gaussian has a range of its own.
+
+    A range about a Gaussian's motion keeps 1/65,534 of it, where float16 keeps 1/2,048 of the largest value.
+    """
+
+    points: npt.NDArray[np.int16]  # [M, n, 10]
+    steps: npt.NDArray[np.float32]  # [M, 10]
+    middles: npt.NDArray[np.float32]  # [M, 10]
+
+    @classmethod
+    def of(cls, control: np.ndarray) -> "StoredPoses":
+        """Rounded from control points, [M, n, 10]."""
+        low, high = control.min(axis=1), control.max(axis=1)
+        middles = ((low + high) / 2).astype(np.float32)
+        steps = np.maximum(np.maximum(high - middles, middles - low) / LEVELS, 1e-30).astype(np.float32)
+        points = np.round((control - middles[:, None]) / steps[:, None])
+        return cls(points.clip(-LEVELS, LEVELS).astype(np.int16), steps, middles)
+
+    @classmethod
+    def joined(cls, parts: Sequence["StoredPoses"]) -> "StoredPoses":
+        """Those of all parts, one after the other; of as many control points each."""
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("points", "steps", "middles")))
+
+    def control(self) -> np.ndarray:
+        """[M, n, 10] what a graph reads from them."""
+        return self.points * self.steps[:, None] + self.middles[:, None]
+
+
+@dataclass(frozen=True)
+class GriddedPoses:
+    """Poses of H Gaussians, each on one of several grids of times."""
+
+    grids: tuple[tuple[npt.NDArray[np.int64], StoredPoses], ...]  # which of the H, and their poses
+
+    @classmethod
+    def on_one(cls, stored: StoredPoses) -> "GriddedPoses":
+        """All on the same."""
+        return cls(((np.arange(len(stored.points)), stored),))
+
+    def __len__(self) -> int:
+        return sum(len(rows) for rows, _ in self.grids)
+
+    @property
+    def order(self) -> npt.NDArray[np.int64]:
+        """[H] which of the H come first, second, … where grid follows on grid."""
+        return np.concatenate([rows for rows, _ in self.grids])
+
+
+def at_time(graph: GraphBuilder, poses: GriddedPoses, time_range: tuple[float, float]) -> str:
+    """[H, 10] poses of all at `t`, in their `order`.
+
+    Of each grid the next four control points are read in one piece and blended in one product. To do so for all, once
+    a frame, takes a quarter of the time of looking up rows for each of the ids that a call asks for.
+    """
+    counts = [stored.points.shape[1] for _, stored in poses.grids]
+    cells, weights = time_weights(graph, "poses.clock", time_range, counts)
+    neighbours = graph.constant("poses.neighbours", np.arange(4, dtype=np.int64))
+    shape = graph.constant("poses.shape", np.array([-1, POSE], np.int64))
+    parts = []
+    for g, (_, stored) in enumerate(poses.grids):
+        name, which = f"poses.grid{g}", graph.constant(f"poses.grid{g}.which", np.array([g], np.int64))
+        times = graph.node("Add", [graph.node("Gather", [cells, which], f"{name}.cell"), neighbours], f"{name}.times")
+        points = stored.points.transpose(1, 0, 2).reshape(counts[g], -1)
+        near = graph.node("Gather", [graph.constant(f"{name}.points", points), times], f"{name}.near")
+        near = graph.node("Cast", [near], f"{name}.float", to=TensorProto.FLOAT)  # [4, M · 10]
+        blended = graph.node(
+            "MatMul", [graph.node("Gather", [weights, which], f"{name}.weights"), near], f"{name}.blended"
+        )
+        parts.append(graph.node("Reshape", [blended, shape], f"{name}.pose"))
+    blended = graph.node("Concat", parts, "poses.blended", axis=0)
+    steps = graph.constant("poses.steps", np.concatenate([stored.steps for _, stored in poses.grids]))
+    middles = graph.constant("poses.middles", np.concatenate([stored.middles for _, stored in poses.grids]))
+    return graph.node("Add", [graph.node("Mul", [blended, steps], "poses.scaled"), middles], "poses.raw")
+
+
+def of_ids(graph: GraphBuilder, poses: GriddedPoses, time_range: tuple[float, float]) -> str:
+    """[M, 10] poses of `ids` at `t`."""
+    places = np.empty(len(poses), np.int64)
+    places[poses.order] = np.arange(len(poses))
+    rows = graph.node("Gather", [graph.constant("poses.places", places), "ids"], "poses.rows")
+    return graph.node("Gather", [at_time(graph, poses, time_range), rows], "poses.of_ids")

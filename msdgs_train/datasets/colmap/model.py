@@ -1,0 +1,65 @@
+"""What COLMAP's sparse models hold, whether they are binary or text."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_train.datasets.common.scene_data import DatasetInvalid
+
+PARAMETERS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+"""The camera models that are understood, and what their parameters are, in the order of the file."""
+
+MODEL_NAMES = (
+    *PARAMETERS,
+    *("OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+    *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM"),
+    "EQUIRECTANGULAR",
+)
+"""By the number that binary files give them."""
+
+
+class ModelCamera(NamedTuple):
+    """Intrinsics that images share."""
+
+    width: int
+    height: int
+    values: dict[str, float]  # of `PARAMETERS`, pixels but for k and p
+
+
+class ModelImage(NamedTuple):
+    """A photograph and its pose: x_camera = R(qvec) · x_world + tvec, in OpenCV axes."""
+
+    name: str  # path below the folder of images
+    camera_id: int
+    qvec: np.ndarray  # [4] float64, wxyz, as it stands in the file
+    tvec: np.ndarray  # [3] float64
+
+
+def make_camera(
+    file: Path, field: str, model: str, width: int, height: int, parameters: tuple[float, ...]
+) -> ModelCamera:
+    """Raises `DatasetInvalid` naming file and field where the parameters are not those of the camera model."""
+    keys = PARAMETERS[model]
+    if len(parameters) != len(keys):
+        raise DatasetInvalid(file, field, f"must have {len(keys)} parameters for {model}, got {len(parameters)}")
+    for key, value in zip(keys, parameters, strict=True):
+        if not math.isfinite(value):
+            raise DatasetInvalid(file, f"{field}.{key}", f"must be finite, got {value}")
+    return ModelCamera(width, height, dict(zip(keys, parameters, strict=True)))
+
+
+def check_model(file: Path, field: str, model: str) -> None:
+    """Raises `DatasetInvalid` naming a camera model that isn't understood."""
+    if model not in PARAMETERS:
+        known = ", ".join(PARAMETERS)
+        raise DatasetInvalid(
+            file, field, f"is {model}, and only {known} are understood: let COLMAP undistort the images"
+        )

@@ -1,0 +1,160 @@
+"""Videos whose frames are photographs: one file a camera, of which training wants any frame at any time.
+
+H.264 gives no random access: the way to a frame begins at the keyframe before it, 0.8 s for the 20th frame at 2704×2028
+on two busy cores, against milliseconds from pixels that lie ready. So the first frame that is wanted of a video decodes
+all of it, frame by frame and reduced to the size of training, into one uint8 `.npy` file [F, H, W, 3], which is
+memory-mapped from then on and used again by later runs. No more than one frame is held as an array at a time.
+
+The files lie in `$XDG_CACHE_HOME/msdgs/videos`, or else `~/.cache/msdgs/videos`, and may be deleted whenever no
+training runs: 1.2 GB for 300 frames of 1352×1014. Their names hang on the video's path, size and time of change.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame
+from msdgs_train.engine.files import replacing
+
+
+class VideoInfo(NamedTuple):
+    """What a video's header says; sizes in pixels."""
+
+    count: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFrame(Frame):
+    """A frame of a video. `image_path` is no file but the video's path with the frame's number behind it."""
+
+    video: Path
+    index: int
+    count: int  # of the whole video
+
+    def load_rgba(self) -> np.ndarray:
+        """[height, width, 4] uint8, sRGB, opaque, reduced to the camera's size. The first of a video decodes all."""
+        width, height = self.camera.width, self.camera.height
+        frames = open_frames(self.video, VideoInfo(self.count, width, height))
+        rgba = np.full((height, width, 4), 255, np.uint8)
+        rgba[..., :3] = frames[self.index]
+        return rgba
+
+
+def read_info(video: Path) -> VideoInfo:
+    """Count and size of the frames, without decoding any. Raises `DatasetInvalid` naming the file."""
+    av = _av(video)
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise _invalid(video, "has no pictures in it")
+            stream = container.streams.video[0]
+            width, height = stream.codec_context.width, stream.codec_context.height
+            count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
+    except av.FFmpegError as error:
+        raise _invalid(video, f"can't be read: {error.strerror}") from None
+    if count < 1:
+        raise _invalid(video, "has no frames in it")
+    return VideoInfo(count, width, height)
+
+
+def open_frames(video: Path, wanted: VideoInfo) -> np.ndarray:
+    """[count, height, width, 3] uint8 RGB, read-only and memory-mapped, reduced to the wanted size.
+
+    Decodes the video unless an earlier call has. Raises `DatasetInvalid` where it has another number of frames, can't
+    be decoded, or its frames can't be kept.
+    """
+    cached = _cache_file(video, wanted)
+    frames = _mapped(cached, wanted)
+    if frames is None:
+        _decode_to(cached, video, wanted)
+        frames = _mapped(cached, wanted)
+    if frames is None:
+        raise _invalid(video, f"was decoded into {cached}, which can't be read back")
+    return frames
+
+
+def _mapped(file: Path, wanted: VideoInfo) -> np.ndarray | None:
+    try:
+        frames = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):  # not there, or cut off
+        return None
+    shape = (wanted.count, wanted.height, wanted.width, 3)
+    return frames if frames.shape == shape and frames.dtype == np.uint8 else None
+
+
+def _cache_file(video: Path, wanted: VideoInfo) -> Path:
+    try:
+        state = video.stat()
+    except OSError as error:
+        raise _invalid(video, f"can't be read: {error.strerror}") from None
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    identity = f"{video.resolve()} {state.st_size} {state.st_mtime_ns} {wanted}"
+    return root / "msdgs" / "videos" / f"{video.stem}-{hashlib.sha256(identity.encode()).hexdigest()[:20]}.npy"
+
+
+def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as temporary, temporary.open("wb") as output:
+            _write(output, video, wanted)
+    except OSError as error:
+        gigabytes = 3e-9 * wanted.count * wanted.width * wanted.height
+        raise _invalid(
+            video,
+            f"can't be kept decoded in {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Name a folder "
+            f"with room in the environment variable XDG_CACHE_HOME, or train at a smaller size",
+        ) from None
+
+
+def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
+    """Plain writes, not through a map: a full disk is an error to the former and kills the process in the latter."""
+    shape = (wanted.count, wanted.height, wanted.width, 3)
+    np.lib.format.write_array_header_1_0(output, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    count = 0
+    for pixels in _decoded(video, wanted):
+        count += 1
+        if count <= wanted.count:
+            output.write(pixels.data)
+    if count != wanted.count:
+        raise _invalid(video, f"has {wanted.count} frames by its header, but {count} can be decoded: encode it anew")
+
+
+def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
+    """Contiguous uint8 RGB [height, width, 3], by the colour matrix that the video names, or else BT.601 as by FFmpeg.
+
+    Each new pixel is the mean over the area it covers, within 0.5 of 255 of `resize_area` on average. FFmpeg's fast way
+    for the full size and its halves leaves out half of the chroma and is off by 1.4 to 5.
+    """
+    av = _av(video)
+    kinds = av.video.reformatter.Interpolation
+    area = kinds.AREA | kinds.ACCURATE_RND | kinds.FULL_CHR_H_INT
+    try:
+        with av.open(str(video)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            for frame in container.decode(stream):
+                yield np.ascontiguousarray(
+                    frame.to_ndarray(format="rgb24", width=wanted.width, height=wanted.height, interpolation=area)
+                )
+    except av.FFmpegError as error:
+        raise _invalid(video, f"can't be decoded: {error.strerror}") from None
+
+
+def _av(video: Path) -> Any:
+    try:
+        import av  # here, as only scenes with videos need it
+        import av.video.reformatter
+    except ModuleNotFoundError as error:
+        raise _invalid(video, f"needs {error.name} to be read: pip install 'msdgs[train]'") from None
+    return av
+
+
+def _invalid(video: Path, problem: str) -> DatasetInvalid:
+    return DatasetInvalid(video, "video", problem)

@@ -1,0 +1,167 @@
+"""A small moving scene of our own, photographed by ray marching into D-NeRF layout, with its motion known exactly.
+
+A ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly squashes, twists and bends, a
+pendulum on a thin rod swings in a frame of thin bars, all on a still, tiled ground. As in D-NeRF there is one camera
+at a time and every frame is seen from somewhere else. The same arguments give the same bytes.
+"""
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
+from msdgs_train.datasets.common.images import composite, resize_area, write_png
+from msdgs_train.datasets.synthetic.rendering import render
+from msdgs_train.datasets.synthetic.trajectories import trajectories
+
+CAMERA_ANGLE_X = 0.69  # radians
+CAMERA_DISTANCE = 4.0
+LOWEST, HIGHEST = 6.0, 75.0  # elevation of training cameras, degrees
+TEST_ELEVATION = 25.0
+R2_SEQUENCE = (0.7548776662466927, 0.5698402909980532)
+"""Two-dimensional golden ratio (M. Roberts, 2018): steps that spread azimuth and elevation evenly together."""
+
+MAX_SIZE = 4096
+TRAJECTORIES = "trajectories.json"
+TRAJECTORY_TIMES = 51
+POINTS_PER_OBJECT = 24
+CONTACT_SHEET = "contact_sheet.png"
+CONTACT_SIZE, CONTACT_COLUMNS, CONTACT_ROWS = 128, 6, 4
+
+
+class View(NamedTuple):
+    """A photograph to take."""
+
+    name: str
+    camera: Camera
+    t: float
+
+
+def generate(
+    out: Path | str,
+    *,
+    size: int = 128,
+    train_frames: int = 64,
+    test_frames: int = 12,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Make the dataset in folder `out`: photographs, transforms_{train,test}.json, trajectories.json, a contact sheet.
+
+    Everything is built beside `out` and moved there when complete; an interrupted call leaves `out` as it was. A
+    dataset that this function made there before is replaced, anything else is refused with `InvalidInput`.
+
+    Args:
+        size: width and height of the photographs in pixels.
+        train_frames: photographs at evenly spaced times in [0, 1], cameras spread over the upper hemisphere.
+        test_frames: photographs at times between, from one smooth turn around the scene.
+        seed: turns and shifts the cameras; the motion is always the same.
+        progress: called with (done, total) after every photograph.
+    """
+    for name, value, least in (("train_frames", train_frames, 1), ("test_frames", test_frames, 0)):
+        if value < least:
+            raise InvalidInput(name, f"{least} or more", value)
+    if not 1 <= size <= MAX_SIZE:
+        raise InvalidInput("size", f"in [1, {MAX_SIZE}] pixels", size)
+    splits = {"train": training_views(train_frames, size, seed), "test": held_out_views(test_frames, size, seed)}
+    total, done = train_frames + test_frames, 0
+    thumbnails = []
+    with _replaced_when_complete(Path(out)) as folder:
+        for split, views in splits.items():
+            (folder / split).mkdir()
+            for view in views:
+                rgba = render(view.camera, view.t)
+                write_png(folder / split / f"{view.name}.png", rgba)
+                thumbnails.append(_thumbnail(rgba))
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+            _write_json(folder / f"transforms_{split}.json", _transforms(split, views))
+        _write_json(folder / TRAJECTORIES, trajectories(POINTS_PER_OBJECT, np.linspace(0, 1, TRAJECTORY_TIMES), seed))
+        write_png(folder / CONTACT_SHEET, _contact_sheet(thumbnails[:train_frames]))
+
+
+def training_views(count: int, size: int, seed: int) -> list[View]:
+    """One camera a time, over the upper hemisphere; neighbours in time are far apart, as in D-NeRF."""
+    shift = np.random.default_rng(seed).uniform(size=2)
+    across, up = ((shift + np.arange(count)[:, None] * R2_SEQUENCE) % 1).T
+    low, high = math.sin(math.radians(LOWEST)), math.sin(math.radians(HIGHEST))
+    elevations = np.degrees(np.arcsin(low + up * (high - low)))  # even in area
+    times = np.linspace(0, 1, count)
+    return _views(size, 360 * across, elevations, times)
+
+
+def held_out_views(count: int, size: int, seed: int) -> list[View]:
+    """One smooth turn around the scene, at times in the middle of `count` equal parts."""
+    parts = (np.arange(count) + 0.5) / max(count, 1)
+    shift = np.random.default_rng(seed).uniform()
+    return _views(size, 360 * (shift + parts), np.full(count, TEST_ELEVATION), parts)
+
+
+def _views(size: int, azimuths: np.ndarray, elevations: np.ndarray, times: np.ndarray) -> list[View]:
+    focal = 0.5 * size / math.tan(0.5 * CAMERA_ANGLE_X)
+    target, up = np.zeros(3), np.array([0.0, 0.0, 1.0])
+    views = []
+    for index, (azimuth, elevation, t) in enumerate(zip(azimuths, elevations, times, strict=True)):
+        pose = orbit(target, CAMERA_DISTANCE, float(azimuth), float(elevation), up)
+        views.append(View(f"r_{index:03d}", Camera(focal, focal, size / 2, size / 2, size, size, pose), float(t)))
+    return views
+
+
+def _transforms(split: str, views: list[View]) -> dict[str, object]:
+    frames = [
+        {
+            "file_path": f"./{split}/{view.name}",
+            "time": view.t,
+            "transform_matrix": (view.camera.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
+        }
+        for view in views
+    ]
+    return {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, separators=(",", ":")) + "\n", encoding="utf-8")
+
+
+def _thumbnail(rgba: np.ndarray) -> np.ndarray:
+    side = min(CONTACT_SIZE, len(rgba))
+    small = resize_area(rgba, side, side)
+    return np.floor(255 * composite(small, (1.0, 1.0, 1.0)) + 0.5).astype(np.uint8)
+
+
+def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
+    """Up to 24 pictures, evenly taken, in rows."""
+    count = min(len(thumbnails), CONTACT_COLUMNS * CONTACT_ROWS)
+    chosen = [thumbnails[index * len(thumbnails) // count] for index in range(count)]
+    columns = min(count, CONTACT_COLUMNS)
+    chosen += [np.full_like(chosen[0], 255)] * (-count % columns)
+    return np.concatenate([np.concatenate(chosen[i : i + columns], axis=1) for i in range(0, len(chosen), columns)])
+
+
+@contextmanager
+def _replaced_when_complete(out: Path) -> Iterator[Path]:
+    """A folder to build in, beside `out`; on leaving without an exception it takes the place of `out`."""
+    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / TRAJECTORIES).exists())):
+        raise InvalidInput("out", "a new or empty folder, or a dataset made by this command", out)
+    out = out.absolute()
+    partial, old = (out.with_name(f".{out.name}.{os.getpid()}.{word}") for word in ("partial", "old"))
+    for leftover in (partial, old):
+        shutil.rmtree(leftover, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        if out.exists():
+            out.rename(old)
+        partial.rename(out)
+    finally:
+        for leftover in (partial, old):
+            shutil.rmtree(leftover, ignore_errors=True)

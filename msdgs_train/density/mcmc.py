@@ -1,0 +1,126 @@
+"""Density control under a budget (3D Gaussian Splatting as Markov Chain Monte Carlo, Kheradmand et al. 2024).
+
+Faint Gaussians move to where opaque ones are, and new ones are added there until the budget is reached. A Gaussian and
+its new companions share its opacity and footprint, so that the picture stays. Faint ones wander. The formulas and
+constants are those of gsplat's `MCMCStrategy`, which itself runs on CUDA only.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from msdgs_train.density.gradient import rotate
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.optimizer import forget_rows, replace_rows
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+
+GROWTH = 1.05
+"""How many there may be after a round for one before, as long as the budget allows it."""
+MOST_SHARES = 51
+"""A Gaussian that more are put beside is divided as if by so many."""
+MOST_OPAQUE = 1 - torch.finfo(torch.float32).eps
+WANDER_SLOPE = 100.0
+"""How sharply wandering ends above `prune_opacity`."""
+
+
+class Relocated(NamedTuple):
+    """How many faint Gaussians one round has moved, and how many it has added."""
+
+    moved: int
+    added: int
+
+
+@dataclass
+class Relocation:
+    """Every now and then moves the faint and adds new ones, never more than `max_gaussians` in all."""
+
+    config: TrainConfig
+    generator: torch.Generator
+
+    @classmethod
+    def start(cls, config: TrainConfig) -> "Relocation":
+        """With its own randomness, of the settings' seed."""
+        return cls(config, torch.Generator().manual_seed(config.seed + 1))
+
+    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Gradients don't matter here."""
+
+    def forget(self, count: int) -> None:
+        """Nothing was gathered."""
+
+    def state(self) -> tuple[Tensor, ...]:
+        """Nothing but the generator."""
+        return ()
+
+    def load_state(self, state: tuple[Tensor, ...]) -> None:
+        """Nothing."""
+
+    def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
+        """A round where one is due; and the faint wander by a part of the learning rate of the means."""
+        if self.config.densifies_after(step):
+            self.relocate(gaussians, optimizer, step)
+        rate = next(group["lr"] for group in optimizer.param_groups if group["name"] == "means")
+        self.wander(gaussians, rate)
+
+    @torch.no_grad()
+    def relocate(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> Relocated:
+        """Put the faint, and what the budget has room for, beside others, drawn by their opacity."""
+        opacities = gaussians.raw_opacities.double().sigmoid()
+        alive = torch.nonzero(opacities > self.config.prune_opacity)[:, 0]
+        count = len(opacities)
+        added = max(0, min(self.config.most_gaussians(step), int(GROWTH * count)) - count)
+        moved = count - len(alive)
+        if moved + added == 0 or len(alive) == 0:  # a scene that has faded altogether may recover
+            return Relocated(0, 0)
+        drawn = torch.multinomial(opacities[alive], moved + added, replacement=True, generator=self.generator)
+        sources = alive[drawn]
+        companions = torch.bincount(sources, minlength=count)
+        shared = torch.nonzero(companions)[:, 0]
+        new_opacities, shrink = share(opacities[shared], companions[shared] + 1)
+        new_opacities = new_opacities.clamp(self.config.prune_opacity, MOST_OPAQUE)
+        gaussians.raw_opacities[shared] = torch.logit(new_opacities).to(gaussians.raw_opacities)
+        gaussians.log_scales[shared] += shrink.log()[:, None].to(gaussians.log_scales)
+        forget_rows(optimizer, gaussians, shared)
+        replace_rows(optimizer, gaussians, alive, {name: p[sources] for name, p in gaussians.named_parameters()})
+        return Relocated(moved, added)
+
+    @torch.no_grad()
+    def wander(self, gaussians: CanonicalGaussians, rate: float) -> None:
+        """Move each centre by noise of the shape of its covariance, the more the fainter it is (equation 9 there)."""
+        faint = torch.sigmoid(-WANDER_SLOPE * (gaussians.raw_opacities.sigmoid() - self.config.prune_opacity))
+        noise = torch.randn(len(gaussians), 3, generator=self.generator)
+        quats = functional.normalize(gaussians.raw_quats, dim=1)
+        inverse = quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
+        shaped = rotate(quats, gaussians.log_scales.exp().square() * rotate(inverse, noise))  # Σ times the noise
+        gaussians.means.add_((rate * self.config.mcmc_noise * faint)[:, None] * shaped)
+
+
+def share(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+    """What each of `shares` equal Gaussians in one place is, that together look as one; float64.
+
+    Args:
+        opacities: [N] of the one, in (0, 1).
+        shares: [N] int, 1 or more.
+
+    Returns:
+        Opacities [N], 1 − (1 − o)^(1/n), with which they let as much through at their centre as the one; and [N] by
+        what their scales are to be multiplied, so that their alpha, summed along a line through the centre, is the
+        same too: o / Σ_k C(n, k+1) (−1)^k o_n^(k+1) / √(k+1), the double sum of the paper's equation 9 with its
+        inner sum of binomials done.
+    """
+    opacities = opacities.clamp(max=MOST_OPAQUE)  # the sum loses its digits where all of its terms are large
+    shares = shares.clamp(1, MOST_SHARES).double()
+    new = -torch.expm1(torch.log1p(-opacities) / shares)
+    terms = torch.arange(1, MOST_SHARES + 1, dtype=torch.float64)
+    binomials = torch.exp(
+        torch.lgamma(shares + 1)[:, None]
+        - torch.lgamma(terms + 1)
+        - torch.lgamma((shares[:, None] - terms + 1).clamp_min(1))
+    )
+    binomials = torch.where(terms <= shares[:, None], binomials, 0.0)
+    signs = 1 - 2 * ((terms - 1) % 2)
+    total = (signs * binomials * new[:, None] ** terms / terms.sqrt()).sum(dim=1)
+    return new, opacities / total

@@ -1,0 +1,66 @@
+"""What a strategy of density control is to the trainer, which one the settings ask for, and Gaussians to begin with."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from msdgs_train.density.gradient import DensityControl
+from msdgs_train.density.mcmc import Relocation
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.optimizer import replace_rows
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+
+SOWING_SEED = 7
+"""Added to that of the settings: not the very places at which training began."""
+
+
+class DensityStrategy(Protocol):
+    """Adds, removes and moves Gaussians while they are trained."""
+
+    @property
+    def generator(self) -> torch.Generator:
+        """All of its randomness."""
+        ...
+
+    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Hear of one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
+        ...
+
+    def forget(self, count: int) -> None:
+        """Drop what was gathered; there are `count` Gaussians now."""
+        ...
+
+    def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
+        """Do what is due after this optimiser step, counted from 1."""
+        ...
+
+    def state(self) -> tuple[Tensor, ...]:
+        """What has been gathered, besides the generator, for a bit-exact continuation."""
+        ...
+
+    def load_state(self, state: tuple[Tensor, ...]) -> None:
+        """Go on from it."""
+        ...
+
+
+def start_density_control(config: TrainConfig, extent: float, count: int) -> DensityStrategy:
+    """The strategy of the settings, for `count` Gaussians; `extent` is the radius of the cameras' positions."""
+    if config.densify_strategy == "mcmc":
+        return Relocation.start(config)
+    return DensityControl.start(config, extent, count)
+
+
+@torch.no_grad()
+def sow(
+    gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, config: TrainConfig, half_extent: float
+) -> None:
+    """Add `config.sown` faint Gaussians, or as many as there is room for, anywhere in [-half_extent, half_extent]³."""
+    model, count = config.model, min(config.sown, config.max_gaussians - len(gaussians))
+    if count <= 0:
+        return
+    new = CanonicalGaussians.random_in_cube(
+        count, half_extent, model.sh_degree, model.embedding_size, config.seed + SOWING_SEED, model.motions
+    )
+    kept = torch.arange(len(gaussians))
+    replace_rows(optimizer, gaussians, kept, {name: values.detach() for name, values in new.named_parameters()})

@@ -1,0 +1,117 @@
+"""What a run leaves to look at: metrics as JSON lines, a curve, and renderings beside their photographs."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from msdgs_train.datasets.common.images import write_png
+from msdgs_train.engine.tensorboard_events import FOLDER, TensorBoardEvents
+from msdgs_train.engine.trainer import Evaluated, StepResult
+from msdgs_train.evaluation.metrics import Quality
+
+METRICS = "metrics.jsonl"
+CURVE = "curve.png"
+RENDERS = "renders"
+
+
+class MetricsLog:
+    """Lines of `metrics.jsonl`: {"kind": "train", "step", "loss", "psnr", …} and {"kind": "eval", "split", …}.
+
+    With `tensorboard` the same numbers also go to event files in `tensorboard/`, and so do pictures.
+    """
+
+    def __init__(self, run: Path, *, keep_until: int = 0, tensorboard: bool = False) -> None:
+        """Goes on after the lines up to step `keep_until`; those of steps after the last checkpoint are dropped."""
+        self.path = run / METRICS
+        kept = [line for line in read_metrics(run) if line["step"] <= keep_until]
+        self.path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        self._events = TensorBoardEvents(run / FOLDER, kept, keep_until) if tensorboard else None
+
+    def train(self, result: StepResult, seconds: float) -> None:
+        """One line about the steps so far."""
+        self._append({"kind": "train", **result._asdict(), "seconds": round(seconds, 3)})
+
+    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+        """One line about a split of held-out photographs."""
+        self._append({"kind": "eval", "step": step, "split": split, **quality._asdict()})
+
+    def picture(self, step: int, split: str, evaluated: Evaluated) -> None:
+        """A held-out photograph at the left and its rendering at the right, for TensorBoard only."""
+        if self._events is not None:
+            self._events.image(step, f"{split}/{_stem(evaluated)}", side_by_side(evaluated))
+
+    def flush(self) -> None:
+        """What was logged outlives this process."""
+        if self._events is not None:
+            self._events.flush()
+
+    def close(self) -> None:
+        """Nothing is logged after this."""
+        if self._events is not None:
+            self._events.close()
+
+    def _append(self, line: dict[str, Any]) -> None:
+        with self.path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        if self._events is not None:
+            self._events.add(line)
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """The lines of a run's `metrics.jsonl`, without a last one that was cut off; none if there is no such file."""
+    path = run / METRICS
+    lines = []
+    for text in path.read_text().splitlines() if path.exists() else ():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def draw_curve(run: Path) -> None:
+    """Loss, PSNR in training and on held-out photographs, and the number of Gaussians, over the steps."""
+    lines = read_metrics(run)
+    train = [line for line in lines if line["kind"] == "train"]
+    figure = Figure(figsize=(9, 9))
+    figure.subplots_adjust(0.1, 0.06, 0.97, 0.98, hspace=0.05)
+    loss, psnr, count = figure.subplots(3, 1, sharex=True)
+    steps = [line["step"] for line in train]
+    loss.semilogy(steps, [line["loss"] for line in train])
+    psnr.plot(steps, [line["psnr"] for line in train], label="train, last photographs")
+    for split in sorted({line["split"] for line in lines if line["kind"] == "eval"}):
+        points = [(line["step"], line["psnr"]) for line in lines if line["kind"] == "eval" and line["split"] == split]
+        psnr.plot(*zip(*points, strict=True), marker="o", label=f"{split}, last {points[-1][1]:.2f} dB")
+    psnr.legend()
+    count.plot(steps, [line["gaussians"] for line in train])
+    for axis, label in ((loss, "loss"), (psnr, "PSNR, dB"), (count, "Gaussians")):
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    count.set_xlabel("step")
+    figure.savefig(run / CURVE, dpi=110)
+
+
+def write_side_by_side(run: Path, split: str, evaluated: Evaluated) -> Path:
+    """The photograph at the left, the rendering at the right, in `renders/`; returns the PNG's path."""
+    folder = run / RENDERS
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{split}_{_stem(evaluated)}.png"
+    write_png(path, side_by_side(evaluated))
+    return path
+
+
+def side_by_side(evaluated: Evaluated) -> np.ndarray:
+    """The photograph at the left, the rendering at the right, [H, 2 W, 3] uint8."""
+    return to_bytes(np.concatenate([evaluated.truth.numpy(), evaluated.rgb.numpy()], axis=1))
+
+
+def _stem(evaluated: Evaluated) -> str:
+    return Path(evaluated.frame.name).name
+
+
+def to_bytes(rgb: np.ndarray) -> np.ndarray:
+    """uint8 of display-referred values in [0, 1], rounded."""
+    return np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,137 @@
+"""A run's models judged on held-out photographs: the last one and the best one, each by name."""
+
+import json
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, composite, load_scene
+from msdgs_train.engine.run import BEST, CONFIG, MODEL
+from msdgs_train.engine.run_record import RECORD, Best, RunInvalid, read_record
+from msdgs_train.evaluation.metrics import masked_psnr, quality
+from msdgs_train.evaluation.moving_region import moving_region
+from msdgs_train.evaluation.perceptual import PerceptualMetrics, perceptual_metrics
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
+
+FILES = {"last": MODEL, "best": BEST}
+
+
+class Scores(NamedTuple):
+    """How close renderings are to their photographs; None where a score can't be had."""
+
+    psnr: float  # dB, data range 1
+    ssim: float  # window 11, σ = 1.5
+    lpips: float | None  # VGG-16
+    flip: float | None  # mean ꟻLIP
+    moving_psnr: float | None  # dB, over the pixels of the moving region; None where nothing moves
+
+
+class JudgedModel(NamedTuple):
+    """One model of a run and its scores."""
+
+    name: str  # "last" or "best"
+    loaded: LoadedModel
+    images: list[Scores]  # in the order of the split's frames
+
+    @property
+    def mean(self) -> Scores:
+        """Over the images; a score is left out where an image lacks it, and None where all do."""
+        columns = [[value for value in column if value is not None] for column in zip(*self.images, strict=True)]
+        return Scores(*(statistics.fmean(column) if column else None for column in columns))  # type: ignore[arg-type]
+
+    def render(self, frame: Frame) -> Tensor:
+        """[H, W, 3] in [0, 1], as the frame's camera sees the model at its time."""
+        return self.loaded.render(frame.camera, frame.t).clamp(0, 1)
+
+    def photograph(self, frame: Frame) -> Tensor:
+        """[H, W, 3] in [0, 1], over the background that the model was trained with."""
+        return torch.from_numpy(composite(frame.load_rgba(), self.loaded.scene.background))
+
+
+class Evaluation(NamedTuple):
+    """All that is known about a run's models on one split."""
+
+    data: Path
+    split: str
+    frames: list[Frame]
+    models: list[JudgedModel]  # last, and best if the run has kept one
+    best: Best | None  # how the best one was chosen
+    region_source: str  # "photographs" or "model": what the moving region is made from
+    masks: list[np.ndarray]  # [H, W] bool for each frame, the moving region; the same for all models
+    unavailable: dict[str, str]  # scores that could not be computed, and why
+
+
+def evaluate_run(
+    run: Path, data: Path | None = None, split: str = "test", progress: Callable[[int, int], None] | None = None
+) -> Evaluation:
+    """Judge `model.pt` and, where there is one, `best.pt` of the run in folder `run` on a split.
+
+    Args:
+        run: the folder that `msdgs-train fit` has filled.
+        data: the dataset; by default the one that the run was trained on.
+        split: "test", "val" or "train".
+        progress: called with pictures done and pictures in all.
+
+    Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
+    """
+    size = _photograph_width(run)
+    loaded = {name: load_model(run / file) for name, file in FILES.items() if name == "last" or (run / file).exists()}
+    data = _data_folder(run, data)
+    scene = load_scene(data, size)
+    frames = _frames(scene, data, split)
+    region = moving_region(scene, split, list(loaded.values()))
+    perceptual = perceptual_metrics()
+    models = [JudgedModel(name, model, []) for name, model in loaded.items()]
+    masks = []
+    for index, frame in enumerate(frames):
+        masks.append(region.mask(frame))
+        for place, judged in enumerate(models):
+            judged.images.append(scores(judged.render(frame), judged.photograph(frame), masks[-1], perceptual))
+            if progress is not None:
+                progress(index * len(models) + place + 1, len(frames) * len(models))
+    record = read_record(run)
+    best = record.best if record and "best" in loaded else None
+    return Evaluation(data, split, frames, models, best, region.source, masks, perceptual.unavailable)
+
+
+def scores(rgb: Tensor, truth: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
+    """Of one rendering and its photograph, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
+    psnr, ssim = quality(rgb, truth)
+    others = {name: metric(rgb, truth) for name, metric in perceptual.metrics.items()}
+    return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, truth, mask))
+
+
+def _photograph_width(run: Path) -> int | None:
+    """The setting that decides what pictures are judged; others may have come and gone between versions."""
+    path = run / CONFIG
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))["size"]
+    except OSError as error:
+        problem = f"{error.strerror}; RUN is a folder that `msdgs-train fit DATA RUN` has filled"
+        raise RunInvalid(path, problem) from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunInvalid(path, f"isn't the settings of a run: {error!r}") from None
+
+
+def _data_folder(run: Path, data: Path | None) -> Path:
+    if data is not None:
+        return data.absolute()
+    record = read_record(run)
+    if record is None:
+        raise RunInvalid(run / RECORD, f"no such file, so the dataset has to be given: msdgs-train eval {run} DATA")
+    if not record.data.is_dir():
+        where = f"if it is elsewhere now: msdgs-train eval {run} DATA"
+        raise DatasetInvalid(record.data, "folder", f"does not exist; {where}")
+    return record.data
+
+
+def _frames(scene: SceneData, data: Path, split: str) -> list[Frame]:
+    if not scene.splits.get(split):
+        there = [f"`{name}` with {len(frames)}" for name, frames in scene.splits.items() if frames]
+        raise DatasetInvalid(data, split, f"has no photographs; there are {', '.join(there)}")
+    return scene.splits[split]

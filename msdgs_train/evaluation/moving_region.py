@@ -1,0 +1,110 @@
+"""Where a picture moves. A static background is easy to get right and hides what is wrong with the motion.
+
+The moving region of a frame is where something can be seen, at its time, that moves over the scene's time:
+
+- Where cameras are fixed, it comes from the photographs alone: the pixels of which a channel is more than `MIN_CHANGE`
+  away from its median over the photographs of this camera.
+- Where they are not, it comes from the models: the pixels of which a channel changes by more than `MIN_CHANGE` when the
+  Gaussians that move are left out. A Gaussian moves, in the view of a frame, if its centre's projections at `TIMES`
+  times, evenly spaced over the scene's, span more than `MIN_TRAVEL` pixels of width or height. What turns or grows
+  without its centre moving doesn't count. Where several models are compared, a pixel is in the region if it is in that
+  of any of them, so that all are judged on the same pixels.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msdgs_serve.rasterizer.view import GSPLAT
+from msdgs_serve.scene import Camera
+from msdgs_train.datasets import Frame, SceneData, composite
+from msdgs_train.gaussians.model import PosedGaussians
+from msdgs_train.gaussians.model_file import LoadedModel
+from msdgs_train.rendering.rasterize import rasterize
+
+MIN_CHANGE = 0.1  # of the range of a channel
+MIN_TRAVEL = 1.0  # pixels
+TIMES = 9
+FIXED_TIMES = 3  # a camera with photographs at so many times is fixed
+MEDIAN_PHOTOGRAPHS = 25  # at most, evenly chosen
+
+
+class MovingRegion(NamedTuple):
+    """Gives a frame's region, [H, W] bool, and says what it is made from."""
+
+    source: Literal["photographs", "model"]
+    mask: Callable[[Frame], np.ndarray]
+
+
+def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -> MovingRegion:
+    """From the photographs where each camera of the split has photographs at `FIXED_TIMES` times or more, of any
+    split; otherwise from the models."""
+    groups: dict[bytes, list[Frame]] = defaultdict(list)
+    for frame in (frame for frames in scene.splits.values() for frame in frames):
+        groups[_identity(frame.camera)].append(frame)
+    of_split = {_identity(frame.camera) for frame in scene.splits[split]}
+    if all(len({frame.t for frame in groups[camera]}) >= FIXED_TIMES for camera in of_split):
+        background = models[0].scene.background
+        medians = {camera: _median(groups[camera], background) for camera in of_split}
+        return MovingRegion(
+            "photographs",
+            lambda frame: _differs(composite(frame.load_rgba(), background), medians[_identity(frame.camera)]),
+        )
+    regions = [_ModelRegion(loaded, scene.time_range) for loaded in models]
+    return MovingRegion("model", lambda frame: np.any([region.mask(frame.camera, frame.t) for region in regions], 0))
+
+
+class _ModelRegion:
+    @torch.no_grad()
+    def __init__(self, loaded: LoadedModel, time_range: tuple[float, float]) -> None:
+        self.model = loaded.model
+        self.background = torch.tensor(loaded.scene.background)
+        self.centres = [loaded.model.pose(float(t)).means for t in np.linspace(*time_range, TIMES)]
+
+    @torch.no_grad()
+    def mask(self, camera: Camera, t: float) -> np.ndarray:
+        still = ~travels(self.centres, camera)
+        posed = self.model.pose(t)
+        whole, without = (
+            rasterize(*gaussians, camera, self.background, self.model.rasterizer)[0].clamp(0, 1).numpy()
+            for gaussians in (posed, PosedGaussians(*(tensor[still] for tensor in posed)))
+        )
+        return _differs(whole, without)
+
+
+def travels(centres: list[Tensor], camera: Camera) -> Tensor:
+    """[N] bool: the projections of a centre, [N, 3] at each of several times, span more than `MIN_TRAVEL` pixels.
+
+    Times at which it isn't in front of the camera are left out.
+    """
+    world_to_camera = torch.from_numpy(camera.world_to_camera).float()
+    focal, infinity = torch.tensor([camera.fx, camera.fy]), torch.tensor(torch.inf)
+    lowest, highest = infinity, -infinity
+    for means in centres:
+        points = means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+        pixels = focal * points[:, :2] / points[:, 2:]
+        in_front = points[:, 2:] > GSPLAT.near_plane
+        lowest = torch.minimum(lowest, torch.where(in_front, pixels, infinity))
+        highest = torch.maximum(highest, torch.where(in_front, pixels, -infinity))
+    return (highest - lowest).amax(dim=1) > MIN_TRAVEL
+
+
+def _median(frames: list[Frame], background: tuple[float, float, float]) -> np.ndarray:
+    """[H, W, 3] over the photographs of one camera."""
+    in_time = sorted(frames, key=lambda frame: frame.t)
+    places = np.linspace(0, len(in_time) - 1, min(len(in_time), MEDIAN_PHOTOGRAPHS)).round().astype(int)
+    return np.median([composite(in_time[place].load_rgba(), background) for place in places], axis=0)
+
+
+def _differs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.abs(one - other).max(axis=-1) > MIN_CHANGE
+
+
+def _identity(camera: Camera) -> bytes:
+    """Equal for cameras that are the same to six digits."""
+    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+    return (np.concatenate([intrinsics, camera.camera_to_world.ravel()]).round(6) + 0.0).tobytes()

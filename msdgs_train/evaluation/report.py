@@ -1,0 +1,166 @@
+"""What an evaluation leaves in RUN/eval: numbers as JSON, a table to read, and a contact sheet to look at."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msdgs_train.datasets.common.images import resize_area
+from msdgs_train.engine.files import write_text
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.evaluation.evaluate import FILES, Evaluation, JudgedModel, Scores
+from msdgs_train.evaluation.sheets import ColourScale, Panel, colour, draw_sheet
+
+FOLDER = "eval"
+SHEET_ROWS = 8
+LARGEST_PANEL = 320  # pixels of width; smaller pictures are repeated up to SMALLEST_PANEL
+SMALLEST_PANEL = 200
+COLOUR_MAP = "magma"
+FULL_ERROR = 0.25  # mean over the channels, the brightest colour of the map; fixed, so that sheets can be compared
+OUTLINE = (0, 220, 255)
+
+HEADINGS = {
+    "psnr": "PSNR, dB ↑",
+    "ssim": "SSIM ↑",
+    "lpips": "LPIPS ↓",
+    "flip": "ꟻLIP ↓",
+    "moving_psnr": "PSNR where it moves, dB ↑",
+}
+
+
+def write_evaluation(run: Path, evaluation: Evaluation) -> list[Path]:
+    """Write `<split>.png`, `.md` and `.json` to RUN/eval, each atomically and the JSON last; returns their paths."""
+    folder = run / FOLDER
+    folder.mkdir(exist_ok=True)
+    picture, table, numbers = (folder / f"{evaluation.split}.{kind}" for kind in ("png", "md", "json"))
+    draw_contact_sheet(picture, evaluation)
+    write_text(table, as_markdown(evaluation))
+    write_text(numbers, json.dumps(as_json(evaluation), indent=2, ensure_ascii=False) + "\n")
+    return [picture, table, numbers]
+
+
+def as_json(evaluation: Evaluation) -> dict[str, Any]:
+    """Plain values; a score that can't be had is null."""
+    return {
+        "data": str(evaluation.data),
+        "split": evaluation.split,
+        "moving_region": {
+            "source": evaluation.region_source,
+            "share": float(np.mean([mask.mean() for mask in evaluation.masks])),
+        },
+        "unavailable": evaluation.unavailable,
+        "best": evaluation.best and {"split": evaluation.best.split, "psnr": evaluation.best.psnr},
+        "models": {judged.name: _model_as_json(evaluation, judged) for judged in evaluation.models},
+    }
+
+
+def as_markdown(evaluation: Evaluation) -> str:
+    """Tables of the means of each model and of its images, and what the columns mean."""
+    rows = [[*_names(judged), *cells(evaluation, judged.mean)] for judged in evaluation.models]
+    parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} photographs of {evaluation.data}"]
+    parts += [_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
+    for judged in evaluation.models:
+        images = [
+            [frame.name, f"{frame.t:.4g}", *cells(evaluation, scores), f"{100 * mask.mean():.1f} %"]
+            for frame, scores, mask in zip(evaluation.frames, judged.images, evaluation.masks, strict=True)
+        ]
+        parts += [f"## {judged.name}", _table(["image", "t", *HEADINGS.values(), "moving region"], images)]
+    return "\n\n".join(parts) + "\n"
+
+
+def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
+    """A score each as text, in the order of `HEADINGS`."""
+    digits = {"psnr": 2, "moving_psnr": 2}
+    return [
+        f"{value:.{digits.get(name, 4)}f}"
+        if value is not None
+        else ("unavailable" if name in evaluation.unavailable else "nothing moves")
+        for name, value in scores._asdict().items()
+    ]
+
+
+def notes(evaluation: Evaluation) -> list[str]:
+    """What has to be said below the table."""
+    made_from = {"photographs": "the photographs", "model": "the models"}[evaluation.region_source]
+    share = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
+    said = [f"Where it moves: {share:.1f} % of the pixels, found in {made_from}; the same for all models."]
+    if evaluation.best is not None:
+        best = evaluation.best
+        said.append(f"best: of the highest PSNR on `{best.split}` while training, {best.psnr:.2f} dB.")
+    elif len(evaluation.models) < len(FILES):
+        said.append(f"best: this run has kept no {FILES['best']}.")
+    return [*said, *(f"{HEADINGS[name][:-2]}: unavailable, {why}." for name, why in evaluation.unavailable.items())]
+
+
+def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
+    """A row each for the worst frame of the last model, the best, and some evenly spaced in between: the photograph,
+    then each model's rendering and its error, with the moving region outlined. Atomic."""
+    models = distinct_models(evaluation)
+    by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: evaluation.models[0].images[index].psnr)
+    count = min(SHEET_ROWS, len(by_psnr))
+    chosen = [by_psnr[round(place)] for place in np.linspace(0, len(by_psnr) - 1, count)]
+    rows = [_row(evaluation, models, index) for index in chosen]
+    shown = "" if count == len(by_psnr) else f"{count} of "
+    names = " and ".join(f"{judged.name} (step {judged.loaded.step:,})" for judged in models)
+    title = f"{evaluation.split}, {shown}{len(by_psnr)} frames, worst first: {names}"
+    draw_sheet(path, title, rows, ColourScale("error", "0", f"≥ {FULL_ERROR}", COLOUR_MAP))
+
+
+def distinct_models(evaluation: Evaluation) -> list[JudgedModel]:
+    """Without the best one where it is the last one, which need not be looked at twice."""
+    last, *others = evaluation.models
+    return [last, *(judged for judged in others if judged.loaded.step != last.loaded.step)]
+
+
+def _row(evaluation: Evaluation, models: list[JudgedModel], index: int) -> list[Panel]:
+    frame, mask = evaluation.frames[index], evaluation.masks[index]
+    truth = models[0].photograph(frame).numpy()
+    row = [Panel(_fitted(to_bytes(truth)), f"{frame.name}, t = {frame.t:.3g}")]
+    for judged in models:
+        scores, rgb = judged.images[index], judged.render(frame).numpy()
+        moving = "" if scores.moving_psnr is None else f", moving {scores.moving_psnr:.1f}"
+        error = colour(np.abs(rgb - truth).mean(axis=-1) / FULL_ERROR, COLOUR_MAP)
+        error[_outline(mask)] = OUTLINE
+        row.append(Panel(_fitted(to_bytes(rgb)), f"{judged.name}: {scores.psnr:.1f} dB{moving}"))
+        row.append(Panel(_fitted(error), "error" + (", moving region outlined" if mask.any() else "")))
+    return row
+
+
+def _outline(mask: np.ndarray) -> np.ndarray:
+    """[H, W] bool: pixels outside of the mask with a neighbour inside, so that nothing inside is covered."""
+    padded = np.pad(mask, 1)
+    return ~mask & (padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
+
+
+def _fitted(pixels: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3] of a width that a sheet has room for, with pixels repeated or averaged."""
+    height, width, _ = pixels.shape
+    if width <= LARGEST_PANEL:
+        times = -(-SMALLEST_PANEL // width)
+        return pixels.repeat(times, axis=0).repeat(times, axis=1)
+    opaque = np.concatenate([pixels, np.full((height, width, 1), 255, np.uint8)], axis=2)
+    return resize_area(opaque, LARGEST_PANEL, max(1, round(height * LARGEST_PANEL / width)))[..., :3]
+
+
+def _model_as_json(evaluation: Evaluation, judged: JudgedModel) -> dict[str, Any]:
+    images = [
+        {"name": frame.name, "t": frame.t, **scores._asdict(), "moving_share": float(mask.mean())}
+        for frame, scores, mask in zip(evaluation.frames, judged.images, evaluation.masks, strict=True)
+    ]
+    return {
+        "file": FILES[judged.name],
+        "step": judged.loaded.step,
+        "gaussians": len(judged.loaded.model.gaussians),
+        "mean": judged.mean._asdict(),
+        "images": images,
+    }
+
+
+def _names(judged: JudgedModel) -> list[str]:
+    return [judged.name, FILES[judged.name], f"{judged.loaded.step:,}", f"{len(judged.loaded.model.gaussians):,}"]
+
+
+def _table(header: list[str], rows: list[list[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,112 @@
+"""Differentiable rendering: the service's own kernels on a CPU, gsplat on CUDA, behind one function."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msdgs_serve.rasterizer.compositing import Frame, composite
+from msdgs_serve.rasterizer.compositing_backward import composite_backward
+from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.projection_backward import project_backward
+from msdgs_serve.rasterizer.tiles import bin_into_tiles
+from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
+from msdgs_serve.scene import Camera, Gaussians
+
+
+class RasterizationInfo:
+    """What density control needs to know of one rendering."""
+
+    radii: Tensor
+    """[N] larger half-extent of the footprint in pixels, 0 where not drawn."""
+    means2d_grads: Tensor | None = None
+    """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    camera: Camera,
+    background: Tensor,
+    options: RasterizerOptions = GSPLAT,
+) -> tuple[Tensor, Tensor, RasterizationInfo]:
+    """Draw N activated Gaussians; differentiable in every tensor.
+
+    Args:
+        means: [N, 3] world space.
+        quats: [N, 4] wxyz, unit.
+        scales: [N, 3] standard deviations, scene units.
+        opacities: [N] in (0, 1).
+        sh: [N, (degree + 1)², 3].
+        camera: pinhole, OpenCV axes.
+        background: [3] colour behind everything.
+        options: rasterizer constants; on CUDA gsplat's limits of alpha and transmittance are fixed.
+
+    Returns:
+        rgb [H, W, 3] with the background, alpha [H, W], and what density control needs.
+    """
+    info = RasterizationInfo()
+    if means.is_cuda:
+        from msdgs_train.rendering.cuda import rasterize_cuda
+
+        rgb, alpha = rasterize_cuda(means, quats, scales, opacities, sh, camera, background, options, info)
+    else:
+        rgb, alpha = _Rasterize.apply(means, quats, scales, opacities, sh, background, camera, options, info)
+    return rgb, alpha, info
+
+
+BACKGROUND = 5
+"""Its place among the arguments; summing its gradient takes as long as half of the rest where a picture is large."""
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        background: Tensor,
+        camera: Camera,
+        options: RasterizerOptions,
+        info: RasterizationInfo,
+    ) -> tuple[Tensor, Tensor]:
+        gaussians = Gaussians(*map(_array, (means, quats, scales, opacities, sh)))
+        splats = project(gaussians, camera, options)
+        tiles = bin_into_tiles(splats, camera.width, camera.height)
+        frame = composite(splats, tiles, camera.width, camera.height, _array(background), options)
+        info.radii = torch.from_numpy(splats.extents.max(axis=1, initial=0))
+        image = torch.from_numpy(frame.rgb)
+        # saved as tensors: autograd then notices if one is written to before the backward pass
+        ctx.save_for_backward(means, quats, scales, opacities, sh, image)
+        ctx.drawn = (splats, tiles, frame.alpha)
+        ctx.view = (camera, options)
+        ctx.info = info
+        return image, torch.from_numpy(frame.alpha)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
+        *arrays, rgb = map(_array, ctx.saved_tensors)
+        gaussians = Gaussians(*arrays)
+        splats, tiles, alpha = ctx.drawn
+        grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
+        unused = np.empty((0, 0), rgb.dtype)
+        frame = Frame(rgb, alpha, unused, unused)
+        sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
+        grads = project_backward(gaussians, splats, sums, *ctx.view)
+        ctx.info.means2d_grads = torch.from_numpy(grads.means2d)
+        arrays = (grads.means, grads.quats, grads.scales, grads.opacities, grads.sh)
+        grad_background = None
+        if ctx.needs_input_grad[BACKGROUND]:
+            grad_background = torch.from_numpy(np.einsum("hw,hwc->c", 1 - alpha, grad_rgb))
+        return *(torch.from_numpy(array) for array in arrays), grad_background, None, None, None
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()

@@ -1,0 +1,79 @@
+"""A model at one moment, and how any camera sees it."""
+
+import copy
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+
+from msdgs_serve.rasterizer import Rendering, rasterize
+from msdgs_serve.scene import Camera, Gaussians
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import LoadedModel
+
+Channel = Literal["rgb", "alpha", "depth"]
+OUTLYING_DEPTHS = (0.02, 0.98)
+"""Quantiles of the depths that are seen: what is nearer is white, what is farther black."""
+
+
+@dataclass(eq=False)
+class Snapshot:
+    """A model that nobody changes any more. For one thread."""
+
+    model: DynamicGaussians
+    background: tuple[float, float, float]  # sRGB in [0, 1]
+    deform: bool = True  # False in the warm-up, whose layers have not been trained
+    sh_degree: int | None = None  # of the bands in use; None: all
+    _posed: tuple[tuple[float, int], Gaussians] | None = field(default=None, init=False)
+
+    def draw(self, camera: Camera, t: float, layers: int, channel: Channel = "rgb") -> np.ndarray:
+        """[H, W, 3] uint8 at time `t`, after so many layers of the deformation.
+
+        Alpha is white where nothing shines through, depth where it is nearest. Raises `InvalidInput` where Gaussians
+        aren't finite.
+        """
+        posed, options = self._pose(t, layers), self.model.rasterizer
+        drawn = rasterize(posed, camera, background=self.background, depth=channel == "depth", options=options)
+        return _picture(drawn, channel)
+
+    @torch.no_grad()
+    def _pose(self, t: float, layers: int) -> Gaussians:
+        """Kept until another is wanted: a camera that moves asks for the same again and again."""
+        if self._posed is None or self._posed[0] != (t, layers):
+            posed = self.model.pose(t, steps=layers, deform=self.deform, sh_degree=self.sh_degree)
+            self._posed = (t, layers), Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
+        return self._posed[1]
+
+
+def snapshot_of_training(trainer: Trainer) -> Snapshot:
+    """A copy of the model as it would be judged and saved now. Not to be called while a step is done."""
+    model = copy.deepcopy(trainer.kept_model)
+    return Snapshot(model, trainer.config.evaluation_background, *trainer.parts_in_use)
+
+
+def snapshot_of_file(loaded: LoadedModel) -> Snapshot:
+    """What `model.pt` or `best.pt` holds."""
+    return Snapshot(loaded.model, loaded.scene.background)
+
+
+def _picture(rendering: Rendering, channel: Channel) -> np.ndarray:
+    match channel:
+        case "rgb":
+            return to_bytes(rendering.rgb)
+        case "alpha":
+            values = rendering.alpha
+        case "depth":
+            values = _nearness(rendering.depth)
+    return np.repeat(to_bytes(values)[:, :, None], 3, axis=2)
+
+
+def _nearness(depth: np.ndarray) -> np.ndarray:
+    """[H, W] in [0, 1] of distances along the axis, which are infinite where nothing is; 1 is nearest."""
+    seen = np.isfinite(depth)
+    if not seen.any():
+        return np.zeros_like(depth)
+    near, far = np.quantile(depth[seen], OUTLYING_DEPTHS)
+    return np.where(seen, (far - np.where(seen, depth, far)) / max(far - near, 1e-9), 0)

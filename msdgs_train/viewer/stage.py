@@ -1,0 +1,59 @@
+"""Where and when a scene takes place, and from where it is seen at first."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.scene import Camera
+from msdgs_serve.scene.camera import orbit
+from msdgs_train.datasets import SceneData
+from msdgs_train.evaluation.layer_strip import camera_of
+from msdgs_train.gaussians.model_file import LoadedModel
+
+DEFAULT_FOV = 50.0  # degrees, vertical
+
+
+class Stage(NamedTuple):
+    """What a viewer has to know before it shows anything. World axes, scene units."""
+
+    time_range: tuple[float, float]
+    layers: int  # K
+    eye: np.ndarray  # [3]
+    target: np.ndarray  # [3] in the middle of the first picture; the camera turns around it
+    up: np.ndarray  # [3] unit
+    fov_y: float  # radians
+
+
+def stage_of_data(scene: SceneData, layers: int) -> Stage:
+    """Seen as in the first photograph."""
+    middle = np.zeros(3) if scene.points is None or not len(scene.points) else np.median(scene.points, axis=0)
+    cameras = [frame.camera for frame in scene.splits["train"]]
+    return _seen_by(cameras, middle, scene.time_range, layers)
+
+
+def stage_of_file(loaded: LoadedModel) -> Stage:
+    """Seen by the first camera that the model holds, or where it has none from aside, z upwards."""
+    low, high = np.array(loaded.scene.bounds)
+    cameras = [camera_of(entry, entry["width"]) for entry in loaded.scene.cameras]
+    if not cameras:
+        distance = max(float(np.linalg.norm(high - low)), 1e-3)
+        pose = orbit((low + high) / 2, distance, 30.0, 20.0, np.array([0.0, 0.0, 1.0]))
+        cameras = [Camera.from_fov(pose, 1, 1, DEFAULT_FOV)]
+    return _seen_by(cameras, (low + high) / 2, loaded.scene.time_range, len(loaded.model.deformation))
+
+
+def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[float, float], layers: int) -> Stage:
+    """By the first of them; the target is the point of its axis that is nearest to `middle`, [3]."""
+    first = cameras[0]
+    forward = first.camera_to_world[:3, 2]
+    ahead = float((middle - first.position) @ forward)
+    distance = ahead if ahead > 0 else max(float(np.linalg.norm(middle - first.position)), 1e-3)
+    up = -np.mean([camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
+    if np.linalg.norm(up) < 1e-3 or np.linalg.norm(np.cross(up, forward)) < 1e-3:
+        up = -first.camera_to_world[:3, 1]
+    fov_y = 2 * math.atan(first.height / (2 * first.fy))
+    return Stage(
+        time_range, layers, first.position, first.position + distance * forward, up / np.linalg.norm(up), fov_y
+    )

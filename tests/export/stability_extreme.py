@@ -1,0 +1,343 @@
+"""Made models and scenes at the edges: the traps of the field, counts, extents, scales, opacities, broken files."""
+
+import io
+import itertools
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+
+from export.jobs.bake import bake
+from export.measure.frames import View, image_gap, in_picture
+from export.measure.gap import half_diagonal, largest_error, pose_arrays, pose_errors
+from export.plans.registry import build
+from export.precision.formats import FLOAT32, in_format
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.scene import Gaussians
+from msdgs_serve.scene.errors import MsdgsError
+from msdgs_train.gaussians.model import Domain, DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
+from msdgs_train.layers.mlp import PositionalEncoding, octaves
+from msdgs_train.rendering.rasterize import rasterize as rasterize_for_training
+from tests.export.stability_rows import Row, measured, refused, relative
+from tests.support.exports import export_scene
+from tests.support.models import CAMERA, SCENE, random_model
+from tests.support.scene_files import write_scene
+from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of
+
+COUNT = 60
+Change = Callable[[DynamicGaussians], object]
+BACKGROUND = (0.2, 0.6, 0.9)
+MOVES, SCALES, PICTURE = "pose from the scene file", "scales from the file, relative", "float32 picture"
+
+
+def changed(change: Change = lambda model: None, count: int = COUNT, **config: Any) -> DynamicGaussians:
+    """A random model of one layer, changed."""
+    model = random_model(count, **{"sh_degree": 0, "layers": ("mlp",), "xyz_frequencies": 6, **config})
+    with torch.no_grad():
+        change(model)
+    return model
+
+
+def exported(model: DynamicGaussians, scene: SceneInfo = SCENE) -> DeformationSession:
+    """The scene file that the export makes of a model, opened."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder)
+        save_model(path / "model.pt", model, scene, 1)
+        return DeformationSession(export_scene(path / "model.pt", path / "scene.onnx", times=3).path)
+
+
+def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: DeformationSession | None = None) -> float:
+    """Largest error of the file's poses against the model in float64, at both ends and between, as
+    `export.measure.verify` measures it."""
+    session = session or exported(model, scene)
+    double, worst = in_format(model, FLOAT32).double(), 0.0
+    for t in (scene.time_range[0], sum(scene.time_range) / 2, scene.time_range[1]):
+        drawn = session.gaussians(t).validate()
+        got = {name: getattr(drawn, name) for name in ("means", "quats", "scales")}
+        errors = pose_errors(got, pose_arrays(double, t), half_diagonal(scene.bounds))
+        worst = max(worst, float(largest_error(errors).max(initial=0)))
+    return worst
+
+
+def picture_error(gaussians: Gaussians, camera: Any) -> float:
+    """dB of the float32 picture against the one of the float64 kernels, which the oracle holds to its loops."""
+    single, double = (rasterize(as_dtype(gaussians, d), camera, background=BACKGROUND).rgb for d in (np.float32, float))
+    return image_gap(single, double).psnr
+
+
+def traps() -> Iterator[Row]:
+    """The traps of the field, one after the other."""
+    yield from _encoding()
+    yield measured("fp16 covariance: scales of 1e-4", SCALES, _scale_error(1e-4), "float32.relative")
+    far = changed(lambda m: m.gaussians.means.add_(30.0), layers=())
+    session = exported(far, replace(SCENE, bounds=[[28.7] * 3, [31.3] * 3], cameras=[]))
+    yield measured(
+        "fp16 positions: 30 units away",
+        "means from the file, relative",
+        relative(session.scene.static_means, far.gaussians.means.detach().numpy()),
+        "float32.relative",
+    )
+    for norm in (0.0, 1e-12):
+        model = changed(lambda m, n=norm: m.gaussians.raw_quats.copy_(torch.tensor([0.0, n, 0.0, 0.0])), layers=())
+        identity = np.tile([1.0, 0, 0, 0], (COUNT, 1))
+        yield measured(
+            f"quaternions of length {norm:g}",
+            "identity in the file",
+            float(np.abs(exported(model).scene.static_quats - identity).max()),
+            "float32.relative",
+        )
+    shrinking = changed(_head_bias(slice(3, 6), -10.0), delta_space="activated")
+    yield measured("activated ΔS of −5 on scales of 0.1", MOVES, file_error(shrinking), "export.relative")
+    for logit in (1e4, -1e4):
+        model = changed(lambda m, v=logit: m.get_parameter("modulation.output.bias").fill_(v))
+        yield measured(f"exp of the modulation: exponent {logit:g}", MOVES, file_error(model), "export.relative")
+    for name, scene in ADVERSARIAL.items():
+        yield measured(f"trap scene `{name}`", PICTURE, picture_error(*scene()), "oracle_db")
+    yield measured("opacity → 1: logit 100", "gradients, of the largest", _opaque_gradient(), "gradient.float32")
+    yield from _times()
+    yield refused("anti-aliasing not recorded", lambda: _opened(antialiasing="none"), "antialiasing")
+
+
+def _encoding() -> Iterator[Row]:
+    x = torch.linspace(-1.3, 1.3, 20_001, dtype=torch.double)[:, None].float()
+    exact = PositionalEncoding.apply(x.double(), octaves(1, 10).double())
+    single = PositionalEncoding.apply(x, octaves(1, 10))
+    half = PositionalEncoding.apply(x.half().float(), octaves(1, 10))
+    yield measured("encoding at 2⁹", "sines in float32", float((single - exact).abs().max()), "encoding.float32")
+    types = {t.data_type for t in onnx.load_from_string(_network(changed())).graph.initializer}
+    half_types = len(types & {onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16})
+    name = f"encoding at 2⁹ in float16, off by {float((half - exact).abs().max()):.2f}"
+    yield measured(name, "such numbers in a scene file", half_types, "stability.none")
+
+
+def _network(model: DynamicGaussians) -> bytes:
+    return build("network", bake(model, SCENE, "0" * 64)).SerializeToString()
+
+
+def _scale_error(scale: float) -> float:
+    model = changed(lambda m: m.gaussians.log_scales.fill_(math.log(scale)), layers=())
+    return relative(exported(model).scene.static_scales, pose_arrays(in_format(model, FLOAT32).double(), 0.0)["scales"])
+
+
+def _head_bias(columns: slice, value: float) -> Change:
+    def change(model: DynamicGaussians) -> None:
+        model.get_parameter("deformation.layers.0.heads.bias")[columns] = value
+
+    return change
+
+
+def _opaque_gradient() -> float:
+    """Largest difference of float32 gradients from float64 ones, where opacities are 1 to the last bit."""
+    camera, gaussians = front_camera(), gaussians_of([[0, 0, 2], [0.1, 0, 3], [-0.1, 0.1, 4]])
+    gradients = []
+    for dtype in (torch.float32, torch.float64):
+        names = ("means", "quats", "scales", "sh")
+        means, quats, scales, sh = (torch.tensor(getattr(gaussians, n), dtype=dtype, requires_grad=True) for n in names)
+        logits = torch.full((3,), 100.0, dtype=dtype, requires_grad=True)
+        rgb, _, _ = rasterize_for_training(
+            means, quats, scales, logits.sigmoid(), sh, camera, torch.ones(3, dtype=dtype)
+        )
+        gradients.append(torch.autograd.grad(rgb.square().sum(), [means, scales, sh, logits]))
+    pairs = zip(*gradients, strict=True)
+    errors = [float((a.double() - b).abs().max() / b.abs().max().clamp_min(1e-30)) for a, b in pairs]
+    return max(errors) if all(math.isfinite(e) for e in errors) else math.inf
+
+
+def _times() -> Iterator[Row]:
+    scene = replace(SCENE, time_range=(0.3, 0.7))
+    model = changed()
+    session = exported(model, scene)
+    yield measured("t = t0, t1 and between", MOVES, file_error(model, scene, session), "export.relative")
+    for t in (0.29, 0.71, math.nan, math.inf):
+        yield refused(f"t = {t} outside of [0.3, 0.7]", lambda t=t: session.pose(t), "`t`", "[0.3, 0.7]")
+    still = replace(SCENE, time_range=(0.5, 0.5))
+    yield measured("t0 = t1", MOVES, file_error(model, still), "export.relative")
+
+
+def _opened(**metadata: Any) -> DeformationSession:
+    with tempfile.TemporaryDirectory() as folder:
+        return DeformationSession(write_scene(Path(folder) / "scene.onnx", **metadata))
+
+
+def counts() -> Iterator[Row]:
+    """None, one, and a million."""
+    for count, layers in ((0, ("mlp",)), (0, ()), (1, ("mlp",)), (1, ("plane",))):
+        model = changed(count=count, layers=layers)
+        yield measured(f"N = {count}, K = {len(layers)}", MOVES, file_error(model), "export.relative")
+
+
+def a_million() -> Iterator[Row]:
+    """A million moving Gaussians, few of which are compared."""
+    small = {"width": 4, "depth": 1, "xyz_frequencies": 1, "time_width": 4, "time_features": 2, "embedding_size": 0}
+    model = changed(_many, count=2, **small)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.onnx"
+        path.write_bytes(_network(model))
+        means, quats, scales = DeformationSession(path).pose(0.5)
+    ids = np.arange(0, len(means), 997)
+    got = {"means": means[ids], "quats": quats[ids], "scales": scales[ids]}
+    errors = pose_errors(got, pose_arrays(in_format(model, FLOAT32).double(), 0.5, ids), half_diagonal(SCENE.bounds))
+    yield measured(f"N = {len(means):,}", MOVES, float(largest_error(errors).max()), "export.relative")
+
+
+def _many(model: DynamicGaussians) -> None:
+    for name, parameter in list(model.gaussians.named_parameters()):
+        many = parameter.detach().repeat(500_000, *[1] * (parameter.ndim - 1))
+        model.gaussians.register_parameter(name, torch.nn.Parameter(many))
+
+
+def extents() -> Iterator[Row]:
+    """The same scene in other units. Plane layers know their extent; MLP layers encode scene units as they are."""
+    for kind in ("plane", "mlp"):
+        for exponent in (-6, -3, 0, 3, 6):
+            model, scene = _scaled(kind, 10.0**exponent)
+            case = f"extent × 1e{exponent}, two {kind} layers"
+            try:
+                session = exported(model, scene)
+            except MsdgsError:
+                reason = "near plane" if exponent < 0 else "float32"
+                yield refused(case, lambda m=model, s=scene: exported(m, s), reason)
+                continue
+            unstable = session.scene.metadata.measured_error["unstable"]["count"]
+            if unstable:  # no float32 file could keep the poses, so frames decide
+                seen, psnr = frames_error(model, scene, session)
+                quantity = f"frames of the scene file, {unstable} of {COUNT} Gaussians unstable, {seen} in them"
+                yield measured(case, quantity, psnr, "stability.accepted_db")
+            else:
+                yield measured(case, MOVES, file_error(model, scene, session), "export.relative")
+
+
+def frames_error(model: DynamicGaussians, scene: SceneInfo, session: DeformationSession) -> tuple[int, float]:
+    """The most Gaussians in a frame, and dB of the file's worst frame against the model in float64, at times that the
+    assessment did not look at."""
+    view, double = View(scene), in_format(model, FLOAT32).double()
+    t0, t1 = scene.time_range
+    seen, worst = 0, math.inf
+    for t in t0 + (t1 - t0) * np.array([0.0, 0.137, 0.419, 0.733, 0.951, 1.0]):
+        drawn = session.gaussians(float(t))
+        got = {name: getattr(drawn, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+        exact = pose_arrays(double, float(t))
+        for camera in view.cameras:
+            seen = max(seen, int(in_picture(exact["means"], camera).sum()))
+            worst = min(worst, image_gap(view.draw(got, camera), view.draw(exact, camera)).psnr)
+    return seen, worst
+
+
+def _scaled(kind: str, factor: float) -> tuple[DynamicGaussians, SceneInfo]:
+    """A scene, its cameras and all of its motion, `factor` times as large."""
+    like = changed(layers=(kind, kind), xyz_frequencies=10)
+    model = DynamicGaussians(like.config, like.gaussians, Domain(1.3 * factor))
+    own = ("cells", "first_time", "time_cells")
+    model.load_state_dict({n: v for n, v in like.state_dict().items() if n.split(".")[-1] not in own}, strict=False)
+    with torch.no_grad():
+        model.gaussians.means.mul_(factor)
+        model.gaussians.log_scales.add_(math.log(factor))
+        for k, part in itertools.product((0, 1), ("weight", "bias")):
+            head = f"deformation.layers.{k}.heads" + (".0" if kind == "plane" else "")
+            model.get_parameter(f"{head}.{part}")[:3] *= factor
+    pose = np.array(CAMERA["camera_to_world"])
+    pose[:3, 3] *= factor
+    cameras = [{"name": "front", "t": 0.0, **CAMERA, "camera_to_world": pose.tolist()}]
+    return model, replace(SCENE, bounds=(np.array(SCENE.bounds) * factor).tolist(), cameras=cameras)
+
+
+def shapes() -> Iterator[Row]:
+    """Scales, needles, opacities at the ends of what there is."""
+    for exponent in (-20, -10, 10, 20):
+        error = _scale_error(math.exp(exponent))
+        yield measured(f"scales of e^{exponent}", SCALES, error, "float32.relative")
+        gaussians = gaussians_of([[0, 0, 2], [0.3, 0.1, 3]], scales=np.exp([exponent, -2.0]))
+        yield measured(f"scales of e^{exponent}", PICTURE, picture_error(gaussians, front_camera()), "oracle_db")
+    for turn in ((1.0, 0, 0, 0), (0.8, 0.0, 0.0, 0.6), (0.5, 0.5, 0.5, 0.5)):
+        needle = gaussians_of([[0, 0, 2]], scales=[[1.0, 1e-6, 1e-6]], quats=turn)
+        error = picture_error(needle, front_camera())
+        yield measured(f"needle of 1e6 : 1, turned {turn}", PICTURE, error, "oracle_db")
+    for logit, opacity in ((200.0, 1.0), (-200.0, 0.0)):
+        model = changed(lambda m, v=logit: m.gaussians.raw_opacities.fill_(v))
+        error = float(np.abs(exported(model).scene.opacities - opacity).max())
+        yield measured(f"opacity {opacity:g}: logit {logit:g}", "opacities from the file", error, "float32.relative")
+
+
+def poison() -> Iterator[Row]:
+    """NaN and inf in each tensor of a model's file, and in what it says of its scene."""
+    contents = _contents()
+    for value in (math.nan, math.inf):
+        missed, named = [], ""
+        tensors = {name: tensor for name, tensor in contents["state"].items() if tensor.numel()}
+        for name, tensor in tensors.items():
+            bad = tensor.clone()
+            bad.view(-1)[:2] = value
+            count = min(2, tensor.numel())
+            state = {**contents["state"], name: bad}
+            broken, reason = {**contents, "state": state}, f"{name} ({count} of {tensor.numel():,})"
+            row = refused("", lambda c=broken: _loaded(_bytes(c)), reason)
+            missed += [] if row.verdict.startswith("refused") else [f"{name}: {row.verdict}"]
+            named = row.verdict
+        case = f"{value} in each of the {len(tensors)} tensors of a model"
+        yield Row(case, "", "–", "a refusal", f"fails: {missed[0]}" if missed else named)
+    huge = {**contents["state"], "gaussians.means": torch.full((3, 3), 1e300, dtype=torch.double)}
+    broken = {**contents, "state": huge}
+    yield refused("1e300 in a float64 tensor", lambda: _loaded(_bytes(broken)), "gaussians.means (9 of 9)")
+    for name, value in (
+        ("time_range", (0.0, math.nan)),
+        ("time_range", (1.0, 0.0)),
+        ("background", (0.0, math.inf, 0.0)),
+        ("bounds", [[-math.inf] * 3, [1.0] * 3]),
+        ("cameras", [{**SCENE.cameras[0], "fx": math.nan}]),
+    ):
+        scene = replace(SCENE, **{name: value})
+        case = f"scene `{name}` = {value}" if name != "cameras" else "a camera of the scene with fx = nan"
+        yield refused(case, lambda s=scene: exported(changed(), s), name.removesuffix("s"))
+
+
+def broken_files() -> Iterator[Row]:
+    """Files that are no model."""
+    whole = _bytes(_contents())
+    for part in (0.0, 0.2, 0.9, 0.999):
+        rest = whole[: int(part * len(whole))]
+        yield refused(f"model.pt cut off after {part:.1%}", lambda d=rest: _loaded(d), "model.pt")
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2 :: 64] = bytes(len(flipped[len(whole) // 2 :: 64]))
+    for case, data in (
+        ("a text", b"not a model"),
+        ("a PNG", b"\x89PNG\r\n\x1a\n" + bytes(64)),
+        ("somebody else's checkpoint", _bytes({"state_dict": {"w": torch.zeros(3)}})),
+        ("a list", _bytes([1, 2, 3])),
+        ("a model of a later format", _bytes({**_contents(), "format": "msdgs-model/9"})),
+        ("bytes overwritten in the middle", bytes(flipped)),
+    ):
+        yield refused(f"model.pt is {case}", lambda d=data: _loaded(d), "model.pt")
+
+
+def _contents() -> dict[str, Any]:
+    model = changed(count=3, layers=("mlp", "plane"), width=4, plane_space_nodes=2, plane_time_nodes=2)
+    buffer = io.BytesIO()
+    with tempfile.TemporaryDirectory() as folder:
+        save_model(Path(folder) / "model.pt", model, SCENE, 1)
+        buffer.write((Path(folder) / "model.pt").read_bytes())
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=True)
+
+
+def _bytes(contents: Any) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(contents, buffer)
+    return buffer.getvalue()
+
+
+def _loaded(data: bytes) -> object:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.pt"
+        path.write_bytes(data)
+        return load_model(path)
+
+
+GROUPS = (traps, counts, a_million, extents, shapes, poison, broken_files)

@@ -1,0 +1,72 @@
+"""Rows of the stability suite: a made case, what was measured, its bound in the tolerances, and whether it held.
+
+A case either holds its bound, or is refused with a message that says why. Anything else fails: a bound broken, another
+exception than the package's own, a refusal that doesn't name its reason, NaN.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from msdgs_serve.scene.errors import MsdgsError
+from tests.support.tolerances import tolerance
+
+HOLDS, REFUSED, FAILS = "holds", "refused", "fails"
+
+
+class Row(NamedTuple):
+    """One line of the table."""
+
+    case: str
+    quantity: str
+    error: str
+    bound: str
+    verdict: str
+
+
+def measured(case: str, quantity: str, error: float, bound: str) -> Row:
+    """Whether an error keeps the row `bound` of the tolerances; of one in dB, which must not be lower."""
+    limit = tolerance(bound)
+    decibels = bound.endswith("_db")
+    held = math.isfinite(error) and (error >= limit if decibels else error <= limit)
+    shown = (f"{error:.1f} dB", f"≥ {limit:g} dB") if decibels else (f"{error:.1e}", f"≤ {limit:.1g}")
+    return Row(case, quantity, *shown, HOLDS if held else FAILS)
+
+
+def refused(case: str, action: Callable[[], object], *reasons: str, quantity: str = "") -> Row:
+    """Whether `action` is refused with one of the package's own errors, whose message has all `reasons` in it."""
+    try:
+        action()
+    except MsdgsError as error:
+        message = " ".join(str(error).split())
+        named = all(reason in message for reason in reasons)
+        return Row(
+            case, quantity, "–", "a refusal", f"{REFUSED}: {shortened(message)}" if named else f"{FAILS}: {message}"
+        )
+    except Exception as error:  # what must not happen is a row, too
+        return Row(case, quantity, "–", "a refusal", f"{FAILS}: {type(error).__name__} {error}")
+    return Row(case, quantity, "–", "a refusal", f"{FAILS}: was accepted")
+
+
+def shortened(message: str, length: int = 110) -> str:
+    """The message without the folder of a file, cut at a word."""
+    message = " ".join(word.rsplit("/", 1)[-1] if word.startswith("/") else word for word in message.split())
+    return message if len(message) <= length else message[:length].rsplit(" ", 1)[0] + " …"
+
+
+def relative(got: np.ndarray, want: np.ndarray) -> float:
+    """Largest error relative to each element; infinite where shapes differ or one is NaN."""
+    got, want = np.asarray(got, np.float64), np.asarray(want, np.float64)
+    if got.shape != want.shape:
+        return math.inf
+    errors = np.abs(got - want) / np.maximum(np.abs(want), 1e-300)
+    return float(np.where(np.isfinite(errors), errors, math.inf).max(initial=0))
+
+
+def markdown(rows: Iterable[Row]) -> str:
+    """The table as it stands in docs/stability.md."""
+    lines = ["| case | quantity | error against float64 | bound | verdict |", "|---|---|---|---|---|"]
+    lines += ["| " + " | ".join(cell.replace("|", "∣") for cell in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"

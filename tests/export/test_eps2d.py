@@ -1,0 +1,136 @@
+"""A model's own eps2d goes with it: whoever draws it, in training, judging, exporting and serving, draws the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import helper
+
+from export.jobs.job import Job
+from export.measure.rendered_error import ExactFrames, posed, shown
+from export.measure.views import View
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.rasterizer import GSPLAT, rasterize
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_train.datasets import Frame, load_scene
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.evaluation.evaluate import JudgedModel
+from msdgs_train.evaluation.layer_strip import camera_of, render_steps
+from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
+from msdgs_train.viewer.snapshot import snapshot_of_file
+from tests.support.exports import export_scene
+from tests.support.models import CAMERA, SCENE, random_model, small_config
+from tests.support.tolerances import tolerance
+from tests.support.training_scene import SHARED_MOTIONS, write_scene
+from tests.support.training_scene import small_config as training_config
+
+T = 0.5
+EPS2D = 0.02
+NARROW = GSPLAT._replace(eps2d=EPS2D)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With a model and its scene file."""
+    folder = tmp_path_factory.mktemp("narrow")
+    model = random_model(count=60, eps2d=EPS2D)
+    with torch.no_grad():
+        model.gaussians.log_scales.sub_(1.5)  # under a pixel, where it is eps2d that is seen
+        model.gaussians.raw_opacities.add_(2.0)
+    save_model(folder / "model.pt", model, SCENE, 1)
+    export_scene(folder / "model.pt", folder / "scene.onnx")
+    return folder
+
+
+@pytest.fixture
+def loaded(folder: Path) -> LoadedModel:
+    return load_model(folder / "model.pt")
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return camera_of(CAMERA, CAMERA["width"])
+
+
+@pytest.fixture
+def expected(loaded: LoadedModel, camera: Camera) -> np.ndarray:
+    gaussians = posed(loaded.model, T)
+    narrow = shown(gaussians, camera, SCENE.background, NARROW)
+    assert np.abs(narrow - shown(gaussians, camera, SCENE.background, GSPLAT)).max() > 0.05
+    return narrow
+
+
+def test_pictures_of_a_model(loaded: LoadedModel, camera: Camera, expected: np.ndarray):
+    frame = Frame("a", camera, T, Path("a.png"))
+    judged = JudgedModel("last", loaded, []).render(frame).numpy()
+    np.testing.assert_allclose(judged, expected, atol=tolerance("served_frame"))
+    np.testing.assert_array_equal(render_steps(loaded, T, camera)[-1], to_bytes(judged))
+    np.testing.assert_array_equal(snapshot_of_file(loaded).draw(camera, T, layers=2), to_bytes(judged))
+
+
+def test_a_served_frame(folder: Path, camera: Camera, expected: np.ndarray):
+    session = DeformationSession(folder / "scene.onnx")
+    assert session.scene.metadata.eps2d == EPS2D
+    np.testing.assert_allclose(
+        Renderer().render(session, camera, T).rgb.clip(0, 1), expected, atol=tolerance("served_frame")
+    )
+
+
+def test_exact_frames_of_an_export(
+    folder: Path, tmp_path: Path, loaded: LoadedModel, camera: Camera, expected: np.ndarray
+):
+    exact = ExactFrames(loaded.model, [View(camera, T, "a")], SCENE.background)
+    rows = np.arange(len(loaded.model.gaussians))
+    assert exact.measure(exact.pose, rows).psnr_worst == 100.0
+    assert exact.measure(exact.pose, rows, options=GSPLAT).psnr_worst < 40.0
+    job = Job(folder / "model.pt", tmp_path)
+    candidate = job.candidate("network", 50.0)
+    assert candidate.options == NARROW
+    assert job.error(candidate).psnr_worst > 50.0
+    got = candidate.session.gaussians(T)
+    drawn = rasterize(got, camera, background=SCENE.background, options=candidate.options).rgb.clip(0, 1)
+    assert np.square(drawn - expected).mean() < 1e-5
+
+
+def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
+    contents = onnx.load(folder / "scene.onnx")
+    kept = {entry.key: entry.value for entry in contents.metadata_props if entry.key != "eps2d"}
+    del contents.metadata_props[:]
+    helper.set_model_props(contents, kept)
+    onnx.save(contents, tmp_path / "scene.onnx")
+    assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.eps2d == GSPLAT.eps2d
+
+
+def test_training_may_begin_with_more(tmp_path: Path):
+    """What is saved says what it was trained with, early and late, and going on knows it too."""
+    sizes = replace(SHARED_MOTIONS, eps2d=EPS2D)
+    config = training_config(model=sizes, window_until_fraction=0.5, eps2d_start=0.4)
+    trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))
+    assert trainer.model.config.eps2d == 0.4
+    seen = []
+    for _ in range(14):
+        trainer.step()
+        trainer.save_model(tmp_path / "model.pt")
+        seen.append(load_model(tmp_path / "model.pt").model.config.eps2d)
+        if trainer.step_count == 12:
+            trainer.save_checkpoint(tmp_path / "checkpoint.pt", 0.0)
+    assert seen == [0.4] * 12 + [EPS2D] * 2
+    trainer.load_checkpoint(tmp_path / "checkpoint.pt")
+    assert trainer.model.config.eps2d == 0.4
+
+
+@pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+def test_a_start_that_cannot_be_is_named(value: float):
+    with pytest.raises(InvalidInput, match=r"config\.eps2d_start"):
+        training_config(eps2d_start=value)
+
+
+@pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf"), "0.3", True])
+def test_one_that_cannot_be_is_named(value: object):
+    with pytest.raises(InvalidInput, match=r"model\.eps2d"):
+        small_config(eps2d=value)

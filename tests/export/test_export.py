@@ -1,0 +1,294 @@
+"""`export/to_onnx.py`: what the file holds, what it leaves behind, and that an old file outlives every failure."""
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+import torch
+
+from export.jobs.bake import ModelNotExportable, bake, starting_cameras
+from export.measure.verify import VerificationFailed, times_to_verify, verify
+from export.plans.registry import build
+from export.to_onnx import main
+from msdgs_serve import __version__
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import MsdgsError
+from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from tests.support.exports import export_scene
+from tests.support.models import SCENE, random_model
+from tests.support.processes import ROOT
+from tests.support.tolerances import tolerance
+
+
+def saved(folder: Path, model: DynamicGaussians) -> Path:
+    save_model(folder / "model.pt", model, SCENE, 1)
+    return folder / "model.pt"
+
+
+@pytest.fixture(scope="module")
+def model() -> DynamicGaussians:
+    return random_model()
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians) -> Path:
+    folder = tmp_path_factory.mktemp("scene")
+    return export_scene(saved(folder, model), folder / "scene.onnx").path
+
+
+@pytest.mark.parametrize(
+    ("count", "changes", "moving"),
+    [
+        (300, {}, 300),
+        (300, {"layers": ("mlp",), "depth": 1}, 300),
+        (300, {"layers": ("mlp",) * 4, "embedding_size": 0, "noise": 0.01}, 300),
+        (300, {"layers": ("plane",)}, 300),
+        (300, {"layers": ("mlp", "plane", "plane"), "plane_time_nodes": 2, "plane_space_nodes": 2}, 300),
+        (1, {"layers": ("plane", "mlp")}, 1),
+        (300, {"weights": False, "layers": ("mlp", "plane")}, 300),
+        (300, {"modulate": ("means",)}, 300),
+        (300, {"modulate": ("quats", "means", "scales"), "layers": ("plane", "mlp")}, 300),
+        (300, {"delta_space": "activated", "noise": 0.03}, 300),
+        (300, {"depth": 4, "skip": 3}, 300),
+        (300, {"layers": ("plane", "plane"), "plane_scales": (1, 2), "plane_space_nodes": 6}, 300),
+        (300, {"sh_degree": 0}, 300),
+        (300, {"layers": ("bases",), "basis_count": 12, "basis_knots": 5}, 300),
+        (300, {"layers": ("bases", "plane", "mlp"), "basis_count": 3, "embedding_size": 0}, 300),
+        (300, {"layers": ()}, 0),
+        (1, {}, 1),
+        (1, {"layers": ()}, 0),
+        (0, {}, 0),
+        (0, {"layers": (), "embedding_size": 0}, 0),
+    ],
+)
+def test_every_kind_of_model_exports(tmp_path: Path, count: int, changes: dict[str, Any], moving: int):
+    model = random_model(count, **changes)
+    exported = export_scene(saved(tmp_path, model), tmp_path / "scene.onnx", times=10)
+    assert (exported.moving_count, exported.static_count) == (moving, count - moving)
+    for name in ("means", "quats", "scales"):
+        for errors in (exported.measured_error, exported.measured_error["against_float32"]):
+            assert errors[name] <= tolerance("export.relative")
+    drawn, posed = DeformationSession(exported.path).gaussians(0.37).validate(), model.pose(0.37)
+    assert len(drawn) == count
+    for name in posed._fields:
+        got, want = getattr(drawn, name), getattr(posed, name).detach().numpy()
+        np.testing.assert_allclose(got, want, rtol=0, atol=tolerance("export.relative"))
+
+
+@pytest.mark.parametrize("option", ["opacity_head", "sh_head"])
+def test_heads_that_the_contract_has_no_place_for_are_refused_by_name(tmp_path: Path, option: str):
+    with pytest.raises(ModelNotExportable, match=f"model.{option}"):
+        export_scene(saved(tmp_path, random_model(**{option: True})), tmp_path / "scene.onnx")
+    assert not (tmp_path / "scene.onnx").exists()
+
+
+def test_a_scene_that_does_not_move_has_no_graph(tmp_path: Path):
+    exported = export_scene(saved(tmp_path, random_model(layers=())), tmp_path / "scene.onnx")
+    assert not onnx.load(exported.path).graph.node
+
+
+def test_plain_onnxruntime_with_t_alone_is_enough(scene_file: Path, model: DynamicGaussians):
+    session = ort.InferenceSession(scene_file)
+    outputs = map(np.asarray, session.run(None, {"t": np.array([0.5], np.float32)}))
+    values = dict(zip([o.name for o in session.get_outputs()], outputs, strict=True))
+    assert np.abs(values["means"] - model.pose(0.5).means.detach().numpy()).max() < tolerance("export.relative")
+    assert values["opacities"].shape == (300,)
+    assert values["sh"].shape == (300, 16, 3)
+
+
+def test_embeddings_and_their_network_are_gone(scene_file: Path, model: DynamicGaussians):
+    contents = scene_file.read_bytes()
+
+    def stored(tensor: torch.Tensor) -> bool:
+        return tensor.detach().numpy().tobytes() in contents
+
+    assert model.modulation is not None
+    assert model.gaussians.embeddings is not None
+    assert not any(stored(row) for row in model.gaussians.embeddings[:20])
+    assert not any(stored(parameter) for parameter in model.modulation.parameters())
+    assert stored(model.gaussians.means)
+    scales = model.modulation(model.gaussians.embeddings).scales
+    assert scales is not None
+    assert stored(scales)
+    names = [tensor.name for tensor in onnx.load(scene_file).graph.initializer]
+    assert not [name for name in names if "embedding" in name]
+
+
+def test_what_depends_on_time_alone_is_one_row_a_call(scene_file: Path):
+    contents = onnx.load(scene_file)
+    names = [name for node in contents.graph.node for name in node.output if "time" in name]
+    assert "layer2.first.time_bias" in names
+    contents.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
+    session = ort.InferenceSession(contents.SerializeToString())
+    inputs = {"t": np.array([0.5], np.float32), "ids": np.arange(50)}
+    assert {np.asarray(value).shape[0] for value in session.run(names, inputs)} == {1}
+
+
+def test_metadata(scene_file: Path):
+    metadata = DeformationSession(scene_file).scene.metadata
+    assert metadata.contract == "msdgs/1"
+    assert metadata.layers == ("mlp", "mlp")
+    assert (metadata.plan, metadata.delta_space, metadata.antialiasing) == ("network", "raw", "dilate")
+    assert (metadata.time_range, metadata.background) == (SCENE.time_range, SCENE.background)
+    assert metadata.bounds == ((-1.3,) * 3, (1.3,) * 3)
+    assert (metadata.sh_degree, metadata.left_out, metadata.package_version) == (3, (), __version__)
+    assert metadata.measured_error["times"] == 50
+    assert metadata.checkpoint_sha256 == hashlib.sha256((scene_file.parent / "model.pt").read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(("count", "kept"), [(0, 0), (1, 1), (5, 5), (8, 8), (30, 8)])
+def test_a_few_cameras_spread_evenly_are_kept(count: int, kept: int):
+    cameras = starting_cameras(SceneInfo(cameras=SCENE.cameras[:count]))
+    assert len(cameras) == kept
+    if count:
+        assert (cameras[0].name, cameras[-1].name) == ("r_000", f"r_{count - 1:03}")
+
+
+def test_a_camera_that_cannot_be_used_is_refused():
+    with pytest.raises(ModelNotExportable, match=r"camera.*fx"):
+        starting_cameras(SceneInfo(cameras=[SCENE.cameras[0] | {"fx": -1.0}]))
+
+
+def test_a_file_is_no_larger_than_what_it_stores():
+    model = random_model(2000)
+    gaussian = 4 * (48 + 1 + 3 + 3 + 4 + 3) + 8  # SH, opacity, mean, log-scale, quaternion, modulation; id
+    weights = 4 * sum(p.numel() for p in model.deformation.parameters())
+    size = len(build("network", bake(model, SCENE, "0" * 64)).SerializeToString())
+    assert 2000 * gaussian + weights < size < 2000 * gaussian + weights + 30_000
+
+
+def test_times_to_compare_at_hold_both_ends_and_lie_between_frames():
+    times = times_to_verify(0.0, 1.0, 50)
+    assert len(set(times)) == 50
+    assert times == sorted(times)
+    assert (times[0], times[-1]) == (0.0, 1.0)
+    for frames in (50, 100, 150):
+        off = np.array(times[1:-1]) * (frames - 1)
+        assert np.abs(off - off.round()).min() > 0
+    assert set(times_to_verify(0.25, 0.25, 50)) == {0.25}
+
+
+@pytest.mark.parametrize("name", ["gaussians.means", "gaussians.sh_rest", "deformation.layers.1.trunk.0.weight"])
+def test_a_file_that_is_not_its_model_is_found_out(scene_file: Path, name: str):
+    other = random_model()
+    with torch.no_grad():
+        other.get_parameter(name).view(-1)[100] += 0.5
+    with pytest.raises(VerificationFailed):
+        verify(DeformationSession(scene_file), other)
+
+
+@pytest.mark.parametrize("count", [1, 30])
+def test_unstable_gaussians_are_counted_and_what_is_seen_of_them_is_judged_by_frames_alone(tmp_path: Path, count: int):
+    model = random_model(300, layers=("mlp",))
+    heads, raw_quats = model.get_submodule("deformation.layers.0.heads"), model.gaussians.raw_quats
+    assert isinstance(heads, torch.nn.Linear)
+    with torch.no_grad():
+        heads.weight *= 1e-4
+        heads.weight[-1] = 0
+        heads.bias[:] = torch.tensor([0.0] * 6 + [-2.0, 0, 0, 0] + [0.0])
+        raw_quats[:] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+        raw_quats[:count] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # its delta, 0.5 × -2, cancels all but the last digits
+    checkpoint = saved(tmp_path, model)
+    unstable = export_scene(checkpoint, tmp_path / "scene.onnx", times=4).measured_error["unstable"]
+    assert unstable["count"] == count
+    assert unstable["error"] > tolerance("export.relative")
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [({"tolerance": 0.0}, VerificationFailed), ({"on_time": interrupt}, KeyboardInterrupt)],
+)
+def test_an_old_file_outlives_what_goes_wrong(tmp_path: Path, settings: dict[str, Any], error: type):
+    output = tmp_path / "scene.onnx"
+    output.write_bytes(b"an older scene")
+    checkpoint = saved(tmp_path, random_model())
+    with pytest.raises(error):
+        export_scene(checkpoint, output, **settings)
+    assert output.read_bytes() == b"an older scene"
+    assert sorted(tmp_path.iterdir()) == [checkpoint, output]
+
+
+def fill(name: str, value: float) -> Callable[[DynamicGaussians], None]:
+    def poison(model: DynamicGaussians) -> None:
+        with torch.no_grad():
+            model.get_parameter(name)[-1] = value
+
+    return poison
+
+
+@pytest.mark.parametrize(
+    ("poison", "message"),
+    [
+        (fill("gaussians.means", float("nan")), r"gaussians.means \(3 of 900\)"),
+        (fill("deformation.layers.0.heads.weight", float("inf")), r"layers.0.heads.weight \(32 of 352\)"),
+    ],
+)
+def test_poison_in_a_model_is_named(tmp_path: Path, poison: Callable[[DynamicGaussians], None], message: str):
+    poison(model := random_model())
+    with pytest.raises(MsdgsError, match=message):
+        export_scene(saved(tmp_path, model), tmp_path / "scene.onnx")
+    assert not (tmp_path / "scene.onnx").exists()
+
+
+@pytest.mark.parametrize("layers", [0, 2])
+@pytest.mark.parametrize(("log_scale", "limit"), [(200.0, LOG_SCALE_LIMIT), (-200.0, -LOG_SCALE_LIMIT)])
+def test_a_scale_that_would_overflow_or_vanish_is_cut(tmp_path: Path, layers: int, log_scale: float, limit: float):
+    fill("gaussians.log_scales", log_scale)(model := random_model(layers=("mlp",) * layers))
+    path = export_scene(saved(tmp_path, model), tmp_path / "scene.onnx").path
+    scales = DeformationSession(path).gaussians(0.5).validate().scales
+    np.testing.assert_allclose(scales[-1], np.exp(limit), rtol=tolerance("float32.relative"))
+
+
+@pytest.mark.parametrize("contents", [None, b"", b"no model", "folder"])
+def test_the_command_says_what_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], contents: bytes | str | None
+):
+    path = tmp_path / "model.pt"
+    if isinstance(contents, bytes):
+        path.write_bytes(contents)
+    elif contents:
+        path.mkdir()
+    assert main(path, tmp_path / "scene.onnx", quick=True) == 1
+    shown = capsys.readouterr().err
+    assert "error: " in shown
+    assert "model.pt" in shown
+    assert not (tmp_path / "scene.onnx").exists()
+
+
+def test_the_command_refuses_a_folder_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(saved(tmp_path, random_model(5)), tmp_path / "nowhere" / "scene.onnx", quick=True) == 1
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_the_script_runs_from_any_folder(tmp_path: Path):
+    (tmp_path / "elsewhere").mkdir()
+    saved(tmp_path, random_model(50))
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(ROOT / "export" / "to_onnx.py"), *arguments]
+        return subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, timeout=120)
+
+    done = run("../model.pt", "--quick", "--no-unseen")
+    assert done.returncode == 0, done.stderr
+    assert "passed" in done.stderr
+    assert len(DeformationSession(tmp_path / "model.onnx").scene) == 50
+    teaching = run("--help")
+    assert "msdgs-serve" in teaching.stdout
+    assert "--tolerance" in teaching.stdout
+
+
+def test_no_module_shadows_another():
+    names = {path.stem for path in (ROOT / "export").glob("*.py")}
+    assert not names & ({"onnx", "onnxruntime", "torch", "numpy"} | sys.stdlib_module_names)

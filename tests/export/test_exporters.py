@@ -1,0 +1,301 @@
+"""What is written for other viewers is the scene: read back, and held to the rules of each format."""
+
+import json
+import struct
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
+from export.exporters.gltf import EXTENSION, read_gltf
+from export.exporters.proof import ConversionFailed, visionary_of
+from export.exporters.usd import read_usd
+from export.exporters.visionary import visionary_model
+from export.exporters.visionary_rules import VisionaryInvalid, check_visionary
+from export.importers import read_splats
+from export.importers.sequence import read_sequence, sequence_scene
+from export.jobs.bake import bake
+from export.plans.registry import build
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import framing
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
+from tests.support.models import SCENE, random_model
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.support.tolerances import tolerance
+
+QUIET = Console(quiet=True)
+
+
+def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
+    """A moving scene of 300 Gaussians."""
+    model = random_model(300, noise=0.02, time_frequencies=2, **config)
+    file = folder / "scene.onnx"
+    file.write_bytes(build(plan, bake(model, SCENE, "0" * 64)).SerializeToString())
+    return file
+
+
+def run(scene: Path, out: Path, t: float | None = None, frames: int = 30, min_psnr: float | None = None) -> None:
+    convert(Settings(scene, out, t, frames, min_psnr), QUIET)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_ply_of_one_moment_is_that_moment(tmp_path: Path, degree: int):
+    scene = scene_file(tmp_path, sh_degree=degree)
+    run(scene, tmp_path / "a.ply", t=0.4)
+    expected, got = DeformationSession(scene).gaussians(0.4), read_splats(tmp_path / "a.ply").gaussians
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        scale = max(1.0, float(np.abs(getattr(expected, name)).max()))
+        assert np.abs(getattr(got, name) - getattr(expected, name)).max() <= tolerance("splat_values") * scale
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode().split("property float ")
+    names = [line.split()[0] for line in header[1:]]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert len(names) == 14 + 3 * (degree + 1) ** 2
+
+
+def test_a_sequence_covers_the_scenes_time(tmp_path: Path):
+    scene = scene_file(tmp_path)
+    run(scene, tmp_path / "frames", frames=11)
+    files = sorted((tmp_path / "frames").iterdir())
+    assert [file.name for file in files] == [f"scene_{i:02}.ply" for i in range(11)]
+    last = DeformationSession(scene).gaussians(1.0)
+    assert np.abs(read_splats(files[-1]).gaussians.means - last.means).max() < tolerance("splat_values")
+    with pytest.raises(InvalidInput, match=r"a folder without PLY files"):
+        run(scene, tmp_path / "frames", frames=3)
+
+
+def test_of_switched_frames_only_the_one_that_is_shown_is_written(tmp_path: Path):
+    folder, scene = tmp_path / "frames", tmp_path / "scene.onnx"
+    folder.mkdir()
+    frames = [some_gaussians(count, sh_degree=0) for count in (120, 80, 200)]
+    for number, frame in enumerate(frames):
+        (folder / f"frame_{number}.ply").write_bytes(ply_bytes(inria_columns(frame)))
+    scene.write_bytes(sequence_scene(read_sequence(folder), "0" * 64).SerializeToString())
+    assert DeformationSession(scene).scene.metadata.plan == "frames:3"
+    for name, read in (("a.ply", read_splats), ("a.spz", read_splats), ("a.glb", None)):
+        run(scene, tmp_path / name, t=0.5)
+        got = read(tmp_path / name).gaussians if read else read_gltf(tmp_path / name)
+        assert len(got) == 80
+        assert np.abs(got.means - frames[1].means).max() < tolerance("spz_position")
+    with pytest.raises(InvalidInput, match="USD would blend them"):
+        run(scene, tmp_path / "a.usdc")
+
+
+@pytest.mark.parametrize("antialiasing", ["dilate", "mip"])
+def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
+    scene = scene_file(tmp_path, sh_degree=2)
+    contents = onnx.load(scene)
+    for entry in contents.metadata_props:
+        if entry.key == "antialiasing":
+            entry.value = f'"{antialiasing}"'
+    onnx.save(contents, scene)
+    run(scene, tmp_path / "a.spz")  # which compares pictures, and refuses under 45 dB
+    read = read_splats(tmp_path / "a.spz")
+    assert read.antialiasing == antialiasing
+    expected = DeformationSession(scene).gaussians(0.0)
+    assert np.abs(read.gaussians.means - expected.means).max() < tolerance("splat_values")
+    turned = np.abs(to_matrix(read.gaussians.quats) - to_matrix(expected.quats))
+    assert turned.max() < tolerance("spz_rotation")
+
+
+@pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it softer"), (0.3, ""), (0.5, "draw it harder")])
+def test_who_converts_is_told_how_others_draw_it(tmp_path: Path, eps2d: float, said: str):
+    printed = StringIO()
+    scene = scene_file(tmp_path, eps2d=eps2d)
+    convert(Settings(scene, tmp_path / "a.ply", 0.0, 30, None), Console(file=printed, soft_wrap=True))
+    assert ("draw it" in printed.getvalue()) == bool(said)
+    assert said in printed.getvalue()
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_gltf_is_that_moment(tmp_path: Path, degree: int):
+    scene = scene_file(tmp_path, sh_degree=degree)
+    run(scene, tmp_path / "a.glb", t=0.4)
+    assert_same(read_gltf(tmp_path / "a.glb"), DeformationSession(scene).gaussians(0.4))
+    contents = (tmp_path / "a.glb").read_bytes()
+    magic, version, size, text = struct.unpack_from("<4sIII", contents)
+    assert (magic, version, size) == (b"glTF", 2, len(contents))
+    document = json.loads(contents[20 : 20 + text])
+    (primitive,) = document["meshes"][0]["primitives"]
+    attributes = {name.removeprefix("KHR_gaussian_splatting:") for name in primitive["attributes"]}
+    assert {"POSITION", "ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"} <= attributes
+    assert sum(name.startswith("SH_DEGREE") for name in attributes) == (degree + 1) ** 2
+    assert document["extensionsUsed"] == list(primitive["extensions"]) == ["KHR_gaussian_splatting"]
+    assert {"mode": 0, "kernel": "ellipse"}.items() <= {**primitive, **primitive["extensions"][EXTENSION]}.items()
+    assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
+    assert (20 + text) % 4 == 0
+
+
+def assert_same(got: Gaussians, expected: Gaussians) -> None:
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), atol=tolerance("splat_values"))
+
+
+@pytest.mark.parametrize("ending", ["usdc", "usda"])
+def test_usd_has_a_sample_a_frame(tmp_path: Path, ending: str):
+    usd = pytest.importorskip("pxr.Usd")
+    scene, out = scene_file(tmp_path, sh_degree=1), tmp_path / f"a.{ending}"
+    run(scene, out, frames=5)
+    stage = usd.Stage.Open(str(out))
+    prim = stage.GetDefaultPrim()
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetMetadata("upAxis")) == (0, 4, "Y")
+    assert prim.GetAttribute("positions").GetTimeSamples() == [0, 1, 2, 3, 4]
+    assert len(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get()) == 300 * 4
+    session, shown = DeformationSession(scene), read_usd(out)
+    for frame in range(5):
+        assert_same(shown(frame), session.gaussians(frame / 4))
+    first = session.gaussians(0.0)
+    turned = prim.GetAttribute("orientations").Get(0)[0]  # by half a turn about x, with OpenCV's y pointing down
+    assert turned.GetReal() == pytest.approx(float(first.quats[0, 0]))
+    assert turned.GetImaginary()[1] == pytest.approx(-float(first.quats[0, 2]))
+    run(scene, tmp_path / f"still.{ending}", t=0.4)
+    still = usd.Stage.Open(str(tmp_path / f"still.{ending}"))
+    assert still.GetDefaultPrim().GetAttribute("positions").GetTimeSamples() == []
+    assert_same(read_usd(tmp_path / f"still.{ending}")(0), session.gaussians(0.4))
+
+
+def test_what_is_not_close_enough_does_not_replace_a_file(tmp_path: Path):
+    scene, out = scene_file(tmp_path), tmp_path / "a.spz"
+    out.write_text("old")
+    with pytest.raises(ConversionFailed, match=r"99.5 dB were asked for"):
+        run(scene, out, min_psnr=99.5)
+    assert out.read_text() == "old"
+    assert LOSSLESS > LOSSY >= 45
+
+
+@pytest.mark.parametrize("plan", ["network", "lowrank:8", "lowrank:1", "keyframes:7", "keyframes"])
+def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str):
+    scene = scene_file(tmp_path, plan)
+    run(scene, tmp_path / "a.visionary.onnx")
+    shown, session = visionary_of(tmp_path / "a.visionary.onnx"), DeformationSession(scene)
+    for t in (0.0, 0.3, 0.77, 1.0):
+        got, expected = shown(t), session.gaussians(t)
+        assert np.abs(got.means - expected.means).max() <= tolerance("export.relative")
+        ours, theirs = covariances(expected), covariances(got)
+        assert np.abs(ours - theirs).max() <= tolerance("visionary.relative") * np.abs(ours).max()
+
+
+def covariances(g: Gaussians) -> np.ndarray:
+    axes = to_matrix(g.quats.astype(np.float64)) * g.scales[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def test_visionary_scene_stands_upright_about_what_its_cameras_look_at(tmp_path: Path):
+    scene = scene_file(tmp_path)
+    run(scene, tmp_path / "a.visionary.onnx")
+    stated = json.loads((tmp_path / "a.scene.json").read_text())
+    metadata = DeformationSession(scene).scene.metadata
+    (asset,) = stated["assets"]
+    assert (tmp_path / asset["path"]).is_file()
+    assert stated["env"]["bgColor"] == [*metadata.background, 1]
+    x, y, z = asset["transform"]["rotationEulerRad"]
+    turns = [Rotation.from_rotvec(angle * axis).as_matrix() for angle, axis in zip((x, y, z), np.eye(3), strict=True)]
+    matrix, view = turns[0] @ turns[1] @ turns[2], framing(metadata)
+    np.testing.assert_allclose(matrix @ view.up, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(matrix @ view.target + asset["transform"]["position"], 0, atol=1e-12)
+
+
+def test_visionary_pads_with_nothing(tmp_path: Path):
+    model = visionary_model(scene_file(tmp_path))
+    session = onnx.shape_inference.infer_shapes(model)
+    assert session.graph.output[0].type.tensor_type.shape.dim[0].dim_value == 512
+    (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+    assert len(visionary_of(tmp_path / "a.onnx")(0.5)) == 300
+
+
+def with_output_for_colors(model: onnx.ModelProto) -> None:
+    model.graph.output.append(helper.make_tensor_value_info("means_rgb", TensorProto.FLOAT, [1]))
+
+
+def with_camera(model: onnx.ModelProto) -> None:
+    model.opset_import[0].version = 18
+    model.graph.input.append(helper.make_tensor_value_info("camera", TensorProto.FLOAT, [4, 4]))
+
+
+def with_300_rows(model: onnx.ModelProto) -> None:
+    model.graph.output[0].type.tensor_type.shape.dim[0].dim_value = 300
+
+
+def with_a_loop(model: onnx.ModelProto) -> None:
+    model.graph.node[0].op_type = "Loop"
+
+
+def with_a_function(model: onnx.ModelProto) -> None:
+    made = helper.make_function("own", "Twice", ["x"], ["y"], [], [helper.make_opsetid("", 17)])
+    model.functions.append(made)
+
+
+def with_half_precision_inside(model: onnx.ModelProto) -> None:
+    model.graph.node.append(helper.make_node("Cast", ["time"], ["half"], to=TensorProto.FLOAT16))
+
+
+def with_a_double(model: onnx.ModelProto) -> None:
+    value = numpy_helper.from_array(np.zeros(2))
+    model.graph.node.append(helper.make_node("Constant", [], ["two"], value=value))
+
+
+def with_infinity(model: onnx.ModelProto) -> None:
+    model.graph.initializer.append(numpy_helper.from_array(np.full(2, np.inf, np.float32), "far"))
+
+
+def with_padding_that_shows(model: onnx.ModelProto) -> None:
+    rows = next(each for each in model.graph.initializer if each.name == "static_rows")
+    values = numpy_helper.to_array(rows).copy()
+    values[-1, 3] = 0.5
+    rows.CopyFrom(numpy_helper.from_array(values, rows.name))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_output_for_colors, r"`means_rgb` would be taken for colours"),
+        (with_camera, r"instead of 17 alone; its input must be `time`"),
+        (with_300_rows, r"300 rows are no multiple of 256"),
+        (with_a_loop, r"Loop is control flow"),
+        (with_a_function, r"function `Twice` is its own"),
+        (with_half_precision_inside, r"Cast to `half` is FLOAT16, not float32"),
+        (with_a_double, r"constant `two` is DOUBLE, not float32"),
+        (with_infinity, r"constant `far` holds NaN or infinity"),
+        (with_padding_that_shows, r"its padding has opacities other than 0"),
+    ],
+)
+def test_rules_of_visionary_are_checked(tmp_path: Path, change: Callable[[onnx.ModelProto], None], message: str):
+    model = visionary_model(scene_file(tmp_path))
+    change(model)
+    with pytest.raises(VisionaryInvalid, match=message):
+        check_visionary(model)
+
+
+def test_visionary_may_have_gaussians_in_half_precision(tmp_path: Path):
+    model = visionary_model(scene_file(tmp_path))
+    model.graph.node.append(helper.make_node("Cast", ["gaussian_f32"], ["gaussian_f16"], to=TensorProto.FLOAT16))
+    shape = [each.dim_value for each in model.graph.output[0].type.tensor_type.shape.dim]
+    model.graph.output[0].CopyFrom(helper.make_tensor_value_info("gaussian_f16", TensorProto.FLOAT16, shape))
+    check_visionary(model)
+
+
+def test_a_quantised_plan_is_refused_with_what_to_do(tmp_path: Path):
+    with pytest.raises(InvalidInput, match=r"--plan lowrank"):
+        run(scene_file(tmp_path, "int8"), tmp_path / "a.visionary.onnx")
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("a.mp4", r"msdgs-render"),
+        ("a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd or .visionary.onnx"),
+    ],
+)
+def test_other_endings_say_what_there_is(tmp_path: Path, out: str, message: str):
+    with pytest.raises(InvalidInput, match=message):
+        run(scene_file(tmp_path), tmp_path / out)

@@ -1,0 +1,351 @@
+"""Splat files of other programs: each format says what it holds, and what is wrong with it is said by name."""
+
+import gzip
+import os
+import struct
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from export.exporters.spz import write_spz
+from export.importers import ImportFailed, read_splats, recognise
+from export.importers.detect import frame_files
+from export.importers.scene import digest, static_scene, write_imported
+from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import framing
+from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
+from msdgs_serve.scene.spherical_harmonics import sh_basis
+from tests.support.images import psnr
+from tests.support.splat_files import (
+    compressed_ply_bytes,
+    inria_columns,
+    ksplat_bytes,
+    ply_bytes,
+    some_gaussians,
+    splat_bytes,
+    spz2_bytes,
+    spz4_bytes,
+    write_sog,
+    zipped,
+)
+from tests.support.tolerances import tolerance
+
+REAL = os.environ.get("MSDGS_SPLATS")
+"""A folder with real files, where there is one."""
+
+
+POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n"
+
+
+def write(folder: Path, name: str, contents: bytes) -> Path:
+    (folder / name).write_bytes(contents)
+    return folder / name
+
+
+def made(folder: Path, kind: str, g: Gaussians) -> Path:
+    """A file of each kind."""
+    if kind == "ply":
+        return write(folder, "a.ply", ply_bytes(inria_columns(g)))
+    if kind == "compressed ply":
+        return write(folder, "a.compressed.ply", compressed_ply_bytes(g))
+    if kind == "splat":
+        return write(folder, "a.splat", splat_bytes(g))
+    if kind == "ksplat":
+        return write(folder, "a.ksplat", ksplat_bytes(g))
+    if kind == "sog":
+        return write(folder, "a.sog", zipped(write_sog(folder / "sog", g)))
+    write_spz(folder / "a.spz", g, "dilate")
+    if kind != "spz 3":
+        stream = gzip.decompress((folder / "a.spz").read_bytes())
+        write(folder, "a.spz", gzip.compress(spz2_bytes(stream, g.quats)) if kind == "spz 2" else spz4_bytes(stream))
+    return folder / "a.spz"
+
+
+FORMATS = ("ply", "compressed ply", "splat", "ksplat", "sog", "spz 2", "spz 3", "spz 4")
+
+
+def drawn(g: Gaussians) -> np.ndarray:
+    camera = Camera.from_fov(orbit(np.zeros(3), 3.0, 30, 20, np.array([0.0, -1.0, 0.0])), 64, 48, 50)
+    return rasterize(g, camera).rgb.clip(0, 1)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_each_format_shows_what_was_put_into_it(tmp_path: Path, kind: str):
+    g = some_gaussians(sh_degree=0 if kind in ("splat", "ksplat") else 2)
+    file = made(tmp_path, kind, g)
+    assert recognise(file) == kind.split()[-1 if kind == "compressed ply" else 0]
+    read = read_splats(file)
+    assert read.dropped == 0
+    assert len(read) == len(g)
+    quantity = "splat_file_db" if kind == "ply" else "quantised_splat_file_db"
+    assert psnr(drawn(read.gaussians), drawn(g)) >= tolerance(quantity)
+
+
+def test_an_spz_that_was_written_without_turning_it_can_be_read_so(tmp_path: Path):
+    g = some_gaussians(30, 3)
+    write_spz(tmp_path / "a.spz", g, "dilate")
+    plain, unturned = (read_splats(tmp_path / "a.spz", kind).gaussians for kind in ("spz", "spz:unturned"))
+    np.testing.assert_array_equal(unturned.means, plain.means * np.array([1, -1, -1], np.float32))
+    half_turn = np.diag([1, -1, -1])  # of the axes; a Gaussian is the same with its own ones turned about
+    np.testing.assert_allclose(to_matrix(unturned.quats), half_turn @ to_matrix(plain.quats) @ half_turn, atol=1e-6)
+    seen = np.random.default_rng(0).normal(size=(30, 3))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    colors = [
+        np.einsum("nc,ncd->nd", sh_basis(way, 3), each.sh)
+        for way, each in ((seen, plain), (seen @ half_turn, unturned))
+    ]
+    np.testing.assert_allclose(colors[0], colors[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_cut_off_file_is_refused_by_name(tmp_path: Path, kind: str):
+    file = made(tmp_path, kind, some_gaussians(sh_degree=0))
+    whole = file.read_bytes()
+    for keep in (0, 3, 20, len(whole) // 2 + 1, len(whole) - 1):
+        file.write_bytes(whole[:keep])
+        with pytest.raises(ImportFailed, match=file.name):
+            read_splats(file)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_properties_of_a_ply_may_come_in_any_order_and_number_form(tmp_path: Path, degree: int, form: str):
+    g = some_gaussians(40, degree)
+    columns = inria_columns(g)
+    names = list(np.random.default_rng(degree).permutation(list(columns)))
+    shuffled = {"nx": np.zeros(40)} | {name: columns[name] for name in names} | {"extra": np.full(40, np.nan)}
+    read = read_splats(write(tmp_path, "a.ply", ply_bytes(shuffled, form))).gaussians
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(read, name), getattr(g, name), rtol=tolerance("splat_values"), atol=1e-6)
+
+
+def test_quaternions_of_any_length_and_infinite_logits_are_usable_and_broken_gaussians_are_counted(tmp_path: Path):
+    g = some_gaussians(6, 0)
+    columns = {name: values.copy() for name, values in inria_columns(g).items()}
+    for i in range(4):
+        columns[f"rot_{i}"] *= 7
+    columns["opacity"][:2] = (np.inf, -np.inf)
+    columns["x"][2], columns["scale_1"][3], columns["f_dc_0"][4] = np.nan, np.nan, np.inf
+    read = read_splats(write(tmp_path, "a.ply", ply_bytes(columns)))
+    assert (len(read), read.dropped) == (3, 3)
+    assert read.gaussians.opacities[:2].tolist() == [1, 0]
+    np.testing.assert_allclose(read.gaussians.quats[0], g.quats[0], atol=tolerance("splat_values"))
+
+
+def test_more_data_than_the_header_says_is_left_alone(tmp_path: Path):
+    g = some_gaussians(5, 0)
+    file = write(tmp_path, "a.ply", ply_bytes(inria_columns(g)) + b"more")
+    assert len(read_splats(file)) == 5
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_a_header_that_promises_too_much_takes_no_memory(tmp_path: Path, form: str):
+    file = write(tmp_path, "a.ply", ply_bytes(inria_columns(some_gaussians(5, 0)), form, count=10**12))
+    tracemalloc.start()
+    with pytest.raises(ImportFailed, match=r"cut off: 1,000,000,000,000 rows"):
+        read_splats(file)
+    assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    tracemalloc.stop()
+    bomb = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2**32 - 1, 3, 12, 0, 0) + bytes(100_000))
+    with pytest.raises(ImportFailed, match=r"cut off: 4,294,967,295 Gaussians"):
+        read_splats(write(tmp_path, "a.spz", bomb))
+
+
+@pytest.mark.parametrize(
+    ("name", "contents", "message"),
+    [
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+            r"no property `f_dc_0`",
+        ),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", r"no element `vertex`"),
+        ("a.spz", struct.pack("<4sIIBBBB", b"NGSP", 9, 1, 0, 12, 0, 0), r"SPZ version 9"),
+        ("a.spz", struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0), r"SH of degree 4"),
+        ("a.ksplat", bytes(5000), r"a.ksplat: unsupported version"),
+        ("a.onnx", b"scene", r"is a scene file already"),
+        ("a.txt", b"nothing of ours", r"--from says what it is, one of model, ply"),
+    ],
+)
+def test_what_cannot_be_read_says_why(tmp_path: Path, name: str, contents: bytes, message: str):
+    with pytest.raises(ImportFailed, match=message):
+        read_splats(write(tmp_path, name, contents))
+
+
+def test_a_sog_reads_no_files_outside_of_its_folder(tmp_path: Path):
+    folder = write_sog(tmp_path / "sog", some_gaussians(20, 0))
+    meta = (folder / "meta.json").read_text()
+    (folder / "meta.json").write_text(meta.replace('"quats.webp"', '"../sog/quats.webp"'))
+    with pytest.raises(ImportFailed, match=r"`quats.files` must be a list of 1 names of files beside it"):
+        read_splats(folder)
+
+
+@pytest.mark.parametrize("ending", [".sog", ".zip"])
+@pytest.mark.parametrize("damage", [{0: 0}, {6: 255}, {9: 8, 46: 255}], ids=["magic", "version", "a name's encoding"])
+def test_a_zip_whose_directory_is_damaged_is_refused_unnamed(tmp_path: Path, ending: str, damage: dict[int, int]):
+    contents = bytearray(zipped(write_sog(tmp_path / "sog", some_gaussians(20, 0))))
+    directory = contents.index(b"PK\x01\x02")
+    for at, value in damage.items():
+        contents[directory + at] = value
+    file = write(tmp_path, f"a{ending}", bytes(contents))
+    with pytest.raises(ImportFailed, match=r"a\..*: isn't a whole zip"):
+        read_splats(file)
+
+
+def test_a_sog_is_stored_or_deflated(tmp_path: Path):
+    folder = write_sog(tmp_path / "sog", some_gaussians(20, 0))
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_LZMA) as archive:
+        for file in folder.iterdir():
+            archive.write(file, file.name)
+    with pytest.raises(ImportFailed, match=r"its meta.json is packed in a way that no SOG is: 14"):
+        read_splats(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("inria_native_9080.ply", "playbot_4.ply"),
+        ("one.spz", "three.spz", "two.spz"),
+        ("frame_1.ply", "frame_2.spz"),
+        ("frame_1_near.ply", "frame_2_far.ply"),
+        ("take1_frame1.ply", "take2_frame2.ply"),
+        ("frame_1.ply", "frame_2.ply", "ground.ply"),
+        ("a.PLY", "a.ply"),
+    ],
+)
+def test_splat_files_of_other_names_are_no_sequence(tmp_path: Path, names: tuple[str, ...]):
+    for name in names:
+        write(tmp_path, name, POINTS)
+    for read in (recognise, read_sequence):
+        with pytest.raises(ImportFailed, match=rf"{names[0]} and .* differ in more than a number"):
+            read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("frame_9.ply", "frame_010.PLY", "frame_11.ply"),
+        ("1.spz", "2.spz"),
+        ("lod3_frame2.compressed.ply", "lod3_frame10.compressed.ply"),
+        ("frame2_lod3.sog", "frame10_lod3.sog"),
+    ],
+)
+def test_frames_are_in_the_order_of_the_number_that_differs(tmp_path: Path, names: tuple[str, ...]):
+    for name in (*names, "notes_1.txt", ".hidden.ply"):
+        write(tmp_path, name, b"")
+    assert [file.name for file in frame_files(tmp_path)] == list(names)
+    assert recognise(tmp_path) == "sequence"
+
+
+def test_a_static_scene_is_the_file_and_can_be_drawn_without_saying_from_where(tmp_path: Path):
+    file = made(tmp_path, "ply", some_gaussians())
+    read = read_splats(file)
+    scene = write_imported(tmp_path / "a.onnx", static_scene(read, digest(file)), lambda t: read.gaussians, [0.0])
+    assert scene.metadata.measured_error["means"] == 0
+    session = DeformationSession(tmp_path / "a.onnx")
+    view = framing(session.scene.metadata)
+    camera = Camera.from_fov(orbit(view.target, view.distance, 0, 10, view.up), 48, 48, view.fov_y)
+    image = Renderer().render(session, camera, 0.5)
+    assert image.alpha.max() > 0.5
+    assert np.array_equal(session.gaussians(0.5).means, read.gaussians.means)
+
+
+def moving_frames(count: int) -> list[Gaussians]:
+    """One rigid motion; the last ten Gaussians stand still."""
+    first, frames = some_gaussians(200, 0), []
+    for i in range(count):
+        means = first.means.copy()
+        means[:-10] += np.array([0.05 * i, 0.02 * i * i, 0], np.float32)
+        frames.append(Gaussians(means, first.quats, first.scales, first.opacities, first.sh))
+    return frames
+
+
+def write_frames(folder: Path, frames: list[Gaussians]) -> Path:
+    folder.mkdir()
+    for i, frame in enumerate(frames):
+        write(folder, f"frame_{i * 2 + 1}.ply", ply_bytes(inria_columns(frame)))
+    return folder
+
+
+def scene_of(folder: Path, how: str | None = None) -> DeformationSession:
+    sequence, output = read_sequence(folder, how), folder.parent / "scene.onnx"
+    times = sequence.times()
+
+    def rows(t: float) -> slice:
+        return shown_rows(sequence, times.index(t))
+
+    def expected(t: float) -> Gaussians:
+        return posed(sequence, times.index(t))
+
+    write_imported(output, sequence_scene(sequence, "0" * 64), expected, times, rows=rows)
+    return DeformationSession(output)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 11])
+def test_frames_that_correspond_are_blended(tmp_path: Path, count: int):
+    session = scene_of(write_frames(tmp_path / "f", moving_frames(count)))
+    assert session.scene.metadata.plan == f"keyframes:{count + 2}"
+    assert session.scene.static_count == 10
+    assert session.scene.metadata.measured_error["means"] <= tolerance("stored_frame")
+    early, late = (session.gaussians(t).means[0] for t in (0.0, 1 / (count - 1)))
+    between = session.gaussians(0.5 / (count - 1)).means[0]
+    assert np.linalg.norm(between - (early + late) / 2) < 0.5 * np.linalg.norm(late - early)
+
+
+def shuffled(frames: list[Gaussians]) -> list[Gaussians]:
+    mixed = []
+    for i, f in enumerate(frames):
+        order = np.random.default_rng(i).permutation(len(f))
+        mixed.append(Gaussians(f.means[order], f.quats[order], f.scales[order], f.opacities[order], f.sh[order]))
+    return mixed
+
+
+@pytest.mark.parametrize("change", ["order", "count", "one opacity and colour, another order"])
+def test_frames_that_do_not_correspond_are_switched(tmp_path: Path, change: str):
+    frames = moving_frames(4)
+    if change == "count":
+        frames[1] = some_gaussians(120, 0)
+    else:
+        if change != "order":
+            alike = (np.full(200, 0.5, np.float32), np.zeros((200, 1, 3), np.float32))
+            frames = [Gaussians(f.means, f.quats, f.scales, *alike) for f in frames]
+        frames = shuffled(frames)
+    folder = write_frames(tmp_path / "f", frames)
+    session = scene_of(folder)
+    assert session.scene.metadata.plan == "frames:4"
+    for t, frame in ((0.0, 0), (0.15, 0), (0.2, 1), (1 / 3, 1), (1.0, 3)):
+        assert psnr(drawn(session.gaussians(t)), drawn(frames[frame])) >= tolerance("splat_file_db")
+    with pytest.raises(ImportFailed, match=r"can't be blended"):
+        read_sequence(folder, "blend")
+
+
+def test_a_sequence_that_corresponds_can_be_switched_on_request(tmp_path: Path):
+    session = scene_of(write_frames(tmp_path / "f", moving_frames(3)), "switch")
+    assert session.scene.metadata.plan == "frames:3"
+
+
+@pytest.mark.skipif(REAL is None, reason="MSDGS_SPLATS names no folder of real files")
+def test_real_files_agree_with_what_another_program_made_of_them(tmp_path: Path):
+    real = Path(REAL or "")
+    pairs = [("guitar.compressed.ply", "guitar.derived_v4.spz"), ("playbot_sog/3_0", "playbot_lod3.inria.ply")]
+    for first, second in pairs:
+        a, b = (read_splats(real / name).gaussians for name in (first, second))
+        assert len(a) == len(b)
+        assert np.abs(a.means - b.means).max() < tolerance("spz_position")
+        turned = np.abs(to_matrix(a.quats) - to_matrix(b.quats)).max()
+        assert turned < tolerance("spz_rotation")
+        assert np.abs(a.opacities - b.opacities).max() < tolerance("splat_values")
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        for file in sorted((real / "playbot_sog/6_0").iterdir()):
+            archive.write(file, file.name)
+    assert np.array_equal(
+        read_splats(tmp_path / "a.sog").gaussians.sh, read_splats(real / "playbot_sog/6_0").gaussians.sh
+    )

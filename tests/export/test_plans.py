@@ -1,0 +1,201 @@
+"""Every plan keeps the contract, and is as close to the float64 model as its file says."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+
+from export.jobs.bake import Baked, bake
+from export.measure.verify import VerificationFailed, times_to_verify, verify
+from export.plans.registry import Plan, build, parse
+from export.trajectories.sampling import Trajectories
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.gaussians.model import DynamicGaussians
+from tests.support.models import SCENE, random_model
+from tests.support.tolerances import tolerance
+
+KINDS: dict[str, dict[str, Any]] = {
+    "mlp": {"noise": 0.02, "time_frequencies": 2},
+    "plane": {"layers": ("plane",), "plane_time_nodes": 9},
+    "mixed": {"layers": ("mlp", "plane"), "noise": 0.02, "time_frequencies": 2, "plane_time_nodes": 9},
+}
+FITTED = ("lowrank:1", "lowrank:8", "lowrank", "keyframes:4", "keyframes:12", "keyframes")
+
+
+@cache
+def made(kind: str, count: int = 60) -> tuple[DynamicGaussians, Baked, Trajectories]:
+    model = random_model(count, **KINDS[kind])
+    baked = bake(model, SCENE, "0" * 64)
+    return model, baked, Trajectories(baked)
+
+
+def opened(path: Path, contents: onnx.ModelProto) -> DeformationSession:
+    path.write_bytes(contents.SerializeToString())
+    return DeformationSession(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["network", "prefix:3", "int8", "lowrank", "lowrank:16", "keyframes:9", "lowrank:0.05"]
+)
+def test_a_plan_is_its_text(text: str):
+    assert str(parse(text)) == text
+    assert parse(parse(text)) == parse(text)
+
+
+UNKNOWN = """
+    Network networks network:1 prefix prefix:0 prefix:-1 prefix:1.5 prefix:nan int8:2 lowrank: lowrank:0 lowrank:0.0
+    lowrank:129 lowrank:1e3 lowrank:inf lowrank:४ keyframes:3 keyframes:9999999 keyframes:-0.1 keyframes:12:4
+"""
+
+
+@pytest.mark.parametrize("text", [*UNKNOWN.split(), "", "lowrank:4 ", "network\n", "a" * 1000])
+def test_an_unknown_plan_is_refused_with_those_that_exist(text: str):
+    with pytest.raises(InvalidInput, match=r"`plan` must be one of: network; prefix:k.*int8; lowrank:r.*keyframes:n"):
+        parse(text)
+
+
+def test_a_plan_that_this_model_cannot_have_says_what_it_can():
+    _, baked, trajectories = made("plane")
+    with pytest.raises(InvalidInput, match=r"prefix:k with k from 1 to 1"):
+        build("prefix:2", baked, trajectories)
+    with pytest.raises(InvalidInput, match=r"any but int8"):
+        build("int8", baked, trajectories)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("plan", FITTED)
+def test_fitted_plans_are_as_close_as_they_promise_at_times_that_they_have_not_seen(
+    tmp_path: Path, kind: str, plan: str
+):
+    model, baked, trajectories = made(kind)
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    assert session.scene.metadata.plan == plan
+    promise = session.scene.metadata.measured_error["fitted"]
+    assert promise["too_fast"] == 0
+    error = promise["error"] + tolerance("stored_pose") * promise["pixel"]
+    if parse(plan).count is None:
+        assert error <= 0.1 * promise["pixel"] + tolerance("stored_pose") * promise["pixel"]
+    measured = verify(session, model, times=25)
+    assert measured["displacement"] <= tolerance("between_samples.factor") * error
+    assert measured["position"] <= measured["displacement"]
+    assert measured["fitted"] == promise
+
+
+@pytest.mark.parametrize("plan", ["lowrank:8", "keyframes:12", "keyframes:0.02"])
+def test_distances_in_the_file_are_those_of_a_plain_comparison_with_the_model(tmp_path: Path, plan: str):
+    model, baked, trajectories = made("mlp")
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    double = random_model(60, **KINDS["mlp"]).double()
+    worst = 0.0
+    for t in times_to_verify(0.0, 1.0, 12):
+        means, quats, _ = session.pose(t)
+        expected = double.pose(t)
+        worst = max(worst, float(np.linalg.norm(means - expected.means.detach().numpy(), axis=1).max()))
+        np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, atol=tolerance("float32.relative"))
+    assert worst == pytest.approx(verify(session, model, times=12)["position"], rel=tolerance("float32.relative"))
+
+
+@pytest.mark.parametrize("plan", ["lowrank:2", "keyframes:5"])
+def test_a_file_of_another_motion_breaks_its_promise(tmp_path: Path, plan: str):
+    _, baked, trajectories = made("mlp")
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    other = random_model(60, **KINDS["mlp"] | {"seed": 1})
+    other.gaussians = random_model(60, **KINDS["mlp"]).gaussians
+    with pytest.raises(VerificationFailed, match=r"of 1,500 poses are off by more than twice"):
+        verify(session, other, times=25)
+
+
+@pytest.mark.parametrize("plan", ["lowrank:64", "keyframes:67"])
+def test_both_ends_of_time_are_exact(tmp_path: Path, plan: str):
+    model, baked, trajectories = made("plane")
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    for t in (0.0, 1.0):
+        expected = model.pose(t).means.detach().numpy()
+        assert np.abs(session.pose(t)[0] - expected).max() <= tolerance("stored_pose") * trajectories.pixel
+
+
+@pytest.mark.parametrize(("plan", "most"), [("network", 2), ("int8", 2), ("prefix:1", 1), ("keyframes:4", 0)])
+def test_plans_that_run_layers_can_stop_after_each(tmp_path: Path, plan: str, most: int):
+    baked = bake(random_model(60, layers=("mlp", "mlp")), SCENE, "0" * 64)
+    assert opened(tmp_path / "scene.onnx", build(plan, baked)).most_steps == most
+
+
+@pytest.mark.parametrize("plan", ["prefix:1", "prefix:2", "int8", "lowrank:4", "keyframes:9"])
+@pytest.mark.parametrize("ids", [[], [7], [59, 0, 5, 5]])
+def test_rows_are_those_asked_for(tmp_path: Path, plan: str, ids: list[int]):
+    _, baked, trajectories = made("mlp")
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    for some, every in zip(session.pose(0.3, ids), session.pose(0.3), strict=True):
+        assert np.abs(some - every[ids]).max(initial=0) <= tolerance("export.relative")
+
+
+def test_prefix_is_the_model_stopped_early(tmp_path: Path):
+    model, baked, _ = made("mlp")
+    for k in (1, 2):
+        session = opened(tmp_path / "scene.onnx", build(f"prefix:{k}", baked))
+        assert session.scene.metadata.plan == f"prefix:{k}"
+        expected = model.pose(0.4, steps=k).means.detach().numpy()
+        assert np.abs(session.pose(0.4)[0] - expected).max() <= tolerance("export.relative")
+
+
+def test_int8_rounds_wide_products_and_nothing_before_them(tmp_path: Path):
+    model, baked, _ = made("mlp")
+    contents = build("int8", baked)
+    eight_bits = [c.name for c in contents.graph.initializer if c.data_type == onnx.TensorProto.INT8 and c.dims]
+    assert sorted(n.split("_quantized")[0] for n in eight_bits if "zero" not in n) == [
+        f"layer{k}.trunk{i}.weight" for k in (1, 2) for i in (0, 1)
+    ]
+    exact = opened(tmp_path / "exact.onnx", build("network", baked))
+    session = opened(tmp_path / "scene.onnx", contents)
+    moved = np.abs(exact.pose(0.4)[0] - model.gaussians.means.detach().numpy()).max()
+    off = np.abs(session.pose(0.4)[0] - exact.pose(0.4)[0]).max()
+    assert 0 < off < tolerance("int8.relative") * moved
+    assert verify(session, model, times=4)["position"] > 0
+
+
+@pytest.mark.parametrize("plan", ["network", "prefix:1", "int8", "lowrank:3", "lowrank", "keyframes:4", "keyframes"])
+def test_a_scene_that_does_not_move_has_no_graph_under_any_plan(tmp_path: Path, plan: str):
+    for model in (random_model(5, layers=()), random_model(0)):
+        contents = build(plan, bake(model, SCENE, "0" * 64))
+        assert not contents.graph.node
+        assert opened(tmp_path / "scene.onnx", contents).scene.metadata.plan == plan
+
+
+@pytest.mark.parametrize("plan", ["int8", "lowrank:3", "lowrank", "keyframes:4", "keyframes"])
+def test_one_gaussian(tmp_path: Path, plan: str):
+    model, baked, trajectories = made("mlp", 1)
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    assert len(session.gaussians(0.5).validate()) == 1
+    assert verify(session, model, times=9)["displacement"] < (1 if plan == "int8" else trajectories.pixel)
+
+
+def test_a_time_range_of_one_moment(tmp_path: Path):
+    model = random_model(8, **KINDS["mlp"])
+    baked = bake(model, replace(SCENE, time_range=(0.25, 0.25)), "0" * 64)
+    for plan in ("lowrank:2", "keyframes:4"):
+        session = opened(tmp_path / "scene.onnx", build(plan, baked))
+        assert verify(session, model, times=3)["position"] < tolerance("stored_pose")
+
+
+def test_more_poses_and_more_terms_are_closer():
+    _, baked, trajectories = made("mixed")
+
+    def error(plan: str) -> float:
+        properties = {p.key: p.value for p in build(plan, baked, trajectories).metadata_props}
+        return json.loads(properties["measured_error"])["fitted"]["error"]
+
+    for plans in (("lowrank:1", "lowrank:4", "lowrank:16"), ("keyframes:4", "keyframes:8", "keyframes:35")):
+        errors = [error(plan) for plan in plans]
+        assert errors == sorted(errors, reverse=True)
+
+
+def test_plan_knows_whether_it_is_fitted():
+    assert [Plan(name).fitted for name in ("network", "prefix", "int8", "lowrank", "keyframes")] == [False] * 3 + [
+        True
+    ] * 2

@@ -1,0 +1,188 @@
+"""What fitted plans are fitted to: samples as dense as the motion needs, and a motion too fast for them is found."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+
+from export.jobs.bake import Baked, bake
+from export.plans.registry import build
+from export.trajectories import sampling as module
+from export.trajectories.adaptive import fitted, own_poses
+from export.trajectories.poses import ExactPoses, SinglePoses, pixel
+from export.trajectories.sampling import SomeTrajectories, Trajectories
+from export.trajectories.splines import design, fitting, samples_for
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import SceneFileInvalid
+from tests.support.models import SCENE, random_model
+from tests.support.tolerances import assert_close, tolerance
+
+COUNT = 40
+Motion = Callable[[float], np.ndarray]
+
+
+class Made(ExactPoses):
+    """Poses by formula: `motion(t)` is added to the means, [40, 3]."""
+
+    def __init__(self, baked: Baked, motion: Motion) -> None:
+        super().__init__(baked)
+        self._motion = motion
+
+    def at(self, t: float, ids: np.ndarray | None = None) -> np.ndarray:
+        every = np.tile([0.0, 0, 0, 0.1, 0.2, 0.3, 1, 0, 0, 0], (COUNT, 1))
+        every[:, :3] += self._motion(t)
+        return every if ids is None else every[ids]
+
+
+@pytest.fixture
+def sampled(monkeypatch: pytest.MonkeyPatch) -> Callable[[Motion], tuple[Baked, Trajectories]]:
+    baked = bake(random_model(COUNT), SCENE, "0" * 64)
+
+    def sample(motion: Motion) -> tuple[Baked, Trajectories]:
+        for precision in ("ExactPoses", "SinglePoses"):
+            monkeypatch.setattr(module, precision, lambda baked: Made(baked, motion))
+        return baked, Trajectories(baked)
+
+    return sample
+
+
+def of_first(motion: Callable[[float], float], others: float = 0.0) -> Motion:
+    """The first Gaussian moves along x; the others `others` as much."""
+    return lambda t: np.array([[motion(t) * (1 if i == 0 else others), 0, 0] for i in range(COUNT)])
+
+
+FAST = {
+    "between all coarse samples, on none": lambda t: np.sin(2 * np.pi * 64 * t),
+    "a jump back and forth": lambda t: float(np.exp(-(((t - 0.505) / 0.004) ** 2))),
+    "fast from the start": lambda t: np.sin(2 * np.pi * 40 * t),
+}
+
+
+@pytest.mark.parametrize("name", FAST)
+@pytest.mark.parametrize("plan", ["keyframes:5", "keyframes", "lowrank:2", "lowrank"])
+def test_a_fast_motion_that_a_coarse_sampling_misses_is_caught(sampled, tmp_path: Path, name: str, plan: str):
+    baked, trajectories = sampled(of_first(FAST[name]))
+    (tmp_path / "scene.onnx").write_bytes(build(plan, baked, trajectories).SerializeToString())
+    session = DeformationSession(tmp_path / "scene.onnx")
+    off = max(abs(session.pose(t, [0])[0][0, 0] - FAST[name](t)) for t in np.linspace(0, 1, 401))
+    # either its own poses follow it, or the file says that it doesn't
+    fitted = session.scene.metadata.measured_error["fitted"]
+    stated = fitted["error_too_fast"] if 0 in trajectories.unresolved else fitted["error"]
+    assert off <= tolerance("between_samples.factor") * (stated + tolerance("stored_pose") * trajectories.pixel)
+    assert off < tolerance("fast_motion")
+
+
+def test_what_moves_slowly_is_sampled_once(sampled):
+    times: list[float] = []
+
+    def motion(t: float) -> np.ndarray:
+        times.append(t)
+        return of_first(lambda t: np.sin(6 * t), 0.5)(t)
+
+    _, trajectories = sampled(motion)
+    assert len(set(times)) == module.COARSE + 1 + module.PROBES
+    assert len(times) == len(set(times)) + module.PROBES  # which float32 is compared at as well
+    assert not len(trajectories.unresolved)
+    grid = trajectories.on_grid(257, np.array([0, 3]))
+    assert_close(grid[0, :, 0], np.sin(6 * np.linspace(0, 1, 257)).astype(np.float32), "cubic_between")
+
+
+@pytest.mark.parametrize("plan", ["keyframes:0.05", "lowrank:0.05"])
+def test_amplitudes_far_apart_keep_the_same_error(sampled, tmp_path: Path, plan: str):
+    sizes = np.logspace(-4, 2, COUNT)
+
+    def motion(t: float) -> np.ndarray:
+        return np.stack([sizes * np.sin(7 * t + np.arange(COUNT)), 0 * sizes, sizes * t], axis=1)
+
+    baked, trajectories = sampled(motion)
+    (tmp_path / "scene.onnx").write_bytes(build(plan, baked, trajectories).SerializeToString())
+    session = DeformationSession(tmp_path / "scene.onnx")
+    for t in np.linspace(0.013, 0.987, 9):
+        off = np.linalg.norm(session.pose(t)[0] - motion(float(np.float32(t))), axis=1)
+        resolution = tolerance("float32.relative") * sizes  # of the file's own numbers and its time
+        assert (off <= 0.05 * trajectories.pixel * tolerance("between_samples.factor") + 10 * resolution).all()
+
+
+@pytest.mark.parametrize("how", ["refused", "overflows", "a hundredth of a pixel off"])
+def test_where_float32_is_not_exact_enough_no_sample_is_taken_in_it(monkeypatch: pytest.MonkeyPatch, how: str):
+    class Wrong(SinglePoses):
+        def __init__(self, baked: Baked) -> None:
+            if how == "refused":
+                raise SceneFileInvalid("scene", "means", "overflow")
+            super().__init__(baked)
+
+        def at(self, t: float, ids: np.ndarray) -> np.ndarray:
+            if how == "overflows":
+                raise SceneFileInvalid("scene", "means", "overflow")
+            return super().at(t, ids) + np.float32(0.01 * pixel(baked)) * (np.arange(10) < 3)
+
+    monkeypatch.setattr(module, "SinglePoses", Wrong)
+    baked = bake(random_model(COUNT), SCENE, "0" * 64)
+    got = Trajectories(baked).on_grid(module.COARSE + 1, np.arange(COUNT))
+    want = ExactPoses(baked).at(7 / module.COARSE)
+    assert_close(got[:, 7, :3], want[:, :3].astype(np.float32), "float32.relative")
+
+
+def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def motion(t: float) -> np.ndarray:
+        return np.stack([np.sin((1 + i) * t) * np.array([1, 0.5, 0]) for i in range(COUNT)])
+
+    _, trajectories = sampled(motion)
+    every, some, tried = np.arange(COUNT), np.arange(3, COUNT, 4), list[int]()
+    poses, errors = own_poses(trajectories, every, 0.05)
+    assert len(poses.grids) > 1
+
+    def counted(trajectories: Trajectories, ids: np.ndarray, count: int):
+        tried.extend([count] * len(ids))
+        return fitted(trajectories, ids, count)
+
+    monkeypatch.setattr("export.trajectories.adaptive.fitted", counted)
+    again, errors_again = own_poses(SomeTrajectories(trajectories, some), np.arange(len(some)), 0.05)
+    assert len(tried) == len(some)
+    assert_close(errors_again, errors[some], "fitted_beside_others")
+    sizes = {int(i): stored.points.shape[1] for rows, stored in poses.grids for i in rows}
+    assert all(sizes[int(some[i])] == stored.points.shape[1] for rows, stored in again.grids for i in rows)
+
+
+def test_a_scene_is_sampled_once_for_all_plans():
+    model = random_model(5, layers=("plane",), plane_time_nodes=5)
+    kept = module.trajectories_of(bake(model, SCENE, "0" * 64))
+    assert module.trajectories_of(bake(model, SCENE, "1" * 64)) is kept
+    with torch.no_grad():
+        model.gaussians.means.add_(0.1)
+    assert module.trajectories_of(bake(model, SCENE, "0" * 64)) is not kept
+
+
+def test_unresolved_motion_is_counted(sampled):
+    _, trajectories = sampled(of_first(lambda t: np.sin(2 * np.pi * 9000 * t)))
+    assert list(trajectories.unresolved) == [0]
+
+
+def test_a_rotation_past_half_a_turn_has_one_sign_along_time():
+    samples = np.zeros((1, 9, 10), np.float32)
+    angles = np.linspace(0, 2 * np.pi, 9)
+    quats = np.stack([np.cos(angles), np.sin(angles), 0 * angles, 0 * angles], axis=1)
+    samples[0, :, 6:] = quats * np.where(np.arange(9) % 2, -1, 1)[:, None]
+    module.give_one_sign(samples)
+    assert_close(samples[0, :, 6:], quats.astype(np.float32), "encoding.float32")
+
+
+def test_progress_is_told_time_by_time():
+    told: list[tuple[int, int]] = []
+    Trajectories(bake(random_model(5), SCENE, "0" * 64), lambda done, total: told.append((done, total)))
+    assert [done for done, _ in told] == list(range(1, len(told) + 1))
+    assert told[-1][0] == told[-1][1]
+
+
+@pytest.mark.parametrize("count", [4, 5, 12, 67])
+def test_splines_fit_what_they_can_hold_and_keep_both_ends(count: int):
+    times = samples_for(count)
+    assert_close(fitting(count, times) @ design(count, times), np.eye(count), "spline_fit")
+    samples = np.random.default_rng(0).standard_normal((times, 3))
+    shown = design(count, times) @ (fitting(count, times) @ samples)
+    assert_close(shown[[0, -1]], samples[[0, -1]], "spline_fit")
+    knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
+    assert_close(design(count, 9), BSpline(knots, np.eye(count), 3)(np.linspace(0, 1, 9)), "spline_fit")

@@ -1,0 +1,277 @@
+"""The sweep and its report: dominated points are never chosen, errors repeat, wrong wishes are refused."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from export.jobs.job import Job
+from export.jobs.points import DEFAULT_RASTERIZER, Look, Point, choose, front
+from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
+from export.jobs.sweep import Sweep, SweepResult
+from export.measure.rendered_error import RenderedError
+from export.measure.timing import FrameTime, Milliseconds
+from export.to_onnx import main
+from msdgs_serve.deformation import DeformationSession
+from msdgs_train.gaussians.model_file import save_model
+from tests.support.models import SCENE, random_model
+from tests.support.moving_object import GROUND, OBJECT, moving_object
+
+pytestmark = pytest.mark.xdist_group("work precision")  # one worker, so that it sweeps once
+
+POINT_FIELDS = {
+    "front": bool,
+    "chosen": bool,
+    "plan": str,
+    "trim_db": (float, type(None)),
+    "sh_degree": int,
+    "rasterizer": str,
+    "moving": int,
+    "static": int,
+    "layers": int,
+    "bytes": int,
+    "memory_bytes": (int, type(None)),
+    "milliseconds": dict,
+    "error": dict,
+    "photographs_psnr": (float, type(None)),
+    "left_out": list,
+}
+
+
+def point(milliseconds: float, db: float, rasterizer: str = DEFAULT_RASTERIZER) -> Point:
+    """A point of which only time and error matter."""
+    times = FrameTime(*(Milliseconds(milliseconds, milliseconds),) * 3)
+    error = RenderedError(db, db, None, 0.0, 0.0, 0.0, 1)
+    return Point(cast(Any, SimpleNamespace()), rasterizer, times, error, None, None)
+
+
+measured = st.lists(st.builds(point, st.floats(1, 100), st.floats(20, 100)), min_size=1, max_size=12)
+
+
+@given(measured, st.floats(20, 100))
+def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], max_error: float):
+    ahead = front(points)
+    assert ahead
+    for i, a in enumerate(points):
+        beaten = any(
+            b.milliseconds <= a.milliseconds
+            and b.error.psnr_worst >= a.error.psnr_worst
+            and (b.milliseconds, b.error.psnr_worst) != (a.milliseconds, a.error.psnr_worst)
+            for b in points
+        )
+        assert not (beaten and i in ahead)
+    best = choose(points, max_error)
+    within = [p for p in points if p.error.psnr_worst >= max_error]
+    assert (best is None) == (not within)
+    if best is not None:
+        assert best in ahead
+        assert points[best].milliseconds == min(p.milliseconds for p in within)
+
+
+def test_what_no_file_can_ask_for_is_not_chosen():
+    points = [point(10, 60), point(1, 99, "another")]
+    assert front(points) == [0]
+    assert choose(points, 50) == 0
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tuple[Job, SweepResult]:
+    job = new_job(tmp_path_factory.mktemp("swept"))
+    return job, Sweep(job, 45.0).run()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_candidates() -> Iterator[None]:
+    """As many as the tests look at."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("export.jobs.sweep.TRIM_STEPS", (5.0, 1.0, -5.0))
+        patch.setattr("export.jobs.sweep.FITTED", ("keyframes:2.0",))
+        yield
+
+
+def new_job(folder: Path) -> Job:
+    save_model(folder / "model.pt", moving_object(), SCENE, 1)
+    (folder / "candidates").mkdir()
+    return Job(folder / "model.pt", folder / "candidates", max_error=45.0)
+
+
+def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_the_error(
+    swept: tuple[Job, SweepResult],
+):
+    _, result = swept
+    whole = [p for p in result.points if p.candidate.plan == "network" and p.candidate.trim_db is None]
+    most = max(p.candidate.sh_degree for p in whole)
+    assert sum(p.rasterizer == DEFAULT_RASTERIZER and p.candidate.sh_degree == most for p in whole) == 1
+    within = [p for p in result.points if p.error.psnr_worst >= 45 and p.rasterizer == DEFAULT_RASTERIZER]
+    chosen = result.points[result.chosen]
+    assert chosen.milliseconds == min(p.milliseconds for p in within)
+    assert any(p.candidate.session.scene.moving_count <= OBJECT for p in within)
+
+
+def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried(swept: tuple[Job, SweepResult]):
+    job, _ = swept
+    whole, fitted = job.candidate("network", None), job.candidate("keyframes:9", None)
+    sweep = Sweep(job, 45.0)
+    sweep.looks = [Look(whole, DEFAULT_RASTERIZER, 90_000, 89_000, 90), Look(fitted, DEFAULT_RASTERIZER, 50, 5, 60)]
+    assert sweep._look("network", 46.0) is None
+    assert sweep._look("int8", None) is None
+    assert [why for _, why in sweep.refused if "keyframes:9 takes 50 ms" in why] == [why for _, why in sweep.refused]
+    sweep.looks[1] = replace(sweep.looks[1], worst_db=44)  # too far off to do without the layers
+    assert sweep._dear("network", None) is None
+
+
+def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: tuple[Job, SweepResult]):
+    def look(plan: str, cpu: float, size: int, db: float = 60.0) -> Look:
+        return Look(cast(Any, SimpleNamespace(plan=plan, size=size)), DEFAULT_RASTERIZER, cpu + 30, cpu, db)
+
+    sweep = Sweep(swept[0], 45.0)
+    fine, coarse = look("keyframes:0.03", 10.0, 600), look("keyframes:0.1", 11.0, 400)
+    assert sweep._pairs([fine, coarse, look("prefix:1", 30.0, 2), look("int8", 1.0, 1, db=20.0)], 50.0) == {
+        ("keyframes:0.1", 50.0)
+    }
+    assert sweep._pairs([fine, replace(coarse, worst_db=51.0)], 50.0) == {
+        ("keyframes:0.03", 50.0),
+        ("keyframes:0.1", 50.0),
+    }
+    assert sweep._pairs([], 50.0) == set()
+
+
+def test_the_report_says_what_was_gained(swept: tuple[Job, SweepResult]):
+    contents = report(*swept)
+    whole = next(p for p in contents["points"] if p["plan"] == "network" and p["trim_db"] is None)
+    chosen = next(p for p in contents["points"] if p["chosen"])
+    whole["milliseconds"]["deformation"]["min"], chosen["milliseconds"]["deformation"]["min"] = 1480.0, 3.7
+    assert "Deformation takes 3.7 ms a frame" in gain(contents)
+    assert "all layers for all Gaussians take 1,480.0 ms, 400.0 times as long." in gain(contents)
+
+
+def test_the_same_model_has_the_same_errors(swept: tuple[Job, SweepResult], tmp_path: Path):
+    again, result = new_job(tmp_path), swept[1]
+    for p in (result.points[result.chosen], result.points[front(result.points)[-1]]):
+        c = p.candidate
+        lower = c.sh_degree if c.sh_degree < again.trimmed(c.trim_db).moving.config.sh_degree else None
+        assert again.error(again.candidate(c.plan, c.trim_db, lower)) == p.error
+
+
+def test_the_report_holds_what_it_promises(swept: tuple[Job, SweepResult], tmp_path: Path):
+    contents = report(*swept)
+    paths = write_report(contents, tmp_path / "ball.onnx")
+    assert [path.name for path in paths] == ["ball.report.json", "ball.report.md", "ball.report.png"]
+    read = json.loads(paths[0].read_text())
+    assert read == json.loads(json.dumps(contents))
+    assert (read["format"], read["max_error"]) == (FORMAT, 45.0)
+    assert sum(p["chosen"] for p in read["points"]) == 1
+    for p in read["points"]:
+        assert set(p) == set(POINT_FIELDS)
+        for name, kind in POINT_FIELDS.items():
+            assert isinstance(p[name], kind), name
+        assert set(p["milliseconds"]) == {"deformation", "rasterization", "total"}
+        assert set(p["milliseconds"]["total"]) == {"min", "median"}
+        assert 0 < p["milliseconds"]["total"]["min"] <= p["milliseconds"]["total"]["median"]
+        assert p["moving"] + p["static"] <= GROUND + OBJECT
+    page = paths[1].read_text()
+    assert page.count("★ |") == 1
+    chosen = next(p for p in read["points"] if p["chosen"])  # times decide: all of such small files are fast
+    assert ("motion of Gaussians that never move visibly" in page) == (chosen["static"] > 0)
+    assert all(len(row) == len(COLUMNS) for row in rows(contents))
+    with Image.open(paths[2]) as picture:
+        assert picture.format == "PNG"
+        assert len(np.unique(np.asarray(picture).reshape(-1, 4), axis=0)) > 10
+
+
+def saved(folder: Path, **changes: Any) -> Path:
+    save_model(folder / "model.pt", random_model(60, **changes), SCENE, 1)
+    return folder / "model.pt"
+
+
+@pytest.mark.parametrize("max_error", [float("nan"), float("inf"), -1.0, 0.0, 101.0])
+def test_an_error_that_cannot_be_meant_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], max_error: float):
+    assert main(saved(tmp_path), tmp_path / "s.onnx", max_error=max_error) == 1
+    assert "`max_error` must be a PSNR in dB from 10 to 100" in capsys.readouterr().err
+    assert not (tmp_path / "s.onnx").exists()
+
+
+def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = saved(tmp_path)
+    assert main(path, tmp_path / "s.onnx", plan="prefix:1", max_error=75.0) == 1
+    shown = capsys.readouterr().err
+    assert "at most" in shown
+    assert "which the plan prefix:1 reaches" in shown
+    reachable = float(shown.split("at most ")[1].split(",")[0])
+    assert main(path, tmp_path / "s.onnx", plan="prefix:1", max_error=reachable) == 0
+    metadata = DeformationSession(tmp_path / "s.onnx").scene.metadata
+    assert metadata.plan == "prefix:1"
+    assert metadata.measured_error["rendered"]["psnr_worst"] >= reachable
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"plan": "fastest"}, "network"),
+        ({"plan": "prefix:9"}, "prefix:k with k from 1 to 2"),
+        ({"tolerance": float("nan")}, "tolerance"),
+        ({"times": 1}, "times"),
+        ({"data": Path("nowhere")}, "nowhere"),
+        ({"output": Path("nowhere") / "s.onnx"}, "in a folder that exists"),
+    ],
+)
+def test_wrong_wishes_are_refused_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
+):
+    wishes: dict[str, Any] = {"output": tmp_path / "s.onnx"} | settings
+    assert main(saved(tmp_path), **wishes) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
+    assert main(tmp_path / "model.pt", max_error=45.0, no_bands=True) == 0
+    shown = capsys.readouterr().err
+    assert "★" in shown
+    scene = DeformationSession(tmp_path / "model.onnx").scene
+    # which of such small files is the fastest is a matter of chance
+    still = scene.moving_count < len(moving_object().gaussians)
+    assert ("left out: motion of Gaussians that never move visibly" in shown) == still
+    assert scene.metadata.sh_degree == 1 or scene.metadata.left_out[-1]["rule"] == "sh_degree"
+    assert scene.metadata.measured_error["rendered"]["psnr_worst"] >= 45
+    contents = json.loads((tmp_path / "model.report.json").read_text())
+    chosen = next(p for p in contents["points"] if p["chosen"])
+    assert chosen["moving"] == scene.moving_count
+    assert chosen["error"] == scene.metadata.measured_error["rendered"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "model.onnx", "model.pt", "model.report.json", "model.report.md", "model.report.png",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("place", ["export.jobs.command.Sweep.run", "export.jobs.command.write_scene"])
+def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    checkpoint = saved(tmp_path)
+    old = {name: f"an older {name}".encode() for name in ("model.onnx", "model.report.json")}
+    for name, contents in old.items():
+        (tmp_path / name).write_bytes(contents)
+    monkeypatch.setattr(place, interrupt)
+    settings: dict[str, Any] = {} if place.endswith("run") else {"quick": True}
+    assert main(checkpoint, **settings) == 130
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path != checkpoint} == old
+
+
+def test_switched_off_on_the_command_line(tmp_path: Path):
+    save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
+    off: dict[str, Any] = {"no_still": True, "no_unseen": True, "no_layers": True}
+    assert main(tmp_path / "model.pt", quick=True, **off) == 0
+    scene = DeformationSession(tmp_path / "model.onnx").scene
+    assert (scene.moving_count, scene.static_count) == (GROUND + OBJECT, 0)
+    assert scene.metadata.layers == ("mlp", "mlp")
+    assert onnx.load(tmp_path / "model.onnx").graph.node

@@ -1,0 +1,86 @@
+"""Frames in blocks: every frame once, by scene and time; and `msdgs-render` over several scenes."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from msdgs_serve.blocks import LARGEST, View, plan_blocks
+from msdgs_serve.camera_path import read_scene_names
+from msdgs_serve.render_cli import main
+from msdgs_serve.scene import Camera, InvalidInput
+from tests.frames.test_video import nerfstudio
+from tests.support.scene_files import write_scene
+
+CAMERA = Camera.from_fov(np.eye(4), 8, 8, 40.0)
+SCENES = [Path("a.onnx"), Path("b.onnx")]
+views = st.lists(st.builds(View, st.sampled_from(SCENES), st.just(CAMERA), st.sampled_from([0.0, 0.25, 1.0])))
+
+
+@given(views, st.integers(1, 8), st.data())
+def test_every_frame_is_in_one_block_by_scene_and_time(views: list[View], workers: int, data: st.DataObject):
+    numbers = sorted(data.draw(st.sets(st.sampled_from(range(len(views)))) if views else st.just(set())))
+    blocks = plan_blocks(views, numbers, workers)
+    assert sorted(frame.number for block in blocks for frame in block.frames) == numbers
+    for block in blocks:
+        assert 1 <= len(block.frames) <= LARGEST
+        assert all(views[frame.number] == (block.scene, frame.camera, frame.t) for frame in block.frames)
+        assert [frame.t for frame in block.frames] == sorted(frame.t for frame in block.frames)
+    scenes = [block.scene for block in blocks]
+    assert scenes == sorted(scenes, key=scenes.index)
+
+
+def test_a_time_that_fits_into_one_block_is_not_cut():
+    views = [View(SCENES[0], CAMERA, t) for t in np.repeat(np.linspace(0, 1, 7), 6).tolist()]
+    blocks = plan_blocks(views, range(len(views)))
+    of_times = {t: [block for block in blocks if any(frame.t == t for frame in block.frames)] for _, _, t in views}
+    assert all(len(where) == 1 for where in of_times.values())
+
+
+def test_blocks_are_small_enough_for_all_workers():
+    views = [View(SCENES[0], CAMERA, t) for t in np.linspace(0, 1, 64).tolist()]
+    assert len(plan_blocks(views, range(64), workers=8)) >= 4 * 8
+    assert len(plan_blocks(views, range(64))) == 4
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A path of three cameras through two scenes of different time ranges."""
+    write_scene(tmp_path / "one.onnx")
+    write_scene(tmp_path / "two.onnx", time_range=(0.0, 0.5))
+    document = nerfstudio(3, render_width=16, render_height=16)
+    for camera, name in zip(document["camera_path"], ("one", "two", "one"), strict=True):
+        camera["scene"] = f"{name}.onnx"
+    (tmp_path / "views.json").write_text(json.dumps(document))
+    return tmp_path
+
+
+def test_a_path_through_several_scenes_draws_each_frame_of_its_own(folder: Path):
+    assert main([str(folder / "views.json"), str(folder / "out")]) == 0
+    for name, numbers in (("one", (0, 2)), ("two", (1,))):
+        alone = folder / f"alone_{name}"
+        assert main([str(folder / f"{name}.onnx"), str(alone), "--path", str(folder / "views.json")]) == 0
+        for number in numbers:
+            frame = f"frame_{number:05d}.png"
+            assert (folder / "out" / frame).read_bytes() == (alone / frame).read_bytes()
+
+
+@pytest.mark.parametrize("name", [None, 3, "one.pt"])
+def test_a_camera_without_a_scene_is_named(folder: Path, name: object):
+    document = json.loads((folder / "views.json").read_text())
+    document["camera_path"][1]["scene"] = name
+    (folder / "views.json").write_text(json.dumps(document))
+    with pytest.raises(InvalidInput, match=r"camera_path\.1\.scene"):
+        read_scene_names(folder / "views.json")
+
+
+def test_without_ray_it_says_how_to_get_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert main([str(folder / "one.onnx"), str(folder / "out"), "--frames", "1", "--ray", "auto"]) == 2
+    assert "pip install 'msdgs[cluster]'" in capsys.readouterr().err

@@ -1,0 +1,216 @@
+"""Camera paths, films over HTTP, and `msdgs-render`."""
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import httpx
+import numpy as np
+import pytest
+
+from msdgs_serve import blocks
+from msdgs_serve.camera_path import read_nerfstudio
+from msdgs_serve.imaging import Image, encode
+from msdgs_serve.render_cli import INTERRUPTED, main
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
+from msdgs_serve.video import write_video
+from tests.service.test_api_poison import check_problem
+from tests.support.images import decode, psnr
+from tests.support.scene_files import UP, write_scene
+from tests.support.service import serving
+
+SIZE = 64
+POSE = orbit(np.zeros(3), 5.0, 0, 0, UP)
+ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0, "distance": 5, "fov_y": 40}
+
+
+def nerfstudio(count: int = 3, **changes: Any) -> dict[str, Any]:
+    """A path as nerfstudio writes it: one pose, OpenGL axes, row by row."""
+    camera = {"camera_to_world": (POSE @ OPENGL_TO_OPENCV).ravel().tolist(), "fov": 40.0, "aspect": 1.0}
+    path = {"camera_path": [dict(camera) for _ in range(count)], "fps": 12, "seconds": 1}
+    return {**path, "render_width": SIZE, "render_height": SIZE, **changes}
+
+
+def frames_of(film: bytes) -> tuple[list[np.ndarray], float]:
+    with av.open(io.BytesIO(film), "r") as container:
+        rate = container.streams.video[0].average_rate
+        assert rate is not None
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], float(rate)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+
+
+@pytest.fixture(scope="module")
+def client(scene: Path) -> Iterator[httpx.Client]:
+    with serving(scene, max_video_frames=10, max_video_pixels=10 * 100 * 100) as client:
+        yield client
+
+
+def test_nerfstudios_path_is_read():
+    path = read_nerfstudio(nerfstudio(), (0.0, 2.0))
+    assert path.fps == 12
+    assert [t for _, t in path.frames] == [0.0, 1.0, 2.0]
+    expected = Camera.from_fov(POSE, SIZE, SIZE, 40.0)
+    camera = path.frames[0][0]
+    np.testing.assert_allclose(camera.camera_to_world, expected.camera_to_world, atol=1e-12)
+    assert (camera.fx, camera.cx, camera.width) == pytest.approx((expected.fx, expected.cx, SIZE))
+    document = nerfstudio()
+    document["camera_path"][1]["render_time"] = 0.9
+    assert read_nerfstudio(document, (0.0, 2.0)).frames[1][1] == pytest.approx(1.8)
+    assert read_nerfstudio(document, (0.0, 2.0), (32, 16)).frames[0][0].height == 16
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"camera_path": []}, "camera_path"),
+        ({"camera_path": "x"}, "camera_path"),
+        ({"camera_path": [1]}, "camera_path.0"),
+        ({"camera_path": [{"camera_to_world": [1] * 15, "fov": 40}]}, "camera_path.0.camera_to_world"),
+        ({"camera_path": [{"camera_to_world": [float("nan")] * 16, "fov": 40}]}, "camera_path.0.camera_to_world"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 180}]}, "camera_path.0.fov"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist()}]}, "camera_path.0.fov"),
+        ({"fps": 0}, "fps"),
+        ({"render_width": None}, "render_width"),
+        ({"render_height": 1.5}, "render_height"),
+    ],
+    ids=str,
+)
+def test_a_path_that_is_wrong_is_told_where(client: httpx.Client, changes: dict[str, Any], field: str):
+    document = nerfstudio(**changes)
+    with pytest.raises(InvalidInput) as error:
+        read_nerfstudio(document, (0.0, 1.0))
+    assert error.value.field == field
+    response = client.post(
+        "/render/video", content=json.dumps({"path": document}), headers={"Content-Type": "application/json"}
+    )
+    assert response.status_code == 422
+    check_problem(response)
+
+
+@pytest.mark.parametrize("video_format", ["mp4", "webm"])
+def test_a_film_shows_the_frames(client: httpx.Client, video_format: str):
+    times = [0.0, 0.25, 0.5, 0.75, 1.0]
+    body = {"frames": [{"camera": ORBIT, "t": t} for t in times], "width": SIZE, "height": SIZE, "fps": 5.0}
+    response = client.post("/render/video", json={**body, "format": video_format})
+    assert response.status_code == 200, response.text
+    assert response.headers["Content-Type"] == f"video/{video_format}"
+    frames, rate = frames_of(response.content)
+    assert (len(frames), rate) == (5, 5.0)
+    for t, frame in zip(times, frames, strict=True):
+        alone = client.post("/render", json={"camera": ORBIT, "t": t, "width": SIZE, "height": SIZE})
+        assert psnr(frame / 255, decode(alone.content, "png")[0] / 255) > 20
+    by_path = client.post("/render/video", json={"path": nerfstudio(5), "fps": 5.0, "format": video_format})
+    assert len(frames_of(by_path.content)[0]) == 5
+
+
+@pytest.mark.parametrize(
+    ("body", "field"),
+    [
+        ({}, "frames"),
+        ({"frames": [{"camera": ORBIT, "t": 0}], "path": nerfstudio()}, "frames"),
+        ({"frames": [{"camera": ORBIT, "t": 0}, {"camera": ORBIT, "t": 2}]}, "frames.1.t"),
+        ({"frames": [{"camera": ORBIT, "t": 0}] * 11}, "frames"),
+        ({"frames": [{"camera": ORBIT, "t": 0}] * 10, "width": 200, "height": 100}, "frames"),
+        ({"path": nerfstudio(), "width": 10}, "width"),
+        ({"path": nerfstudio(), "width": 1, "height": 1}, "height"),
+        ({"path": nerfstudio(), "format": "gif"}, "format"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_what_is_no_film(client: httpx.Client, body: dict[str, Any], field: str):
+    response = client.post("/render/video", json=body)
+    assert response.status_code == 422, response.text
+    check_problem(response)
+    assert response.json()["errors"][0]["field"] in (field, "width")
+
+
+def test_odd_sizes_lose_an_edge():
+    file = io.BytesIO()
+    assert write_video([np.full((11, 13, 3), 200, np.uint8)] * 2, 24, "mp4", file) == 2
+    frames, _ = frames_of(file.getvalue())
+    assert frames[0].shape == (10, 12, 3)
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+def test_images_of_a_turn(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "frames"
+    assert run(scene, out, "--frames", 3, "--width", 20, "--height", 10) == 0
+    files = sorted(out.glob("frame_*.png"))
+    assert [file.name for file in files] == ["frame_00000.png", "frame_00001.png", "frame_00002.png"]
+    assert decode(files[0].read_bytes(), "png")[0].shape == (10, 20, 3)
+    printed = capsys.readouterr()
+    assert "3 frames of 20 × 10" in printed.out
+    assert "frame 3 of 3" in printed.err
+
+
+def test_what_was_stopped_goes_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    film, drawn = tmp_path / "turn.mp4", []
+
+    def encode_two(image: Image, *arguments: Any) -> bytes:
+        if len(drawn) == 2:
+            raise KeyboardInterrupt
+        drawn.append(image.t)
+        return encode(image, *arguments)
+
+    command = (scene, film, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
+    monkeypatch.setattr(blocks, "encode", encode_two)
+    assert run(*command) == INTERRUPTED
+    assert not film.exists()
+    monkeypatch.setattr(blocks, "encode", lambda image, *more: drawn.append(image.t) or encode(image, *more))
+    assert run(*command) == 0
+    assert drawn == [0.0, 0.25, 0.5, 0.75, 1.0]
+    frames, rate = frames_of(film.read_bytes())
+    assert (len(frames), rate) == (5, 10)
+    assert [path.name for path in tmp_path.iterdir()] == ["turn.mp4"]
+
+
+def test_a_path_of_nerfstudio_on_disk(scene: Path, tmp_path: Path):
+    (tmp_path / "path.json").write_text(json.dumps(nerfstudio()))
+    assert run(scene, tmp_path / "out", "--path", tmp_path / "path.json", "--format", "exr") == 0
+    pixels, spec = decode((tmp_path / "out" / "frame_00002.exr").read_bytes(), "exr")
+    assert pixels.shape == (SIZE, SIZE, 5)
+    assert spec.getattribute("msdgs:time") == 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["scene", "out", "--path", "missing.json"], "missing.json"),
+        (["scene", "out", "--frames", "0"], "--frames"),
+        (["scene", "out", "--width", "10"], "--height"),
+        (["scene", "film.gif"], "mp4, webm"),
+        (["scene", "film.mp4", "--transparent"], "--transparent"),
+        (["scene", "taken"], "an empty folder"),
+        (["missing.onnx", "out"], "missing.onnx"),
+        (["scene", "out", "--quality", "80"], "quality"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str,
+):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    Path("taken").mkdir()
+    Path("taken/something").touch()
+    assert run(*(scene if each == "scene" else each for each in arguments)) == 2
+    complaint = capsys.readouterr().err
+    assert complaint.startswith("msdgs-render: ")
+    assert message in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_frames_of_another_command_are_not_mixed(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run(scene, tmp_path / "out", "--frames", 2, "--width", 8, "--height", 8) == 0
+    assert run(scene, tmp_path / "out", "--frames", 3, "--width", 8, "--height", 8) == 2
+    assert "made by another command" in capsys.readouterr().err

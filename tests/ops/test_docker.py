@@ -1,0 +1,163 @@
+"""Images and composition: what can be seen without a daemon, and with one the whole check of docker/check.py."""
+
+import contextlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from benchmarks.service_process import free_port
+from msdgs_serve.api.metrics import Metrics
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.api.work import WorkQueue
+from msdgs_serve.pose_cache import PoseCache
+from msdgs_serve.store import SceneStore
+from tests.support.processes import ROOT
+from tests.support.scene_files import write_scene
+from tests.support.service import in_this_process, serving
+
+DOCKER = ROOT / "docker"
+SKIPPED = 77
+PIN = re.compile(r"^([\w.-]+)==([^\s;\\]+)", re.MULTILINE)
+
+
+def pins(path: Path) -> dict[str, str]:
+    return {canonicalize_name(name): version for name, version in PIN.findall(path.read_text())}
+
+
+@pytest.mark.parametrize("name", ["build", "serve", "train"])
+def test_every_requirement_is_a_tested_version_with_hashes(name: str):
+    path = DOCKER / "requirements" / f"{name}.txt"
+    tested, locked = pins(ROOT / "constraints.txt"), pins(path)
+    assert locked
+    differing = {name: version for name, version in locked.items() if tested.get(name, version) != version}
+    assert not differing, "docker/lock.sh makes them anew"
+    blocks = re.split(r"\n(?=\S)", path.read_text().strip())
+    assert len(blocks) == len(locked)
+    assert all("--hash=sha256:" in block for block in blocks)
+
+
+@pytest.mark.parametrize(("name", "extras"), [("serve", ()), ("train", ("train", "export"))])
+def test_everything_that_the_package_asks_for_is_locked(name: str, extras: tuple[str, ...]):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *(d for extra in extras for d in project["optional-dependencies"][extra])]
+    names = {canonicalize_name(Requirement(text).name) for text in asked}
+    assert names - pins(DOCKER / "requirements" / f"{name}.txt").keys() <= {"torch"}, "docker/lock.sh makes them anew"
+
+
+def test_what_serves_has_no_torch():
+    assert not {"torch", "onnx", "scipy", "matplotlib"} & pins(DOCKER / "requirements" / "serve.txt").keys()
+    assert "torch" not in pins(DOCKER / "requirements" / "train.txt"), "it comes from an index of its own"
+
+
+def test_what_images_copy_is_sent_to_the_build():
+    sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    copied = re.findall(
+        r"^COPY (?!--from)(?:--chown=\S+ )?(.+) \S+$", (DOCKER / "Dockerfile").read_text(), re.MULTILINE
+    )
+    files = [file for line in copied for file in line.split()]
+    assert files
+    for file in files:
+        assert (ROOT / file).exists()
+        assert any(Path(file).match(pattern) for pattern in sent), file
+
+
+def composition() -> dict[str, Any]:
+    return yaml.safe_load((DOCKER / "compose.yaml").read_text())["services"]
+
+
+def test_services_have_no_rights_they_don_t_need():
+    for name, service in composition().items():
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+    assert all(composition()[name]["read_only"] for name in ("render", "proxy", "prometheus"))
+
+
+def test_the_service_is_told_nothing_that_it_doesn_t_know():
+    known = {f"MSDGS_{name.upper()}" for name in Settings.model_fields}
+    assert composition()["render"]["environment"].keys() <= known
+    in_image = re.findall(r"MSDGS_\w+", (DOCKER / "Dockerfile").read_text())
+    assert in_image
+    assert set(in_image) <= known
+
+
+def queries_of_the_dashboard() -> list[str]:
+    dashboard = json.loads((DOCKER / "grafana" / "dashboards" / "msdgs.json").read_text())
+    return [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+
+
+def test_the_dashboard_asks_for_metrics_that_there_are():
+    metrics = Metrics(SceneStore([]), PoseCache(0), WorkQueue(1, 1, 1.0))
+    metrics.count_request("POST", "/render", 200, 0.1, 100)
+    metrics.count_problem("invalid")
+    metrics.count_stages({"draw": 0.1})
+    exposed = set(re.findall(r"^(\w+)[{ ]", metrics.page().decode(), re.MULTILINE))
+    named = set(re.findall(r"\b(?:msdgs|process)_\w+", " ".join(queries_of_the_dashboard())))
+    assert named
+    assert named <= exposed
+
+
+@pytest.mark.slow
+@in_this_process
+@pytest.mark.skipif(shutil.which("prometheus") is None, reason="there is no prometheus to run")
+def test_prometheus_answers_every_query_of_the_dashboard(tmp_path: Path):
+    scene = write_scene(tmp_path / "balls.onnx")
+    with serving(scene) as client, prometheus(tmp_path, client.base_url.netloc.decode()) as answer:
+        unanswered = queries_of_the_dashboard()
+        assert unanswered
+        deadline = time.monotonic() + 60
+        while unanswered and time.monotonic() < deadline:
+            for camera, status in (({"type": "orbit", "azimuth": 0, "elevation": 0}, 200), (None, 422)):
+                body = {"camera": camera, "t": 0.5, "width": 16, "height": 16}
+                assert client.post("/render", json=body).status_code == status
+            time.sleep(0.2)
+            unanswered = [query for query in unanswered if not answer(query)]
+        assert not unanswered
+
+
+@contextlib.contextmanager
+def prometheus(folder: Path, target: str) -> Iterator[Callable[[str], list[Any]]]:
+    """The composition's, which looks at `target` every second instead; a function that asks it."""
+    settings = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yaml").read_text())
+    settings["global"]["scrape_interval"] = "1s"
+    (job,) = settings["scrape_configs"]
+    del job["dns_sd_configs"]
+    job["static_configs"] = [{"targets": [target]}]
+    (folder / "prometheus.yaml").write_text(yaml.safe_dump(settings))
+    address = f"127.0.0.1:{free_port()}"
+    options = [f"--config.file={folder}/prometheus.yaml", f"--storage.tsdb.path={folder}/data"]
+    command = ["prometheus", *options, f"--web.listen-address={address}"]
+
+    def answer(query: str) -> list[Any]:
+        with contextlib.suppress(httpx.TransportError):  # it isn't up yet
+            found = httpx.get(f"http://{address}/api/v1/query", params={"query": query})
+            return found.json()["data"]["result"] if found.status_code == 200 else []
+        return []
+
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield answer
+        finally:
+            process.terminate()
+
+
+@pytest.mark.slow
+def test_the_image_and_the_composition_with_a_daemon():
+    done = subprocess.run(
+        [sys.executable, DOCKER / "check.py"], cwd=ROOT, capture_output=True, text=True, timeout=1800, check=False
+    )
+    if done.returncode == SKIPPED:
+        pytest.skip(done.stdout.strip())
+    assert done.returncode == 0, done.stdout + done.stderr

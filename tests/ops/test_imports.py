@@ -1,0 +1,63 @@
+"""Which room may import which: read from the sources by import-linter, and seen in fresh interpreters."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.support.processes import ROOT
+
+HEAVY = {"numpy", "numba", "onnxruntime", "OpenImageIO", "fastapi", "pydantic", "torch"}
+HTTP = {"fastapi", "starlette", "uvicorn", "pydantic", "pydantic_settings"}
+NOT_FOR_SERVING = {"torch", "onnx", "msdgs_train", "export", "matplotlib", "tyro", "rich"}
+
+IMPORT_ALL = """
+import importlib, pkgutil, msdgs_serve
+names = [m.name for m in pkgutil.walk_packages(msdgs_serve.__path__, "msdgs_serve.") if not m.name.startswith({skip!r})]
+for name in names:
+    importlib.import_module(name)
+"""
+
+
+def modules_after(code: str) -> set[str]:
+    """Top-level modules that a fresh interpreter has loaded after running `code`."""
+    report = "\nimport json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+    finished = subprocess.run(
+        [sys.executable, "-c", code + report], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    return set(json.loads(finished.stdout))
+
+
+def test_import_contracts_hold() -> None:
+    finished = subprocess.run(
+        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    assert not modules_after("import msdgs_serve") & HEAVY
+
+
+def test_no_module_of_the_service_loads_what_training_needs() -> None:
+    loaded = modules_after(IMPORT_ALL.format(skip="msdgs_serve.client"))  # httpx loads rich where it is installed
+    assert "fastapi" in loaded
+    assert not loaded & NOT_FOR_SERVING
+
+
+def test_only_the_api_loads_http() -> None:
+    loaded = modules_after(IMPORT_ALL.format(skip="msdgs_serve.api"))
+    assert "numba" in loaded
+    assert not loaded & HTTP
+
+
+def test_the_serving_demo_needs_only_the_standard_library() -> None:
+    loaded = modules_after("import sys; sys.path.insert(0, 'examples'); import demo")
+    assert "serving" in loaded
+    assert not loaded & (HEAVY | HTTP | NOT_FOR_SERVING)

@@ -1,0 +1,89 @@
+"""The manifest for Kubernetes: it is valid, and says of the service what is true of it."""
+
+from typing import Any
+
+import pytest
+import yaml
+
+from msdgs_serve.api.metrics import Metrics
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.api.work import WorkQueue
+from msdgs_serve.pose_cache import PoseCache
+from msdgs_serve.store import SceneStore
+from tests.support.processes import ROOT
+
+FOLDER = ROOT / "docker" / "kubernetes"
+KUBERNETES = "1.30"
+OBJECTS: list[dict[str, Any]] = list(yaml.safe_load_all((FOLDER / "msdgs.yaml").read_text()))
+
+
+def found(kind: str, name: str) -> dict[str, Any]:
+    (match,) = [each for each in OBJECTS if (each["kind"], each["metadata"]["name"]) == (kind, name)]
+    return match
+
+
+def container(name: str) -> dict[str, Any]:
+    (only,) = found("Deployment", name)["spec"]["template"]["spec"]["containers"]
+    return only
+
+
+@pytest.mark.parametrize("manifest", OBJECTS, ids=lambda each: f"{each['kind']}-{each['metadata']['name']}")
+def test_it_is_valid(manifest: dict[str, Any]):
+    validate = pytest.importorskip("kubernetes_validate", reason="needs: pip install kubernetes-validate").validate
+    assert validate(manifest, KUBERNETES, strict=True) == KUBERNETES
+
+
+@pytest.mark.parametrize("name", ["msdgs-render", "msdgs-proxy"])
+def test_pods_have_probes_limits_and_few_rights(name: str):
+    pod, only = found("Deployment", name)["spec"]["template"]["spec"], container(name)
+    assert {"readinessProbe", "livenessProbe"} <= only.keys()
+    assert {"cpu", "memory"} == only["resources"]["requests"].keys() == only["resources"]["limits"].keys()
+    assert pod["securityContext"]["runAsNonRoot"]
+    assert only["securityContext"]["readOnlyRootFilesystem"]
+    assert only["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+
+
+@pytest.mark.parametrize("name", ["msdgs-render", "msdgs-proxy"])
+def test_selectors_find_their_pods(name: str):
+    deployment = found("Deployment", name)
+    labels = deployment["spec"]["template"]["metadata"]["labels"]
+    assert deployment["spec"]["selector"]["matchLabels"] == labels
+    assert found("Service", "msdgs" if name == "msdgs-proxy" else name)["spec"]["selector"] == labels
+
+
+def test_the_services_settings_are_known():
+    render = container("msdgs-render")
+    names = {each["name"] for each in render["env"]}
+    assert names <= {f"MSDGS_{field.upper()}" for field in Settings.model_fields}
+    assert {each["name"]: each for each in render["env"]}["MSDGS_THREADS"]["value"] == render["resources"]["limits"][
+        "cpu"
+    ]
+    grace = found("Deployment", "msdgs-render")["spec"]["template"]["spec"]["terminationGracePeriodSeconds"]
+    assert grace > Settings.model_fields["drain_seconds"].default
+    assert render["startupProbe"]["httpGet"]["path"] == render["readinessProbe"]["httpGet"]["path"] == "/ready"
+    assert render["livenessProbe"]["httpGet"]["path"] == "/live"
+
+
+def test_the_autoscaler_reads_a_metric_of_the_service():
+    (metric,) = found("HorizontalPodAutoscaler", "msdgs-render")["spec"]["metrics"]
+    name = metric["pods"]["metric"]["name"]
+    page = Metrics(SceneStore([]), PoseCache(0), WorkQueue(1, 1, 1.0)).page().decode()
+    assert f"\n{name} " in page
+    (rule,) = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text())["rules"]["custom"]
+    assert rule["name"]["matches"] == name
+    assert rule["seriesQuery"].startswith(f"{name}{{")
+    assert int(metric["pods"]["target"]["averageValue"]) < Settings.model_fields["queued_renders"].default
+
+
+def test_the_proxy_finds_its_settings():
+    name = "msdgs-proxy"
+    (settings, _) = found("Deployment", name)["spec"]["template"]["spec"]["volumes"]
+    assert [source["configMap"]["name"] for source in settings["projected"]["sources"]] == [
+        "msdgs-nginx",
+        found("ConfigMap", "msdgs-replicas")["metadata"]["name"],
+    ]
+    assert "include replicas.conf;" in (ROOT / "docker" / "nginx" / "nginx.conf").read_text()
+    assert (
+        f"server {found('Service', 'msdgs-render')['metadata']['name']}.default."
+        in (found("ConfigMap", "msdgs-replicas")["data"]["replicas.conf"])
+    )

@@ -1,0 +1,106 @@
+"""What `pip install .` alone brings: enough to serve a scene outside of the checkout, and no more than that."""
+
+import json
+import os
+import subprocess
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from examples.serving import get, render, serving
+from tests.support.images import decode
+from tests.support.processes import ROOT
+
+PACKAGES = {"msdgs_serve", "msdgs_train"}
+SCENE = ROOT / "examples" / "toybench.onnx"
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("packaging")]  # one worker, so that it installs once
+
+DESCRIBE = """
+import importlib.metadata as m, importlib.util, json
+files = [str(path) for path in m.files("msdgs")]
+names = sorted(d.name.lower() for d in m.distributions())
+print(json.dumps({"files": files, "distributions": names, "where": importlib.util.find_spec("msdgs_serve").origin}))
+"""
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fresh environment with the package from this checkout, built and installed, and nothing else asked for."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=True)
+    pins = str(ROOT / "constraints.txt")
+    installed = subprocess.run(
+        [folder / "bin" / "python", "-m", "pip", "install", "--no-compile", "--constraint", pins, str(ROOT)],
+        cwd=folder,
+        env=clean_environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "No matching distribution" in installed.stderr and not os.environ.get("CI"):
+        pytest.skip(f"no package index can be reached: {installed.stderr.strip().splitlines()[-1]}")
+    assert installed.returncode == 0, installed.stdout + installed.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def described(environment: Path) -> dict:
+    """What the environment holds."""
+    command = [environment / "bin" / "python", "-c", DESCRIBE]
+    return json.loads(subprocess.check_output(command, cwd=environment, env=clean_environment()))
+
+
+def clean_environment() -> dict[str, str]:
+    """The environment without what would let the checkout or this environment be seen."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+
+
+def test_nothing_of_training_is_installed(described: dict) -> None:
+    assert not {"torch", "onnx", "tyro", "rich", "matplotlib", "pytest"} & set(described["distributions"])
+
+
+def test_the_package_is_what_was_installed(environment: Path, described: dict) -> None:
+    assert Path(described["where"]).is_relative_to(environment)
+
+
+def test_the_wheel_holds_the_two_packages_and_their_data(described: dict) -> None:
+    shipped = [path for path in described["files"] if not path.startswith(("..", "msdgs-"))]
+    assert {path.split("/")[0] for path in shipped} == PACKAGES
+    sources = [path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file()]
+    wanted = {str(path.relative_to(ROOT)) for path in sources if path.parent.name != "__pycache__"}
+    assert wanted <= set(shipped)
+    assert "msdgs_serve/py.typed" in shipped
+
+
+@pytest.mark.parametrize("command", [["msdgs-train", "--help"], ["python", str(ROOT / "export" / "to_onnx.py")]])
+def test_training_and_export_name_the_extra_that_they_need(environment: Path, command: list[str]) -> None:
+    program = [environment / "bin" / command[0], *command[1:]]
+    told = subprocess.run(
+        program, cwd=environment, env=clean_environment(), capture_output=True, text=True, check=False
+    )
+    assert told.returncode != 0
+    assert "pip install" in told.stderr
+    assert "Traceback" not in told.stderr
+
+
+def test_help_teaches(environment: Path) -> None:
+    program = environment / "bin" / "msdgs-serve"
+    told = subprocess.check_output([program, "--help"], cwd=environment, env=clean_environment(), text=True)
+    assert "onnx" in told
+    assert "--port" in told
+
+
+def test_it_serves_a_scene(environment: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in set(os.environ) - set(clean_environment()):
+        monkeypatch.delenv(name)
+    with serving(SCENE, 0, environment) as url:
+        scene = get(f"{url}/scenes/toybench")
+        camera = {"type": "orbit", "azimuth": 30, "elevation": 25}
+        png = render(url, {"camera": camera, "t": sum(scene["time_range"]) / 2, "width": 48, "height": 32})
+    pixels, _ = decode(png, "png")
+    assert pixels.shape == (32, 48, 3)
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100, "an empty frame"

@@ -1,0 +1,66 @@
+"""Run the kernels' tests without the compiler and tell which of their lines ran.
+
+python -m tests.rasterizer.kernel_coverage
+
+Kernels are plain Python then, on NumPy arrays of 16. What builds LLVM code needs the compiler and isn't counted. The
+status is 1 where a test fails or fewer lines ran than tests/support/tolerances.py asks for.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+from coverage import Coverage
+
+from tests.support.processes import ROOT
+from tests.support.tolerances import tolerance
+
+FILES = (
+    "test_lanes.py",
+    "test_rasterizer_oracle.py",
+    "test_rasterizer_gsplat.py",
+    "test_gradients.py",
+    "test_rasterizer_counts.py",
+)
+NAMES = (
+    "operations or memory or powers or behind or opacity or 6-1-53 or 12-15-53 or harmonics or none_and or camera "
+    "or 40-21-20"
+)
+"""Of the tests, those that are small enough for plain Python."""
+
+BUILDS_CODE = ("def .*builder: Any", "@lower_builtin", "@type_callable", "@register_model")
+
+
+def kernel_files() -> list[Path]:
+    """The rasterizer's files with kernels, and those with the operations that kernels are written in."""
+    folder = ROOT / "msdgs_serve" / "rasterizer"
+    return [path for path in sorted(folder.glob("*.py")) if "@kernel" in path.read_text()] + [
+        folder / name for name in ("atomic.py", "lanes.py", "lanes_memory.py")
+    ]
+
+
+def main() -> int:
+    """Start anew with the compiler off, as it can't be switched off later."""
+    if os.environ.get("NUMBA_DISABLE_JIT") != "1":
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+        return subprocess.call([sys.executable, "-m", "tests.rasterizer.kernel_coverage"], cwd=ROOT, env=environment)
+    with tempfile.TemporaryDirectory() as folder:
+        coverage = Coverage(
+            data_file=Path(folder, "coverage"), include=list(map(str, kernel_files())), config_file=False
+        )
+        for pattern in BUILDS_CODE:
+            coverage.exclude(pattern)
+        with coverage.collect():
+            # NumPy warns of what compiled code passes over in silence: infinity where nothing is seen
+            options = ["-n", "0", "-q", "-p", "no:cacheprovider", "-W", "ignore::RuntimeWarning", "-k", NAMES]
+            status = pytest.main([*options, *(str(Path(__file__).with_name(name)) for name in FILES)])
+        percent = coverage.report(show_missing=True)
+    print(f"{percent:.1f} % of the kernels' lines")
+    return int(status != 0 or percent < tolerance("kernel_coverage"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

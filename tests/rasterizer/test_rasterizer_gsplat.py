@@ -1,0 +1,182 @@
+"""Projection, covariance and colours against gsplat's own plain torch reference: code that no one here wrote."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from msdgs_serve.rasterizer import GSPLAT, rasterize
+from msdgs_serve.rasterizer.projection import (
+    BLUE,
+    DEPTH,
+    GREEN,
+    LOG2_OPACITY,
+    RED,
+    ROOT_A,
+    ROOT_B,
+    ROOT_C,
+    ROOT_SCALE,
+    Splats,
+    X,
+    Y,
+    project,
+)
+from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
+from tests.support import reference_torch
+from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene
+from tests.support.tolerances import assert_close
+
+SCENES = ["random", *sorted(ADVERSARIAL)]
+
+
+def scene(name: str, dtype: type) -> tuple[Gaussians, Camera]:
+    gaussians, camera = random_scene(11, 300) if name == "random" else ADVERSARIAL[name]()
+    gaussians = as_dtype(gaussians, np.float64)
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)  # as gsplat will do
+    return as_dtype(replace(gaussians, quats=quats), dtype), camera
+
+
+def gsplat_projection(gaussians: Gaussians, camera: Camera) -> reference_torch.Projection:
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
+    means, quats, scales, sh = (torch.from_numpy(array.astype(np.float64)) for array in arrays)
+    return reference_torch.project(means, quats, scales, sh, camera)
+
+
+def conics(splats: Splats) -> np.ndarray:
+    """[N, 3] xx, xy, yy of the inverse covariance from its root [[a, b], [0, c]]."""
+    a, b, c = splats.records[:, [ROOT_A, ROOT_B, ROOT_C]].astype(np.float64).T / ROOT_SCALE
+    return np.stack([a * a, a * b, b * b + c * c], axis=1)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_projection(name: str, dtype: type):
+    gaussians, camera = scene(name, dtype)
+    got, want = project(gaussians, camera, GSPLAT), gsplat_projection(gaussians, camera)
+    drawn = got.extents[:, 0] > 0
+    assert drawn.any()
+    row = np.dtype(dtype).name
+    assert_close(got.records[drawn, DEPTH], want.depths.numpy()[drawn], f"projection.{row}.relative")
+    assert_close(got.records[drawn][:, [RED, GREEN, BLUE]], want.colors.numpy()[drawn], f"color.{row}")
+    pixels = want.means2d.numpy()[drawn]
+    size = np.maximum(np.abs(pixels), max(camera.width, camera.height))  # float32 has so many digits after the point
+    assert_close(
+        (got.records[drawn][:, [X, Y]] - pixels) / size + 1, np.ones_like(pixels), f"projection.{row}.relative"
+    )
+    inverse = want.conics.numpy()[drawn]
+    size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])  # of xy: the most that a covariance allows
+    assert_close((conics(got)[drawn] - inverse) / size + 1, np.ones_like(inverse), f"conic.{row}.relative")
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_is_not_drawn_adds_nothing(name: str):
+    gaussians, camera = scene(name, np.float64)
+    splats = gsplat_projection(gaussians, camera)
+    hidden = project(gaussians, camera, GSPLAT).extents[:, 0] == 0
+    opacities = torch.from_numpy(gaussians.opacities)
+    hidden_ones = reference_torch.Projection(*(values[hidden] for values in splats))
+    _, alpha = reference_torch.render(hidden_ones, opacities[hidden], camera, torch.zeros(3).double())
+    assert not alpha.any()
+
+
+@pytest.mark.parametrize("name", ["random", "off_axis_89", "principal_point_outside", "inside_splat"])
+def test_pictures(name: str):
+    gaussians, camera = scene(name, np.float64)
+    background = np.array([0.3, 0.1, 0.7])
+    splats = gsplat_projection(gaussians, camera)
+    opacities = torch.from_numpy(gaussians.opacities)
+    rgb, alpha = reference_torch.render(splats, opacities, camera, torch.from_numpy(background))
+    got = rasterize(gaussians, camera, background=background)
+    assert_close(got.rgb, rgb.numpy(), "rgb.float64")
+    assert_close(got.alpha, alpha.numpy(), "alpha.float64")
+
+
+def of_model(model: str, camera: Camera) -> Camera:
+    """The same picture, more or less, by a camera of another model."""
+    scale = 0.25 if model == "orthographic" else 1.0
+    return replace(camera, model=model, fx=scale * camera.fx, fy=scale * camera.fy)
+
+
+@pytest.mark.parametrize("model", ["orthographic", "fisheye"])
+def test_other_cameras(model: str):
+    """Colours aside: gsplat takes an orthographic camera's lines of sight for those of a pinhole."""
+    gaussians, camera = scene("random", np.float64)
+    camera = of_model(model, camera)
+    got, want = project(gaussians, camera, GSPLAT), gsplat_projection(gaussians, camera)
+    drawn = got.extents[:, 0] > 0
+    assert drawn.mean() > 0.5
+    pixels, inverse = want.means2d.numpy()[drawn], want.conics.numpy()[drawn]
+    assert_close(got.records[drawn][:, [X, Y]], pixels, "projection.gsplat_fisheye")
+    size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])
+    assert_close((conics(got)[drawn] - inverse) / size, np.zeros_like(inverse), "projection.gsplat_fisheye")
+    assert_close(got.records[drawn, DEPTH], want.depths.numpy()[drawn], "projection.float64.relative")
+    exact, depths = camera.project(gaussians.means)
+    assert_close(got.records[drawn][:, [X, Y]], exact[drawn], "pixel")
+    assert_close(got.records[drawn, DEPTH], depths[drawn], "projection.float64.relative")
+
+
+def test_mip_dims_what_it_spreads():
+    gaussians, camera = scene("random", np.float64)
+    gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
+    got = project(gaussians, camera, GSPLAT._replace(mip=True))
+    compensations = gsplat_projection(gaussians, camera).compensations.numpy()
+    drawn = got.extents[:, 0] > 0
+    assert 0.1 < np.median(compensations[drawn]) < 0.9
+    dimmed = gaussians.opacities * compensations
+    assert_close(2 ** got.records[drawn, LOG2_OPACITY], dimmed[drawn], "conic.float64.relative")
+    assert (dimmed[~drawn & (gsplat_projection(gaussians, camera).depths.numpy() > 1)] < GSPLAT.alpha_min).any()
+
+
+def test_distorted_fisheye_is_its_formula():
+    """Positions from the formula, footprints from its central differences."""
+    gaussians, camera = scene("random", np.float64)
+    k = (0.1, -0.05, 0.02, -0.01)
+    camera = replace(camera, model="fisheye", distortion=k)
+    world_to_camera = camera.world_to_camera
+    points = gaussians.means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        theta = np.arctan2(radius, points[:, 2])
+        rho = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
+        return points[:, :2] * (rho / radius)[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+    step = 1e-6
+    columns = [(pixels(points + step * axis) - pixels(points - step * axis)) / (2 * step) for axis in np.eye(3)]
+    axes = to_matrix(gaussians.quats) * gaussians.scales[:, None, :]
+    half_axes = np.stack(columns, axis=2) @ world_to_camera[:3, :3] @ axes
+    covariances = half_axes @ half_axes.swapaxes(1, 2) + GSPLAT.eps2d * np.eye(2)
+    inverse = np.linalg.inv(covariances)[:, [0, 0, 1], [0, 1, 1]]
+    got = project(gaussians, camera, GSPLAT)
+    drawn = got.extents[:, 0] > 0
+    assert drawn.mean() > 0.5
+    assert_close(got.records[drawn][:, [X, Y]], pixels(points)[drawn], "pixel")
+    assert_close(camera.project(gaussians.means)[0], pixels(points), "pixel")
+    size = np.sqrt(inverse[:, [0, 0, 2]] * inverse[:, [0, 2, 2]])[drawn]
+    assert_close((conics(got)[drawn] - inverse[drawn]) / size, np.zeros_like(size), "conic.finite_differences")
+
+
+@pytest.mark.parametrize("model", ["orthographic", "fisheye"])
+def test_a_point_on_the_axis_is_drawn_in_the_centre(model: str):
+    gaussians = gaussians_of([[0, 0, 2.0]], scales=0.1, dtype=np.float64)
+    camera = replace(front_camera(), model=model)
+    got = project(gaussians, camera, GSPLAT)
+    np.testing.assert_allclose(got.records[0, [X, Y]], [camera.cx, camera.cy], atol=1e-6)
+    pixels = camera.fx * 0.1 / (2 if model == "fisheye" else 1)
+    expected = 1 / (pixels**2 + GSPLAT.eps2d)
+    np.testing.assert_allclose(conics(got)[0], [expected, 0, expected], rtol=1e-6, atol=1e-9)
+    axis = gaussians_of([[0, 0, 0.0]], dtype=np.float64)
+    assert project(axis, camera, GSPLAT).extents[0, 0] == 0
+
+
+def test_orthographic_pictures_do_not_depend_on_distance():
+    gaussians, camera = scene("random", np.float64)
+    gaussians = replace(gaussians, sh=gaussians.sh[:, :4])
+    camera = of_model("orthographic", camera)
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] -= 3 * pose[:3, 2]
+    near, far = rasterize(gaussians, camera), rasterize(gaussians, replace(camera, camera_to_world=pose))
+    assert near.alpha.max() > 0.5
+    assert_close(far.rgb, near.rgb, "rgb.float64")

@@ -1,0 +1,276 @@
+"""What must hold for every scene, without knowing the right picture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from msdgs_serve.rasterizer import GSPLAT, INRIA, Rendering, rasterize
+from msdgs_serve.scene import Camera, Gaussians, InvalidInput
+from msdgs_serve.scene.quaternion import from_matrix, to_matrix
+from tests.support import reference
+from tests.support.scenes import as_dtype, draw, front_camera, gaussians_of, joined, random_scene, select, unit_quats
+from tests.support.tolerances import assert_close, tolerance
+
+BACKGROUND = np.array([0.2, 0.6, 0.9])
+DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float32", "float64"])
+SEEDS = pytest.mark.parametrize("seed", [20, 21])
+
+
+def scene(seed: int, dtype: type, count: int = 150) -> tuple[Gaussians, Camera]:
+    gaussians, camera = random_scene(seed, count)
+    return as_dtype(gaussians, dtype), camera
+
+
+def assert_same(got: Rendering, want: Rendering, clear: np.ndarray | None = None):
+    """Within the rounding of their dtype, where `clear` (everywhere by default)."""
+    row = got.rgb.dtype.name
+    clear = np.ones(got.alpha.shape, bool) if clear is None else clear
+    assert clear.mean() > 0.9
+    for name in ("rgb", "alpha"):
+        assert_close(getattr(got, name)[clear], getattr(want, name)[clear], f"{name}.{row}")
+    seen = clear & np.isfinite(want.depth)
+    np.testing.assert_array_equal(np.isfinite(got.depth)[clear], np.isfinite(want.depth)[clear])
+    assert_close(got.depth[seen], want.depth[seen], f"depth.{row}.relative")
+
+
+def assert_identical(got: Rendering, want: Rendering):
+    for channel, expected in zip(got, want, strict=True):
+        np.testing.assert_array_equal(channel, expected)
+
+
+def clear_pixels(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Where rounding can't tip a decision."""
+    return reference.render(gaussians, camera, BACKGROUND).slack == 0
+
+
+@DTYPES
+@SEEDS
+def test_order_of_gaussians_does_not_matter(seed: int, dtype: type):
+    gaussians, camera = scene(seed, dtype)
+    order = np.random.default_rng(seed).permutation(len(gaussians))
+    assert_identical(draw(select(gaussians, order), camera), draw(gaussians, camera))
+
+
+@DTYPES
+@pytest.mark.parametrize("factor", [0.25, 1024.0])
+def test_scaling_scene_and_camera_changes_nothing(factor: float, dtype: type):
+    """By powers of 2, which are exact; depth grows with the scene."""
+    gaussians, camera = scene(20, dtype)
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] *= factor
+    small = draw(gaussians, camera, background=BACKGROUND)
+    scaled = replace(gaussians, means=gaussians.means * dtype(factor), scales=gaussians.scales * dtype(factor))
+    large = draw(scaled, replace(camera, camera_to_world=pose), background=BACKGROUND)
+    assert_identical(large._replace(depth=large.depth / factor), small)
+
+
+@DTYPES
+def test_what_is_asked_for_besides_changes_nothing_else(dtype: type):
+    gaussians, camera = scene(22, dtype)
+    plain = rasterize(gaussians, camera, background=BACKGROUND)
+    assert plain.depth.shape == plain.median_depth.shape == plain.counts.shape == (0, 0)
+    with_depth = draw(gaussians, camera, background=BACKGROUND)
+    assert with_depth.median_depth.shape == (0, 0)
+    with_median = rasterize(gaussians, camera, background=BACKGROUND, median_depth=True)
+    np.testing.assert_array_equal(with_median.depth, with_depth.depth)
+    for more in (with_depth, with_median):
+        np.testing.assert_array_equal(more.rgb, plain.rgb)
+        np.testing.assert_array_equal(more.alpha, plain.alpha)
+
+
+def rotated(gaussians: Gaussians, camera: Camera, turn: np.ndarray) -> tuple[Gaussians, Camera]:
+    """World and camera moved rigidly: harmonics too, by fitting the turned function in its own band."""
+    directions = np.random.default_rng(0).normal(size=(100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before, after = (reference.sh_basis(d, 3) for d in (directions @ turn, directions))
+    harmonics = np.linalg.lstsq(after, before, rcond=None)[0]  # value at turn @ d is the old one at d
+    shift = np.array([0.7, -0.3, 0.4])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, shift
+    moved = Gaussians(
+        means=gaussians.means @ turn.T + shift,
+        quats=from_matrix(turn @ to_matrix(gaussians.quats)),
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        sh=np.einsum("jk,nkc->njc", harmonics, gaussians.sh),
+    )
+    return moved, replace(camera, camera_to_world=pose @ camera.camera_to_world)
+
+
+@SEEDS
+def test_moving_world_and_camera_together_changes_nothing(seed: int):
+    gaussians, camera = scene(seed, np.float64)
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    gaussians = replace(gaussians, quats=quats)
+    moved = rotated(gaussians, camera, to_matrix(unit_quats(np.random.default_rng(seed), 1)[0]))
+    assert_same(draw(*moved, background=BACKGROUND), draw(gaussians, camera, background=BACKGROUND))
+
+
+@DTYPES
+def test_sign_of_quaternions_does_not_matter(dtype: type):
+    gaussians, camera = scene(20, dtype)
+    negated = replace(gaussians, quats=-gaussians.quats)
+    assert_identical(draw(negated, camera), draw(gaussians, camera))
+
+
+@pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
+@DTYPES
+def test_opaque_front_hides_all(dtype: type, options):
+    """Two giants of opacity 1: the first leaves 1 - alpha_max, the second would use that up, so nothing follows."""
+    behind, camera = gaussians_of([[0, 0, 4], [0.2, 0, 5], [-0.3, 0.2, 6]], scales=0.5, dtype=dtype), front_camera()
+    front = gaussians_of([[0, 0, 2], [0, 0, 2.5]], scales=1e4, opacities=1.0, rgb=[0.1, 0.7, 0.3], dtype=dtype)
+    options = options._replace(transmittance_min=(1 - options.alpha_max) ** 2 * 2)
+    alone = draw(front, camera, background=BACKGROUND, options=options)
+    assert_identical(draw(joined(behind, front), camera, background=BACKGROUND, options=options), alone)
+    want = options.alpha_max * np.array([0.1, 0.7, 0.3]) + (1 - options.alpha_max) * BACKGROUND
+    assert_close(alone.rgb, np.broadcast_to(want, alone.rgb.shape), "rgb.float32")
+    assert_close(alone.depth, np.full(alone.depth.shape, 2.0), "depth.float32.relative")
+
+
+@DTYPES
+@SEEDS
+def test_background_shows_through_what_is_left(seed: int, dtype: type):
+    """rgb(background) = rgb(black) + (1 - alpha) background; alpha and depth don't know of it."""
+    gaussians, camera = scene(seed, dtype)
+    over, black = draw(gaussians, camera, background=BACKGROUND), draw(gaussians, camera)
+    assert_close(over.rgb, black.rgb + (1 - black.alpha)[..., None] * BACKGROUND, f"rgb.{np.dtype(dtype).name}")
+    assert_identical(over._replace(rgb=black.rgb), black)
+
+
+@DTYPES
+@SEEDS
+def test_alpha_is_the_weight_of_all_splats(seed: int, dtype: type):
+    """White Gaussians over black: the colour is the sum of the weights."""
+    gaussians, camera = scene(seed, dtype)
+    white = np.full((len(gaussians), 1, 3), 0.5 / 0.28209479177387814, dtype)
+    picture = draw(replace(gaussians, sh=white), camera)
+    for channel in range(3):
+        assert_close(picture.rgb[..., channel], picture.alpha, f"rgb.{np.dtype(dtype).name}")
+    assert picture.alpha.min() >= 0
+    assert picture.alpha.max() <= 1
+
+
+@DTYPES
+@SEEDS
+def test_colors_are_linear_without_the_clamp(seed: int, dtype: type):
+    """Half the colour, half the picture: weights don't depend on colours."""
+    gaussians, camera = scene(seed, dtype)
+    bright = gaussians_of(gaussians.means, rgb=np.linspace(0.2, 0.8, 450).reshape(-1, 3), dtype=dtype)
+    dim = gaussians_of(gaussians.means, rgb=np.linspace(0.1, 0.4, 450).reshape(-1, 3), dtype=dtype)
+    assert_close(
+        draw(replace(gaussians, sh=dim.sh), camera).rgb * 2,
+        draw(replace(gaussians, sh=bright.sh), camera).rgb,
+        f"rgb.{np.dtype(dtype).name}",
+    )
+
+
+@DTYPES
+def test_crops_show_the_same_pixels(dtype: type):
+    """Moving the principal point cuts the picture; means stay inside all crops, where no Jacobian is clamped."""
+    rng = np.random.default_rng(22)
+    means = np.column_stack([rng.uniform(-0.15, 0.15, size=(40, 2)), rng.uniform(1.5, 3, 40)])
+    gaussians = gaussians_of(means, scales=rng.uniform(0.02, 1.5, 40), opacities=0.4, dtype=dtype)
+    camera = front_camera(64, 48)
+    whole = draw(gaussians, camera, background=BACKGROUND)
+    clear = clear_pixels(gaussians, camera)
+    for left, top, width, height in ((0, 0, 37, 29), (27, 0, 37, 31), (0, 19, 40, 29), (25, 17, 13, 11)):
+        crop = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
+        part = np.s_[top : top + height, left : left + width]
+        expected = Rendering(*(channel[part] for channel in whole))
+        assert_same(draw(gaussians, crop, background=BACKGROUND), expected, clear[part])
+
+
+@SEEDS
+def test_mirrored_picture(seed: int):
+    """The world seen in a mirror at x = 0, by a camera on the axis, is the picture turned left to right."""
+    gaussians, _ = scene(seed, np.float64)
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    gaussians = replace(gaussians, means=gaussians.means + np.array([0, 0, 4]), quats=quats, sh=gaussians.sh[:, :1])
+    mirrored = replace(gaussians, means=gaussians.means * [-1, 1, 1], quats=quats * [1, 1, -1, -1])
+    picture, camera = draw(gaussians, front_camera()), front_camera()
+    turned = draw(mirrored, camera)
+    assert_same(Rendering(*(channel[:, ::-1] for channel in turned)), picture)
+
+
+@SEEDS
+def test_float32_is_close_to_float64(seed: int):
+    gaussians, camera = scene(seed, np.float32)
+    double = draw(as_dtype(gaussians, np.float64), camera, background=BACKGROUND)
+    single = draw(gaussians, camera, background=BACKGROUND)
+    want = Rendering(*(channel.astype(np.float32) for channel in double))
+    assert_same(single, want, clear_pixels(gaussians, camera))
+    assert -10 * np.log10(np.mean((single.rgb - double.rgb) ** 2)) > tolerance("oracle_db")
+
+
+@DTYPES
+def test_invisible_gaussians_change_no_byte(dtype: type):
+    """Opacity 0, under the threshold, behind the eye, beside the picture."""
+    gaussians, camera = scene(20, dtype)
+    forward, right = camera.camera_to_world[:3, 2], camera.camera_to_world[:3, 0]
+    middle = camera.position + 2 * forward
+    means = [middle, middle, camera.position - forward, middle + 30 * right]
+    hidden = gaussians_of(means, scales=0.1, opacities=[0, 0.0039, 1, 1], dtype=dtype)
+    hidden = replace(hidden, sh=np.pad(hidden.sh, ((0, 0), (0, 15), (0, 0))))
+    assert_identical(draw(joined(hidden, gaussians), camera), draw(gaussians, camera))
+
+
+@DTYPES
+def test_depth_of_one_splat_is_its_own(dtype: type):
+    gaussians = gaussians_of([[0.1, -0.1, 3]], scales=0.5, dtype=dtype)
+    picture = draw(gaussians, front_camera())
+    seen = picture.alpha > 0
+    assert 0 < seen.mean() < 1
+    assert_close(picture.depth[seen], np.full(seen.sum(), 3.0), "depth.float32.relative")
+    assert np.isinf(picture.depth[~seen]).all()
+
+
+@DTYPES
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_extra_channels_are_drawn_as_colors_are(channels: int, dtype: type):
+    """Each channel as the red of the same Gaussians, over black; depth is what the camera's axis says."""
+    gaussians, camera = scene(20, dtype)
+    extra = np.random.default_rng(0).uniform(-1, 1, size=(len(gaussians), channels)).astype(dtype)
+    got = draw(gaussians, camera, background=BACKGROUND, extra=extra)
+    plain = draw(gaussians, camera, background=BACKGROUND)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(plain, name))
+    assert plain.extra.shape == (camera.height, camera.width, 0)
+    assert got.extra.shape == (camera.height, camera.width, channels)
+    for channel in range(channels):
+        shifted = np.zeros((len(gaussians), 1, 3), dtype)
+        shifted[:, 0, 0] = (extra[:, channel] + 2 - 0.5) * np.sqrt(4 * np.pi)  # colours can't be below 0
+        red = draw(replace(gaussians, sh=shifted), camera).rgb[:, :, 0]
+        assert_close(got.extra[:, :, channel], red - 2 * plain.alpha, f"rgb.{np.dtype(dtype).name}")
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 1)), np.zeros(150), np.full((150, 1), np.nan)])
+def test_extra_channels_that_cannot_be(bad: np.ndarray):
+    gaussians, camera = scene(20, np.float32)
+    with pytest.raises(InvalidInput, match="extra"):
+        draw(gaussians, camera, extra=bad)
+
+
+@DTYPES
+def test_median_depth_is_where_half_of_the_light_is_gone(dtype: type):
+    """Against a loop over the Gaussians, front to back, at pixels where no rounding decides."""
+    gaussians, camera = scene(20, dtype)
+    got = draw(gaussians, camera, background=BACKGROUND, median_depth=True)
+    plain = draw(gaussians, camera, background=BACKGROUND)
+    np.testing.assert_array_equal(got.rgb, plain.rgb)
+    assert plain.median_depth.size == 0
+    want, margin = np.full(got.alpha.shape, np.inf), np.full(got.alpha.shape, np.inf)
+    axis = camera.world_to_camera[2]
+    depths = (gaussians.means.astype(float) @ axis[:3] + axis[3]).astype(dtype)
+    before = np.ones_like(got.alpha)
+    order = np.argsort(depths, kind="stable")
+    for count, i in enumerate(order, start=1):
+        after = 1 - draw(select(gaussians, order[:count]), camera).alpha
+        margin = np.minimum(margin, np.abs(after - 0.5))
+        want[(before > 0.5) & (after <= 0.5)] = depths[i]
+        before = after
+    clear = margin > 1e-4
+    assert np.isfinite(want[clear]).any()
+    np.testing.assert_array_equal(np.isfinite(got.median_depth[clear]), np.isfinite(want[clear]))
+    seen = clear & np.isfinite(want)
+    assert_close(got.median_depth[seen], want[seen], "projection.float32.relative")

@@ -1,0 +1,112 @@
+"""The kernels against the float64 loop renderer, on random and on adversarial scenes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering
+from tests.support.reference import DEPTH_BAND, Reference, render
+from tests.support.scenes import ADVERSARIAL, as_dtype, draw, front_camera, gaussians_of, random_scene, select
+from tests.support.tolerances import tolerance
+
+BACKGROUND = (0.2, 0.6, 0.9)
+EXACT_DEPTHS = {"equal_depths"}
+
+
+def assert_same_picture(got: Rendering, want: Reference, row: str, least_clean: float = 0.5):
+    """Tight where every decision is clear; bounded by the decisions' own effect in the band where it is not."""
+    clean = want.slack == 0
+    assert clean.mean() >= least_clean, "the comparison would be empty"
+    for name in ("rgb", "alpha"):
+        channel, expected = getattr(got, name), getattr(want, name)
+        assert np.isfinite(channel).all(), name
+        scale = want.color_range if name == "rgb" else 1.0
+        error = np.abs(channel - expected).reshape(*clean.shape, -1).max(axis=-1)
+        assert error[clean].max(initial=0) <= tolerance(f"{name}.{row}"), f"{name}, pixels without doubt"
+        excess = error - want.slack * max(scale, 1.0)
+        assert excess.max(initial=0) <= tolerance(f"{name}.{row}"), f"{name}, pixels at a threshold"
+    assert_same_depth(got, want, row)
+    mse = np.mean((got.rgb - want.rgb) ** 2)
+    assert mse == 0 or 10 * np.log10(1 / mse) >= tolerance("oracle_db")
+
+
+def assert_same_depth(got: Rendering, want: Reference, row: str):
+    clean = want.slack == 0
+    empty = np.isinf(want.depth)
+    np.testing.assert_array_equal(np.isinf(got.depth)[clean], empty[clean])
+    seen = clean & ~empty
+    relative = np.abs(got.depth[seen] / want.depth[seen] - 1)
+    assert relative.max(initial=0) <= tolerance(f"depth.{row}.relative")
+
+
+@pytest.mark.parametrize(
+    ("seed", "count", "width", "height", "degree"),
+    [
+        (0, 300, 53, 37, 3),
+        (1, 300, 64, 48, 2),
+        (2, 600, 17, 71, 1),
+        (3, 50, 16, 16, 0),
+        (4, 300, 1, 1, 3),
+        (5, 300, 33, 1, 3),
+        (6, 1, 53, 37, 3),
+        (7, 0, 53, 37, 3),
+        (12, 15, 53, 37, 3),
+        (13, 17, 37, 53, 2),
+        (14, 47, 16, 17, 1),
+    ],
+)
+def test_random_scenes(seed: int, count: int, width: int, height: int, degree: int):
+    gaussians, camera = random_scene(seed, count, width, height, sh_degree=degree)
+    got = draw(gaussians, camera, background=BACKGROUND)
+    assert got.rgb.dtype == got.alpha.dtype == got.depth.dtype == np.float32
+    assert got.rgb.shape == (height, width, 3)
+    assert got.alpha.shape == got.depth.shape == (height, width)
+    assert_same_picture(got, render(gaussians, camera, BACKGROUND), "float32")
+
+
+@pytest.mark.parametrize("name", sorted(ADVERSARIAL))
+def test_adversarial_scenes(name: str):
+    gaussians, camera = ADVERSARIAL[name]()
+    want = render(gaussians, camera, BACKGROUND, depth_band=0.0 if name in EXACT_DEPTHS else DEPTH_BAND)
+    assert_same_picture(draw(gaussians, camera, background=BACKGROUND), want, "float32")
+
+
+def test_largest_picture():
+    """8192 × 8192, in which a few splats are found where they belong, small, large and at the far corner."""
+    side = 8192
+    camera = front_camera(side, side, focal=6000.0)
+    means = np.array([[0, 0, 3], [-1.2, 1.3, 2], [0.5, -1.0, 2.2], [1.36, 1.36, 2]])
+    gaussians = gaussians_of(means, scales=[0.3, 0.002, 1e-5, 0.01], opacities=0.8)
+    got = draw(gaussians, camera, background=BACKGROUND)
+    assert got.rgb.shape == (side, side, 3)
+    centers = means[:, :2] / means[:, 2:] * 6000 + side / 2
+    for x, y in np.clip(centers.astype(int) - 30, 0, side - 60):
+        part = np.s_[y : y + 60, x : x + 60]
+        crop = replace(camera, cx=camera.cx - x, cy=camera.cy - y, width=60, height=60)
+        want = render(gaussians, crop, BACKGROUND)
+        assert want.alpha.any()
+        assert_same_picture(Rendering(*(channel[part] for channel in got)), want, "float32_8192")
+    assert not got.alpha[:1000, :1000].any()
+
+
+@pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
+@pytest.mark.parametrize("name", ["random", *sorted(ADVERSARIAL)])
+def test_float64_agrees_to_rounding(name: str, options: RasterizerOptions):
+    gaussians, camera = random_scene(8, 200) if name == "random" else ADVERSARIAL[name]()
+    gaussians = as_dtype(gaussians, np.float64)
+    got = draw(gaussians, camera, background=BACKGROUND, options=options)
+    assert got.rgb.dtype == np.float64
+    assert_same_picture(got, render(gaussians, camera, BACKGROUND, options, depth_band=0.0), "float64")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_median_depth_lies_behind_half_of_the_light(dtype: type):
+    """Three sheets of opacity 0.4: the light falls to 0.6, then to 0.36; where there is one sheet, never to a half."""
+    sheets = gaussians_of([[0, 0, 2], [0, 0, 3], [0, 0, 4]], scales=1e4, opacities=0.4, dtype=dtype)
+    camera = front_camera(20, 20)
+    picture = draw(sheets, camera, median_depth=True)
+    np.testing.assert_array_equal(picture.median_depth, np.full((20, 20), 3, dtype))
+    alone = draw(select(sheets, slice(1)), camera, median_depth=True)
+    assert np.isinf(alone.median_depth).all()
+    assert draw(sheets, camera).median_depth.shape == (0, 0)

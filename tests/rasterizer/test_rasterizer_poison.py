@@ -1,0 +1,140 @@
+"""Values that must be drawn correctly or refused by name, through `rasterize`."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from msdgs_serve.rasterizer import GSPLAT
+from msdgs_serve.scene import Camera, Gaussians, InvalidInput
+from tests.support.scenes import as_dtype, draw, front_camera, gaussians_of, random_scene
+
+BACKGROUND = (0.2, 0.6, 0.9)
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def poisoned(field: str, value: object) -> tuple[Gaussians, Camera]:
+    gaussians, camera = random_scene(30, 20)
+    array = getattr(gaussians, field).copy()
+    array[7] = value
+    return replace(gaussians, **{field: array}), camera
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf])
+def test_not_finite_is_refused_by_name(field: str, poison: float):
+    with pytest.raises(InvalidInput) as error:
+        draw(*poisoned(field, poison))
+    assert error.value.field == f"gaussians.{field}"
+
+
+@pytest.mark.parametrize(("field", "poison"), [("quats", 0.0), ("scales", 0.0), ("scales", -1.0), ("opacities", 1.5)])
+def test_out_of_range_is_refused_by_name(field: str, poison: float):
+    with pytest.raises(InvalidInput) as error:
+        draw(*poisoned(field, poison))
+    assert error.value.field == f"gaussians.{field}"
+
+
+@pytest.mark.parametrize("background", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0), 0.5, np.zeros((2, 3))])
+def test_bad_background_is_refused_by_name(background: npt.ArrayLike):
+    with pytest.raises(InvalidInput) as error:
+        draw(*random_scene(30, 5), background=background)
+    assert error.value.field == "background"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("near_plane", 0.0),
+        ("near_plane", np.nan),
+        ("eps2d", -0.1),
+        ("eps2d", np.inf),
+        ("alpha_min", 0.0),
+        ("alpha_min", np.nan),
+        ("alpha_max", 1.0),
+        ("alpha_max", 0.001),
+        ("transmittance_min", -1e-4),
+        ("transmittance_min", 1.0),
+    ],
+)
+def test_bad_options_are_refused_by_name(field: str, value: float):
+    with pytest.raises(InvalidInput) as error:
+        draw(*random_scene(30, 5), options=GSPLAT._replace(**{field: value}))
+    assert error.value.field == f"options.{field}"
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("degree", range(4))
+def test_no_gaussians_are_the_background(dtype: type, degree: int):
+    gaussians, camera = random_scene(30, 0, sh_degree=degree)
+    picture = draw(as_dtype(gaussians, dtype), camera, background=BACKGROUND)
+    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.array(BACKGROUND, dtype), picture.rgb.shape))
+    assert not picture.alpha.any()
+    assert np.isinf(picture.depth).all()
+    assert picture.rgb.dtype == dtype
+
+
+def test_all_behind_the_camera_are_the_background():
+    gaussians = gaussians_of([[0, 0, -1], [0, 0, 0], [0.1, 0, -5]], scales=3.0, opacities=1.0)
+    picture = draw(gaussians, front_camera(), background=BACKGROUND)
+    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.array(BACKGROUND, np.float32), picture.rgb.shape))
+
+
+def test_one_pixel_and_one_gaussian():
+    camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, np.eye(4))
+    picture = draw(gaussians_of([[0, 0, 2]], opacities=0.5, rgb=[1, 0, 0.5]), camera)
+    np.testing.assert_array_equal(picture.rgb, np.array([[[0.5, 0, 0.25]]], np.float32))
+    assert picture.alpha == 0.5
+    assert picture.depth == 2
+
+
+def test_eye_at_the_mean_of_a_splat():
+    """There is no direction to see it in, and it is not in front."""
+    gaussians = gaussians_of([[0, 0, 0]], scales=1.0, opacities=1.0)
+    assert not draw(gaussians, front_camera()).alpha.any()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("means", 3e38),
+        ("means", -3e38),
+        ("means", 1e-45),
+        ("scales", 3e38),
+        ("scales", [3e38, 1e-38, 1.0]),
+        ("scales", 1e-45),
+        ("sh", 1e30),
+        ("sh", -1e30),
+    ],
+)
+def test_extreme_but_finite_values_leave_no_nan(field: str, value: object, dtype: type):
+    gaussians, camera = poisoned(field, value)
+    picture = draw(as_dtype(gaussians, dtype), camera, background=BACKGROUND)
+    for channel in picture:
+        assert not np.isnan(channel).any()
+    assert (picture.alpha >= 0).all()
+    assert (picture.alpha <= 1).all()
+    assert (picture.depth > 0).all()
+
+
+@pytest.mark.parametrize("means", [[0, 0, 1e-30], [1e30, 0, 1e-2], [1e20, 1e20, 1.0], [0, 0, 3e38]])
+def test_extreme_places_leave_no_nan(means: list[float]):
+    picture = draw(gaussians_of([means, [0, 0, 2]], scales=[1e10, 0.1]), front_camera())
+    assert np.isfinite(picture.rgb).all()
+    assert not np.isnan(picture.depth).any()
+
+
+def test_mixed_dtypes_are_cast():
+    gaussians, camera = random_scene(30, 20)
+    mixed = replace(gaussians, scales=gaussians.scales.astype(np.float64), sh=gaussians.sh.astype(np.float64))
+    np.testing.assert_array_equal(draw(mixed, camera).rgb, draw(gaussians, camera).rgb)
+
+
+def test_inputs_are_left_alone():
+    gaussians, camera = random_scene(30, 50)
+    before = {name: getattr(gaussians, name).copy() for name in FIELDS}
+    draw(gaussians, camera, background=BACKGROUND)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(gaussians, name), before[name])

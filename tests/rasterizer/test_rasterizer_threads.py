@@ -1,0 +1,127 @@
+"""Same bytes from any number of threads; compiled once, for every process and every layout of arrays."""
+
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from msdgs_serve.rasterizer import Rendering
+from msdgs_serve.scene import Gaussians
+from tests.support.processes import run_python
+from tests.support.scenes import as_dtype, draw, random_scene
+from tests.support.tolerances import assert_close
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+RENDER_TO_FILE = """
+import sys
+import numpy as np
+from tests.support.scenes import draw, random_scene
+np.savez(sys.argv[1], **draw(*random_scene(40, 12, 19, 13))._asdict())
+"""
+
+COUNT_COMPILATIONS = (
+    RENDER_TO_FILE
+    + """
+from tests.rasterizer.test_rasterizer_threads import kernels
+stats = [kernel.stats for kernel in kernels()]
+print(sum(sum(s.cache_hits.values()) for s in stats), sum(sum(s.cache_misses.values()) for s in stats))
+"""
+)
+
+
+def kernels() -> list[Dispatcher]:
+    """Every numba function in the package's loaded modules."""
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith("msdgs_serve")]
+    found = {id(value): value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
+    return list(found.values())
+
+
+def compiled() -> int:
+    """Versions of kernels in this process, one for each combination of argument types."""
+    return sum(len(kernel.signatures) for kernel in kernels())
+
+
+def bytes_of(picture: Rendering) -> list[bytes]:
+    return [channel.tobytes() for channel in picture]
+
+
+@pytest.mark.parametrize("threads", ["1", "2", "3", "7"])
+def test_same_bytes_for_any_number_of_threads(threads: str, monkeypatch: pytest.MonkeyPatch):
+    """The pool is as large as it was first asked for; the work is split anew by each number."""
+    gaussians, camera = random_scene(41, 500, 150, 90)
+    expected = bytes_of(draw(gaussians, camera))
+    monkeypatch.setenv("MSDGS_THREADS", threads)
+    assert bytes_of(draw(gaussians, camera)) == expected
+
+
+def test_several_callers_at_once_get_serial_bytes():
+    scenes = [random_scene(seed, 300, 90 + seed, 70) for seed in range(8)]
+    expected = [bytes_of(draw(*scene)) for scene in scenes]
+    start = threading.Barrier(4)
+
+    def caller(_: int) -> list[list[bytes]]:
+        start.wait(timeout=30)
+        return [bytes_of(draw(*scene)) for scene in scenes]
+
+    with ThreadPoolExecutor(4) as callers:
+        for got in callers.map(caller, range(4)):
+            assert got == expected
+
+
+def test_repeated_calls_give_the_same_bytes():
+    scene = random_scene(42, 300)
+    assert bytes_of(draw(*scene)) == bytes_of(draw(*scene))
+
+
+def test_second_process_compiles_nothing(tmp_path: Path):
+    """The first leaves its kernels in the cache on disk; the second finds all of them there."""
+    draw(*random_scene(40, 12, 19, 13))
+    hits, misses = map(int, run_python(COUNT_COMPILATIONS, tmp_path / "picture.npz").split())
+    assert misses == 0
+    assert hits > 0
+
+
+def test_without_the_compiler_the_picture_is_the_same(tmp_path: Path):
+    """The kernels are plain Python too: what a debugger and a coverage report see is what runs."""
+    run_python(RENDER_TO_FILE, tmp_path / "picture.npz", NUMBA_DISABLE_JIT="1")
+    expected = draw(*random_scene(40, 12, 19, 13))
+    with np.load(tmp_path / "picture.npz") as plain:
+        for name in ("rgb", "alpha", "depth"):
+            channel = getattr(expected, name)
+            assert_close(plain[name], channel, f"{name}.float32" + (".relative" if name == "depth" else ""))
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+@pytest.mark.parametrize("layout", [np.asfortranarray, read_only, lambda a: np.repeat(a, 2, axis=0)[::2]])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_no_layout_of_arrays_is_compiled_for_anew(layout, dtype: type):
+    gaussians, camera = random_scene(43, 20)
+    gaussians = as_dtype(gaussians, dtype)
+    expected = bytes_of(draw(gaussians, camera))
+    laid_out = Gaussians(**{name: layout(getattr(gaussians, name)) for name in FIELDS})
+    before = compiled()
+    assert bytes_of(draw(laid_out, camera)) == expected
+    assert compiled() == before
+
+
+def test_cameras_of_any_number_type_are_compiled_for_once():
+    """JSON brings integers, NumPy brings its own scalars."""
+    gaussians, camera = random_scene(43, 20)
+    square = replace(camera, fx=50.0, fy=50.0, cx=26.0, cy=18.0)
+    expected = bytes_of(draw(gaussians, square))
+    for kind in (int, np.float32, np.int64):
+        typed = replace(camera, fx=kind(50), fy=kind(50), cx=kind(26), cy=kind(18), width=np.int32(53))  # pyright: ignore
+        before = compiled()
+        assert bytes_of(draw(gaussians, typed)) == expected
+        assert compiled() == before

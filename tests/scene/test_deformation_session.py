@@ -1,0 +1,177 @@
+"""The reader of scene files: times, ids, threads and memory."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from export.jobs.bake import bake
+from export.plans.registry import build
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo
+from tests.support.models import random_model
+from tests.support.scene_files import write_scene
+from tests.support.tolerances import tolerance
+
+
+def written(path: Path, model: DynamicGaussians, **scene: Any) -> Path:
+    path.write_bytes(build("network", bake(model, SceneInfo(**scene), "0" * 64)).SerializeToString())
+    return path
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("scene") / "scene.onnx", random_model(1000))
+
+
+@pytest.fixture(scope="module")
+def session(path: Path) -> DeformationSession:
+    return DeformationSession(path, chunk=128)
+
+
+def test_all_moving_gaussians_by_default(session: DeformationSession):
+    means, quats, scales = session.pose(0.5)
+    assert (means.shape, quats.shape, scales.shape) == ((1000, 3), (1000, 4), (1000, 3))
+    gaussians = session.gaussians(0.5).validate()
+    assert (len(gaussians), gaussians.sh_degree) == (1000, 3)
+    assert np.array_equal(gaussians.means, means)
+
+
+def test_moving_gaussians_come_first_then_static_ones(tmp_path: Path):
+    session = DeformationSession(write_scene(tmp_path / "scene.onnx"))
+    assert (session.scene.moving_count, session.scene.static_count) == (1, 1)
+    for t in (0.0, 0.25, 1.0):
+        assert np.allclose(session.gaussians(t).means, [[0, 0, 2 * t - 1], [0, 0, 0]])
+
+
+@pytest.mark.parametrize("ids", [[], [3], [999, 0, 5, 5], list(range(999, -1, -1))])
+def test_ids_come_back_in_their_order(session: DeformationSession, ids: list[int]):
+    for some, every in zip(session.pose(0.5, ids), session.pose(0.5), strict=True):
+        assert some.shape == every[ids].shape
+        # rows of a product may be added in another order in a chunk of another length
+        assert np.abs(some - every[ids]).max(initial=0) <= tolerance("export.relative")
+
+
+@pytest.mark.parametrize("ids", [[-1], [1000], [0.5], [[1]], ["a"], 3])
+def test_ids_that_are_not_there_are_refused(session: DeformationSession, ids: list[int]):
+    with pytest.raises(InvalidInput, match="ids"):
+        session.pose(0.5, ids)
+
+
+@pytest.mark.parametrize("t", [-0.001, 1.001, float("nan"), float("inf")])
+def test_times_outside_the_range_are_refused(session: DeformationSession, t: float):
+    for ask in (session.pose, session.gaussians):
+        with pytest.raises(InvalidInput, match=r"`t` must be in the scene's range \[0.0, 1.0\]"):
+            ask(t)
+
+
+def test_layers_may_be_applied_one_after_the_other(tmp_path: Path):
+    model = random_model(200, layers=("mlp", "plane", "mlp"))
+    session = DeformationSession(written(tmp_path / "scene.onnx", model))
+    assert session.most_steps == 3
+    for steps in range(4):
+        with torch.no_grad():
+            want = model.pose(0.37, steps=steps)
+        got = dict(zip(("means", "quats", "scales"), session.pose(0.37, steps=steps), strict=True))
+        for part, values in got.items():
+            assert np.abs(values - getattr(want, part).detach().numpy()).max() <= tolerance("export.relative")
+    for part, every in zip(session.pose(0.37, steps=3), session.pose(0.37), strict=True):
+        assert np.array_equal(part, every)
+
+
+def test_a_layer_may_be_applied_in_part(tmp_path: Path):
+    session = DeformationSession(written(tmp_path / "scene.onnx", random_model(200, layers=("mlp", "mlp"))))
+    start, first = (session.pose(0.37, steps=steps)[0] for steps in (0, 1))
+    assert np.abs(first - start).max() > 10 * tolerance("export.relative")
+    part = session.pose(0.37, steps=0.25)[0]
+    assert np.abs(part - (start + 0.25 * (first - start))).max() <= tolerance("export.relative")
+
+
+@pytest.mark.parametrize("steps", [-0.1, 3.1, float("nan"), float("inf")])
+def test_steps_that_the_scene_has_not_are_refused(session: DeformationSession, steps: float):
+    with pytest.raises(InvalidInput, match=rf"`steps` must be in \[0, {session.most_steps}\], the scene's layers"):
+        session.gaussians(0.5, steps)
+
+
+@pytest.mark.parametrize("steps", [0.0, 1.0, float("nan")])
+def test_a_scene_without_layers_has_no_steps(tmp_path: Path, steps: float):
+    session = DeformationSession(write_scene(tmp_path / "scene.onnx"))
+    assert session.most_steps == 0
+    with pytest.raises(InvalidInput, match="`steps` must be left out: the plan network doesn't run layers one by one"):
+        session.pose(0.5, steps=steps)
+
+
+def test_the_scene_has_its_own_range_of_times(tmp_path: Path):
+    session = DeformationSession(written(tmp_path / "scene.onnx", random_model(9), time_range=(0.2, 0.6)))
+    session.pose(0.2)
+    session.pose(0.6)
+    with pytest.raises(InvalidInput, match="t"):
+        session.pose(0.1)
+
+
+def test_the_same_bits_for_any_number_of_threads(session: DeformationSession, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MSDGS_THREADS", "2")
+    parallel = session.pose(0.7)
+    monkeypatch.setenv("MSDGS_THREADS", "1")
+    for one, two in zip(session.pose(0.7), parallel, strict=True):
+        assert one.tobytes() == two.tobytes()
+
+
+def test_several_callers_at_once(session: DeformationSession):
+    times = np.linspace(0, 1, 12).tolist()
+    alone = [session.pose(t)[0].tobytes() for t in times]
+    with ThreadPoolExecutor(4) as callers:
+        together = list(callers.map(lambda t: session.pose(t)[0].tobytes(), times))
+    assert together == alone
+
+
+def test_a_chunk_must_have_a_size(path: Path):
+    with pytest.raises(InvalidInput, match="chunk"):
+        DeformationSession(path, chunk=0)
+
+
+PEAK_GROWTH = """
+import sys
+from pathlib import Path
+from msdgs_serve.deformation import DeformationSession
+def peak_mb():  # not getrusage: its peak is inherited from the process that started this one
+    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024
+session = DeformationSession(sys.argv[1])
+session.pose(0.5, range(2 * 2048))
+before = peak_mb()
+session.pose(0.5)
+print(peak_mb() - before)
+assert "torch" not in sys.modules and "onnx" not in sys.modules
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from Linux's /proc")
+def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
+    count, width = 60_000, 256
+    model = random_model(1, layers=("mlp",), width=width, sh_degree=0, embedding_size=0)
+    for name, parameter in list(model.gaussians.named_parameters()):
+        setattr(
+            model.gaussians, name, torch.nn.Parameter(parameter.detach().repeat(count, *[1] * (parameter.ndim - 1)))
+        )
+    path = written(tmp_path / "scene.onnx", model)
+    done = subprocess.run([sys.executable, "-c", PEAK_GROWTH, str(path)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    activation_mb = count * width * 4 / 2**20
+    outputs_mb = count * 10 * 4 / 2**20
+    assert float(done.stdout) < outputs_mb + 0.25 * activation_mb
+
+
+@pytest.mark.parametrize("text", [b"package_version", b"static_means"])
+def test_text_that_is_not_utf_8_is_refused(path: Path, tmp_path: Path, text: bytes):
+    """In the metadata, in names of outputs."""
+    damaged = tmp_path / "damaged.onnx"
+    damaged.write_bytes(path.read_bytes().replace(text, b"\xff" + text[1:]))
+    with pytest.raises(SceneFileInvalid, match=r"damaged.onnx"):
+        DeformationSession(damaged)

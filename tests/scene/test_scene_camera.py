@@ -1,0 +1,178 @@
+"""Cameras by projecting points whose pixels are known, and inputs that are no camera."""
+
+import math
+
+import numpy as np
+import pytest
+
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.camera import look_at, orbit
+from tests.support.scenes import random_camera
+from tests.support.tolerances import assert_close
+
+
+def pixel_of(camera: Camera, point: object) -> np.ndarray:
+    """[2] x, y of a world point."""
+    x, y, z = (camera.world_to_camera @ [*np.asarray(point, float), 1.0])[:3]
+    assert z > 0, "behind the camera"
+    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+
+def test_identity_pose_is_opencv():
+    camera = Camera(100.0, 200.0, 50.0, 40.0, 100, 80, np.eye(4))
+    assert_close(pixel_of(camera, [0, 0, 5]), [50, 40], "pixel")
+    assert_close(pixel_of(camera, [1, 0, 5]), [70, 40], "pixel")  # x: right
+    assert_close(pixel_of(camera, [0, 1, 5]), [50, 80], "pixel")  # y: down
+
+
+def test_world_to_camera_is_the_inverse():
+    camera = random_camera(np.random.default_rng(0), 53, 37)
+    assert_close(camera.world_to_camera @ camera.camera_to_world, np.eye(4), "rotation")
+    assert_close(camera.world_to_camera @ [*camera.position, 1], [0, 0, 0, 1], "rotation")
+
+
+@pytest.mark.parametrize("fov_y", [1.0, 45.0, 90.0, 170.0])
+def test_from_fov_sees_that_angle(fov_y: float):
+    camera = Camera.from_fov(np.eye(4), 200, 100, fov_y)
+    half = math.tan(math.radians(fov_y / 2))
+    assert_close(pixel_of(camera, [0, half, 1]), [100, 100], "pixel")
+    assert_close(pixel_of(camera, [-2 * half, -half, 1]), [0, 0], "pixel")
+
+
+def test_from_look_at_centres_the_target_with_up_upwards():
+    eye, target, up = np.array([3.0, -2, 1]), np.array([0.5, 0.2, -0.1]), np.array([0.0, 0, 1])
+    camera = Camera.from_look_at(eye, target, up, 80, 60, 50.0)
+    assert_close(camera.position, eye, "rotation")
+    assert_close(pixel_of(camera, target), [40, 30], "pixel")
+    above = pixel_of(camera, target + 0.1 * up)
+    assert_close(above[0], 40, "pixel")
+    assert above[1] < 30
+    right = np.cross(target - eye, up)
+    assert pixel_of(camera, target + 0.1 * right)[0] > 40
+
+
+def test_from_opengl_looks_along_minus_z_with_y_up():
+    camera = Camera.from_opengl(np.eye(4), 80, 60, fx=50, fy=50, cx=40, cy=30)
+    assert_close(pixel_of(camera, [0, 0, -2]), [40, 30], "pixel")
+    assert_close(pixel_of(camera, [1, 0, -2]), [65, 30], "pixel")
+    assert_close(pixel_of(camera, [0, 1, -2]), [40, 5], "pixel")
+
+
+@pytest.mark.parametrize("up", [[0.0, 0, 1], [0.0, -1, 0], [1.0, 2, 3]])
+def test_orbit_keeps_distance_and_elevation(up: list[float]):
+    target, direction = np.array([0.3, -0.2, 0.5]), np.array(up) / np.linalg.norm(up)
+    for azimuth in (0.0, 90.0, 215.0):
+        pose = orbit(target, 4.0, azimuth, 30.0, np.array(up))
+        outwards = pose[:3, 3] - target
+        assert_close(np.linalg.norm(outwards), 4, "rotation")
+        assert_close(outwards @ direction, 4 * math.sin(math.radians(30)), "rotation")
+        camera = Camera.from_fov(pose, 64, 64, 40.0)
+        assert_close(pixel_of(camera, target), [32, 32], "pixel")
+        assert pixel_of(camera, target + 0.1 * direction)[1] < 32
+
+
+def test_orbit_by_azimuth_is_a_rotation_around_up():
+    up, origin = np.array([0.0, 0, 1]), np.zeros(3)
+    start, quarter = (orbit(origin, 2.0, azimuth, 20.0, up) for azimuth in (10.0, 100.0))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert_close(quarter[:3], turn @ start[:3], "rotation")
+
+
+def test_resized_camera_sees_the_same_in_proportion():
+    camera = random_camera(np.random.default_rng(1), 80, 60)
+    point = camera.position + 3 * camera.camera_to_world[:3, 2] + [0.1, 0.2, -0.1]
+    resized = camera.resized(160, 30)
+    assert (resized.width, resized.height) == (160, 30)
+    assert_close(pixel_of(resized, point), pixel_of(camera, point) * [2, 0.5], "pixel")
+
+
+GOOD = {"fx": 50.0, "fy": 50.0, "cx": 20.0, "cy": 15.0, "width": 40, "height": 30, "camera_to_world": np.eye(4)}
+
+
+@pytest.mark.parametrize(
+    ("field", "poison"),
+    [
+        *((name, value) for name in ("fx", "fy") for value in (0.0, -1.0, math.nan, math.inf)),
+        *((name, value) for name in ("cx", "cy") for value in (math.nan, -math.inf)),
+        *((name, value) for name in ("width", "height") for value in (0, -3, 1.5, 10**9, math.nan, "40")),
+        ("camera_to_world", np.eye(3)),
+        ("camera_to_world", np.full((4, 4), np.nan)),
+        ("camera_to_world", np.zeros((4, 4))),
+        ("camera_to_world", np.diag([2.0, 2, 2, 1])),
+        ("camera_to_world", np.diag([1.0, 1, -1, 1])),
+        ("camera_to_world", np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]])),
+    ],
+)
+def test_poison_is_refused_by_name(field: str, poison: object):
+    with pytest.raises(InvalidInput, match=rf"`camera\.{field}` must be .*, got ") as error:
+        Camera(**{**GOOD, field: poison})  # pyright: ignore[reportArgumentType]
+    assert error.value.field == f"camera.{field}"
+
+
+@pytest.mark.parametrize("fov_y", [0.0, 180.0, -10.0, 190.0, math.nan])
+def test_fov_out_of_range_is_refused(fov_y: float):
+    with pytest.raises(InvalidInput, match=r"`camera\.fov_y` must be in \(0, 180\) degrees, got "):
+        Camera.from_fov(np.eye(4), 40, 30, fov_y)
+
+
+@pytest.mark.parametrize(
+    ("field", "eye", "target", "up"),
+    [
+        ("target", [1, 2, 3], [1, 2, 3], [0, 0, 1]),
+        ("up", [0, 0, 3], [0, 0, 0], [0, 0, 1]),
+        ("up", [0, 0, 3], [0, 0, 0], [0, 0, 0]),
+        ("eye", [0, 0, np.nan], [0, 0, 0], [0, 0, 1]),
+        ("target", [0, 0, 3], [np.inf, 0, 0], [0, 1, 0]),
+        ("up", [0, 0, 3], [0, 0, 0], [1, 0]),
+    ],
+)
+def test_look_at_without_a_direction_is_refused(field: str, eye: object, target: object, up: object):
+    with pytest.raises(InvalidInput) as error:
+        look_at(np.array(eye, float), np.array(target, float), np.array(up, float))
+    assert error.value.field == f"camera.{field}"
+
+
+@pytest.mark.parametrize(
+    ("field", "distance", "azimuth", "elevation", "up"),
+    [
+        ("distance", 0.0, 0.0, 0.0, [0, 0, 1]),
+        ("distance", math.inf, 0.0, 0.0, [0, 0, 1]),
+        ("azimuth", 1.0, math.nan, 0.0, [0, 0, 1]),
+        ("elevation", 1.0, 0.0, 90.0, [0, 0, 1]),
+        ("elevation", 1.0, 0.0, math.nan, [0, 0, 1]),
+        ("up", 1.0, 0.0, 0.0, [0, 0, 0]),
+    ],
+)
+def test_orbit_out_of_range_is_refused(field: str, distance: float, azimuth: float, elevation: float, up: object):
+    with pytest.raises(InvalidInput) as error:
+        orbit(np.zeros(3), distance, azimuth, elevation, np.array(up, float))
+    assert error.value.field == f"camera.{field}"
+
+
+def test_pose_can_not_be_changed_from_outside():
+    pose = np.eye(4)
+    camera = Camera(**{**GOOD, "camera_to_world": pose})
+    pose[0, 3] = 7
+    assert camera.position[0] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        camera.camera_to_world[0, 3] = 7
+
+
+@pytest.mark.parametrize(
+    ("field", "changes"),
+    [
+        ("camera.model", {"model": "panorama"}),
+        ("camera.distortion", {"model": "fisheye", "distortion": (0.1, 0.2)}),
+        ("camera.distortion", {"model": "fisheye", "distortion": (0.1, 0.2, 0, math.nan)}),
+        ("camera.distortion", {"distortion": (0.1, 0, 0, 0)}),
+    ],
+)
+def test_a_camera_model_that_cannot_be(field: str, changes: dict):
+    with pytest.raises(InvalidInput, match=field):
+        Camera(10.0, 10.0, 4.0, 4.0, 8, 8, np.eye(4), **changes)
+
+
+def test_a_resized_camera_keeps_its_model():
+    camera = Camera(10.0, 12.0, 4.0, 3.0, 8, 6, np.eye(4), "fisheye", (0.1, 0.0, 0.0, 0.0)).resized(16, 12)
+    assert (camera.model, camera.distortion) == ("fisheye", (0.1, 0.0, 0.0, 0.0))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 24, 8, 6)

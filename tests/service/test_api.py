@@ -1,0 +1,293 @@
+"""The service over HTTP: responses are decoded and their pixels looked at."""
+
+import itertools
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.imaging import FORMATS
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.scene import Camera
+from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
+from tests.support.images import decode, linear_to_srgb, psnr
+from tests.support.scene_files import UP, metadata, write_scene
+from tests.support.scenes import draw
+from tests.support.service import serving
+
+SIZE = 64
+LEVEL = {"type": "orbit", "azimuth": 0, "elevation": 0, "distance": 5, "fov_y": 40}
+FRAME = {"camera": LEVEL, "t": 0.0, "width": SIZE, "height": SIZE}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+
+
+@pytest.fixture(scope="module")
+def client(scene: Path) -> Iterator[httpx.Client]:
+    with serving(scene) as client:
+        yield client
+
+
+def level_pose() -> np.ndarray:
+    """Where `LEVEL` is."""
+    return orbit(np.zeros(3), 5.0, 0, 0, UP)
+
+
+def render(client: httpx.Client, **changes: Any) -> np.ndarray:
+    """The pixels of `FRAME` with some keys changed."""
+    body = {**FRAME, **changes}
+    response = client.post("/render", json=body)
+    assert response.status_code == 200, response.text
+    image_format = body.get("format", "png")
+    assert response.headers["content-type"] == FORMATS[image_format].media_type
+    return decode(response.content, image_format)[0]
+
+
+@pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
+def test_the_frame_is_what_the_rasterizer_draws(client: httpx.Client, scene: Path, t: float):
+    camera = Camera.from_fov(level_pose(), SIZE, SIZE, 40.0)
+    drawn = draw(DeformationSession(scene).gaussians(t), camera, background=metadata().background)
+    assert np.abs(render(client, t=t) / 255 - drawn.rgb).max() <= 0.5 / 255 + 1e-6
+    float_pixels = render(client, t=t, format="exr", background="scene")
+    assert np.abs(linear_to_srgb(float_pixels[..., :3]) - drawn.rgb).max() < 1e-5
+    np.testing.assert_array_equal(float_pixels[..., 4], drawn.depth)
+
+
+def test_lossy_formats_show_the_same_frame(client: httpx.Client):
+    exact = render(client) / 255
+    for image_format in ("jpeg", "webp"):
+        assert psnr(render(client, format=image_format, quality=95) / 255, exact) > 35
+
+
+def test_backgrounds(client: httpx.Client):
+    corner = (0, 0)
+    np.testing.assert_allclose(render(client)[corner] / 255, metadata().background, atol=0.5 / 255)
+    assert render(client, background=[1, 0.5, 0])[corner].tolist() == [255, 128, 0]
+    assert render(client, background="transparent")[corner].tolist() == [0, 0, 0, 0]
+    np.testing.assert_array_equal(render(client, background=None), render(client, background="transparent"))
+    linear = render(client, format="exr")
+    assert linear[corner][:4].tolist() == [0, 0, 0, 0]
+    assert np.isinf(linear[corner][4])
+
+
+def test_layers_are_applied_one_after_the_other(tmp_path: Path, client: httpx.Client):
+    with serving(write_scene(tmp_path / "balls.onnx", steps=True)) as by_layers:
+        assert by_layers.get("/scenes/balls").json()["steps"] == 1
+        for t, steps in ((0.75, 0), (0.75, 0.5), (0.75, 1)):
+            assert np.array_equal(render(by_layers, t=t, steps=steps), render(client, t=t * steps))
+        link = {**{name: value for name, value in LEVEL.items() if name != "type"}, "width": SIZE, "height": SIZE}
+        answer = by_layers.get("/render", params={**link, "t": 0.75, "steps": 0.5})
+        assert np.array_equal(decode(answer.content, "png")[0], render(client, t=0.375))
+        problem = by_layers.post("/render", json={**FRAME, "steps": 2})
+        assert (problem.status_code, problem.json()["errors"][0]["field"]) == (422, "steps")
+    assert client.get("/scenes/balls").json()["steps"] == 0
+    assert client.post("/render", json={**FRAME, "steps": 0}).json()["errors"][0]["field"] == "steps"
+
+
+def test_one_view_said_in_four_ways(client: httpx.Client):
+    pose = level_pose()
+    focal = SIZE / 2 / np.tan(np.radians(20))
+    cameras = [
+        {"type": "look_at", "eye": pose[:3, 3].tolist(), "target": [0, 0, 0], "up": [0, 0, 1], "fov_y": 40},
+        {"type": "matrix", "camera_to_world": pose.tolist(), "fov_y": 40},
+        {"type": "matrix", "camera_to_world": pose.tolist(), "fx": focal, "fy": focal, "cx": 32, "cy": 32},
+        {"type": "matrix", "camera_to_world": (pose @ OPENGL_TO_OPENCV).tolist(), "axes": "opengl", "fx": focal},
+    ]
+    expected = render(client).astype(int)
+    for camera in cameras:
+        assert np.abs(render(client, camera=camera) - expected).max() <= 1
+
+
+def test_cameras_of_other_models(client: httpx.Client):
+    """At five units, the middle of the picture is where a pinhole has it; away from it they differ."""
+    pose = level_pose()
+    matrix = {"type": "matrix", "camera_to_world": pose.tolist(), "fx": 100.0}
+    pinhole = render(client, camera=matrix).astype(int)
+    for changes in ({"model": "fisheye"}, {"model": "fisheye", "distortion": [0.5, 0, 0, 0]}):
+        other = render(client, camera={**matrix, **changes}).astype(int)
+        assert np.abs(other[SIZE // 2, SIZE // 2] - pinhole[SIZE // 2, SIZE // 2]).max() <= 2
+        assert np.abs(other - pinhole).max() > 5
+    flat = render(client, camera={**matrix, "model": "orthographic", "fx": 20.0}).astype(int)
+    nearer = pose.copy()
+    nearer[:3, 3] += pose[:3, 2]
+    moved = {**matrix, "camera_to_world": nearer.tolist(), "model": "orthographic", "fx": 20.0}
+    np.testing.assert_allclose(render(client, camera=moved), flat, atol=1)
+
+
+def test_a_camera_of_the_scene_by_index_or_name(client: httpx.Client):
+    by_index = render(client, camera={"type": "scene", "index": 1}, width=None, height=None)
+    assert by_index.shape == (48, 64, 3)
+    by_name = render(client, camera={"type": "scene", "name": "view_90"}, width=64, height=48)
+    np.testing.assert_array_equal(by_index, by_name)
+    stored = client.get("/scenes/balls").json()["cameras"][1]
+    intrinsics = {name: stored[name] for name in ("fx", "fy", "cx", "cy", "camera_to_world")}
+    np.testing.assert_array_equal(
+        render(client, camera={"type": "matrix", **intrinsics}, width=64, height=48), by_index
+    )
+
+
+def test_what_a_camera_leaves_out_comes_from_the_scene(client: httpx.Client):
+    short = render(client, camera={"type": "orbit", "azimuth": 90, "elevation": 20}, width=None, height=None)
+    first = render(client, camera={"type": "scene", "name": "view_90"}, width=None, height=None)
+    assert np.abs(short.astype(int) - first).max() <= 1
+
+
+def test_a_side_left_out_follows_the_other(client: httpx.Client):
+    camera = {"type": "scene", "index": 0}
+    assert render(client, camera=camera, width=128, height=None).shape == (96, 128, 3)
+    assert render(client, camera=camera, width=None, height=12).shape == (12, 16, 3)
+
+
+def test_a_scene_without_cameras_is_framed_by_its_bounds(tmp_path: Path):
+    with serving(write_scene(tmp_path / "bare.onnx", cameras=())) as client:
+        pixels = render(client, camera={"type": "orbit", "azimuth": 0, "elevation": 0}, width=None, height=None)
+        assert pixels.shape == (512, 512, 3)
+        assert pixels[256, 256].argmax() == 0
+        response = client.post("/render", json={**FRAME, "camera": {"type": "scene"}})
+        assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "camera.index")
+
+
+@pytest.mark.parametrize("image_format", FORMATS)
+def test_one_pixel(client: httpx.Client, image_format: str):
+    assert render(client, width=1, height=1, format=image_format).shape[:2] == (1, 1)
+
+
+def test_eight_clients_at_once_get_the_bytes_that_one_gets(client: httpx.Client):
+    formats = itertools.cycle(FORMATS)
+    bodies = [
+        {**FRAME, "width": 20 + 9 * i, "height": 90 - 7 * i, "t": i % 3 / 2, "format": next(formats)} for i in range(8)
+    ]
+
+    def post(body: dict[str, Any]) -> bytes:
+        response = client.post("/render", json=body)
+        assert response.status_code == 200, response.text
+        return response.content
+
+    alone = [post(body) for body in bodies]
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(post, bodies * 4)) == alone * 4
+
+
+def test_a_long_render_does_not_hold_up_other_calls(scene: Path, monkeypatch: pytest.MonkeyPatch):
+    renderer = Renderer()
+    started, go_on = threading.Event(), threading.Event()
+
+    def slow_pose(session: DeformationSession, t: float, *_: Any) -> Any:
+        started.set()
+        assert go_on.wait(10)
+        return session.gaussians(t)
+
+    with serving(scene, renderer=renderer, concurrent_renders=1) as client, ThreadPoolExecutor(1) as pool:
+        monkeypatch.setattr(renderer, "posed", slow_pose)
+        rendering = pool.submit(render, client)
+        assert started.wait(10)
+        assert client.get("/live").json()["status"] == "ok"
+        assert client.get("/scenes/balls").status_code == 200
+        go_on.set()
+        assert rendering.result(10).shape == (SIZE, SIZE, 3)
+
+
+def test_scenes_are_listed_and_described(client: httpx.Client):
+    assert client.get("/scenes").json() == {"scenes": [{"name": "balls", "loaded": True, "problem": False}]}
+    described = client.get("/scenes/balls").json()
+    assert described["gaussians"] == {"moving": 1, "static": 1, "total": 2}
+    assert described["time_range"] == [0, 1]
+    assert described["plan"] == "network"
+    assert [camera["name"] for camera in described["cameras"]] == ["view_0", "view_90"]
+    assert described["measured_error"] == metadata().measured_error
+
+
+def test_several_scenes_need_a_name(tmp_path: Path):
+    write_scene(tmp_path / "red.onnx")
+    write_scene(tmp_path / "blue.onnx", static_color=(0, 0, 1))
+    with serving(tmp_path) as client:
+        assert [scene["name"] for scene in client.get("/scenes").json()["scenes"]] == ["blue", "red"]
+        assert render(client, scene="red")[SIZE // 2, SIZE // 2].argmax() == 0
+        assert render(client, scene="blue")[SIZE // 2, SIZE // 2].argmax() == 2
+        response = client.post("/render", json=FRAME)
+        assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "scene")
+        response = client.post("/render", json={**FRAME, "scene": "green"})
+        assert (response.status_code, response.json()["errors"][0]["field"]) == (404, "scene")
+        for example in examples(client).values():
+            assert client.post("/render", json=example["value"]).status_code == 200
+
+
+def test_a_scene_that_breaks_is_reported_and_goes_on(tmp_path: Path):
+    path = write_scene(tmp_path / "balls.onnx")
+    with serving(tmp_path) as client:
+        before = render(client)
+        path.write_bytes(b"no scene")
+        np.testing.assert_array_equal(render(client), before)
+        eventually(lambda: client.get("/scenes").json()["scenes"][0]["problem"])
+        np.testing.assert_array_equal(render(client), before)
+        write_scene(path, static_color=(0, 0, 1))
+        eventually(lambda: render(client)[SIZE // 2, SIZE // 2].argmax() == 2)
+        assert client.get("/scenes").json()["scenes"] == [{"name": "balls", "loaded": True, "problem": False}]
+
+
+def test_a_scene_broken_from_the_start_is_unavailable_without_saying_where_it_lies(tmp_path: Path):
+    (tmp_path / "broken.onnx").write_bytes(b"no scene")
+    with serving(tmp_path) as client:
+        for response in (client.post("/render", json=FRAME), client.get("/scenes/broken")):
+            assert response.status_code == 503
+            assert str(tmp_path) not in response.text
+        assert client.get("/openapi.json").status_code == 200
+
+
+def eventually(condition: Callable[[], bool]) -> None:
+    """Files are looked at in the background."""
+    deadline = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def examples(client: httpx.Client) -> dict[str, Any]:
+    """Of `POST /render` in the OpenAPI document."""
+    call = client.get("/openapi.json").json()["paths"]["/render"]["post"]
+    return call["requestBody"]["content"]["application/json"]["examples"]
+
+
+def test_every_example_in_the_documentation_works(client: httpx.Client):
+    found = examples(client)
+    assert {example["value"]["camera"]["type"] for example in found.values()} == {"orbit", "look_at", "matrix", "scene"}
+    for name, example in found.items():
+        response = client.post("/render", json=example["value"])
+        assert response.status_code == 200, (name, response.text)
+        pixels, _ = decode(response.content, example["value"].get("format", "png"))
+        assert pixels[..., :3].std() > 0, f"{name} shows nothing"
+
+
+def test_the_documentation_is_whole(client: httpx.Client):
+    document = client.get("/openapi.json").json()
+    text = client.get("/openapi.json").text
+    schemas = document["components"]["schemas"]
+    for reference in {part.split('"')[0] for part in text.split('"#/components/schemas/')[1:]}:
+        assert reference in schemas
+    assert set(document["paths"]) == {
+        *("/render", "/render/batch", "/render/video", "/scenes", "/scenes/{name}", "/scenes/{name}/report"),
+        *("/live", "/ready", "/metrics"),
+    }
+    expected = {"200", "304", "400", "404", "408", "413", "422", "503", "504"}
+    assert set(document["paths"]["/render"]["post"]["responses"]) == expected
+
+
+def test_pages_about_the_calls_need_nothing_from_elsewhere(client: httpx.Client):
+    for page in ("/docs", "/redoc"):
+        text = client.get(page).text
+        sources = re.findall(r"(?:src|href)=[\"']([^\"']+)", text)
+        assert [source for source in sources if source.endswith(".js")], text
+        for source in sources:
+            assert source.startswith("/"), source
+            assert client.get(client.base_url.copy_with(path=source)).status_code == 200, source

@@ -1,0 +1,306 @@
+"""Whatever is sent, the answer is a 4xx that names the field, small, and never the input itself."""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from msdgs_serve.api.errors import MAX_BODY_BYTES
+from tests.support.scene_files import write_scene
+from tests.support.service import in_this_process, serving
+
+ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
+LOOK_AT = {"type": "look_at", "eye": [5, 0, 0], "target": [0, 0, 0], "up": [0, 0, 1]}
+POSE = [[0, 0, -1, 5], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+MATRIX = {"type": "matrix", "camera_to_world": POSE, "fx": 50}
+SCENE = {"type": "scene"}
+FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
+
+NAN, INFINITY, HUGE = json.loads("NaN"), json.loads("Infinity"), 10**400
+NOT_NUMBERS = [NAN, INFINITY, -INFINITY, HUGE, -HUGE, 1e300, "1", "", True, [], [1], {}, {"a": 1}]
+NOT_FINITE = [NAN, INFINITY, -INFINITY, HUGE, 1e300]
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    path = write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+    with serving(path, max_pixels=10_000, max_body_bytes=200_000) as client:
+        yield client
+
+
+def refused(client: httpx.Client, body: Any, status: int = 422) -> list[str]:
+    """The names of the fields that the answer complains about."""
+    content = body if isinstance(body, bytes) else json.dumps(body).encode()
+    response = client.post("/render", content=content, headers={"content-type": "application/json"})
+    assert response.status_code == status, (content[:200], response.text[:500])
+    check_problem(response)
+    return [error["field"] for error in response.json()["errors"]]
+
+
+def check_problem(response: httpx.Response) -> None:
+    """The one shape of all errors."""
+    assert response.headers["content-type"] == "application/problem+json"
+    assert len(response.content) <= MAX_BODY_BYTES
+    problem = response.json()
+    assert set(problem) == {"type", "title", "status", "detail", "errors"}
+    assert problem["status"] == response.status_code
+    assert problem["title"]
+    assert problem["detail"]
+
+
+def changed(field: str, value: Any) -> dict[str, Any]:
+    """A good body but for one field; `camera.fov_y` and the like belong to the camera that has them."""
+    cameras = {"eye": LOOK_AT, "target": LOOK_AT, "up": LOOK_AT, "camera_to_world": MATRIX}
+    cameras |= dict.fromkeys(("fx", "fy", "cx", "cy", "axes"), MATRIX)
+    cameras |= dict.fromkeys(("index", "name"), SCENE)
+    name, _, inner = field.partition(".")
+    if not inner:
+        return {**FRAME, name: value}
+    return {**FRAME, "camera": {**cameras.get(inner, ORBIT), inner: value}}
+
+
+def test_the_bodies_that_are_spoilt_here_are_good(client: httpx.Client):
+    for camera in (ORBIT, LOOK_AT, MATRIX, SCENE):
+        assert client.post("/render", json={**FRAME, "camera": camera}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "field",
+    ["t", *(f"camera.{name}" for name in ("azimuth", "elevation", "distance", "fov_y", "fx", "fy", "cx", "cy"))],
+)
+@pytest.mark.parametrize("value", NOT_NUMBERS, ids=lambda value: repr(value)[:12])
+def test_what_is_not_a_usable_number(client: httpx.Client, field: str, value: Any):
+    if field == "t" and value == [1]:
+        pytest.skip("a list of times is one")
+    assert refused(client, changed(field, value))[0].startswith(field)
+
+
+@pytest.mark.parametrize("field", ["width", "height", "quality", "camera.index"])
+@pytest.mark.parametrize("value", [*NOT_NUMBERS, 1.5, -1, 10**9], ids=lambda value: repr(value)[:12])
+def test_what_is_not_a_usable_whole_number(client: httpx.Client, field: str, value: Any):
+    assert refused(client, {**changed(field, value), "format": "jpeg"})[0].startswith(field)
+
+
+@pytest.mark.parametrize("field", ["camera.eye", "camera.target", "camera.up", "background"])
+@pytest.mark.parametrize(
+    "value",
+    ["x", 1, True, [], [1, 1], [1, 1, 1, 1], [1, None, 1], [[1, 1, 1]], {}, {"0": 1}]
+    + [[1, 1, bad] for bad in NOT_NUMBERS],
+    ids=lambda value: repr(value)[:20],
+)
+def test_what_is_not_three_usable_numbers(client: httpx.Client, field: str, value: Any):
+    assert all(name.startswith(field) for name in refused(client, changed(field, value)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("t", None),
+        ("t", -0.001),
+        ("t", 1.001),
+        ("width", 0),
+        ("height", 0),
+        ("width", 16385),
+        ("height", 16384),
+        ("scene", ""),
+        ("scene", 7),
+        ("scene", "x" * 201),
+        ("scene", "\ud800"),
+        ("format", "gif"),
+        ("format", None),
+        ("format", ["png"]),
+        ("quality", 0),
+        ("quality", 101),
+        ("background", "blue"),
+        ("background", [2, 0, 0]),
+        ("background", [-0.1, 0, 0]),
+        ("camera", None),
+        ("camera", []),
+        ("camera", "orbit"),
+        ("camera", {}),
+        ("camera", {"type": "fisheye"}),
+        ("camera", {"type": "\ud800"}),
+        ("camera", {"type": ["orbit"]}),
+        ("camera.elevation", 90),
+        ("camera.elevation", -90),
+        ("camera.distance", 0),
+        ("camera.distance", -1),
+        ("camera.fov_y", 0),
+        ("camera.fov_y", 180),
+        ("camera.fov_y", 1e-300),
+        ("camera.up", [0, 0, 0]),
+        ("camera.up", [1e-200, 0, 0]),
+        ("camera.up", [1, 0, 0]),
+        ("camera.target", [5, 0, 0]),
+        ("camera.fx", 0),
+        ("camera.fx", -50),
+        ("camera.fx", 1e-300),
+        ("camera.fy", 0),
+        ("camera.axes", "maya"),
+        ("camera.camera_to_world", POSE[:3]),
+        ("camera.camera_to_world", [row[:3] for row in POSE]),
+        ("camera.camera_to_world", np.zeros((4, 4)).tolist()),
+        ("camera.camera_to_world", (2 * np.array(POSE)).tolist()),
+        ("camera.camera_to_world", np.diag([1, 1, -1, 1]).tolist()),
+        ("camera.camera_to_world", [[1, 2, 3, 0], [2, 4, 6, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        ("camera.camera_to_world", [*POSE[:3], [0, 0, 1, 1]]),
+        ("camera.index", 2),
+        ("camera.name", "view_1"),
+        ("camera.surprise", 1),
+        ("surprise", 1),
+    ],
+    ids=lambda value: repr(value)[:30],
+)
+def test_values_that_make_no_sense(client: httpx.Client, field: str, value: Any):
+    assert refused(client, changed(field, value))[0].startswith(field)
+
+
+@pytest.mark.parametrize("bad", NOT_FINITE, ids=lambda value: repr(value)[:12])
+def test_every_number_of_a_matrix_is_checked(client: httpx.Client, bad: Any):
+    for row in range(4):
+        for column in range(4):
+            pose = [list(numbers) for numbers in POSE]
+            pose[row][column] = bad
+            fields = refused(client, changed("camera.camera_to_world", pose))
+            assert fields == [f"camera.camera_to_world.{row}.{column}"]
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"camera": {**MATRIX, "fov_y": 40}}, "camera.fov_y"),
+        ({"camera": {"type": "matrix", "camera_to_world": POSE}}, "camera.fov_y"),
+        ({"camera": {"type": "matrix", "camera_to_world": POSE, "fov_y": 40, "fy": 50}}, "camera.fy"),
+        ({"camera": {**MATRIX, "distortion": [0.1, 0, 0, 0]}}, "camera.distortion"),
+        ({"camera": {**MATRIX, "model": "fisheye", "fx": None, "fov_y": 40}}, "camera.fov_y"),
+        ({"camera": {**MATRIX, "model": "panorama"}}, "camera.model"),
+        ({"camera": MATRIX, "width": None}, "width"),
+        ({"camera": MATRIX, "height": None}, "height"),
+        ({"camera": {"type": "scene", "name": "view_0", "index": 0}}, "camera.index"),
+        ({"camera": {"type": "scene", "index": 0}, "height": 16384, "width": None}, "width"),
+        ({"format": "jpeg", "background": "transparent"}, "background"),
+        ({"format": "jpeg", "background": None}, "background"),
+        ({"format": "png", "quality": 90}, "quality"),
+        ({"format": "webp", "width": 16384, "height": 1}, "width"),
+        ({"width": 101, "height": 100}, "width"),
+    ],
+    ids=lambda value: repr(value)[:40],
+)
+def test_values_that_do_not_go_together(client: httpx.Client, change: dict[str, Any], field: str):
+    assert field in refused(client, {**FRAME, **change})
+
+
+@pytest.mark.parametrize("field", ["camera", "t", "camera.type", "camera.azimuth", "camera.elevation"])
+def test_missing_fields(client: httpx.Client, field: str):
+    body = {**FRAME, "camera": dict(ORBIT)}
+    name, _, inner = field.partition(".")
+    if inner:
+        del body[name][inner]
+    else:
+        del body[name]
+    assert refused(client, body) == [field]
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        (b"", 422),
+        (b"null", 422),
+        (b"[]", 422),
+        (b"7", 422),
+        (b'"text"', 422),
+        (b"{", 422),
+        (b"\xff", 400),
+        (b"[" * 100_000, 400),
+        (b'{"t":' + b"1" * 10_000 + b"}", 400),
+        (b"x" * 200_001, 413),
+        (b'{"scene": "' + b"x" * 10_000_000 + b'"}', 413),
+    ],
+    ids=lambda value: repr(value)[:20],
+)
+def test_bodies_that_are_no_object(client: httpx.Client, body: bytes, status: int):
+    assert refused(client, body, status) == ["body"]
+
+
+def test_a_long_body_without_an_announced_length(client: httpx.Client):
+    response = client.post("/render", content=(b"x" * 10_000 for _ in range(100)))
+    assert response.status_code == 413
+    check_problem(response)
+
+
+@pytest.mark.parametrize("text", ["x", "é", "\U0001f600", "\ud800", '"', "\0"], ids=ascii)
+@pytest.mark.parametrize("field", ["scene", "format", "surprise", "camera.type", "camera.name"])
+def test_long_text_is_not_sent_back(client: httpx.Client, field: str, text: str):
+    count = 190_000 // len(json.dumps(text))
+    fields = refused(client, changed(field, text * count))
+    assert len(fields) == 1
+
+
+def test_a_thousand_long_keys_give_a_short_answer(client: httpx.Client):
+    fields = refused(client, {**FRAME, **{f"{number}\U0001f600" * 20: 1 for number in range(400)}})
+    assert 1 <= len(fields) < 400
+
+
+def test_a_form_is_told_to_be_json(client: httpx.Client):
+    response = client.post("/render", data={"t": "1"})
+    assert response.status_code == 422
+    check_problem(response)
+    assert "application/json" in response.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/nothing", 404),
+        ("PUT", "/render", 405),
+        ("DELETE", "/scenes/balls", 403),
+        ("GET", "/scenes/nothing", 404),
+        ("GET", "/scenes/..%2Fballs", 404),
+        ("GET", "/scenes/%00", 404),
+        ("GET", "/scenes/" + "x" * 201, 422),
+    ],
+)
+def test_other_calls_fail_in_the_same_shape(client: httpx.Client, method: str, path: str, status: int):
+    response = client.request(method, path)
+    assert response.status_code == status
+    check_problem(response)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {**LOOK_AT, "eye": [1e9, 0, 0]},
+        {**LOOK_AT, "eye": [1e-6, 0, 0]},
+        {**LOOK_AT, "eye": [0, 0, 1], "target": [0, 0, 5], "up": [1e-6, 0, 0]},
+        {**ORBIT, "distance": 1e-6},
+        {**ORBIT, "distance": 1e9, "azimuth": 1e9},
+        {**ORBIT, "fov_y": 0.01},
+        {**ORBIT, "fov_y": 179},
+        {**MATRIX, "fx": 1e-3, "fy": 1e8},
+        {**MATRIX, "cx": 1e9, "cy": -1e9},
+        {**MATRIX, "fx": 1e8, "cx": -1e9},
+    ],
+    ids=lambda value: repr(value)[-40:],
+)
+def test_extreme_but_valid_cameras_are_drawn(client: httpx.Client, camera: dict[str, Any]):
+    response = client.post("/render", json={**FRAME, "camera": camera})
+    assert response.status_code == 200, response.text
+
+
+@in_this_process
+def test_a_failure_of_the_server_says_nothing_of_its_inside(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    def fail(*_: object) -> bytes:
+        raise RuntimeError("secret")
+
+    monkeypatch.setattr("msdgs_serve.api.frames.encode", fail)
+    response = client.post("/render", json=FRAME)
+    assert response.status_code == 500
+    check_problem(response)
+    assert "secret" not in response.text
+    assert client.get("/live").status_code == 200, "the connection lives on"
+    assert any(record.exc_info and "secret" in str(record.exc_info[1]) for record in caplog.records)

@@ -1,0 +1,111 @@
+"""Many frames in one call: each its own answer, equal ones drawn once."""
+
+import base64
+import email
+import email.policy
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from msdgs_serve.api.errors import MAX_BODY_BYTES
+from msdgs_serve.renderer import Renderer
+from tests.support.scene_files import write_scene
+from tests.support.service import serving
+
+FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer()
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Iterator[httpx.Client]:
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scene(folder / "red.onnx")
+    write_scene(folder / "blue.onnx", static_color=(0, 0, 1))
+    with serving(folder, renderer=renderer, max_batch=20) as client:
+        yield client
+
+
+def batch(client: httpx.Client, frames: list[Any]) -> list[dict[str, Any]]:
+    """The lines of the answer, in the order of the frames."""
+    response = client.post("/render/batch", json={"frames": frames})
+    assert response.status_code == 200, response.text
+    assert response.headers["Content-Type"] == "application/x-ndjson"
+    return sorted((json.loads(line) for line in response.content.splitlines()), key=lambda line: line["index"])
+
+
+def test_every_frame_is_what_a_call_of_its_own_gives(client: httpx.Client):
+    frames = [{**FRAME, "scene": "red"}, {**FRAME, "scene": "blue", "format": "jpeg"}]
+    frames += [{**FRAME, "scene": "red", "t": 0.1 * number} for number in range(5)]
+    lines = batch(client, frames)
+    assert [line["index"] for line in lines] == list(range(7))
+    for frame, line in zip(frames, lines, strict=True):
+        alone = client.post("/render", json=frame)
+        assert (line["status"], line["media_type"]) == (200, alone.headers["Content-Type"])
+        assert base64.b64decode(line["data"]) == alone.content
+
+
+def test_a_frame_that_is_wrong_leaves_the_others(client: httpx.Client):
+    bad: list[Any] = [
+        {**FRAME, "scene": "red", "t": 7},
+        {**FRAME, "scene": "green"},
+        {**FRAME, "scene": "red", "camera": {"type": "fisheye"}},
+        {},
+        {**FRAME, "scene": "red", "t": [0.1, 0.2]},
+        {**FRAME, "scene": "x" * 100_000},
+    ]
+    lines = batch(client, [{**FRAME, "scene": "red"}, *bad, {**FRAME, "scene": "blue"}])
+    assert [line["status"] for line in lines] == [200, 422, 404, 422, 422, 422, 422, 200]
+    fields = [line["problem"]["errors"][0]["field"] for line in lines[1:-1]]
+    assert fields == ["t", "scene", "camera.type", "camera", "t", "scene"]
+    assert all(len(json.dumps(line["problem"])) <= MAX_BODY_BYTES for line in lines[1:-1])
+
+
+def test_equal_frames_are_drawn_once(client: httpx.Client, renderer: Renderer, monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+    original = renderer.render
+    monkeypatch.setattr(renderer, "render", lambda *arguments: drawn.append(1) or original(*arguments))
+    before = renderer.cache.use
+    frames = [{**FRAME, "scene": "red", "t": 0.7 + 0.1 * (number % 2)} for number in range(8)]
+    frames += [{**frames[0], "width": 20}]
+    lines = batch(client, frames)
+    assert [line["status"] for line in lines] == [200] * 9
+    assert len(drawn) == 3
+    assert renderer.cache.use.misses - before.misses == 2, "two sizes share the pose of one time"
+    assert lines[0]["data"] == lines[2]["data"]
+
+
+def test_a_frame_that_fails_inside_says_nothing_of_it(client: httpx.Client, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> bytes:
+        raise RuntimeError("secret")
+
+    monkeypatch.setattr("msdgs_serve.api.frames.encode", fail)
+    (line,) = batch(client, [{**FRAME, "scene": "red"}])
+    assert line["status"] == 500
+    assert "secret" not in json.dumps(line)
+
+
+def test_the_same_as_parts(client: httpx.Client):
+    frames = [{**FRAME, "scene": "red"}, {**FRAME, "scene": "red", "t": 7}, {**FRAME, "scene": "blue"}]
+    response = client.post("/render/batch", json={"frames": frames}, headers={"Accept": "multipart/mixed"})
+    head = f"Content-Type: {response.headers['Content-Type']}\r\n\r\n".encode()
+    message = email.message_from_bytes(head + response.content, policy=email.policy.HTTP)
+    parts = {int(str(part["Msdgs-Index"])): part for part in message.iter_parts()}  # pyright: ignore
+    assert [parts[index]["Msdgs-Status"] for index in range(3)] == ["200", "422", "200"]
+    alone = client.post("/render", json=frames[2])
+    assert parts[2].get_payload(decode=True) == alone.content
+    assert parts[2]["ETag"] == alone.headers["ETag"]
+    assert parts[1].get_content_type() == "application/problem+json"
+
+
+@pytest.mark.parametrize("frames", [[], [FRAME] * 21, "x", [1], None], ids=["none", "many", "text", "number", "null"])
+def test_what_is_no_batch(client: httpx.Client, frames: Any):
+    response = client.post("/render/batch", json={"frames": frames})
+    assert response.status_code == 422
+    assert response.json()["errors"][0]["field"].startswith("frames")

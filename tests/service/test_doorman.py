@@ -1,0 +1,135 @@
+"""Calls that are refused before they are parsed: when that is, and that nobody can tell the difference."""
+
+import logging
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from msdgs_serve.api.doorman import Doorman
+from msdgs_serve.api.metrics import Metrics
+from msdgs_serve.api.server import Server
+from msdgs_serve.api.work import WorkQueue
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.store import SceneStore
+from tests.support.scene_files import write_scene
+from tests.support.service import in_this_process, serving
+
+BODY = b'{"t": 0}'
+HEAD = b"POST /render HTTP/1.1\r\nHost: here\r\nContent-Type: application/json\r\nContent-Length: 8\r\n"
+CALL = HEAD + b"\r\n" + BODY
+CHANGES = "date", "x-request-id", "retry-after"
+REFUSED = 'msdgs_problems_total{kind="overloaded"}', 'msdgs_requests_total{method="POST",route="/render",status="503"}'
+
+
+@contextmanager
+def full(queue: WorkQueue, places: int) -> Iterator[None]:
+    """All places are taken by calls that do nothing."""
+    with ExitStack() as calls:
+        for _ in range(places):
+            calls.enter_context(queue.admitted())
+        yield
+
+
+@pytest.fixture
+def queue() -> Iterator[WorkQueue]:
+    """Of two places."""
+    queue = WorkQueue(workers=1, waiting=1, seconds=20)
+    yield queue
+    queue.shut_down()
+
+
+@pytest.fixture
+def doorman(queue: WorkQueue) -> Doorman:
+    """Of that queue."""
+    renderer = Renderer()
+    return Doorman(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
+
+
+def test_only_a_full_queue_has_calls_turned_away(doorman: Doorman, queue: WorkQueue):
+    assert doorman.answer(CALL, ("1.2.3.4", 5), ()) is None
+    with full(queue, 2):
+        answer = doorman.answer(CALL, ("1.2.3.4", 5), [(b"date", b"today")])
+    assert answer is not None
+    assert answer.startswith(b"HTTP/1.1 503 Service Unavailable\r\ndate: today\r\n")
+    assert doorman.answer(CALL, None, ()) is None
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        HEAD,
+        HEAD + b"\r\n",
+        CALL[:-1],
+        CALL + b"P",
+        CALL + CALL,
+        CALL.replace(b"Length: 8", b"Length: 9") + b" ",
+        CALL.replace(b"here", b"he\x00re"),
+        CALL.replace(b"POST", b"GET"),
+        CALL.replace(b"/render", b"/render/batch"),
+        CALL.replace(b"/render", b"/render?t=1"),
+        CALL.replace(b"1.1", b"1.0"),
+        CALL.replace(b"Length: 8", b"Length: eight"),
+        CALL.replace(b"Length: 8", b"Length: +8"),
+        HEAD + b"Content-Length: 8\r\n\r\n" + BODY,
+        HEAD + b"If-None-Match: *\r\n\r\n" + BODY,
+        HEAD + b"Expect: 100-continue\r\n\r\n" + BODY,
+        HEAD + b"Transfer-Encoding: chunked\r\n\r\n" + BODY,
+        HEAD + b"Connection: close\r\n\r\n" + BODY,
+        HEAD + b"Upgrade: h2c\r\n\r\n" + BODY,
+        HEAD + b"X-Forwarded-For: 1.2.3.4\r\n\r\n" + BODY,
+        HEAD + b" folded\r\n\r\n" + BODY,
+        HEAD + b"no colon\r\n\r\n" + BODY,
+        HEAD.replace(b"Host: here\r\n", b"") + b"\r\n" + BODY,
+        HEAD.replace(b"Host", b"Host ") + b"\r\n" + BODY,
+    ],
+)
+def test_what_is_not_plain_is_for_the_application(doorman: Doorman, queue: WorkQueue, data: bytes):
+    with full(queue, 2):
+        assert doorman.answer(data, None, ()) is None
+
+
+def sent(connection: socket.socket, data: bytes) -> tuple[bytes, dict[str, str], bytes]:
+    """Status line, headers and body of the answer."""
+    connection.sendall(data)
+    received = b""
+    while b"\r\n\r\n" not in received:
+        received += connection.recv(65536)
+    head, _, body = received.partition(b"\r\n\r\n")
+    status, *lines = head.split(b"\r\n")
+    headers = dict(line.decode().lower().split(": ", 1) for line in lines)
+    while len(body) < int(headers["content-length"]):
+        body += connection.recv(65536)
+    return status, headers, body
+
+
+@in_this_process
+def test_nobody_can_tell_the_difference(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """The same answer, line in the log and counts as the application's; the connection is as good as before."""
+    write_scene(tmp_path / "ball.onnx")
+    slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # a header that the doorman doesn't know
+    named = HEAD + b"X-Request-ID: mine\r\n\r\n" + BODY
+    servers: list[Server] = []
+    caplog.set_level(logging.INFO, "msdgs_serve.access")
+    with serving(tmp_path / "ball.onnx", server=servers, concurrent_renders=1, queued_renders=1) as client:
+        service = servers[0].service
+        address = client.base_url.host, client.base_url.port
+        with socket.create_connection(address, timeout=20) as connection:
+            with full(service.queue, 2):
+                answers = [sent(connection, data) for data in (CALL, slow, CALL)]
+                assert sent(connection, named)[1]["x-request-id"] == "mine"
+            for status, headers, body in answers:
+                assert status == answers[0][0] == b"HTTP/1.1 503 Service Unavailable"
+                assert body == answers[0][2]
+                assert headers.keys() == answers[0][1].keys()
+                assert all(value == answers[0][1][name] for name, value in headers.items() if name not in CHANGES)
+            assert len({headers["x-request-id"] for _, headers, _ in answers}) == 3
+            assert sent(connection, CALL)[0] == b"HTTP/1.1 422 Unprocessable Entity", "there is room, and no camera"
+        counted = client.get("/metrics").text.splitlines()
+        assert [line.split()[-1] for name in REFUSED for line in counted if line.startswith(name)] == ["4.0", "4.0"]
+    lines = [vars(record)["facts"] for record in caplog.records if vars(record)["facts"]["status"] == 503]
+    alike = [{name: fact for name, fact in line.items() if name != "milliseconds"} for line in lines]
+    assert alike == alike[:1] * 4

@@ -1,0 +1,101 @@
+"""Motion vectors: where what is seen at a pixel is seen a time later."""
+
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from msdgs_serve.client import Client, Orbit
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.renderer import Renderer, RenderOptions
+from msdgs_serve.scene import Camera
+from msdgs_serve.scene.camera import orbit
+from tests.support.images import decode
+from tests.support.scene_files import UP, write_scene
+from tests.support.service import serving
+from tests.support.tolerances import assert_close
+
+SIZE = 96
+ORBIT = {"type": "orbit", "azimuth": 40, "elevation": 10, "distance": 5, "fov_y": 40}
+FRAME = {"camera": ORBIT, "width": SIZE, "height": SIZE, "t": 0.1, "channels": ["motion"], "dt": 0.2}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+
+
+def place(camera: Camera, point: list[float]) -> np.ndarray:
+    """[2] in pixels."""
+    x, y, z = (camera.world_to_camera @ [*point, 1])[:3]
+    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+
+@pytest.mark.parametrize(("t", "dt"), [(0.1, 0.2), (0.9, -0.3), (0.0, 1.0)])
+def test_the_ball_goes_where_its_centre_goes(scene: Path, t: float, dt: float):
+    camera = Camera.from_fov(orbit(np.zeros(3), 5.0, 40, 10, UP), SIZE, SIZE, 40.0)
+    session = DeformationSession(scene)
+    image = Renderer().render(session, camera, t, RenderOptions(motion_dt=dt))
+    assert image.motion is not None
+    column, row = np.floor(place(camera, [0, 0, 2 * t - 1])).astype(int)
+    moved = place(camera, [0, 0, 2 * (t + dt) - 1]) - place(camera, [0, 0, 2 * t - 1])
+    assert_close(image.motion[row, column], moved, "motion_vector")
+    resting = place(camera, [0, 0, 0])
+    assert_close(image.motion[int(resting[1]), int(resting[0])], np.zeros(2), "motion_vector")
+    assert (image.motion[image.alpha == 0] == 0).all()
+
+
+def test_a_frame_warped_by_its_motion_is_the_later_frame(scene: Path):
+    """Endpoints of all well covered pixels of the moving ball against the known translation."""
+    camera = Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), SIZE, SIZE, 40.0)
+    session = DeformationSession(scene)
+    now = Renderer().render(session, camera, 0.0, RenderOptions("transparent", motion_dt=0.1))
+    later = Renderer().render(session, camera, 0.1, RenderOptions("transparent"))
+    assert now.motion is not None
+    rows, columns = np.nonzero((now.alpha > 0.5) & (now.rgb[..., 1] > now.rgb[..., 0]))
+    ends = np.stack([columns, rows], axis=1) + now.motion[rows, columns]
+    whole = np.round(ends).astype(int)
+    np.testing.assert_allclose(later.alpha[whole[:, 1], whole[:, 0]], now.alpha[rows, columns], atol=0.2)
+    expected = place(camera, [0, 0, -0.8]) - place(camera, [0, 0, -1])
+    errors = np.linalg.norm(now.motion[rows, columns] - expected, axis=1)
+    assert np.median(errors) < 0.25
+
+
+def test_behind_the_camera_nothing_moves_and_nothing_breaks(scene: Path):
+    inside = Camera.from_fov(orbit(np.zeros(3), 0.05, 0, 80, UP), SIZE, SIZE, 90.0)
+    image = Renderer().render(DeformationSession(scene), inside, 0.0, RenderOptions(motion_dt=1.0))
+    assert image.motion is not None
+    assert np.isfinite(image.motion).all()
+
+
+def test_motion_over_http(scene: Path):
+    with serving(scene) as http:
+        motion = decode(http.post("/render", json={**FRAME, "format": "npy"}).content, "npy")[0]
+        assert motion.shape == (SIZE, SIZE, 2)
+        pixels, spec = decode(http.post("/render", json={**FRAME, "format": "exr"}).content, "exr")
+        assert spec.channelnames == ("forward.u", "forward.v")
+        np.testing.assert_array_equal(pixels, motion)
+        picture, _ = decode(http.post("/render", json=FRAME).content, "png")
+        assert (picture[np.abs(motion).max(axis=2) < 1e-6] == 0).all()
+        assert picture.max() > 200
+        with Client(str(http.base_url)) as client:
+            camera = Orbit(40, 10, distance=5, fov_y=40)
+            frame = client.render(camera, 0.1, width=SIZE, height=SIZE, channels=("rgb", "motion"), dt=0.2)
+        np.testing.assert_array_equal(frame.motion, motion)  # pyright: ignore[reportArgumentType]
+        check_refusals(http)
+
+
+def check_refusals(http: httpx.Client) -> None:
+    """What doesn't go with motion."""
+    changes: list[tuple[dict[str, Any], str]] = [
+        ({"dt": None}, "dt"),
+        ({"dt": 0.95}, "dt"),
+        ({"channels": ["rgb"]}, "dt"),
+        ({"shutter": {"open": 0, "close": 0.1}}, "shutter"),
+    ]
+    for change, field in changes:
+        response = http.post("/render", json={**FRAME, **change})
+        assert response.status_code == 422
+        assert response.json()["errors"][0]["field"] == field

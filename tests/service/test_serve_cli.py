@@ -1,0 +1,128 @@
+"""`msdgs-serve` as a person starts it: what it prints, what it answers, how it ends."""
+
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from msdgs_serve.api.cli import main
+from msdgs_serve.api.settings import Settings
+from tests.support.images import decode
+from tests.support.scene_files import write_scene
+
+COMMAND = [sys.executable, "-c", "import sys; from msdgs_serve.api.cli import main; sys.exit(main())"]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return write_scene(tmp_path / "balls.onnx")
+
+
+@pytest.fixture
+def process(scene: Path) -> Iterator[subprocess.Popen[str]]:
+    """The service on a free port."""
+    command = [*COMMAND, str(scene), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def read_until(process: subprocess.Popen[str], pattern: str) -> str:
+    """What it printed until a line matches."""
+    assert process.stdout
+    printed = ""
+    for line in process.stdout:
+        printed += line
+        if re.search(pattern, line):
+            return printed
+    assert process.stderr
+    raise AssertionError(f"it ended: {printed}{process.stderr.read()}")
+
+
+def test_it_says_where_it_listens_and_what_to_paste_and_stops_at_ctrl_c(process: subprocess.Popen[str]):
+    printed = read_until(process, r"-d '")
+    match = re.search(r"Listening on (http://127\.0\.0\.1:\d+)", printed)
+    assert match
+    assert httpx.get(f"{match[1]}/ready").status_code == 200
+    words = shlex.split(printed[printed.index("curl") :])
+    body, headers = words[words.index("-d") + 1], dict([words[words.index("-H") + 1].split(": ")])
+    response = httpx.post(words[1], content=body, headers=headers)
+    assert response.status_code == 200, response.text
+    assert decode(response.content, "png")[0].shape == (400, 400, 3)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out.strip(), err) == (0, "Stopped.", "")
+
+
+def test_help_teaches(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    for part in ("msdgs-serve scene.onnx", "MSDGS_SCENES=", "export/to_onnx.py", "--port", "--max-pixels", "/docs"):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "which scene?"),
+        (["missing.onnx"], "missing.onnx, which does not exist"),
+        (["model.pt"], "export/to_onnx.py"),
+        (["broken.onnx"], "broken.onnx: `file`"),
+        (["balls.onnx", "--port", "70000"], "--port: "),
+        (["balls.onnx", "--max-pixels", "many"], "--max-pixels: "),
+        (["balls.onnx", "--host", "256.1.1.1"], "can't listen on 256.1.1.1"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+):
+    monkeypatch.chdir(scene.parent)
+    Path("model.pt").touch()
+    Path("broken.onnx").write_bytes(scene.read_bytes()[:50])
+    assert main(arguments) == 2
+    complaint = capsys.readouterr().err
+    assert complaint.startswith("msdgs-serve: ")
+    assert message in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_a_start_that_fails_ends_the_program(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def fail(*_: object) -> bytes:
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr("msdgs_serve.api.service.encode", fail)
+    assert main([str(scene), "--port", "0"]) == 2
+    assert "could not start" in capsys.readouterr().err
+
+
+def test_a_port_in_use_is_said_before_anything_is_loaded(scene: Path, capsys: pytest.CaptureFixture[str]):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main([str(scene), "--port", str(port)]) == 2
+    printed = capsys.readouterr()
+    assert f"can't listen on 127.0.0.1 port {port}" in printed.err
+    assert "Loading" not in printed.out
+
+
+def test_flags_win_over_the_environment(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MSDGS_SCENES", f"{scene}:{tmp_path}")
+    monkeypatch.setenv("MSDGS_PORT", "9000")
+    monkeypatch.setenv("MSDGS_MAX_PIXELS", "500")
+    settings = Settings(_cli_parse_args=["--port", "9001"])  # pyright: ignore[reportCallIssue]
+    assert settings.scenes == [scene, tmp_path]
+    assert (settings.port, settings.max_pixels) == (9001, 500)
+    settings = Settings(_cli_parse_args=["other.onnx"])  # pyright: ignore[reportCallIssue]
+    assert settings.scenes == [Path("other.onnx")]

@@ -1,0 +1,355 @@
+"""What answers say beside the frame: versions, times, ids, keys, metrics."""
+
+import asyncio
+import io
+import json
+import logging
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from msdgs_serve.api.body_limit import BodyLimit
+from msdgs_serve.api.keys import KeyCheck
+from msdgs_serve.api.observe import JsonLines, request_id
+from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
+from msdgs_serve.imaging.pictures import FARTHEST_GREY
+from tests.service.test_api import eventually
+from tests.service.test_api_poison import check_problem
+from tests.support.images import decode
+from tests.support.scene_files import metadata, write_scene
+from tests.support.service import in_this_process, serving
+
+SIZE = 48
+ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0, "distance": 5, "fov_y": 40}
+FRAME = {"camera": ORBIT, "t": 0.5, "width": SIZE, "height": SIZE}
+KEYS = ["0123456789abcdef", "fedcba9876543210"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+
+
+@pytest.fixture(scope="module")
+def client(scene: Path) -> Iterator[httpx.Client]:
+    with serving(scene, max_samples=16, max_batch=8) as client:
+        yield client
+
+
+def post(client: httpx.Client, **changes: Any) -> httpx.Response:
+    return client.post("/render", json={**FRAME, **changes})
+
+
+def array(client: httpx.Client, **changes: Any) -> np.ndarray:
+    response = post(client, format="npy", **changes)
+    assert response.status_code == 200, response.text
+    return decode(response.content, "npy")[0]
+
+
+def test_a_frame_that_the_client_has_is_not_sent_again(client: httpx.Client):
+    first = post(client)
+    tag = first.headers["ETag"]
+    for value in (tag, f'"other", {tag}', f"W/{tag}", "*"):
+        again = client.post("/render", json=FRAME, headers={"If-None-Match": value})
+        assert (again.status_code, again.content, again.headers["ETag"]) == (304, b"", tag)
+    changed = client.post("/render", json={**FRAME, "t": 0.25}, headers={"If-None-Match": tag})
+    assert changed.status_code == 200
+    assert changed.headers["ETag"] != tag
+
+
+def test_another_file_is_another_version(tmp_path: Path):
+    path = write_scene(tmp_path / "balls.onnx")
+    with serving(tmp_path) as client:
+        before = post(client).headers["ETag"]
+        write_scene(path, static_color=(0, 0, 1))
+        eventually(lambda: post(client).headers["ETag"] != before)
+
+
+def test_the_answer_says_what_was_used(client: httpx.Client):
+    post(client, t=0.123)
+    response = post(client, t=0.123, channels=["depth"])
+    stages = dict(re.findall(r"(\w+);dur=([\d.]+)", response.headers["Server-Timing"]))
+    assert set(stages) == {"queue", "pose", "draw", "encode"}
+    assert all(float(value) < 10_000 for value in stages.values())
+    assert "pose;dur=" in response.headers["Server-Timing"]
+    assert 'desc="hit"' in response.headers["Server-Timing"]
+    assert response.headers["Msdgs-Plan"] == metadata().plan
+    assert response.headers["Msdgs-Channels"] == "depth"
+    assert response.headers["Msdgs-Scene"] == "balls"
+
+
+def compared(psnr: float, **others: Any) -> dict[str, Any]:
+    return {"measured_error": {"rendered": {"psnr_worst": psnr}}, **others}
+
+
+def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
+    write_scene(tmp_path / "walk.onnx", **compared(60))
+    write_scene(tmp_path / "walk.fast.onnx", **compared(40, plan="lowrank:1"))
+    write_scene(tmp_path / "walk.slow.onnx", **compared(50, plan="int8"))
+    write_scene(tmp_path / "walk.other.onnx", **compared(70, checkpoint_sha256="1" * 64))
+    write_scene(tmp_path / "plain.onnx")
+    (tmp_path / "walk.broken.onnx").write_bytes(b"no scene")
+    points = [
+        {"plan": plan, "error": {"psnr_worst": psnr}, "milliseconds": {"total": {"min": milliseconds}}}
+        for plan, psnr, milliseconds in (("network", 60, 20.0), ("lowrank:1", 40, 5.0), ("int8", 50, 30.0))
+    ]
+    report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": points}
+    (tmp_path / "walk.report.json").write_text(json.dumps(report))
+    with serving(tmp_path) as client:
+        for max_error, name, error in ((30, "walk.fast", "40.00"), (45, "walk", "60.00"), (None, "walk", "60.00")):
+            answer = post(client, scene="walk", max_error=max_error)
+            assert (answer.status_code, answer.headers["Msdgs-Scene"]) == (200, name)
+            assert answer.headers["Msdgs-Error"] == error
+        link = client.get(f"/render?scene=walk&max_error=30&t=0.5&width={SIZE}&height={SIZE}")
+        assert (link.headers["Msdgs-Scene"], link.headers["Msdgs-Plan"]) == ("walk.fast", "lowrank:1")
+        for scene, max_error in (("walk", 65), ("plain", 10), ("walk", -1)):
+            refused = post(client, scene=scene, max_error=max_error)
+            assert refused.status_code == 422
+            check_problem(refused)
+            assert refused.json()["errors"][0]["field"] == "max_error"
+        assert "Msdgs-Error" not in post(client, scene="plain").headers
+
+
+def test_a_link_shows_what_the_body_would(client: httpx.Client):
+    link = f"/render?azimuth=0&elevation=0&distance=5&fov_y=40&t=0.5&width={SIZE}&height={SIZE}"
+    response = client.get(link)
+    assert response.content == post(client).content
+    assert response.headers["ETag"] == post(client).headers["ETag"]
+    assert response.headers["Cache-Control"] == "no-cache"
+    assert client.get(link, headers={"If-None-Match": response.headers["ETag"]}).status_code == 304
+    assert client.get("/render").status_code == 200
+    look_at = client.get(f"/render?eye=5,0,0&target=0,0,0&up=0,0,1&fov_y=40&width={SIZE}&height={SIZE}&t=0.5")
+    assert look_at.status_code == 200
+    named = client.get("/render?camera=view_90&background=1,0,0&channels=rgb&format=webp&quality=80")
+    assert decode(named.content, "webp")[0].shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("query", "field"),
+    [
+        ("t=nan", "t"),
+        ("t=2", "t"),
+        ("width=0", "width"),
+        ("eye=1,2", "eye"),
+        ("eye=a,b,c", "eye"),
+        ("camera=view_0&azimuth=3", "azimuth"),
+        ("background=blue", "background"),
+        ("channels=smell", "channels"),
+        ("surprise=1", "surprise"),
+        ("elevation=90", "elevation"),
+    ],
+)
+def test_a_link_that_is_wrong_is_told_where(client: httpx.Client, query: str, field: str):
+    response = client.get(f"/render?{query}")
+    assert response.status_code == 422
+    check_problem(response)
+    assert response.json()["errors"][0]["field"].startswith(field), response.text
+
+
+def test_several_times_are_several_files(client: httpx.Client):
+    response = post(client, t=[0.0, 0.5, 1.0])
+    assert response.headers["Content-Type"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
+        files = [archive.read(name) for name in archive.namelist()]
+    assert files == [post(client, t=t).content for t in (0.0, 0.5, 1.0)]
+    assert post(client, t=[0.0, 0.5, 1.0]).content == response.content
+    stacked = array(client, t=[0.0, 0.5])
+    assert stacked.shape == (2, SIZE, SIZE, 5)
+    np.testing.assert_array_equal(stacked[1], array(client, t=0.5))
+
+
+def test_channels_come_in_the_order_asked_for(client: httpx.Client):
+    everything = array(client, channels=["rgb", "alpha", "depth"])
+    np.testing.assert_array_equal(array(client, channels=["depth", "rgb"]), everything[..., [4, 0, 1, 2]])
+    pixels, spec = decode(post(client, format="exr", channels=["depth"]).content, "exr")
+    assert spec.channelnames == ("Z",)
+    np.testing.assert_array_equal(pixels[..., 0], everything[..., 4])
+
+
+def test_depth_as_a_picture_is_lighter_the_nearer(client: httpx.Client):
+    """White where nearest, `FARTHEST_GREY` where farthest, darker where it is thin, black where nothing is."""
+    depth, alpha = (array(client, channels=[name])[..., 0] for name in ("depth", "alpha"))
+    seen = np.isfinite(depth)
+    assert 0 < seen.mean() < 1
+    for asked, (near, far) in (({}, (depth[seen].min(), depth[seen].max())), ({"depth_range": [0, 10]}, (0, 10))):
+        grey = decode(post(client, channels=["depth"], **asked).content, "png")[0][..., 0].astype(int)
+        place = (np.where(seen, depth, far) - near) / (far - near)
+        want = 255 * alpha * np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0)
+        assert np.abs(grey - want).max() <= 1
+
+
+def test_motion_blur_is_the_mean_of_moments_in_linear_light(client: httpx.Client):
+    blurred = array(client, shutter={"open": -0.2, "close": 0.2, "samples": 4})
+    moments = [array(client, t=t) for t in (0.35, 0.45, 0.55, 0.65)]
+    alpha = np.mean([moment[..., 3] for moment in moments], axis=0)
+    np.testing.assert_allclose(blurred[..., 3], alpha, atol=1e-6)
+    opaque = array(client, shutter={"open": -0.2, "close": 0.2, "samples": 4}, background="scene")
+    light = np.mean(
+        [srgb_to_linear(array(client, t=t, background="scene")[..., :3]) for t in (0.35, 0.45, 0.55, 0.65)], 0
+    )
+    np.testing.assert_allclose(opaque[..., :3], linear_to_srgb(light), atol=1e-5)
+    covered = blurred[..., 3] > 1e-3
+    over = linear_to_srgb(srgb_to_linear(blurred[covered][:, :3] / blurred[covered][:, 3:4]))
+    assert np.isfinite(over).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"shutter": {"open": 0, "close": 0}}, "shutter.close"),
+        ({"shutter": {"open": -0.6, "close": 0}}, "shutter.open"),
+        ({"shutter": {"open": 0, "close": 0.6}}, "shutter.close"),
+        ({"shutter": {"open": 0, "close": 0.1, "samples": 17}}, "shutter.samples"),
+        ({"shutter": {"open": 0, "close": 0.1, "samples": 0}}, "shutter.samples"),
+        ({"t": []}, "t"),
+        ({"t": [0.5] * 9}, "t"),
+        ({"t": [0.5, 2.0]}, "t"),
+        ({"t": [0.5, float("nan")]}, "t.1"),
+        ({"t": [0.0] * 5, "width": 4096, "height": 1000}, "t"),
+        ({"channels": []}, "channels"),
+        ({"channels": ["rgb", "depth"]}, "channels"),
+        ({"channels": ["rgb", "rgb"], "format": "npy"}, "channels"),
+        ({"channels": ["smell"]}, "channels.0"),
+        ({"depth_range": [1, 1]}, "depth_range"),
+        ({"depth_range": [0, float("inf")]}, "depth_range.1"),
+    ],
+    ids=str,
+)
+def test_values_of_the_newer_fields_that_make_no_sense(client: httpx.Client, change: dict[str, Any], field: str):
+    content = json.dumps({**FRAME, **change})
+    response = client.post("/render", content=content, headers={"Content-Type": "application/json"})
+    assert response.status_code == 422
+    check_problem(response)
+    assert response.json()["errors"][0]["field"] == field
+
+
+def test_an_exr_file_knows_its_camera_and_its_time(client: httpx.Client):
+    camera = client.get("/scenes/balls").json()["cameras"][0]
+    body = {"camera": {"type": "scene", "index": 0}, "t": 0.25, "format": "exr"}
+    pixels, spec = decode(client.post("/render", json=body).content, "exr")
+    assert spec.getattribute("msdgs:time") == 0.25
+    assert spec.getattribute("oiio:ColorSpace") == "lin_rec709_scene"
+    point = np.array([0.3, -0.2, 0.1, 1.0])
+    pose = np.array(camera["camera_to_world"])
+    seen = np.linalg.inv(pose) @ point
+    to_camera = np.array(spec.getattribute("worldToCamera")).reshape(4, 4)
+    np.testing.assert_allclose(point @ to_camera, seen * [1, -1, 1, 1], atol=1e-5)
+    x, y, _, w = point @ np.array(spec.getattribute("worldToNDC")).reshape(4, 4)
+    expected = [camera["fx"] * seen[0] / seen[2] + camera["cx"], camera["fy"] * seen[1] / seen[2] + camera["cy"]]
+    np.testing.assert_allclose([x / w * pixels.shape[1], y / w * pixels.shape[0]], expected, atol=1e-3)
+    np.testing.assert_allclose(np.array(spec.getattribute("msdgs:camera_to_world")).reshape(4, 4).T, pose, atol=1e-6)
+
+
+@in_this_process
+def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixture):
+    assert client.get("/live", headers={"X-Request-ID": "abc-1.2_3"}).headers["X-Request-ID"] == "abc-1.2_3"
+    for bad in ("x" * 65, "a b", '"'):
+        made = client.get("/live", headers={"X-Request-ID": bad}).headers["X-Request-ID"]
+        assert re.fullmatch("[0-9a-f]{32}", made)
+    with caplog.at_level(logging.INFO, "msdgs_serve.access"):
+        client.get("/scenes/nothing")
+
+        def told() -> list[logging.LogRecord]:
+            """A line follows its answer, so that of a call before may still come."""
+            return [record for record in caplog.records if "/scenes/nothing" in record.getMessage()]
+
+        eventually(lambda: bool(told()))
+    token = request_id.set("the-id")
+    line = json.loads(JsonLines().format(told()[0]))
+    request_id.reset(token)
+    assert (line["status"], line["method"], line["request_id"]) == (404, "GET", "the-id")
+    assert line["path"] == "/scenes/nothing"
+
+
+def test_without_a_key_nothing_but_health_is_answered(scene: Path, tmp_path: Path):
+    (tmp_path / "keys").write_text("# ours\n" + "\n".join(KEYS) + "\n")
+    with serving(scene) as client:
+        paths = client.get("/openapi.json").json()["paths"]
+    calls = [(method.upper(), path.replace("{name}", "balls")) for path, methods in paths.items() for method in methods]
+    calls = [call for call in calls if call[1] not in ("/live", "/ready")]
+    assert len(calls) >= 10
+    calls += [("GET", "/docs"), ("GET", "/redoc"), ("GET", "/static-offline-docs/swagger-ui.css")]
+    calls += [("GET", "/openapi.json"), ("GET", "/nothing"), ("OPTIONS", "/render")]
+    with serving(scene, api_keys_file=tmp_path / "keys") as client:
+        for headers in ({}, {"X-API-Key": "wrong"}, {"Authorization": f"Basic {KEYS[0]}"}, {"X-API-Key": KEYS[0][:-1]}):
+            for method, path in calls:
+                response = client.request(method, path, headers=headers)
+                assert response.status_code == 401, (method, path, headers)
+                check_problem(response)
+                assert response.headers["WWW-Authenticate"] == "Bearer"
+            for path in ("/live", "/ready"):
+                assert client.get(path, headers=headers).status_code == 200
+        for key in KEYS:
+            assert client.post("/render", json=FRAME, headers={"X-API-Key": key}).status_code == 200
+            assert client.post("/render", json=FRAME, headers={"Authorization": f"bearer {key}"}).status_code == 200
+        document = client.get("/openapi.json", headers={"X-API-Key": KEYS[0]}).json()
+        assert "401" in document["paths"]["/render"]["post"]["responses"]
+
+
+def test_under_a_prefix_paths_mean_the_same():
+    async def inside(scope: Scope, receive: Receive, send: Send) -> None:
+        await Response(status_code=204)(scope, receive, send)
+
+    app = BodyLimit(KeyCheck(inside, KEYS), max_bytes=4, seconds=5, streamed=[("POST", "/live")])
+    transport = httpx.ASGITransport(app, root_path="/scenes")
+
+    async def status(method: str, path: str, body: bytes = b"") -> int:
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return (await client.request(method, path, content=body)).status_code
+
+    assert asyncio.run(status("GET", "/scenes/live")) == asyncio.run(status("GET", "/live")) == 204
+    assert asyncio.run(status("GET", "/scenes/render")) == asyncio.run(status("GET", "/other/live")) == 401
+    assert asyncio.run(status("POST", "/scenes/live", b"12345")) == 204
+    assert asyncio.run(status("POST", "/scenes/ready", b"12345")) == 413
+
+
+def test_other_web_pages_may_call_only_where_they_are_named(scene: Path, client: httpx.Client):
+    origin = {"Origin": "https://example.org"}
+    assert "access-control-allow-origin" not in client.post("/render", json=FRAME, headers=origin).headers
+    with serving(scene, cors_origins=["https://example.org"]) as open_client:
+        answer = open_client.post("/render", json=FRAME, headers=origin)
+        assert answer.headers["access-control-allow-origin"] == "https://example.org"
+        other = open_client.post("/render", json=FRAME, headers={"Origin": "https://example.net"})
+        assert "access-control-allow-origin" not in other.headers
+
+
+def numbers(client: httpx.Client, name: str) -> dict[str, float]:
+    """The values of a metric by its labels."""
+    lines = client.get("/metrics").text.splitlines()
+    pairs = [line.rsplit(" ", 1) for line in lines if line.startswith((f"{name}{{", f"{name} "))]
+    return {labels.removeprefix(name): float(value) for labels, value in pairs}
+
+
+def test_metrics_are_what_the_client_counted(scene: Path):
+    count = 40
+    with serving(scene) as client:
+        for number in range(count):
+            assert post(client, t=number % 4 / 4).status_code == 200
+            assert post(client, t=7).status_code == 422
+        requests = numbers(client, "msdgs_requests_total")
+        assert requests['{method="POST",route="/render",status="200"}'] == count
+        assert requests['{method="POST",route="/render",status="422"}'] == count
+        assert numbers(client, "msdgs_problems_total")['{kind="invalid"}'] == count
+        assert numbers(client, "msdgs_stage_seconds_count")['{stage="encode"}'] == count
+        lookups = numbers(client, "msdgs_pose_cache_lookups_total")
+        assert sum(lookups.values()) == count + 1, "and one frame drawn at the start"
+        assert numbers(client, "msdgs_scenes") == {'{state="known"}': 1, '{state="loaded"}': 1, '{state="broken"}': 0}
+
+
+@in_this_process
+def test_methods_that_nobody_knows_are_counted_as_one(client: httpx.Client):
+    assert client.request("BREW", "/render").status_code == 405
+    assert 'method="other"' in client.get("/metrics").text
+
+
+def test_a_service_is_ready_when_scenes_are_loaded(client: httpx.Client):
+    assert client.get("/ready").json() == {"status": "ready"}
+    assert client.get("/live").json()["status"] == "ok"

@@ -1,0 +1,211 @@
+"""More than the service can do: refused in time and with advice, while what was accepted is finished."""
+
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from msdgs_serve.api.server import Server
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.pose_cache import PoseCache
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.scene import Gaussians
+from msdgs_serve.watch import Watch
+from tests.service.test_api_poison import check_problem
+from tests.support.scene_files import write_scene
+from tests.support.service import serving
+
+ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
+FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
+
+
+class SlowPoses(PoseCache):
+    """Poses that wait until they may go on, once `slow` is set, and are never remembered."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self.slow = False
+        self.go_on = threading.Event()
+        self.step = 0.0
+        self.begun = 0
+
+    def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
+        watch.check()
+        if self.slow:
+            self.begun += 1
+            assert self.go_on.wait(20)
+            time.sleep(self.step)
+        return session.gaussians(t)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+
+
+@pytest.fixture
+def poses() -> Iterator[SlowPoses]:
+    poses = SlowPoses()
+    yield poses
+    poses.go_on.set()
+
+
+def renderer_with(poses: SlowPoses) -> Renderer:
+    renderer = Renderer()
+    renderer.cache = poses
+    return renderer
+
+
+def until(condition: Callable[[], bool], seconds: float = 10.0) -> float:
+    """Wait for it; returns how long that took."""
+    started = time.monotonic()
+    while not condition():
+        assert time.monotonic() - started < seconds
+        time.sleep(0.005)
+    return time.monotonic() - started
+
+
+def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, poses: SlowPoses):
+    server: list[Server] = []
+    with (
+        serving(scene, renderer=renderer_with(poses), server=server, concurrent_renders=2, queued_renders=3) as client,
+        ThreadPoolExecutor(5) as pool,
+    ):
+        poses.slow = True
+        accepted = [pool.submit(client.post, "/render", json=FRAME) for _ in range(5)]
+        queue = server[0].service.queue
+        until(lambda: (queue.running, queue.waiting) == (2, 3))
+        for _ in range(3):
+            response = client.post("/render", json=FRAME)
+            assert response.status_code == 503
+            check_problem(response)
+            assert 1 <= int(response.headers["Retry-After"]) <= 60
+        assert client.post("/render/batch", json={"frames": [FRAME]}).status_code == 503
+        assert client.post("/render", json={**FRAME, "width": 0}).status_code == 503, "a body is not even looked at"
+        have = client.post("/render", json=FRAME, headers={"If-None-Match": "*"})
+        assert have.status_code == 304, "what the client has costs no place"
+        assert client.get("/live").status_code == 200
+        assert client.get("/ready").status_code == 200
+        poses.go_on.set()
+        assert [future.result(20).status_code for future in accepted] == [200] * 5
+        assert client.post("/render", json=FRAME).status_code == 200
+
+
+def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: SlowPoses):
+    server: list[Server] = []
+    with serving(
+        scene, renderer=renderer_with(poses), server=server, render_seconds=0.3, concurrent_renders=1
+    ) as client:
+        poses.slow = True
+        started = time.monotonic()
+        response = client.post("/render", json=FRAME)
+        assert 0.3 <= time.monotonic() - started < 0.8
+        assert response.status_code == 504
+        check_problem(response)
+        assert server[0].service.queue.running == 1, "the place is taken as long as the thread is"
+        waiting = client.post("/render", json=FRAME)
+        assert waiting.status_code == 504, "the time in line counts"
+        poses.slow = False
+        poses.go_on.set()
+        until(lambda: server[0].service.queue.running == 0)
+        assert client.post("/render", json=FRAME).status_code == 200
+
+
+def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
+    """A request on a connection of its own; whoever closes that is gone."""
+    request = client.build_request("POST", path, json=body)
+    request.read()
+    host = client.base_url.host
+    assert client.base_url.port
+    connection = socket.create_connection((host, client.base_url.port))
+    head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\n"
+    connection.sendall(f"{head}Content-Length: {len(request.content)}\r\n\r\n".encode() + request.content)
+    return connection
+
+
+@pytest.mark.parametrize("path", ["/render", "/render/batch"])
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.9])
+def test_work_for_a_client_that_is_gone_ends(scene: Path, poses: SlowPoses, path: str, part: float):
+    samples = 40
+    body: dict[str, Any] = {**FRAME, "shutter": {"open": -0.1, "close": 0.1, "samples": samples}}
+    server: list[Server] = []
+    with serving(scene, renderer=renderer_with(poses), server=server) as client:
+        poses.slow, poses.step = True, 0.05
+        poses.go_on.set()
+        connection = leave(client, {"frames": [body, {**body, "t": 0.6}]} if path.endswith("batch") else body, path)
+        until(lambda: poses.begun >= part * samples)
+        connection.close()
+        queue = server[0].service.queue
+        assert until(lambda: queue.running == queue.waiting == 0) < 0.5
+        begun = poses.begun
+        assert begun < samples
+        time.sleep(0.2)
+        assert poses.begun == begun
+
+
+def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: SlowPoses):
+    server: list[Server] = []
+    with (
+        serving(scene, renderer=renderer_with(poses), server=server, concurrent_renders=1) as client,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        queue = server[0].service.queue
+        poses.slow = True
+        first = pool.submit(client.post, "/render", json=FRAME)
+        until(lambda: queue.running == 1)
+        connection = leave(client, FRAME)
+        until(lambda: queue.waiting == 1)
+        connection.close()
+        until(lambda: queue.waiting == 0)
+        poses.go_on.set()
+        assert first.result(20).status_code == 200
+        assert poses.begun == 1
+
+
+def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses):
+    server: list[Server] = []
+    with (
+        serving(scene, renderer=renderer_with(poses), server=server) as client,
+        httpx.Client(base_url=client.base_url) as other,
+        ThreadPoolExecutor(8) as pool,
+    ):
+        poses.slow = True
+        frames = [pool.submit(client.post, "/render", json=FRAME) for _ in range(8)]
+        queue = server[0].service.queue
+        until(lambda: queue.running + queue.waiting == 8)
+        server[0].handle_exit(signal.SIGTERM, None)
+        assert other.get("/ready").status_code == 503
+        assert other.get("/live").status_code == 200
+        refused = other.post("/render", json=FRAME)
+        assert refused.status_code == 503
+        assert refused.headers["Retry-After"]
+        poses.go_on.set()
+        assert [frame.result(20).status_code for frame in frames] == [200] * 8
+        until(lambda: not server[0].started or not _listens(client))
+
+
+def _listens(client: httpx.Client) -> bool:
+    assert client.base_url.port
+    try:
+        socket.create_connection((client.base_url.host, client.base_url.port), timeout=1).close()
+    except OSError:
+        return False
+    return True
+
+
+def test_one_who_gives_up_does_not_spoil_the_pose_for_others(scene: Path):
+    """The pose that a stopped watch was computing is claimed by the next who waits for it."""
+    cache, session = PoseCache(1 << 20), DeformationSession(scene)
+    stopped = Watch()
+    stopped.stop()
+    assert cache.get(session, 0.5, Watch()) is cache.get(session, 0.5, Watch())
+    assert (cache.use.hits, cache.use.misses, cache.use.poses) == (1, 1, 1)
+    with pytest.raises(Exception, match="nobody waits"):
+        cache.get(session, 0.5, stopped)

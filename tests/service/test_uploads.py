@@ -1,0 +1,164 @@
+"""Scenes that clients add and delete: whole or not at all, and nothing but scenes."""
+
+import hashlib
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import onnx
+import pytest
+
+from tests.service.test_api import eventually
+from tests.service.test_api_poison import check_problem
+from tests.support.images import decode
+from tests.support.scene_files import write_scene
+from tests.support.service import own_connection, serving
+
+FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
+SECONDS = 0.5
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "scenes").mkdir()
+    return tmp_path / "scenes"
+
+
+@pytest.fixture
+def client(folder: Path) -> Iterator[httpx.Client]:
+    with serving(folder, uploads=True, max_scene_megabytes=1, body_seconds=SECONDS) as client:
+        yield client
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> bytes:
+    return write_scene(tmp_path / "walk.onnx").read_bytes()
+
+
+def add(client: httpx.Client, content: Any, name: str = "walk", **query: Any) -> httpx.Response:
+    return client.post("/scenes", content=content, params={"name": name, **query})
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.parent.rglob("*") if path.is_file() and path.parent == folder)
+
+
+def test_a_scene_is_added_shown_and_deleted(client: httpx.Client, folder: Path, file: bytes):
+    response = add(client, file, sha256=hashlib.sha256(file).hexdigest())
+    assert response.status_code == 201, response.text
+    assert response.json() == {"name": "walk", "sha256": hashlib.sha256(file).hexdigest()}
+    assert client.get(response.headers["Location"]).json()["sha256"] == response.json()["sha256"]
+    assert client.post("/render", json=FRAME).status_code == 200
+    assert client.delete("/scenes/walk").status_code == 204
+    assert client.post("/render", json={**FRAME, "scene": "walk"}).status_code == 404
+    assert files(folder) == []
+
+
+def test_a_scene_is_replaced_only_on_request(client: httpx.Client, tmp_path: Path, file: bytes):
+    assert add(client, file).status_code == 201
+    blue = write_scene(tmp_path / "blue.onnx", static_color=(0, 0, 1)).read_bytes()
+    conflict = add(client, blue)
+    assert conflict.status_code == 409
+    check_problem(conflict)
+    assert add(client, blue, replace="true").status_code == 201
+    pixels, _ = decode(client.post("/render", json={**FRAME, "t": 0, "width": 64, "height": 64}).content, "png")
+    assert pixels[32, 32].argmax() == 2
+
+
+@pytest.mark.parametrize(
+    "name", ["../walk", "a/b", "/etc/walk", "a\\b", ".hidden", "..", "a\0b", "a\nb", "x" * 201, ""]
+)
+def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, folder: Path, file: bytes, name: str):
+    response = add(client, file, name)
+    assert response.status_code == 422
+    check_problem(response)
+    assert response.json()["errors"][0]["field"] == "name"
+    assert files(folder) == []
+    assert not (folder.parent / "scenes.onnx").exists()
+
+
+def with_external_data(path: Path, location: str) -> bytes:
+    """A scene whose constants lie in another file."""
+    model = onnx.load(path)
+    tensor = next(each for each in model.graph.initializer if each.name == "all_sh")
+    tensor.ClearField("raw_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    for key, value in {"location": location, "length": "24"}.items():
+        entry = tensor.external_data.add()
+        entry.key, entry.value = key, value
+    return model.SerializeToString()
+
+
+@pytest.mark.parametrize("location", ["/etc/passwd", "../secret", "walk.data", "a/../../secret"])
+def test_files_that_need_other_files_are_refused(client: httpx.Client, tmp_path: Path, folder: Path, location: str):
+    content = with_external_data(write_scene(tmp_path / "external.onnx"), location)
+    (tmp_path / "secret").write_bytes(b"s" * 24)
+    response = add(client, content)
+    assert response.status_code == 422
+    check_problem(response)
+    assert str(tmp_path) not in response.text
+    assert files(folder) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"no scene", b"\x08\x0a"], ids=["empty", "text", "beginning"])
+def test_what_is_no_scene_is_refused_and_leaves_nothing(client: httpx.Client, folder: Path, content: bytes):
+    response = add(client, content)
+    assert response.status_code == 422
+    check_problem(response)
+    assert files(folder) == []
+
+
+def test_a_file_that_was_damaged_on_its_way_is_refused(client: httpx.Client, folder: Path, file: bytes):
+    damaged = bytearray(file)
+    place = file.index(np.float32(0.15).tobytes())
+    damaged[place] ^= 1
+    response = add(client, bytes(damaged), sha256=hashlib.sha256(file).hexdigest())
+    assert response.status_code == 422
+    assert response.json()["errors"][0]["field"] == "sha256"
+    assert files(folder) == []
+
+
+def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path):
+    response = add(client, (b"x" * 65536 for _ in range(40)))
+    assert response.status_code == 413
+    check_problem(response)
+    assert files(folder) == []
+
+
+@own_connection
+def test_a_file_that_stops_coming_is_given_up(client: httpx.Client, folder: Path):
+    assert client.base_url.port
+    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
+        connection.sendall(b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nhalf a scene")
+        eventually(lambda: len(files(folder)) == 1)
+        assert connection.recv(65536).startswith(b"HTTP/1.1 408 ")
+    eventually(lambda: files(folder) == [])
+
+
+@own_connection
+def test_a_client_that_leaves_in_the_middle_leaves_nothing(client: httpx.Client, folder: Path):
+    assert client.base_url.port
+    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
+        connection.sendall(b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nhalf a scene")
+        eventually(lambda: len(files(folder)) == 1)
+    eventually(lambda: files(folder) == [])
+
+
+def test_where_it_is_not_allowed_nothing_is_added_or_deleted(folder: Path, file: bytes):
+    write_scene(folder / "walk.onnx")
+    with serving(folder) as client:
+        for response in (add(client, file, "jump"), client.delete("/scenes/walk")):
+            assert response.status_code == 403
+            check_problem(response)
+    assert files(folder) == ["walk.onnx"]
+
+
+def test_what_a_killed_process_left_is_cleared_at_the_start(folder: Path):
+    (folder / ".incoming-token").write_bytes(b"half a scene")
+    write_scene(folder / "walk.onnx")
+    with serving(folder, uploads=True) as client:
+        assert client.get("/scenes").json()["scenes"][0]["name"] == "walk"
+    assert files(folder) == ["walk.onnx"]

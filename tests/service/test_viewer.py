@@ -1,0 +1,431 @@
+"""The page at /, in a browser: it loads, drags, plays, changes view, and says when the service goes away."""
+
+import base64
+import itertools
+import json
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, Request
+
+from msdgs_serve.api.routes.viewer import FILES, FOLDER
+from msdgs_serve.imaging import ImageFormat
+from msdgs_serve.scene.camera import orbit
+from tests.support.browser import chromium, forget, wait_until_still
+from tests.support.images import decode
+from tests.support.scene_files import metadata, write_scene
+from tests.support.service import serving
+from tests.support.tolerances import tolerance
+
+KEY = "0123456789abcdef"
+MILLISECONDS = 15_000
+REPORT = {
+    "format": "msdgs-report/1",
+    "checkpoint_sha256": "0" * 64,
+    "machine": {"processor": "a processor", "threads": 2},
+    "max_error": 50.0,
+    "points": [
+        {
+            "plan": plan, "front": True, "chosen": plan == "prefix", "trim_db": None, "bytes": 1e6,
+            "milliseconds": {"total": {"min": milliseconds}}, "error": {"psnr_worst": decibels},
+        }
+        for plan, milliseconds, decibels in (("network", 40.0, 95.0), ("prefix", 20.0, 60.0))
+    ],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scene(folder / "balls.onnx", steps=True)
+    write_scene(folder / "it's.onnx", static_color=(0.0, 0.0, 1.0), moving=False)
+    (folder / "balls.report.json").write_text(json.dumps(REPORT))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def client(scenes: Path) -> Iterator[httpx.Client]:
+    with serving(scenes) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    """An empty page that may not complain in its console, but of requests that found no service."""
+    with browser.new_context(viewport={"width": 820, "height": 420}, reduced_motion="reduce") as context:
+        page = context.new_page()
+        page.set_default_timeout(MILLISECONDS)
+        complaints: list[str] = []
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("console", lambda line: complaints.append(line.text) if line.type in ("error", "warning") else None)
+        yield page
+        assert [text for text in complaints if not text.startswith("Failed to load resource")] == []
+
+
+@pytest.fixture
+def opened(page: Page, client: httpx.Client) -> Page:
+    page.goto(f"{client.base_url}/#scene=balls")
+    wait_until_still(page)
+    return page
+
+
+@pytest.fixture(scope="module")
+def modules(browser: Browser, client: httpx.Client) -> Iterator[Page]:
+    """A page whose modules can be imported by scripts."""
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"{client.base_url}/viewer/icon.svg")
+        yield page
+
+
+def picture(page: Page) -> np.ndarray:
+    """What the canvas holds, [H, W, 3] from 0 to 255."""
+    address = page.evaluate("document.getElementById('picture').toDataURL('image/png')")
+    return decode(base64.b64decode(address.split(",")[1]), "png")[0][..., :3]
+
+
+def bodies(page: Page) -> list[dict[str, Any]]:
+    """Of requests for frames; the list grows while the page asks."""
+    asked: list[dict[str, Any]] = []
+
+    def note(request: Request) -> None:
+        if request.method == "POST" and request.url.endswith("/render"):
+            asked.append(json.loads(request.post_data or ""))
+
+    page.on("request", note)
+    return asked
+
+
+def test_only_its_own_files_may_be_loaded(client: httpx.Client):
+    page = client.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert page.headers["content-security-policy"].startswith("default-src 'none'; script-src 'self';")
+    assert client.get("/", headers={"If-None-Match": page.headers["etag"]}).status_code == 304
+    for name in re.findall(r'(?:src|href)="viewer/([^"]*)"', page.text):
+        assert client.get(f"/viewer/{name}").status_code == 200
+    for name in ("../index.html", "..%2F__init__.py", "nothing.js", "%2Fetc%2Fpasswd"):
+        assert client.get(f"/viewer/{name}").status_code == 404
+    assert not re.search(r"https?://", page.text), "something from elsewhere"
+    assert {path.name for path in FOLDER.iterdir()} == set(FILES)
+
+
+def test_it_shows_the_scene_as_the_service_draws_it(opened: Page, client: httpx.Client):
+    asked = bodies(opened)
+    opened.reload()
+    wait_until_still(opened)
+    frame = client.post("/render", json=asked[-1])
+    np.testing.assert_array_equal(picture(opened), decode(frame.content, "png")[0])
+    assert opened.title() == "balls · msdgs"
+    assert opened.locator("#scenes li").all_inner_texts() == ["balls", "it's"]
+    assert opened.locator("#facts").inner_text().startswith("Gaussians")
+
+
+def test_dragging_turns_and_ends_in_full_quality(opened: Page):
+    before, asked = picture(opened), bodies(opened)
+    opened.mouse.move(200, 200)
+    forget(opened)
+    opened.mouse.down()
+    for step in range(10, 100, 10):
+        opened.mouse.move(200 + step, 200 + step // 2)
+        opened.wait_for_timeout(20)
+    opened.mouse.up()
+    wait_until_still(opened)
+    first, last = asked[0], asked[-1]
+    assert (first["format"], last["format"]) == ("jpeg", "png")
+    assert first["width"] <= last["width"]
+    assert last["camera"]["azimuth"] != 30
+    assert last["camera"]["elevation"] > 20
+    assert np.abs(picture(opened).astype(int) - before).max() > 50
+    assert "at=" in opened.url
+
+
+def test_wheel_keys_and_shift_drag_move_the_camera(opened: Page):
+    asked = bodies(opened)
+
+    def camera_after(act: Any) -> dict[str, Any]:
+        count = len(asked)
+        forget(opened)
+        act()
+        wait_until_still(opened)
+        assert len(asked) > count
+        return asked[-1]["camera"]
+
+    def shift_drag() -> None:
+        opened.keyboard.down("Shift")
+        opened.mouse.move(200, 200)
+        opened.mouse.down()
+        opened.mouse.move(240, 200)
+        opened.mouse.up()
+        opened.keyboard.up("Shift")
+
+    opened.mouse.move(200, 200)
+    nearer = camera_after(lambda: opened.mouse.wheel(0, -300))
+    assert nearer["distance"] < 5
+    panned = camera_after(shift_drag)
+    assert panned["target"] != nearer["target"]
+    assert panned["distance"] == nearer["distance"]
+    turned = camera_after(lambda: opened.keyboard.press("ArrowLeft"))
+    assert turned["azimuth"] != panned["azimuth"]
+    flown = camera_after(lambda: opened.keyboard.press("w", delay=100))
+    assert flown["target"] != turned["target"]
+    assert camera_after(lambda: opened.keyboard.press("r"))["target"] == [0, 0, 0]
+
+
+def test_two_fingers_zoom(browser: Browser, client: httpx.Client):
+    with browser.new_context(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True) as context:
+        page = context.new_page()
+        page.goto(f"{client.base_url}/#scene=balls")
+        wait_until_still(page)
+        asked = bodies(page)
+        touch = context.new_cdp_session(page)
+        forget(page)
+        for kind, spread in (("touchStart", 20), ("touchMove", 60), ("touchMove", 90)):
+            points = [{"x": 195 + side * spread, "y": 350, "id": side + 1} for side in (-1, 1)]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        wait_until_still(page)
+        assert asked[-1]["camera"]["distance"] < 3
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390, "wider than a phone"
+
+
+def test_it_plays_one_request_at_a_time(opened: Page):
+    flying, most, asked = 0, 0, bodies(opened)
+
+    def count(change: int) -> None:
+        nonlocal flying, most
+        flying += change
+        most = max(most, flying)
+
+    opened.on("request", lambda request: count(1) if request.url.endswith("/render") else None)
+    for event in ("requestfinished", "requestfailed"):
+        opened.on(event, lambda request: count(-1) if request.url.endswith("/render") else None)
+    opened.select_option("#speed", "2")
+    opened.get_by_role("button", name="Play").click()
+    opened.wait_for_timeout(2500)  # a whole run takes 2 s
+    opened.get_by_role("button", name="Pause").click()
+    wait_until_still(opened)
+    times = [body["t"] for body in asked]
+    assert most == 1
+    assert len(set(times)) > 5
+    assert any(later < earlier for earlier, later in itertools.pairwise(times)), "it did not begin again"
+    shown = float(opened.locator("#time-text").inner_text().removeprefix("t "))
+    assert shown == pytest.approx(times[-1], abs=0.00051)
+
+
+def test_it_stops_at_the_end_without_loop(opened: Page):
+    opened.get_by_role("button", name="Loop").click()
+    opened.locator("#time").fill("0.9")
+    opened.locator("#picture").focus()
+    opened.keyboard.press("Space")
+    opened.get_by_role("button", name="Play").wait_for()
+    assert opened.locator("#time-text").inner_text() == "t 1.000"
+
+
+def test_depth_count_and_motion(opened: Page):
+    asked = bodies(opened)
+    for label, channel in (("Depth", "depth"), ("Count", "gaussians"), ("Motion", "motion")):
+        before = picture(opened)
+        with opened.expect_response("**/render") as answer:
+            opened.get_by_text(label, exact=True).click()
+        assert answer.value.status == 200
+        opened.wait_for_function("(c) => location.hash.includes(`view=${c}`)", arg=channel)
+        assert asked[-1]["channels"] == [channel]
+        assert np.abs(picture(opened).astype(int) - before).max() > 50
+    opened.locator("#time").fill("1")
+    opened.wait_for_function("() => location.hash.includes('t=1&')")
+    assert asked[-1]["t"] + asked[-1]["dt"] == 1, "motion at the end of time leads beyond it"
+
+
+def test_the_slider_of_layers(opened: Page):
+    asked = bodies(opened)
+    opened.locator("#time").fill("1")
+    opened.wait_for_function("() => location.hash.includes('t=1&')")
+    all_layers = picture(opened)
+    opened.locator("#steps").fill("0.5")
+    opened.wait_for_function("() => location.hash.includes('steps=0.5&')")
+    assert opened.locator("#steps-text").inner_text() == "0.5 of 1"
+    assert asked[-1]["steps"] == 0.5
+    assert np.abs(picture(opened).astype(int) - all_layers).max() > 50
+    opened.locator("#steps").fill("1")
+    opened.wait_for_function("() => !location.hash.includes('steps')")
+    assert "steps" not in asked[-1]
+    opened.goto(opened.url.split("#")[0] + "#scene=balls&t=0.25&steps=0.25")
+    opened.get_by_text("0.25 of 1").wait_for()
+    opened.locator("#scenes").get_by_text("it's").click()
+    opened.wait_for_function("() => location.hash.includes('scene=it')")
+    assert not opened.locator("#layers").is_visible()
+
+
+def test_a_camera_of_the_scene_keeps_its_proportions(opened: Page):
+    asked = bodies(opened)
+    opened.select_option("#camera", label="view_90")
+    opened.wait_for_function("() => location.hash.includes('camera=1')")
+    assert asked[-1]["camera"] == {"type": "scene", "index": 1}
+    assert abs(asked[-1]["width"] / asked[-1]["height"] - 64 / 48) < 0.01
+    opened.locator("#picture").focus()
+    opened.keyboard.press("ArrowUp")
+    opened.wait_for_function("() => location.hash.includes('at=')")
+    taken_over = asked[-1]["camera"]
+    assert (taken_over["type"], taken_over["azimuth"]) == ("orbit", 90)
+    assert opened.locator("#camera").input_value() == ""
+
+
+def test_another_scene_and_the_address_of_this_one(opened: Page):
+    opened.locator("#scenes").get_by_text("it's").click()
+    opened.wait_for_function("() => location.hash.includes('scene=it')")
+    assert opened.locator("#title").inner_text() == "it's"
+    assert not opened.locator("#report").is_visible()
+    opened.goto(opened.url.split("#")[0] + "#scene=balls&t=0.25&view=depth&at=10,30,4,0,0,0.5")
+    opened.get_by_text("t 0.250").wait_for()
+    assert opened.locator("#title").inner_text() == "balls"
+    assert opened.get_by_label("Depth").is_checked()
+
+
+def test_the_report_is_drawn(opened: Page):
+    dots = opened.locator("#diagram .dot")
+    assert dots.count() == 2
+    assert opened.locator("#report-point").inner_text().startswith("Chosen: prefix")
+    dots.last.focus()
+    assert "95.0 dB" in opened.locator("#report-point").inner_text()
+
+
+def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Client):
+    permissions = ["clipboard-read", "clipboard-write"]
+    with browser.new_context(viewport={"width": 820, "height": 420}, permissions=permissions) as context:
+        page = context.new_page()
+        page.goto(f"{client.base_url}/#scene=it's&t=0.5")
+        wait_until_still(page)
+        page.get_by_role("button", name="curl").click()
+        page.get_by_text("Copied.").wait_for()
+        words = shlex.split(page.evaluate("navigator.clipboard.readText()"))
+        assert words[:2] == ["curl", str(client.base_url.join("render"))]
+        answer = client.post("/render", content=words[-1], headers={"Content-Type": "application/json"})
+        np.testing.assert_array_equal(decode(answer.content, "png")[0], picture(page))
+        files: list[tuple[str, ImageFormat, int]] = [("PNG", "png", 3), ("EXR", "exr", 5)]
+        for label, image_format, channels in files:
+            with page.expect_download() as download:
+                page.get_by_role("button", name=label, exact=True).click()
+            assert download.value.suggested_filename == f"it's-0.5.{image_format}"
+            content = Path(download.value.path()).read_bytes()
+            assert decode(content, image_format)[0].shape == (*picture(page).shape[:2], channels)
+
+
+def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Path):
+    with serving(scenes) as client:
+        port = client.base_url.port
+        page.goto(f"{client.base_url}/#scene=balls")
+        wait_until_still(page)
+    page.locator("#picture").focus()
+    page.keyboard.press("ArrowLeft")
+    page.get_by_text("The service doesn’t answer").wait_for()
+    forget(page)
+    assert port is not None
+    with serving(scenes, port=port):
+        wait_until_still(page)
+        assert not page.locator("#banner").is_visible()
+
+
+def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_path: Path):
+    (tmp_path / "keys").write_text(KEY)
+    with serving(scenes, api_keys_file=tmp_path / "keys") as client:
+        page.goto(f"{client.base_url}/#scene=balls")
+        page.locator("#key").fill("wrong")
+        page.get_by_role("button", name="Use it").click()
+        page.get_by_text("The service asks for a key.").wait_for()
+        page.locator("#key").fill(KEY)
+        page.get_by_role("button", name="Use it").click()
+        wait_until_still(page)
+        page.reload()
+        wait_until_still(page)
+        assert not page.locator("#key-dialog").is_visible()
+
+
+def strongest_in_the_middle(image: np.ndarray) -> int:
+    """Which of red, green and blue."""
+    return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
+
+
+def in_time(page: Page, holds: Callable[[np.ndarray], bool]) -> bool:
+    """Whether the picture comes to be so within ten seconds."""
+    for _ in range(100):
+        if holds(picture(page)):
+            return True
+        page.wait_for_timeout(100)
+    return False
+
+
+def test_a_changed_file_is_shown(page: Page, tmp_path: Path):
+    write_scene(tmp_path / "ball.onnx", static_color=(1.0, 0.0, 0.0), moving=False)
+    with serving(tmp_path) as client:
+        page.goto(str(client.base_url))
+        wait_until_still(page)
+        assert in_time(page, lambda image: strongest_in_the_middle(image) == 0)
+        write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=False).rename(tmp_path / "ball.onnx")
+        assert in_time(page, lambda image: strongest_in_the_middle(image) == 1)
+
+
+def test_a_service_that_allows_fewer_pixels(page: Page, scenes: Path):
+    with serving(scenes, max_pixels=100 * 100) as client:
+        asked = bodies(page)
+        page.goto(f"{client.base_url}/#scene=balls")
+        wait_until_still(page)
+        assert asked[-1]["width"] * asked[-1]["height"] <= 100 * 100
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, 0.2, 0.9)])
+def test_the_camera_is_the_services_own(modules: Page, up: tuple[float, float, float]):
+    view = {"target": [0.5, 1, -2], "distance": 3, "up": up, "fov_y": 40, "width": 4, "height": 3}
+    script = """async (view) => {
+        const { Camera } = await import("/viewer/camera.js");
+        const camera = new Camera(view);
+        camera.orbit(-75, 15);
+        const { right, above, forward } = camera.axes;
+        return [right, above.map((x) => -x), forward, camera.eye]; }"""
+    columns = np.array(modules.evaluate(script, view)).T
+    wanted = orbit(np.array(view["target"]), 3, 30 - 75, 20 + 15, np.array(up))
+    assert np.abs(columns - wanted[:3]).max() < tolerance("rotation")
+
+
+def test_a_pose_that_is_taken_over_stays_where_it_is(modules: Page):
+    stored = metadata().cameras[1]
+    script = """async ([view, stored]) => {
+        const { Camera } = await import("/viewer/camera.js");
+        const camera = new Camera(view);
+        camera.take(stored, 1);
+        const { right, above, forward } = camera.axes;
+        return [right, above.map((x) => -x), forward, camera.eye]; }"""
+    view = {"target": [0.5, 0, 0.25], "distance": 3, "up": [0, 0, 1], "fov_y": 40, "width": 4, "height": 3}
+    columns = np.array(modules.evaluate(script, [view, stored.to_plain()])).T
+    assert np.abs(columns - stored.camera.camera_to_world[:3]).max() < tolerance("rotation")
+
+
+@pytest.mark.parametrize(("pose", "nanoseconds_a_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
+def test_moving_frames_come_15_times_a_second(modules: Page, pose: float, nanoseconds_a_pixel: float):
+    script = """async ([pose, aPixel]) => {
+        const { Pace } = await import("/viewer/pace.js");
+        const pace = new Pace();
+        const taken = [];
+        for (let i = 0; i < 20; i += 1) {
+          const { width, height } = pace.size({ width: 1600, height: 1200 });
+          const drawing = width * height * aPixel;
+          taken.push([width * height, pose + drawing]);
+          pace.measured(width * height, pose + drawing, drawing);
+        }
+        return taken; }"""
+    taken = modules.evaluate(script, [pose, nanoseconds_a_pixel * 1e-9])
+    pixels, seconds = taken[-1]
+    assert seconds < 1 / 15
+    affordable = (1 / 15 - pose) / (nanoseconds_a_pixel * 1e-9)
+    assert pixels > 0.5 * min(affordable, 1600 * 1200), "fewer pixels than there is time for"

@@ -1,0 +1,61 @@
+"""The service on a port of this machine, in a thread; with MSDGS_TEST_SERVICE=ray on Ray Serve."""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from msdgs_serve.api.app import create_app
+from msdgs_serve.api.cli import bind
+from msdgs_serve.api.server import Server
+from msdgs_serve.api.service import Phase
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.store import SceneStore
+from tests.support.service_on_ray import serving_on_ray
+
+WATCH_SECONDS = 0.05
+SERVICE_VARIABLE = "MSDGS_TEST_SERVICE"
+ON_RAY = os.environ.get(SERVICE_VARIABLE) == "ray"
+in_this_process = pytest.mark.skipif(ON_RAY, reason="reaches into the process of the service: not on Ray Serve")
+own_connection = pytest.mark.skipif(ON_RAY, reason="slow connections end at the proxy of Ray Serve")
+
+
+@contextlib.contextmanager
+def serving(
+    *scenes: Path, renderer: Renderer | None = None, server: list[Server] | None = None, **settings: Any
+) -> Iterator[httpx.Client]:
+    """A client of a service over these scenes, which ends on leaving. The server is added to `server`."""
+    chosen = Settings(scenes=list(scenes), **{"watch_seconds": WATCH_SECONDS, "port": 0, **settings})
+    if ON_RAY:
+        if renderer is not None or server is not None or chosen.port:
+            pytest.skip("reaches into the process of the service, or says its port: not on Ray Serve")
+        with serving_on_ray(chosen) as client:
+            yield client
+        return
+    app = create_app(SceneStore(scenes, chosen.open_scene), renderer or Renderer(), chosen)
+    listener = bind("127.0.0.1", chosen.port)
+    running = Server(app, chosen)
+    if server is not None:
+        server.append(running)
+    thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    deadline = time.monotonic() + 60
+    while running.service.phase is Phase.STARTING or not running.started:
+        assert thread.is_alive(), running.service.failure
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=60) as client:
+            yield client
+    finally:
+        running.should_exit = True
+        thread.join(10)
+        listener.close()
+    assert not thread.is_alive()

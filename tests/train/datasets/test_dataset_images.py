@@ -1,0 +1,99 @@
+"""Alpha and size: what photographs become when they are read, reduced and laid over a background."""
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from msdgs_train.datasets import composite
+from msdgs_train.datasets.common.images import read_rgba, read_size, resize_area, write_png
+from tests.support.tolerances import assert_close
+
+
+def photograph(seed: int, width: int, height: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, size=(height, width, 4), dtype=np.uint8)
+
+
+def area_mean_by_loops(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Each new pixel, by going through all old ones that it overlaps; [height, width, 4] float64."""
+    old_height, old_width, _ = rgba.shape
+    result = np.zeros((height, width, 4))
+    for i in range(height):
+        for j in range(width):
+            weight, alpha, color = 0.0, 0.0, np.zeros(3)
+            for y in range(old_height):
+                for x in range(old_width):
+                    down = min((i + 1) * old_height / height, y + 1) - max(i * old_height / height, y)
+                    across = min((j + 1) * old_width / width, x + 1) - max(j * old_width / width, x)
+                    area = max(down, 0.0) * max(across, 0.0)
+                    weight += area
+                    alpha += area * rgba[y, x, 3]
+                    color += area * float(rgba[y, x, 3]) * rgba[y, x, :3]
+            result[i, j] = [*(color / alpha if alpha else np.zeros(3)), alpha / weight]
+    return result
+
+
+@pytest.mark.parametrize(("width", "height"), [(6, 4), (5, 4), (4, 3), (7, 7), (1, 1), (12, 1)])
+def test_reduction_is_the_mean_over_the_covered_area(width: int, height: int):
+    rgba = photograph(width, 12, 8)
+    rgba[:3, :5, 3] = 0
+    assert_close(resize_area(rgba, width, height), area_mean_by_loops(rgba, width, height), "rounded_to_8bit")
+
+
+def test_the_same_size_changes_nothing():
+    rgba = photograph(0, 12, 8)
+    rgba[:3, :5, 3] = 0
+    assert (resize_area(rgba, 12, 8) == rgba).all()
+
+
+def test_halves_are_the_exact_box():
+    rgba = photograph(0, 16, 8).astype(np.int64)
+    rgba[..., 3] = 255
+    got = resize_area(rgba.astype(np.uint8), 8, 4)
+    total = rgba[0::2, 0::2] + rgba[1::2, 0::2] + rgba[0::2, 1::2] + rgba[1::2, 1::2]
+    assert (got == (total + 2) // 4).all()
+
+
+def test_colour_behind_transparent_pixels_does_not_bleed_in():
+    rgba = np.zeros((2, 2, 4), np.uint8)
+    rgba[0, 0] = [200, 100, 50, 255]
+    rgba[1, 1] = [0, 255, 0, 0]
+    assert resize_area(rgba, 1, 1).tolist() == [[[200, 100, 50, 64]]]
+
+
+def test_reducing_and_compositing_commute():
+    """As light does: straight colours averaged without their alpha would give a dark rim."""
+    rgba = photograph(3, 40, 20)
+    background = (0.9, 0.3, 0.1)
+    first_laid = composite(rgba, background).reshape(10, 2, 20, 2, 3).mean(axis=(1, 3))
+    assert_close(composite(resize_area(rgba, 20, 10), background), first_laid, "composite_of_8bit")
+
+
+def test_compositing_by_straight_alpha():
+    rgba = np.array([[[255, 0, 0, 255], [255, 0, 0, 0], [255, 0, 51, 102]]], np.uint8)
+    background = (0.0, 1.0, 0.5)
+    got = composite(rgba, background)
+    assert got.dtype == np.float32
+    assert_close(got, [[[1, 0, 0], background, [0.4, 0.6, 0.38]]], "float32.relative")
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_all_channel_layouts_become_rgba(tmp_path: Path, channels: int):
+    path = tmp_path / "photograph.png"
+    pixels = photograph(channels, 5, 3)[..., :channels].copy()
+    write_png(path, pixels)
+    rgba = read_rgba(path)
+    assert read_size(path) == (5, 3)
+    assert (rgba[..., :3] == (pixels[..., :3] if channels >= 3 else pixels[..., :1])).all()
+    assert (rgba[..., 3] == (pixels[..., -1] if channels in (2, 4) else 255)).all()
+
+
+def test_sixteen_bits_are_read_as_eight(tmp_path: Path):
+    path = tmp_path / "photograph.png"
+    writer = oiio.ImageOutput.create(str(path))
+    assert writer
+    writer.open(str(path), oiio.ImageSpec(2, 1, 3, "uint16"))
+    writer.write_image(np.array([[[0, 257, 65535], [257 * 100, 257 * 200, 257 * 201]]], np.uint16))
+    writer.close()
+    assert read_rgba(path).tolist() == [[[0, 1, 255, 255], [100, 200, 201, 255]]]

@@ -1,0 +1,309 @@
+"""The synthetic scene: its photographs show what its known motion says, and its folder is whole or not there."""
+
+import json
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
+from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, load_scene
+from msdgs_train.datasets.synthetic.generate import generate
+from msdgs_train.datasets.synthetic.motion import GROUND_Z, OBJECTS, motion_at, world_positions
+from msdgs_train.datasets.synthetic.rendering import first_hits
+from msdgs_train.datasets.synthetic.shapes import distance_at_rest
+from msdgs_train.datasets.synthetic.trajectories import surface_colors, surface_points
+from tests.support.tolerances import assert_close, tolerance
+
+STILL, MOVING = ("ground", "frame"), ("ball", "ring", "jelly", "pendulum")
+TIMES = np.linspace(0, 1, 41)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("synthetic") / "scene"
+    generate(out, size=96, train_frames=6, test_frames=2, seed=3)
+    return out
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> SceneData:
+    return load_scene(folder)
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def chromaticity(rgb: np.ndarray) -> np.ndarray:
+    return rgb / np.maximum(rgb.sum(axis=-1, keepdims=True), 1e-6)
+
+
+def project(camera: Camera, points: np.ndarray) -> np.ndarray:
+    x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+
+
+def distances_along_rays(frame: Frame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """From the camera: to each point, and to the first surface on the way there."""
+    rays = points - frame.camera.position
+    lengths = np.linalg.norm(rays, axis=1)
+    origins = np.broadcast_to(frame.camera.position, points.shape)
+    return lengths, first_hits(origins, rays / lengths[:, None], frame.t)[0]
+
+
+def visible_points(frame: Frame, count: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """World positions and surface colours of material points that the frame's camera sees, inside their patterns."""
+    positions, colors = [], []
+    for name in ("ground", *MOVING):
+        local = surface_points(name, count, seed=1)
+        colors_here = surface_colors(name, local)
+        nearby = [local + step for step in (*0.03 * np.eye(3), *-0.03 * np.eye(3))]
+        inside = np.all([surface_colors(name, points) == colors_here for points in nearby], axis=(0, 2))
+        local = local[inside]
+        points = world_positions(name, local, frame.t)
+        lengths, hits = distances_along_rays(frame, points)
+        seen = np.abs(hits - lengths) < tolerance("ray_hit")
+        positions.append(points[seen])
+        colors.append(surface_colors(name, local[seen]))
+    return np.concatenate(positions), np.concatenate(colors)
+
+
+def interpolated(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Values of [H, W, C] at [N, 2] positions (x, y); pixel (row 0, column 0) has its centre at (0.5, 0.5)."""
+    corner = np.clip(np.floor(pixels - 0.5).astype(int), 0, np.array(image.shape[1::-1]) - 2)
+    fx, fy = np.clip(pixels - 0.5 - corner, 0, 1).T[..., None]
+    x, y = corner.T
+    upper = (1 - fx) * image[y, x] + fx * image[y, x + 1]
+    return (1 - fy) * upper + fy * ((1 - fx) * image[y + 1, x] + fx * image[y + 1, x + 1])
+
+
+def colour_errors(
+    frame: Frame, t: float | None = None, pose: np.ndarray | None = None, shift: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
+    """Differences in chromaticity between material points and the photograph at their projection.
+
+    The points are those visible from the frame's own camera at time `t`; they are projected from `pose`.
+    """
+    positions, colors = visible_points(frame if t is None else replace(frame, t=t))
+    camera = frame.camera if pose is None else replace(frame.camera, camera_to_world=pose)
+    rgba = frame.load_rgba() / 255.0
+    image = linear(rgba[..., :3]) * rgba[..., 3:] + 1 - rgba[..., 3:]
+    seen = chromaticity(interpolated(image, project(camera, positions) + shift))
+    return np.abs(seen - chromaticity(linear(colors))).sum(axis=1)
+
+
+def share_that_fits(errors: list[np.ndarray]) -> float:
+    return float((np.concatenate(errors) < 0.2).mean())
+
+
+def test_photographs_show_material_points_where_the_motion_puts_them(scene: SceneData):
+    """Those that do not fit lie at the edge of a thing. Wrong axes or the wrong time fit half as well, by chance."""
+    frames = [*scene.splits["train"], *scene.splits["test"]]
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    assert share_that_fits([colour_errors(frame) for frame in frames]) > 0.75
+    wrong = {
+        "OpenGL axes": [colour_errors(f, pose=f.camera.camera_to_world @ OPENGL_TO_OPENCV) for f in frames],
+        "upside down": [colour_errors(f, pose=f.camera.camera_to_world @ half_turn) for f in frames],
+        "from behind": [colour_errors(f, pose=half_turn @ f.camera.camera_to_world) for f in frames],
+        "too late": [colour_errors(f, t=f.t + 0.1) for f in frames],
+    }
+    for name, errors in wrong.items():
+        assert share_that_fits(errors) < 0.55, name
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_photographs_are_not_shifted_by_part_of_a_pixel(scene: SceneData, axis: int):
+    shifts = np.linspace(-1, 1, 5)
+    errors = [
+        np.concatenate([colour_errors(frame, shift=tuple(shift * np.eye(2)[axis])) for frame in scene.splits["train"]])
+        for shift in shifts
+    ]
+    square, slope, _ = np.polyfit(shifts, np.mean(errors, axis=1), 2)
+    assert abs(-slope / (2 * square)) < tolerance("picture_offset")
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_every_material_point_stops_the_ray_to_it(scene: SceneData, name: str):
+    """The rays go through the inverse of the motion, the points through the motion itself."""
+    local = surface_points(name, 200)
+    for frame in scene.splits["train"]:
+        lengths, hits = distances_along_rays(frame, world_positions(name, local, frame.t))
+        assert (hits - lengths).max() < tolerance("ray_hit")
+        assert (np.abs(hits - lengths) < tolerance("ray_hit")).sum() > 20
+
+
+def test_several_things_move_and_two_stand_still():
+    for name in OBJECTS:
+        local = surface_points(name, 20)
+        paths = np.stack([world_positions(name, local, t) for t in TIMES])
+        travelled = np.linalg.norm(np.diff(paths, axis=0), axis=-1).sum(axis=0)
+        assert (travelled == 0).all() if name in STILL else (travelled.mean() > 0.5)
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_motion_is_continuous(name: str):
+    """No jumps: steps of half the length are half as far, at contact with the ground too."""
+    local = surface_points(name, 20)
+    farthest = [
+        np.linalg.norm(np.diff([world_positions(name, local, t) for t in np.linspace(0, 1, n)], axis=0), axis=-1).max()
+        for n in (601, 1201)
+    ]
+    assert 0.45 < farthest[1] / farthest[0] < 0.55
+
+
+@pytest.mark.parametrize("name", ["ring", "pendulum"])
+def test_rigid_things_keep_their_distances(name: str):
+    local = surface_points(name, 30)
+    for t in TIMES:
+        moved = world_positions(name, local, t)
+        got, want = (np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (moved, local))
+        assert_close(got, want, "rotation")
+
+
+@pytest.mark.parametrize("name", ["ball", "jelly"])
+def test_elastic_things_change_shape_and_keep_their_volume(name: str):
+    index = OBJECTS.index(name)
+    matrices = np.stack([motion_at(t).matrices[index] for t in TIMES])
+    assert_close(np.linalg.det(matrices), np.ones(len(TIMES)), "rotation")
+    stretches = np.linalg.svd(matrices, compute_uv=False)
+    assert stretches[:, 0].max() > 1.15
+
+
+def test_the_ball_touches_the_ground_and_does_not_enter_it():
+    local = surface_points("ball", 2000)
+    lowest = np.array([world_positions("ball", local, t)[:, 2].min() for t in np.linspace(0, 1, 301)]) - GROUND_Z
+    assert lowest.min() > -tolerance("ray_hit")
+    assert (lowest < 0.01).any()
+    assert lowest.max() > 0.4
+
+
+def test_things_do_not_pass_through_each_other():
+    for t in TIMES:
+        motion = motion_at(t)
+        for name, other in combinations(MOVING, 2):
+            points = world_positions(name, surface_points(name, 100), t)
+            row = OBJECTS.index(other)
+            if (motion.warps[row] != 0).any():
+                gaps = np.linalg.norm(points - motion.centers[row], axis=1) - motion.radii[row]
+            else:
+                local = (points - motion.offsets[row]) @ motion.inverses[row].T
+                gaps = np.array([distance_at_rest(row, *p) for p in local])
+            assert gaps.min() > 0, (name, other, t)
+
+
+def test_everything_lies_in_the_cube_that_training_begins_with(scene: SceneData):
+    for name in OBJECTS:
+        for t in TIMES:
+            assert np.abs(world_positions(name, surface_points(name, 100), t)).max() < scene.half_extent
+
+
+def test_layout(folder: Path, scene: SceneData):
+    assert {split: len(frames) for split, frames in scene.splits.items()} == {"train": 6, "val": 0, "test": 2}
+    assert scene.time_range == (0.0, 1.0)
+    assert [frame.t for frame in scene.splits["test"]] == [0.25, 0.75]
+    assert not {frame.t for frame in scene.splits["train"]} & {frame.t for frame in scene.splits["test"]}
+    for frame in scene.splits["train"]:
+        rgba = frame.load_rgba()
+        assert rgba.shape == (96, 96, 4)
+        assert {0, 255} < set(rgba[..., 3].flat)
+        assert (rgba[rgba[..., 3] == 0] == 0).all()
+        assert np.linalg.norm(frame.camera.position) == pytest.approx(4.0)
+        assert frame.camera.position[2] > 0
+        assert frame.camera.fx == pytest.approx(48 / np.tan(0.345))
+    assert (folder / "contact_sheet.png").exists()
+
+
+def test_written_trajectories_are_the_motion(folder: Path):
+    content = json.loads((folder / "trajectories.json").read_text())
+    assert {point["object"] for point in content["points"]} == set(OBJECTS)
+    for point in content["points"][::7]:
+        positions = [world_positions(point["object"], point["local"], t) for t in content["times"]]
+        assert_close(point["positions"], positions, "material_point")
+        assert point["color"] in surface_colors(point["object"], np.array([point["local"]])).tolist()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    generate(tmp_path / "a", size=24, train_frames=2, test_frames=1, seed=5)
+    monkeypatch.setenv("MSDGS_THREADS", "1")
+    generate(tmp_path / "b", size=24, train_frames=2, test_frames=1, seed=5)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_another_seed_gives_other_cameras_and_the_same_motion(tmp_path: Path):
+    for seed in (0, 1):
+        generate(tmp_path / str(seed), size=8, train_frames=2, test_frames=1, seed=seed)
+    first, second = (load_scene(tmp_path / str(seed)).splits["train"] for seed in (0, 1))
+    assert [frame.t for frame in first] == [frame.t for frame in second]
+    assert np.abs(first[0].camera.position - second[0].camera.position).max() > 0.1
+
+
+def test_progress_counts_every_photograph(tmp_path: Path):
+    heard: list[tuple[int, int]] = []
+    generate(tmp_path / "a", size=8, train_frames=3, test_frames=1, progress=lambda done, of: heard.append((done, of)))
+    assert heard == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def interrupt(done: int, total: int) -> None:
+    if done == 2:
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_generation_leaves_nothing(tmp_path: Path):
+    with pytest.raises(KeyboardInterrupt):
+        generate(tmp_path / "a", size=8, train_frames=3, test_frames=1, progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(DatasetInvalid):
+        load_scene(tmp_path / "a")
+
+
+def test_an_interrupted_generation_leaves_an_earlier_one_whole(tmp_path: Path):
+    generate(tmp_path / "a", size=8, train_frames=2, test_frames=1)
+    before = contents(tmp_path / "a")
+    with pytest.raises(KeyboardInterrupt):
+        generate(tmp_path / "a", size=12, train_frames=3, test_frames=1, progress=interrupt)
+    assert contents(tmp_path / "a") == before
+    generate(tmp_path / "a", size=12, train_frames=3, test_frames=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    scene = load_scene(tmp_path / "a")
+    assert [len(scene.splits[split]) for split in ("train", "test")] == [3, 0]
+    assert scene.splits["train"][0].camera.width == 12
+
+
+def test_foreign_folders_and_files_are_not_replaced(tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    (tmp_path / "file").touch()
+    for name in ("mine", "file"):
+        with pytest.raises(InvalidInput, match="`out` must be a new or empty folder"):
+            generate(tmp_path / name, size=8, train_frames=1, test_frames=0)
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
+
+
+def test_an_empty_folder_may_be_filled(tmp_path: Path):
+    generate(tmp_path, size=8, train_frames=1, test_frames=0)
+    assert len(load_scene(tmp_path).splits["train"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        ({"size": 0}, "size"),
+        ({"size": 5000}, "size"),
+        ({"train_frames": 0}, "train_frames"),
+        ({"test_frames": -1}, "test_frames"),
+    ],
+)
+def test_numbers_that_make_no_dataset(tmp_path: Path, arguments: dict[str, Any], field: str):
+    with pytest.raises(InvalidInput) as caught:
+        generate(tmp_path / "a", **arguments)
+    assert caught.value.field == field
+    assert not (tmp_path / "a").exists()

@@ -1,0 +1,325 @@
+"""The live view: what it draws, that training isn't changed by it, and pausing."""
+
+import itertools
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.scene import Camera, Gaussians, quaternion
+from msdgs_serve.scene.camera import look_at
+from msdgs_train.cli import main as cli
+from msdgs_train.datasets import load_scene
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.run import Observer, Observers, Outcome, fit
+from msdgs_train.engine.trainer import StepResult, Trainer
+from msdgs_train.gaussians.model_file import LoadedModel, SceneInfo, save_model
+from msdgs_train.viewer.snapshot import Snapshot, snapshot_of_training
+from msdgs_train.viewer.stage import stage_of_data, stage_of_file
+from msdgs_train.viewer.training_view import TrainingView
+from msdgs_train.viewer.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
+from tests.support.models import SCENE, random_model
+from tests.support.tolerances import assert_close
+from tests.support.training_scene import FOV, small_config, write_scene
+from tests.support.viewer_page import PageClient, PageServer, page, wait_for
+
+__all__ = ["page"]
+
+WIDTH, HEIGHT = 60, 40
+VIEW = Camera.from_look_at(np.array([2.0, -3.0, 1.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]), WIDTH, HEIGHT, 50.0)
+CLOSER = Camera.from_look_at(np.array([1.0, -2.0, 1.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]), WIDTH, HEIGHT, 50.0)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture(autouse=True)
+def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than all the rest of a tiny run."""
+    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+
+
+@pytest.fixture
+def loaded() -> LoadedModel:
+    return LoadedModel(random_model(noise=0.2), SCENE, 7)
+
+
+def _expected(loaded: LoadedModel, camera: Camera, t: float, layers: int) -> np.ndarray:
+    posed = loaded.model.pose(t, steps=layers)
+    gaussians = Gaussians(*(tensor.detach().numpy() for tensor in posed))
+    return to_bytes(rasterize(gaussians, camera, background=loaded.scene.background).rgb)
+
+
+def _is_grey(picture: np.ndarray) -> bool:
+    return int(np.ptp(picture, axis=2).max()) == 0
+
+
+def test_a_browsers_camera_is_ours() -> None:
+    """Axes are OpenCV's in both, viser's field of view is vertical and in radians."""
+    pose = look_at(np.array([1.0, 2.0, 0.5]), np.array([-0.3, 0.1, 0.2]), np.array([0.0, 0.0, 1.0]))
+    wxyz = quaternion.from_matrix(pose[:3, :3])
+    camera = camera_of_browser(2 * wxyz, pose[:3, 3], np.radians(50.0), 300, 200)
+    assert_close(camera.camera_to_world, pose, "rotation")
+    top = pose[:3, 3] + pose[:3, :3] @ [0.0, -np.tan(np.radians(25.0)), 1.0]
+    right = pose[:3, 3] + pose[:3, :3] @ [1.5 * np.tan(np.radians(25.0)), 0.0, 1.0]
+    pixels, depths = camera.project(np.stack([top, right]))
+    assert_close(pixels, [[150, 0], [300, 100]], "pixel")
+    assert_close(depths, np.ones(2), "rotation")
+
+
+def test_small_while_it_moves_and_large_when_it_is_still(page: PageServer, loaded: LoadedModel) -> None:
+    with Viewer("127.0.0.1", 0) as viewer:
+        show_model(viewer, loaded, "model.pt")
+        page.clients[3] = client = PageClient(VIEW)
+        wait_for(lambda: len(client.pictures) == 2)
+        small = VIEW.resized(round(MOVING_PART * WIDTH), round(MOVING_PART * HEIGHT))
+        np.testing.assert_array_equal(client.pictures[0], _expected(loaded, small, 0.5, 2))
+        np.testing.assert_array_equal(client.pictures[1], _expected(loaded, VIEW, 0.5, 2))
+        time.sleep(0.3)
+        assert len(client.pictures) == 2, "what is shown already isn't drawn again"
+        client.look_from(CLOSER)
+        wait_for(lambda: len(client.pictures) == 4)
+        np.testing.assert_array_equal(client.pictures[3], _expected(loaded, CLOSER, 0.5, 2))
+    assert "step 7" in page.texts[0].content
+
+
+def test_controls_change_what_is_drawn(page: PageServer, loaded: LoadedModel) -> None:
+    with Viewer("127.0.0.1", 0) as viewer:
+        show_model(viewer, loaded, "model.pt")
+        page.clients[0] = client = PageClient(VIEW)
+        wait_for(lambda: len(client.pictures) == 2)
+        assert page.controls["layers"].limits == (0, 2, 1)
+        page.controls["time"].value, page.controls["layers"].value = 0.9, 1
+        wait_for(lambda: np.array_equal(client.pictures[-1], _expected(loaded, VIEW, 0.9, 1)))
+        page.controls["channel"].value = "alpha"
+        wait_for(
+            lambda: client.pictures[-1].shape == (HEIGHT, WIDTH, 3) and np.ptp(client.pictures[-1], axis=2).max() == 0
+        )
+        page.controls["resolution"].value = 30
+        wait_for(lambda: client.pictures[-1].shape == (20, 30, 3))
+
+
+def test_playing_goes_round(page: PageServer, loaded: LoadedModel) -> None:
+    scene = SceneInfo(time_range=(0.2, 0.8), background=SCENE.background, cameras=SCENE.cameras)
+    with Viewer("127.0.0.1", 0) as viewer:
+        show_model(viewer, loaded._replace(scene=scene), "model.pt")
+        page.clients[0] = PageClient(VIEW)
+        page.controls["speed"].value, page.controls["play"].value = 2.0, True
+        seen: list[float] = []
+
+        def has_turned() -> bool:
+            seen.append(page.controls["time"].value)
+            return any(after < before for before, after in itertools.pairwise(seen))
+
+        wait_for(has_turned)
+        assert min(seen) >= 0.2
+        assert max(seen) <= 0.8
+
+
+def test_depth_is_white_where_it_is_nearest() -> None:
+    model = random_model(2, noise=0.0)
+    with torch.no_grad():
+        model.gaussians.means.copy_(torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 2.0]]))
+        model.gaussians.log_scales.fill_(-2.5)
+        model.gaussians.raw_opacities.fill_(5.0)
+    camera = Camera.from_fov(look_at(np.array([0.0, 0, -4]), np.zeros(3), np.array([0.0, -1, 0])), 80, 40, 40.0)
+    picture = Snapshot(model, (1.0, 1.0, 1.0)).draw(camera, 0.0, 0, "depth")
+    (near, far), _ = camera.project(model.gaussians.means.detach().numpy())
+    assert picture[20, int(near[0]), 0] > 250
+    assert picture[20, int(far[0]), 0] < 5
+    assert picture[0, 0, 0] == 0
+
+
+def test_a_model_without_motion_or_cameras_can_be_seen(page: PageServer) -> None:
+    still = LoadedModel(random_model(layers=(), embedding_size=0), SceneInfo(time_range=(1.0, 1.0)), 3)
+    with Viewer("127.0.0.1", 0) as viewer:
+        show_model(viewer, still, "model.pt")
+        page.clients[0] = client = PageClient(VIEW)
+        wait_for(lambda: len(client.pictures) == 2)
+        assert client.pictures[1].any()
+
+
+def test_what_is_not_finite_is_said_and_drawn_when_it_is_again(page: PageServer, loaded: LoadedModel) -> None:
+    broken = random_model(noise=0.2)
+    with torch.no_grad():
+        broken.gaussians.means[5] = float("nan")
+    with Viewer("127.0.0.1", 0) as viewer:
+        show_model(viewer, loaded._replace(model=broken), "model.pt")
+        page.clients[0] = client = PageClient(VIEW)
+        wait_for(lambda: "can't be drawn" in page.texts[1].content)
+        assert client.pictures == []
+        viewer.show(Snapshot(loaded.model, loaded.scene.background))
+        wait_for(lambda: client.pictures)
+        wait_for(lambda: page.texts[1].content == "")
+
+
+def test_the_first_view_is_that_of_a_photograph(data: Path) -> None:
+    scene = load_scene(data)
+    first, stage = scene.splits["train"][0].camera, stage_of_data(scene, 2)
+    pose = look_at(stage.eye, stage.target, stage.up)
+    assert_close(pose, first.camera_to_world, "rotation")
+    assert_close(np.degrees(stage.fov_y), FOV, "rotation")
+    assert_close(stage.target, np.zeros(3), "rotation")
+    assert stage_of_file(LoadedModel(random_model(), SCENE, 7)).layers == 2
+
+
+def test_a_snapshot_stays_as_it_was(data: Path) -> None:
+    """Also in the warm-up, in which nothing is deformed."""
+    trainer = Trainer(small_config(), load_scene(data))
+    camera = trainer.frames[0].camera
+    for deforms in (False, True):
+        assert trainer.parts_in_use[0] is deforms
+        snapshot = snapshot_of_training(trainer)
+        before = snapshot.draw(camera, 0.3, 2)
+        for _ in range(8):
+            trainer.step()
+        again = Snapshot(snapshot.model, snapshot.background, snapshot.deform, snapshot.sh_degree)  # poses anew
+        np.testing.assert_array_equal(before, again.draw(camera, 0.3, 2))
+        assert not np.array_equal(before, snapshot_of_training(trainer).draw(camera, 0.3, 2))
+
+
+class _LooksOn(Observer):
+    """From the beginning on; after some steps it waits for another picture."""
+
+    def __init__(self, page: PageServer) -> None:
+        self._page, self.client = page, PageClient(VIEW)
+
+    def begins(self, trainer: Trainer) -> None:
+        self._page.clients[0] = self.client
+
+    def step(self, result: StepResult, seconds: float) -> None:
+        if result.step % 3 == 0:
+            before = len(self.client.pictures)
+            wait_for(lambda: len(self.client.pictures) > before)
+
+
+@pytest.mark.parametrize("photographs", [1, 3])
+def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, photographs: int) -> None:
+    config = small_config(threads=2, photographs=photographs)
+    fit(config, data, tmp_path / "alone")
+    looks_on = _LooksOn(page)
+    with Viewer("127.0.0.1", 0) as viewer:
+        fit(config, data, tmp_path / "seen", observer=Observers(TrainingView(viewer, config.steps), looks_on))
+    pictures = [picture for picture in looks_on.client.pictures if picture.shape == (HEIGHT, WIDTH, 3)]
+    assert len(pictures) >= 2
+    assert not np.array_equal(pictures[0], pictures[-1]), "training should have been seen"
+    alone, seen = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("alone", "seen"))
+    for part in ("model", "optimizer", "density", "generators", "order", "averages"):
+        _assert_equal(alone[part], seen[part])
+    assert "**step 24** of 24" in page.texts[0].content
+    assert "PSNR" in page.texts[0].content
+
+
+def _assert_equal(one: object, other: object) -> None:
+    if isinstance(one, dict):
+        assert isinstance(other, dict)
+        assert one.keys() == other.keys()
+        one, other = list(one.values()), list(other.values())
+    if isinstance(one, list | tuple):
+        assert isinstance(other, list | tuple)
+        for a, b in zip(one, other, strict=True):
+            _assert_equal(a, b)
+    elif isinstance(one, torch.Tensor):
+        assert isinstance(other, torch.Tensor)
+        assert torch.equal(one, other)
+    else:
+        assert one == other
+
+
+class _Stoppable(Observer):
+    def __init__(self) -> None:
+        self.last, self.stop = 0, False
+
+    def step(self, result: StepResult, seconds: float) -> None:
+        self.last = result.step
+
+    def should_stop(self) -> bool:
+        return self.stop
+
+
+def test_a_pause_holds_the_run_takes_no_time_and_can_be_stopped(data: Path, tmp_path: Path, page: PageServer) -> None:
+    config, watched, outcomes = small_config(steps=100_000, eval_every=0), _Stoppable(), list[Outcome]()
+    with Viewer("127.0.0.1", 0) as viewer:
+        observers = Observers(TrainingView(viewer, config.steps), watched)
+        thread = threading.Thread(
+            target=lambda: outcomes.append(fit(config, data, tmp_path / "run", observer=observers))
+        )
+        started = time.perf_counter()
+        thread.start()
+        wait_for(lambda: watched.last >= 3)
+        page.controls["pause"].value = True
+        time.sleep(1.0)
+        step = watched.last
+        page.clients[0] = client = PageClient(VIEW)
+        wait_for(lambda: len(client.pictures) >= 2)
+        time.sleep(0.2)
+        assert watched.last == step
+        page.controls["pause"].value = False
+        wait_for(lambda: watched.last > step)
+        page.controls["pause"].value = True
+        watched.stop = True
+        thread.join(60)
+    assert outcomes[0].status == "interrupted"
+    assert outcomes[0].step == watched.last
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
+    assert outcomes[0].seconds < time.perf_counter() - started - 1.0
+
+
+def test_the_page_stays_after_the_run(
+    data: Path, tmp_path: Path, page: PageServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page.clients[0] = client = PageClient(VIEW)
+
+    def ctrl_c(viewer: Viewer) -> None:
+        before = len(client.pictures)
+        wait_for(lambda: len(client.pictures) > before)
+
+    monkeypatch.setattr(Viewer, "stay", ctrl_c)
+    options = ["--steps", "2", "--threads=1", "--init-count=60", "--max-gaussians=90", "--viewer"]
+    assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
+    printed = capsys.readouterr().out
+    assert "look at http://localhost:8080" in printed
+    assert "Ctrl-C ends it" in printed
+
+
+def test_a_model_file_is_viewed(
+    tmp_path: Path, page: PageServer, loaded: LoadedModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_model(tmp_path / "model.pt", loaded.model, loaded.scene, 7)
+    client = PageClient(VIEW)
+
+    def ctrl_c(viewer: Viewer) -> None:
+        page.clients[0] = client
+        wait_for(lambda: len(client.pictures) == 2)
+
+    monkeypatch.setattr(Viewer, "stay", ctrl_c)
+    assert cli.main(["view", str(tmp_path / "model.pt")]) == 0
+    np.testing.assert_array_equal(client.pictures[1], _expected(loaded, VIEW, 0.5, 2))
+
+
+def test_without_viser_the_extra_is_named_before_anything_is_done(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    save_model(tmp_path / "model.pt", random_model(), SCENE, 7)
+    for command in (["fit", str(data), str(tmp_path / "run"), "--viewer"], ["view", str(tmp_path / "model.pt")]):
+        assert cli.main(command) == cli.EXIT_INVALID
+        assert "pip install 'msdgs[viewer]'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, words in (("fit", ["--viewer", "--viewer-port", "after each"]), ("view", ["MODEL", "--port"])):
+        with pytest.raises(SystemExit):
+            cli.main([command, "--help"])
+        text = " ".join(capsys.readouterr().out.split())
+        for word in [*words, "msdgs[viewer]"]:
+            assert word in text

@@ -1,0 +1,140 @@
+"""The live view in a browser: a run is looked at, paused, stopped, and seen when it is over."""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+
+from msdgs_train.cli import main as cli
+from msdgs_train.datasets import load_scene
+from msdgs_train.viewer.snapshot import Snapshot
+from msdgs_train.viewer.stage import stage_of_data
+from msdgs_train.viewer.viewer import Viewer
+from tests.support.browser import WEBGL, chromium
+from tests.support.images import decode
+from tests.support.models import random_model
+from tests.support.processes import ROOT
+from tests.support.tolerances import assert_close
+from tests.support.training_scene import write_scene
+from tests.support.viewer_page import wait_for
+
+pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
+pytestmark = pytest.mark.slow
+
+SMALL = ["--threads=1", "--init-count=60", "--max-gaussians=90", "--model.width=16", "--model.depth=2"]
+MILLISECONDS = 60_000
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium(*WEBGL) as browser:
+        yield browser
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    with browser.new_context(viewport={"width": 640, "height": 400}) as context:
+        page = context.new_page()
+        page.set_default_timeout(MILLISECONDS)
+        yield page
+
+
+@contextlib.contextmanager
+def _fit(data: Path, run: Path, steps: int) -> Iterator[subprocess.Popen[str]]:
+    """A run with a view in a process of its own, which doesn't outlive the block."""
+    command = [sys.executable, "-m", "msdgs_train", "fit", str(data), str(run), "--steps", str(steps), *SMALL]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    command += ["--viewer", "--viewer-port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def _address(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    said = re.search(r"http://localhost:\d+", process.stdout.readline())
+    assert said is not None
+    return said[0]
+
+
+def _shown(page: Page) -> np.ndarray:
+    """The left half of the page, [H, W, 3]: controls are at the right, messages at the top."""
+    return decode(page.screenshot(), "png")[0][100:, :320, :3]
+
+
+def _step(page: Page) -> int:
+    text = page.locator("strong", has_text="step").inner_text()
+    return int(re.sub(r"\D", "", text))
+
+
+def test_a_run_is_seen_paused_and_stopped(data: Path, tmp_path: Path, page: Page) -> None:
+    with _fit(data, tmp_path / "run", 1_000_000) as process:
+        page.goto(_address(process))
+        page.locator("strong", has_text="step").wait_for()
+        wait_for(lambda: len(np.unique(_shown(page).reshape(-1, 3), axis=0)) > 50)
+        before = _step(page)
+        wait_for(lambda: _step(page) > before)
+        page.get_by_label("pause").check(force=True)
+        page.wait_for_timeout(1500)
+        paused = _step(page)
+        page.wait_for_timeout(1500)
+        assert _step(page) == paused
+        process.send_signal(signal.SIGINT)
+        output = process.communicate(timeout=60)[0]
+    assert process.returncode == cli.EXIT_INTERRUPTED, output
+    assert "interrupted at step" in output
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
+def test_the_page_stays_until_ctrl_c(data: Path, tmp_path: Path, page: Page) -> None:
+    with _fit(data, tmp_path / "run", 3) as process:
+        page.goto(_address(process))
+        wait_for(lambda: len(np.unique(_shown(page).reshape(-1, 3), axis=0)) > 50)
+        assert process.stdout is not None
+        assert any("Ctrl-C ends it" in line for line in process.stdout)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize("opened_early", [True, False])
+def test_a_browsers_camera_begins_at_the_first_photograph(data: Path, page: Page, opened_early: bool) -> None:
+    scene = load_scene(data)
+    model, stage = random_model(), stage_of_data(scene, 2)
+    with Viewer("127.0.0.1", 0) as viewer:
+        if opened_early:
+            page.goto(viewer.url)
+            wait_for(viewer.server.get_clients)
+        viewer.open(stage)
+        viewer.show(Snapshot(model, (1.0, 1.0, 1.0)))
+        if not opened_early:
+            page.goto(viewer.url)
+        wait_for(lambda: _camera(viewer) is not None)
+        with contextlib.suppress(AssertionError):  # a page begins with a camera of its own
+            wait_for(lambda: np.allclose(_camera(viewer).position, stage.eye, atol=0.1), seconds=20)
+        camera = _camera(viewer)
+    assert_close(camera.camera_to_world, scene.splits["train"][0].camera.camera_to_world, "browser_camera")
+    assert (camera.width, camera.height) == (640, 400)
+    assert_close(2 * np.arctan(camera.height / (2 * camera.fy)), stage.fov_y, "browser_camera")
+
+
+def _camera(viewer: Viewer) -> Any:
+    """Of the only browser; None before it has shown anything."""
+    wanted = [browser.wanted for browser in viewer._browsers.values()]
+    return wanted[0].camera(1.0) if wanted and wanted[0] else None

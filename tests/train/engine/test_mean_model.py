@@ -1,0 +1,154 @@
+"""The mean of the last steps: what it is the mean of, and that it is what is judged, shown, saved and resumed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from msdgs_train.datasets import load_scene
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.run import fit
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
+from msdgs_train.viewer.snapshot import snapshot_of_training
+from tests.support.training_scene import (
+    SHARED_MOTIONS,
+    StopAfter,
+    assert_same_bits,
+    small_config,
+    state_of,
+    write_scene,
+)
+
+STEPS, BEGINS, KEPT = 24, 18, 3
+CONFIG = small_config(
+    model=SHARED_MOTIONS,
+    window_until_fraction=0.5,
+    densify_until_fraction=BEGINS / STEPS,
+    average_steps=KEPT,
+    eval_every=0,
+)
+AS_THE_PRESET = replace(
+    CONFIG, photographs=2, window_until_fraction=BEGINS / STEPS, densify_until_fraction=0.5, eps2d_start=0.4
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+def _parameters(model: torch.nn.Module) -> list[np.ndarray]:
+    return [p.detach().numpy().astype(np.float64) for p in model.parameters()]
+
+
+def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
+    """All of them weigh the same until there are `average_steps`, then older ones ever less."""
+    trainer, seen = Trainer(CONFIG, load_scene(data)), []
+    for step in range(1, STEPS + 1):
+        trainer.step()
+        if step <= BEGINS:
+            assert trainer.kept_model is trainer.model
+            continue
+        seen.append(_parameters(trainer.model))
+        if len(seen) <= KEPT:
+            expected = [np.mean(values, axis=0) for values in zip(*seen, strict=True)]
+        else:
+            expected = [(1 - 1 / KEPT) * old + last / KEPT for old, last in zip(expected, seen[-1], strict=True)]
+        for mean, value in zip(_parameters(trainer.kept_model), expected, strict=True):
+            np.testing.assert_allclose(mean, value, rtol=1e-5, atol=1e-6)
+    moved = zip(_parameters(trainer.kept_model), seen[-1], strict=True)
+    assert sum(not np.array_equal(mean, last) for mean, last in moved) > 5
+
+
+def test_it_is_judged_shown_and_saved(data: Path, tmp_path: Path) -> None:
+    trainer = Trainer(CONFIG, load_scene(data))
+    for _ in range(STEPS):
+        trainer.step()
+    trainer.save_model(tmp_path / "model.pt")
+    saved = load_model(tmp_path / "model.pt")
+    last = LoadedModel(trainer.model, saved.scene, STEPS)
+    for evaluated in trainer.evaluate("test"):
+        view = (evaluated.frame.camera, evaluated.frame.t)
+        np.testing.assert_array_equal(saved.render(*view).clamp(0, 1), evaluated.rgb)
+        assert not torch.equal(last.render(*view), saved.render(*view))
+        shown = snapshot_of_training(trainer).draw(*view, layers=1)
+        np.testing.assert_array_equal(shown, to_bytes(evaluated.rgb.numpy()))
+
+
+@pytest.mark.parametrize("config", [CONFIG, AS_THE_PRESET], ids=["density control last", "windows last"])
+@pytest.mark.parametrize("stop", [BEGINS, BEGINS + 1, BEGINS + 5])
+def test_resuming_changes_no_bit_of_it(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, config: TrainConfig
+) -> None:
+    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+    fit(config, data, tmp_path / "whole")
+    fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
+    assert (state_of(tmp_path / "parts")["/mean/count"] if stop > BEGINS else 0) == min(stop - BEGINS, KEPT)
+    fit(config, data, tmp_path / "parts", resume=True)
+    assert_same_bits(*(state_of(tmp_path / name) for name in ("whole", "parts")))
+    kept = torch.load(tmp_path / "whole/checkpoint.pt", weights_only=True)["mean"]["model"]
+    for file in ("model.pt", "best.pt"):
+        saved = load_model(tmp_path / "parts" / file)
+        assert saved.step == STEPS
+        torch.testing.assert_close(saved.model.state_dict(), kept, rtol=0, atol=0)
+
+
+def _saved(data: Path, path: Path, steps: int) -> Trainer:
+    trainer = Trainer(CONFIG, load_scene(data))
+    for _ in range(steps):
+        trainer.step()
+    trainer.save_checkpoint(path, 0.0)
+    return trainer
+
+
+def test_with_more_steps_it_begins_anew(data: Path, tmp_path: Path) -> None:
+    """Density control goes on then, and the Gaussians are other ones."""
+    before = _saved(data, tmp_path / "checkpoint.pt", STEPS)
+    longer = Trainer(replace(CONFIG, steps=2 * STEPS), before.scene)
+    longer.load_checkpoint(tmp_path / "checkpoint.pt")
+    assert longer.kept_model is longer.model
+    longer.step()
+    assert longer.kept_model is longer.model
+
+
+def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_path: Path) -> None:
+    before = _saved(data, tmp_path / "checkpoint.pt", 12)
+    shorter = Trainer(replace(CONFIG, steps=14), before.scene)
+    shorter.load_checkpoint(tmp_path / "checkpoint.pt")
+    seen = []
+    for _ in range(2):
+        shorter.step()
+        seen.append(_parameters(shorter.model))
+    for mean, *values in zip(_parameters(shorter.kept_model), *seen, strict=True):
+        np.testing.assert_allclose(mean, np.mean(values, axis=0), rtol=1e-5, atol=1e-6)
+
+
+def test_a_run_from_before_there_were_means_goes_on(data: Path, tmp_path: Path) -> None:
+    before = _saved(data, tmp_path / "checkpoint.pt", BEGINS + 2)
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    del state["mean"]
+    torch.save(state, tmp_path / "checkpoint.pt")
+    trainer = Trainer(CONFIG, before.scene)
+    trainer.load_checkpoint(tmp_path / "checkpoint.pt")
+    assert trainer.kept_model is trainer.model
+    trainer.step()
+    for mean, last in zip(_parameters(trainer.kept_model), _parameters(trainer.model), strict=True):
+        np.testing.assert_array_equal(mean, last)
+
+
+@pytest.mark.parametrize("last", ["still", "windows", "density control"])
+def test_it_begins_when_gaussians_and_motions_stay_what_they_are(last: str) -> None:
+    ends = {"still": 0.25, "windows": 0.25, "density control": 0.25, last: 0.5}
+    config = replace(
+        CONFIG,
+        warmup_fraction=ends["still"],
+        window_until_fraction=ends["windows"],
+        densify_until_fraction=ends["density control"],
+    )
+    assert [step for step in range(1, STEPS + 1) if config.averages_after(step)] == list(range(13, STEPS + 1))
+    assert not any(replace(config, average_steps=0).averages_after(step) for step in range(1, STEPS + 1))

@@ -1,0 +1,285 @@
+"""`msdgs-train compare`: the matrix, its runs, what is gone on with, and the table and plots at the end."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.cli import main as cli
+from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
+from msdgs_train.comparison.pools import Ended, processes
+from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
+from msdgs_train.comparison.results import CurvePoint, Result, Spread
+from msdgs_train.comparison.runner import train_all
+from msdgs_train.systems.presets import preset
+from tests.support.processes import ROOT
+from tests.support.training_scene import write_scene
+
+BUDGET = Budget(steps=6, init_count=60, max_gaussians=90)
+SYSTEMS = """
+[still]
+preset = "static"
+
+[k1]
+model.layers = ["mlp"]
+model.width = 16
+model.embedding_size = 4
+
+["k2, w = 1"]
+model.layers = ["mlp", "mlp"]
+model.width = 16
+model.weights = false
+field_rate_start = 1e-3
+"""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "scene", train=3, test=1)
+
+
+@pytest.fixture
+def systems_file(tmp_path: Path) -> Path:
+    path = tmp_path / "systems.toml"
+    path.write_text(SYSTEMS.replace(", w = 1", " w=1"))
+    return path
+
+
+def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) -> None:
+    systems = {system.name: system.config for system in read_systems(["deformgs", str(systems_file)], BUDGET)}
+    assert list(systems) == ["deformgs", "still", "k1", "k2 w=1"]
+    assert systems["deformgs"] == dataclasses.replace(preset("deformgs"), **BUDGET.settings())
+    assert systems["still"].model.layers == ()
+    assert systems["k2 w=1"].model == dataclasses.replace(preset("msdgs-small").model, width=16, weights=False)
+    assert systems["k2 w=1"].field_rate_start == 1e-3
+    for config in systems.values():
+        assert (config.steps, config.init_count, config.max_gaussians, config.threads) == (6, 60, 90, 1)
+
+
+@pytest.mark.parametrize("name", ["ablation.toml", "shared_motions.toml"])
+def test_tables_of_systems_in_the_repository_can_be_compared(name: str) -> None:
+    file = ROOT / "benchmarks" / name
+    systems = read_systems([str(file)], Budget(steps=6, init_count=4000, max_gaussians=5000))
+    assert len({json.dumps(system.config.to_dict()) for system in systems}) == len(systems) > 10
+
+
+def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_path: Path) -> None:
+    systems = read_systems([str(systems_file)], BUDGET)
+    runs = make_runs(systems, [Path("a/one"), Path("b/two")], [3, 5], tmp_path)
+    assert len({run.folder for run in runs}) == len(runs) == 12
+    assert {(run.system, run.scene, run.seed) for run in runs[:6]} == {
+        (system.name, scene, 3) for system in systems for scene in ("one", "two")
+    }
+    assert all(run.config.seed == run.seed for run in runs)
+
+
+@pytest.mark.parametrize(
+    ("contents", "message"),
+    [
+        ("[a]\npreset = 'mine'", r"preset.*mine"),
+        ("[a]\nstpes = 3", r"system `a`.*stpes"),
+        ("[a]\nmodel.hight = 3", r"system `a`.*hight"),
+        ("[a]\nmodel.width = 0", r"system `a`.*width"),
+        ("[a]\nmodel.width = 'wide'", r"system `a`.*width"),
+        ("[a]\nsh_interval = 'long'", r"system `a`"),
+        ("a = 3", r"`a`"),
+        ("['../up']\nsteps = 3", r"up"),
+        ("[a", r"TOML"),
+    ],
+)
+def test_what_cannot_be_used_is_named(tmp_path: Path, contents: str, message: str) -> None:
+    (tmp_path / "systems.toml").write_text(contents)
+    with pytest.raises(InvalidInput, match=message):
+        read_systems([str(tmp_path / "systems.toml")], BUDGET)
+
+
+def test_neither_a_preset_nor_a_file(tmp_path: Path) -> None:
+    for source in ("hexplane", str(tmp_path / "none.toml")):
+        with pytest.raises(InvalidInput, match="config"):
+            read_systems([source], BUDGET)
+
+
+def test_names_may_not_repeat(systems_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=r"system.*still"):
+        read_systems([str(systems_file), str(systems_file)], BUDGET)
+    systems = read_systems(["static"], BUDGET)
+    with pytest.raises(InvalidInput, match=r"scene.*one"):
+        make_runs(systems, [Path("a/one"), Path("b/one")], [0], tmp_path)
+    with pytest.raises(InvalidInput, match=r"seed.*none"):
+        make_runs(systems, [Path("a/one")], [], tmp_path)
+    with pytest.raises(InvalidInput, match=r"seed.*twice"):
+        make_runs(systems, [Path("a/one")], [0, 0], tmp_path)
+
+
+def made_result(system: str, layers: int, seed: int, psnr: float, **changes: Any) -> Result:
+    config = preset("msdgs-small")
+    config = dataclasses.replace(config, seed=seed, model=dataclasses.replace(config.model, layers=("mlp",) * layers))
+    run = Run(system, "toy", seed, Path("toy"), Path("out") / f"{system}{seed}", config)
+    curve = [CurvePoint(10 * i, i * 1.5, psnr - 3 + i) for i in range(1, 4)]
+    values: dict[str, Any] = {
+        "split": "test", "psnr": psnr, "ssim": 0.9, "deformation_parameters": 1000 * layers, "gaussians": 300,
+        "modulation_parameters": 50, "seconds": 60.0, "skipped": 0, "frame_ms": 4.0, "curve": curve,
+    }  # fmt: skip
+    return Result(run=run, **(values | changes))
+
+
+RESULTS = [
+    made_result("k1", 1, 0, 20.0),
+    made_result("k1", 1, 1, 22.0),
+    made_result("k2", 2, 0, 30.0),
+    made_result("k4", 4, 0, 31.0),
+]
+
+
+def test_spread_is_the_sample_standard_deviation() -> None:
+    assert Spread.of([1.0, 2.0, 3.0]) == (2.0, 1.0)
+    assert Spread.of([1.0, 2.0, 3.0]).shown(2) == "2.00 ± 1.00"
+    assert Spread.of([5.0]) == (5.0, None)
+    assert Spread.of([1234.5]).shown(1) == "1,234.5"
+
+
+def test_the_table_has_a_row_for_each_system_and_scene() -> None:
+    rows = table(RESULTS)
+    assert rows[0] == [
+        "k1", "toy", "2", "21.00 ± 1.41", "0.9000 ± 0.0000", "1,000", "1,050 ± 0", "300 ± 0", "60 ± 0", "4.0 ± 0.0"
+    ]  # fmt: skip
+    assert [row[0] for row in rows] == ["k1", "k2", "k4"]
+    text = as_markdown(RESULTS, missing=2)
+    assert "| k2 | toy | 1 | 30.00 | 0.9000 | 2,000 | 2,050 | 300 | 60 | 4.0 |" in text
+    assert "2 runs are not finished" in text
+
+
+def test_the_plots_show_errors() -> None:
+    (axes,) = draw_time(RESULTS).axes
+    assert [line.get_label() for line in axes.get_lines()] == ["k1", "k2", "k4"]
+    x, y = map(np.asarray, axes.get_lines()[1].get_data())
+    assert x.tolist() == [1.5, 3.0, 4.5]
+    assert y.tolist() == pytest.approx([10 ** (-psnr / 20) for psnr in (28, 29, 30)])
+    (axes,) = draw_layers([*RESULTS, _wide()]).axes
+    lines = [container[0].get_data() for container in axes.containers]
+    aside = BESIDE / 2  # bars of the same K stand beside each other
+    assert [list(x) for x, _ in lines] == [[1 - aside, 2 - aside, 4 - aside], [2 + aside]]
+    assert lines[0][1][1] == pytest.approx(10 ** (-30 / 20))
+
+
+def test_each_scene_has_its_panel_and_each_system_its_look() -> None:
+    systems = [f"s{i}" for i in range(12)]
+    here = [made_result(name, 1, 0, 20.0 + i) for i, name in enumerate(systems)]
+    there = [dataclasses.replace(r, run=dataclasses.replace(r.run, scene="other"), psnr=10.0) for r in here[5:]]
+    figure = draw_time([*here, *there])
+    assert [axes.get_title() for axes in figure.axes] == ["toy", "other"]
+    looks = [
+        {str(line.get_label()): (line.get_color(), line.get_linestyle()) for line in a.get_lines()} for a in figure.axes
+    ]
+    assert list(looks[0]) == systems
+    assert len(set(looks[0].values())) == 12
+    assert looks[1] == {name: looks[0][name] for name in systems[5:]}
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == systems
+    panels = draw_layers([*RESULTS, *there]).axes
+    assert [len(axes.containers) for axes in panels] == [1, 1]
+
+
+def _wide() -> Result:
+    result = made_result("wide", 2, 0, 28.0)
+    config = result.run.config
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, width=200))
+    return dataclasses.replace(result, run=dataclasses.replace(result.run, config=config))
+
+
+def arguments(systems_file: Path, data: Path, out: Path, *more: str) -> list[str]:
+    options = ["--steps", "6", "--init-count", "60", "--max-gaussians", "90", "--jobs", "1", *more]
+    return ["compare", str(systems_file), "--data", str(data), "--out", str(out), *options]
+
+
+@pytest.mark.slow
+def test_from_nothing_to_the_table_and_not_again(
+    systems_file: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = arguments(systems_file, data, tmp_path / "out", "--seeds", "0", "1")
+    assert cli.main(command) == 0
+    numbers = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert numbers["missing"] == 0
+    assert [(run["system"], run["seed"]) for run in numbers["runs"]] == [
+        (system, seed) for seed in (0, 1) for system in ("still", "k1", "k2 w=1")
+    ]
+    for run in numbers["runs"]:
+        assert run["frame_ms"] > 0
+        assert run["curve"][-1]["psnr"] == run["psnr"]
+        assert [point["step"] for point in run["curve"]] == [1, 2, 3, 4, 5, 6]
+        assert (run["deformation_parameters"] == 0) == (run["system"] == "still")
+        assert (run["modulation_parameters"] == 0) == (run["system"] == "still")
+    for name in ("comparison.md", "time.png", "layers.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 100
+    assert (tmp_path / "out" / "comparison.md").read_text() in capsys.readouterr().out
+    assert cli.main(command) == 0
+    assert capsys.readouterr().out.count("was finished") == 6
+    assert cli.main([*command, "--size", "12"]) == cli.EXIT_INVALID
+    assert "other settings: size" in capsys.readouterr().err
+
+
+def test_no_jobs_are_refused(
+    systems_file: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([*arguments(systems_file, data, tmp_path / "out"), "--jobs", "0"]) == cli.EXIT_INVALID
+    assert "`jobs` must be 1 or more" in capsys.readouterr().err
+
+
+def test_a_run_that_fails_is_said_and_the_others_go_on(systems_file: Path, tmp_path: Path) -> None:
+    ended: list[tuple[str, Ended]] = []
+    runs = make_runs(read_systems([str(systems_file)], BUDGET), [tmp_path / "nowhere"], [0], tmp_path / "out")
+    assert train_all(runs, processes(1), lambda run, how: ended.append((run.system, how)))
+    assert [system for system, _ in ended] == ["still", "k1", "k2 w=1"]
+    assert all(how.status == "failed" and "nowhere" in how.message for _, how in ended)
+
+
+def begin_training(systems_file: Path, data: Path, out: Path) -> subprocess.Popen[str]:
+    """A comparison in a process of its own, once its first run has begun."""
+    command = arguments(systems_file, data, out, "--seeds", "0")
+    command[command.index("--steps") + 1] = "100000"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "msdgs_train", *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env=environment,
+    )  # fmt: skip
+    deadline = time.monotonic() + 300
+    while not (out / "still" / "scene_0" / "config.json").exists():
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            pytest.fail(process.communicate()[0])
+        time.sleep(0.1)
+    return process
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    process = begin_training(systems_file, data, out)
+    try:
+        process.send_signal(signal.SIGINT)
+        output = process.communicate(timeout=120)[0]
+    finally:
+        process.kill()
+    assert process.returncode == cli.EXIT_INTERRUPTED, output
+    assert "still, scene, seed 0: interrupted" in output
+    assert "the same command goes on" in output
+    assert (out / "still" / "scene_0" / "checkpoint.pt").exists()
+    assert not (out / "k1").exists()
+
+
+@pytest.mark.slow
+def test_where_the_command_is_killed_its_runs_save_and_end(systems_file: Path, data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    process = begin_training(systems_file, data, out)
+    process.kill()
+    process.communicate(timeout=120)  # ends when nobody is left to write
+    assert (out / "still" / "scene_0" / "checkpoint.pt").exists()

@@ -1,0 +1,378 @@
+"""`msdgs-train eval`: its numbers against ones computed here, its masks on scenes with a known answer, its files."""
+
+import json
+import math
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from scipy.ndimage import correlate1d
+
+from msdgs_serve.rasterizer import GSPLAT, rasterize
+from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
+from msdgs_train.cli import main as cli
+from msdgs_train.datasets import Frame, load_scene
+from msdgs_train.datasets.common.images import write_png
+from msdgs_train.engine import run as fit_module
+from msdgs_train.engine.metrics_log import read_metrics, to_bytes
+from msdgs_train.engine.run import fit
+from msdgs_train.evaluation import evaluate as evaluation_module
+from msdgs_train.evaluation import report as evaluation_report
+from msdgs_train.evaluation.evaluate import evaluate_run
+from msdgs_train.evaluation.metrics import masked_psnr
+from msdgs_train.evaluation.moving_region import _identity, moving_region, travels
+from msdgs_train.evaluation.perceptual import perceptual_metrics
+from msdgs_train.evaluation.sheets import CAPTION, HEADER
+from msdgs_train.gaussians.model import PosedGaussians
+from msdgs_train.gaussians.model_file import load_model
+from tests.support.scenes import front_camera, gaussians_of
+from tests.support.tolerances import assert_close
+from tests.support.training_scene import SIZE, small_config, write_scene
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture(scope="module")
+def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run whose best model is not its last one."""
+    run = tmp_path_factory.mktemp("runs") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "draw_curve", lambda run: None)
+        fit(small_config(steps=40, eval_every=5, warmup_fraction=0.1), data, run)
+    return run
+
+
+@pytest.fixture
+def _clean(run: Path) -> None:
+    for path in (run / "eval").glob("*"):
+        path.unlink()
+
+
+def _read(path: Path) -> np.ndarray:
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))[..., :3]
+
+
+def _psnr(rgb: np.ndarray, truth: np.ndarray) -> float:
+    return -10 * math.log10(np.mean((rgb.astype(float) - truth) ** 2))
+
+
+def _ssim(rgb: np.ndarray, truth: np.ndarray) -> float:
+    """As the 3D Gaussian projects compute it: blurred with zeros beyond the border."""
+    taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    taps /= taps.sum()
+    x, y = rgb.astype(float), truth.astype(float)
+    mx, my, xx, yy, xy = (
+        correlate1d(correlate1d(v, taps, 0, mode="constant"), taps, 1, mode="constant")
+        for v in (x, y, x * x, y * y, x * y)
+    )
+    top = (2 * mx * my + 0.01**2) * (2 * (xy - mx * my) + 0.03**2)
+    return float(np.mean(top / ((mx**2 + my**2 + 0.01**2) * (xx - mx**2 + yy - my**2 + 0.03**2))))
+
+
+@torch.no_grad()
+def _render(path: Path, frame: Frame) -> np.ndarray:
+    """With the service's own rasterizer."""
+    gaussians = Gaussians(*(tensor.numpy() for tensor in load_model(path).model.pose(frame.t)))
+    return np.clip(rasterize(gaussians, frame.camera, background=(1.0, 1.0, 1.0)).rgb, 0, 1)
+
+
+@pytest.mark.usefixtures("_clean")
+def test_numbers_are_those_computed_here(data: Path, run: Path) -> None:
+    assert cli.main(["eval", str(run)]) == 0
+    report = json.loads((run / "eval" / "test.json").read_text())
+    assert report["data"] == str(data)
+    assert set(report["models"]) == {"last", "best"}
+    frames = load_scene(data).splits["test"]
+    for name, file in (("last", "model.pt"), ("best", "best.pt")):
+        judged = report["models"][name]
+        assert judged["file"] == file
+        assert [image["name"] for image in judged["images"]] == [frame.name for frame in frames]
+        for image, frame in zip(judged["images"], frames, strict=True):
+            rgb, truth = _render(run / file, frame), _read(frame.image_path)
+            assert_close(image["psnr"], _psnr(rgb, truth), "psnr.relative")
+            assert_close(image["ssim"], _ssim(rgb, truth), "ssim.float32")
+        for score in ("psnr", "ssim"):
+            mean = sum(image[score] for image in judged["images"]) / len(frames)
+            assert_close(judged["mean"][score], mean, "psnr.relative")
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert report["models"]["last"]["mean"]["psnr"] == metrics["splits"]["test"]["psnr"]
+    assert report["models"]["last"]["mean"]["ssim"] == metrics["splits"]["test"]["ssim"]
+
+
+def test_the_best_model_is_that_of_the_highest_psnr_on_val(run: Path) -> None:
+    lines = [line for line in read_metrics(run) if line["kind"] == "eval" and line["split"] == "val"]
+    highest = max(lines, key=lambda line: line["psnr"])
+    best = json.loads((run / "metrics.json").read_text())["best"]
+    assert best == {"file": "best.pt", "split": "val", "step": highest["step"], "psnr": highest["psnr"]}
+    assert load_model(run / "best.pt").step == highest["step"]
+    evaluation = evaluate_run(run, split="val")
+    by_name = {judged.name: judged for judged in evaluation.models}
+    assert by_name["best"].mean.psnr == highest["psnr"]
+    assert by_name["last"].loaded.step == 40
+    assert by_name["last"].mean.psnr <= highest["psnr"]
+
+
+def test_without_val_the_best_is_chosen_on_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+    data = write_scene(tmp_path / "scene")
+    (data / "transforms_val.json").unlink()
+    outcome = fit(small_config(steps=4, eval_every=2), data, tmp_path / "run")
+    assert outcome.best is not None
+    assert (outcome.best.split, outcome.best.psnr >= outcome.qualities["test"].psnr) == ("test", True)
+
+
+def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+    run = tmp_path / "run"
+    first = fit(small_config(steps=3), data, run).best
+    assert first is not None
+    unbeatable = {"split": "val", "step": first.step, "psnr": 99.0}
+    (run / "run.json").write_text(json.dumps({"data": str(data), "best": unbeatable}))
+    before = (run / "best.pt").read_bytes()
+    assert fit(small_config(steps=6), data, run, resume=True).best == type(first)(**unbeatable)
+    assert (run / "best.pt").read_bytes() == before
+    (run / "best.pt").unlink()
+    again = fit(small_config(steps=7), data, run, resume=True).best
+    assert again is not None
+    assert again.step == 7
+
+
+def test_psnr_inside_a_mask_has_a_known_answer() -> None:
+    rgb, truth = torch.full((10, 10, 3), 0.5), torch.full((10, 10, 3), 0.5)
+    mask = np.zeros((10, 10), bool)
+    mask[2:4, 3:8] = True
+    rgb[torch.from_numpy(mask)] += 0.1
+    rgb[9, 9] += 0.4
+    assert masked_psnr(rgb, truth, mask) == pytest.approx(20, abs=1e-4)
+    assert masked_psnr(rgb, truth, np.zeros((10, 10), bool)) is None
+
+
+def test_a_centre_travels_by_pixels() -> None:
+    """At depth 4 and a focal length of 40 a pixel is 0.1 wide; behind the camera nothing is seen to move."""
+    camera = front_camera(focal=40.0)
+    there = torch.tensor([[0.0, 0, 4], [0.0, 0, 4], [0.0, 0, 4], [0.0, 0, -4], [0.0, 0, 4]])
+    moved = there + torch.tensor([[0.09, 0, 0], [0.11, 0, 0], [0, -0.11, 0], [9.0, 0, 0], [0, 0, 1]])
+    assert travels([there, moved], camera).tolist() == [False, True, True, False, False]
+
+
+class _Moving:
+    """Two Gaussians, far apart: the second one goes to the right, 1 unit in a unit of time."""
+
+    rasterizer = GSPLAT
+
+    def pose(self, t: float) -> Any:
+        g = gaussians_of([[-1.0, 0, 4], [0.3 + t, 0, 4]], scales=0.2, opacities=0.9, rgb=[[0.1] * 3, [0.8, 0.1, 0.1]])
+        arrays = (g.means, g.quats, g.scales, g.opacities, g.sh)
+        return PosedGaussians(*(torch.from_numpy(np.asarray(array, np.float32)) for array in arrays))
+
+
+def test_the_models_region_is_where_gaussians_that_move_are_seen() -> None:
+    camera, white = front_camera(), (1.0, 1.0, 1.0)
+    loaded = types.SimpleNamespace(model=_Moving(), scene=types.SimpleNamespace(background=white))
+    frames = [Frame(str(t), camera, t, Path("none")) for t in (0.0, 1.0)]
+    scene = types.SimpleNamespace(splits={"train": [], "test": frames}, time_range=(0.0, 1.0))
+    region = moving_region(scene, "test", [loaded])  # type: ignore[arg-type]
+    assert region.source == "model"
+    masks = [region.mask(frame) for frame in frames]
+    for mask, t in zip(masks, (0.0, 1.0), strict=True):
+        moving = gaussians_of([[0.3 + t, 0, 4]], scales=0.2, opacities=0.9, rgb=[[0.8, 0.1, 0.1]])
+        alone = rasterize(moving, camera, background=white).rgb
+        np.testing.assert_array_equal(mask, (1 - alone).max(axis=-1) > 0.1)
+        assert 10 < mask.sum() < 200
+    assert not (masks[0] & masks[1]).all()
+    assert not masks[0][:, :25].any(), "the Gaussian that stays is at the left"
+
+
+def _write_fixed_camera(folder: Path) -> Path:
+    """One camera that stays: grey, with a black square of 4 pixels that goes to the right, 6 pixels a photograph."""
+    matrix = OPENGL_TO_OPENCV.tolist()
+    for split, times in (("train", (0.0, 0.5, 1.0)), ("test", (0.25, 0.75))):
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for t in times:
+            pixels = np.full((SIZE, SIZE, 3), 128, np.uint8)
+            x = round(20 * t)
+            pixels[10:14, x : x + 4] = 0
+            name = f"{split}/r_{100 * t:03.0f}"
+            write_png(folder / f"{name}.png", pixels)
+            frames.append({"file_path": f"./{name}", "time": t, "transform_matrix": matrix})
+        contents = {"camera_angle_x": 0.7, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(contents))
+    return folder
+
+
+def test_with_fixed_cameras_the_region_is_that_of_the_photographs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The region is the square. The background is right and the square is left out: a known error there, none else."""
+    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+    data, run = _write_fixed_camera(tmp_path / "fixed"), tmp_path / "run"
+    fit(small_config(steps=2), data, run)
+    grey = torch.full((SIZE, SIZE, 3), 128 / 255)
+    monkeypatch.setattr(evaluation_module.JudgedModel, "render", lambda self, frame: grey)
+    evaluation = evaluate_run(run)
+    assert evaluation.region_source == "photographs"
+    for frame, mask, scores in zip(evaluation.frames, evaluation.masks, evaluation.models[0].images, strict=True):
+        square = np.zeros((SIZE, SIZE), bool)
+        square[10:14, round(20 * frame.t) : round(20 * frame.t) + 4] = True
+        np.testing.assert_array_equal(mask, square)
+        inside = -20 * math.log10(128 / 255)
+        assert scores.moving_psnr == pytest.approx(inside, abs=1e-4)
+        assert scores.psnr == pytest.approx(inside + 10 * math.log10(SIZE**2 / 16), abs=1e-4)
+
+
+def test_flip_is_nvidias(data: Path, run: Path) -> None:
+    evaluator = pytest.importorskip("flip_evaluator")
+    evaluation = evaluate_run(run)
+    frame, scores = evaluation.frames[0], evaluation.models[0].images[0]
+    rgb, truth = _render(run / "model.pt", frame), _read(frame.image_path)
+    assert scores.flip is not None
+    assert 0.01 < scores.flip < 1
+    assert_close(scores.flip, evaluator.evaluate(truth, rgb, "LDR")[1], "flip.relative")
+    assert perceptual_metrics().metrics["flip"](torch.from_numpy(truth), torch.from_numpy(truth)) == 0
+
+
+@pytest.mark.usefixtures("_clean")
+def test_what_is_not_there_is_null_and_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("flip_evaluator", "torchvision.models"):
+        monkeypatch.setitem(sys.modules, module, None)
+    assert cli.main(["eval", str(run)]) == 0
+    report = json.loads((run / "eval" / "test.json").read_text())
+    assert set(report["unavailable"]) == {"lpips", "flip"}
+    for judged in report["models"].values():
+        for scores in (judged["mean"], *judged["images"]):
+            assert scores["lpips"] is None
+            assert scores["flip"] is None
+    table = (run / "eval" / "test.md").read_text()
+    assert table.count("unavailable") >= 2 * 2 * 3
+    assert "torchvision isn't installed" in table
+    assert "flip-evaluator isn't installed" in table
+
+
+def test_lpips_wants_its_weights_on_disk_and_pictures_in_plus_minus_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = types.SimpleNamespace(IMAGENET1K_V1=types.SimpleNamespace(url="https://example.org/vgg16-1.pth"))
+    monkeypatch.setitem(sys.modules, "torchvision.models", types.SimpleNamespace(VGG16_Weights=weights))
+    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=_StandInForLpips))
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    assert "vgg16-1.pth" in perceptual_metrics().unavailable["lpips"]
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "vgg16-1.pth").touch()
+    metric = perceptual_metrics().metrics["lpips"]
+    assert metric(torch.zeros(6, 5, 3), torch.ones(6, 5, 3)) == 2.0
+
+
+class _StandInForLpips:
+    def __init__(self, net: str, verbose: bool) -> None:
+        assert net == "vgg"
+
+    def eval(self) -> "_StandInForLpips":
+        return self
+
+    def __call__(self, rgb: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        assert rgb.shape == (1, 3, 6, 5)
+        return (truth - rgb).mean()[None, None, None, None]
+
+
+@pytest.mark.usefixtures("_clean")
+def test_sheet_shows_photograph_rendering_and_error(run: Path) -> None:
+    evaluation = evaluate_run(run)
+    evaluation_report.write_evaluation(run, evaluation)
+    assert {path.name for path in (run / "eval").iterdir()} == {"test.json", "test.md", "test.png"}
+    sheet = _read(run / "eval" / "test.png")
+    worst = min(range(2), key=lambda index: evaluation.models[0].images[index].psnr)
+    times = -(-evaluation_report.SMALLEST_PANEL // SIZE)
+    for picture in (_read(evaluation.frames[worst].image_path), _render(run / "model.pt", evaluation.frames[worst])):
+        assert _contains(to_bytes(sheet), to_bytes(picture).repeat(times, axis=0).repeat(times, axis=1))
+
+
+def _contains(sheet: np.ndarray, picture: np.ndarray) -> bool:
+    """Whether the picture lies somewhere in the sheet, pixel for pixel, in the first row."""
+    height, width, _ = picture.shape
+    rows = sheet[HEADER + CAPTION : HEADER + CAPTION + height]
+    return any(np.array_equal(rows[:, x : x + width], picture) for x in range(sheet.shape[1] - width + 1))
+
+
+@pytest.mark.usefixtures("_clean")
+@pytest.mark.parametrize("broken", ["draw_contact_sheet", "as_json", "savefig"])
+def test_an_interrupted_evaluation_leaves_no_half_written_file(
+    run: Path, broken: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*args: Any, **kwargs: Any) -> None:
+        if broken == "savefig":
+            Path(args[1]).write_bytes(b"\x89PNG, the beginning")
+        raise KeyboardInterrupt
+
+    target = "matplotlib.figure.Figure.savefig" if broken == "savefig" else f"msdgs_train.evaluation.report.{broken}"
+    monkeypatch.setattr(target, interrupt)
+    assert cli.main(["eval", str(run)]) == cli.EXIT_INTERRUPTED
+    assert "interrupted" in capsys.readouterr().err
+    for path in (run / "eval").iterdir():
+        assert not path.name.startswith(".")
+        assert path.suffix != ".json"
+        if path.suffix == ".png":
+            _read(path)
+
+
+def test_missing_files_are_named(data: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, model = (run / "config.json").read_bytes(), (run / "model.pt").read_bytes()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "old" / "config.json").write_bytes(config)
+
+    def message(*arguments: object) -> str:
+        assert cli.main(["eval", *map(str, arguments)]) == cli.EXIT_INVALID
+        return capsys.readouterr().err
+
+    assert "empty/config.json" in message(tmp_path / "empty")
+    assert "model.pt: no such file" in message(tmp_path / "old")
+    (tmp_path / "old" / "model.pt").write_bytes(model)
+    assert "run.json: no such file, so the dataset has to be given" in message(tmp_path / "old")
+    assert "nowhere: `folder` does not exist" in message(tmp_path / "old", tmp_path / "nowhere")
+    (tmp_path / "old" / "run.json").write_text(json.dumps({"data": str(tmp_path / "gone"), "best": None}))
+    assert "gone: `folder` does not exist; if it is elsewhere now: msdgs-train eval" in message(tmp_path / "old")
+    (tmp_path / "old" / "run.json").write_text("[]")
+    assert "run.json: isn't the record of a run" in message(tmp_path / "old")
+    assert cli.main(["eval", str(tmp_path / "old"), str(data), "--split", "val"]) == cli.EXIT_INVALID
+
+
+def test_a_run_from_before_there_was_a_best_model(data: Path, run: Path, tmp_path: Path) -> None:
+    for name in ("config.json", "model.pt"):
+        (tmp_path / name).write_bytes((run / name).read_bytes())
+    assert cli.main(["eval", str(tmp_path), str(data), "--split", "val"]) == 0
+    assert "this run has kept no best.pt" in (tmp_path / "eval" / "val.md").read_text()
+    assert set(json.loads((tmp_path / "eval" / "val.json").read_text())["models"]) == {"last"}
+
+
+def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main(["eval", "--help"])
+    assert exit_info.value.code == 0
+    text = capsys.readouterr().out
+    for word in ("RUN", "DATA", "--split", "LPIPS", "moves", "contact sheet"):
+        assert word in text
+
+
+def test_split_without_photographs_is_named(run: Path, tmp_path: Path) -> None:
+    data = write_scene(tmp_path / "scene")
+    (data / "transforms_test.json").unlink()
+    with pytest.raises(Exception, match="`test` has no photographs; there are `train` with 7, `val` with 1"):
+        evaluate_run(run, data)
+
+
+def test_camera_identity_ignores_rounding() -> None:
+    camera = front_camera()
+    moved = np.eye(4)
+    moved[0, 3] = 1e-9
+    other = Camera(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, -0.0 + moved)
+    assert _identity(camera) == _identity(other)

@@ -1,0 +1,173 @@
+"""Model files: whole or refused, old or new, never in between."""
+
+import pickle
+import re
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from msdgs_train.gaussians.model_file import CheckpointInvalid, load, load_model, save_atomic, save_model
+from tests.support.models import SCENE, random_model
+
+
+@pytest.fixture
+def model_file(tmp_path: Path) -> Path:
+    save_model(tmp_path / "model.pt", random_model(), SCENE, 42)
+    return tmp_path / "model.pt"
+
+
+def rewritten(path: Path, **changes: object) -> Path:
+    torch.save(torch.load(path, weights_only=True) | changes, path)
+    return path
+
+
+@pytest.mark.parametrize("changes", [{}, {"layers": ()}, {"embedding_size": 0}, {"sh_degree": 0}])
+def test_what_is_saved_comes_back(tmp_path: Path, changes: dict[str, int]):
+    model = random_model(**changes)
+    save_model(tmp_path / "model.pt", model, SCENE, 42)
+    loaded = load_model(tmp_path / "model.pt")
+    assert loaded.step == 42
+    assert loaded.scene == SCENE
+    assert loaded.model.config == model.config
+    for got, want in zip(loaded.model.pose(0.4), model.pose(0.4), strict=True):
+        assert torch.equal(got, want)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_gaussians(tmp_path: Path, count: int):
+    save_model(tmp_path / "model.pt", random_model(count), SCENE, 0)
+    assert len(load_model(tmp_path / "model.pt").model.gaussians) == count
+
+
+@pytest.mark.parametrize("part", [0.0, 0.001, 0.3, 0.9, 0.9999])
+def test_cut_off_files_are_refused(model_file: Path, part: float):
+    contents = model_file.read_bytes()
+    model_file.write_bytes(contents[: int(part * len(contents))])
+    with pytest.raises(CheckpointInvalid, match=r"model\.pt: (is empty|isn't a torch checkpoint, or is cut off)"):
+        load_model(model_file)
+
+
+def test_files_of_others_are_refused(tmp_path: Path):
+    path = tmp_path / "model.pt"
+    path.write_text("not a model")
+    with pytest.raises(CheckpointInvalid, match="isn't a torch checkpoint"):
+        load_model(path)
+    torch.save({"weights": torch.zeros(3)}, path)
+    with pytest.raises(CheckpointInvalid, match=r"format msdgs-model/1 \(found None"):
+        load_model(path)
+    torch.save([1, 2], path)
+    with pytest.raises(CheckpointInvalid, match="found 'list'"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("name", ["missing.pt", "."])
+def test_what_is_no_file_is_refused(tmp_path: Path, name: str):
+    with pytest.raises(CheckpointInvalid):
+        load_model(tmp_path / name)
+
+
+@pytest.mark.parametrize("opcodes", [b"\x80\x02u.", b"\x80\x02(u.", b"\x80\x02e.", b"\x80\x02r", b"\x80\x02\x85."])
+def test_a_stream_that_makes_no_sense_is_refused(tmp_path: Path, opcodes: bytes):
+    torch.save({}, tmp_path / "sound.pt")
+    with zipfile.ZipFile(tmp_path / "sound.pt") as sound, zipfile.ZipFile(tmp_path / "model.pt", "w") as changed:
+        for name in sound.namelist():
+            changed.writestr(name, opcodes if name.endswith("data.pkl") else sound.read(name))
+    with pytest.raises(CheckpointInvalid, match="isn't a whole torch checkpoint"):
+        load(tmp_path / "model.pt")
+
+
+class Trap:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("save", [torch.save, lambda trap, path: path.write_bytes(pickle.dumps(trap))])
+def test_no_code_of_a_file_is_run(tmp_path: Path, save):
+    save(Trap(tmp_path / "sprung"), tmp_path / "model.pt")
+    with pytest.raises(CheckpointInvalid):
+        load(tmp_path / "model.pt")
+    assert not (tmp_path / "sprung").exists()
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), float("-inf")])
+def test_values_that_are_not_finite_are_named_and_counted(model_file: Path, poison: float):
+    state = torch.load(model_file, weights_only=True)["state"]
+    state["gaussians.means"][3:5, 1] = poison
+    state["deformation.layers.1.heads.bias"][0] = poison
+    rewritten(model_file, state=state)
+    named = "gaussians.means (2 of 900), deformation.layers.1.heads.bias (1 of 11)"
+    with pytest.raises(CheckpointInvalid, match=re.escape(named)):
+        load_model(model_file)
+
+
+@pytest.mark.parametrize("key", ["config", "scene", "step", "state"])
+def test_incomplete_files_are_refused(model_file: Path, key: str):
+    contents = torch.load(model_file, weights_only=True)
+    del contents[key]
+    torch.save(contents, model_file)
+    with pytest.raises(CheckpointInvalid, match=key):
+        load_model(model_file)
+
+
+@pytest.mark.parametrize("name", ["gaussians.raw_quats", "gaussians.embeddings", "deformation.layers.0.first.weight"])
+@pytest.mark.parametrize("tensor", [None, torch.zeros(2, 2)])
+def test_tensors_missing_or_of_another_shape_are_named(model_file: Path, name: str, tensor: torch.Tensor | None):
+    state = torch.load(model_file, weights_only=True)["state"]
+    if tensor is None:
+        del state[name]
+    else:
+        state[name] = tensor
+    rewritten(model_file, state=state)
+    with pytest.raises(CheckpointInvalid, match=name.removeprefix("gaussians.")):
+        load_model(model_file)
+
+
+@pytest.mark.parametrize("config", [{"unheard_of": 1}, {"layers": -1}])
+def test_configurations_of_others_are_refused(model_file: Path, config: dict[str, int]):
+    rewritten(model_file, config=config)
+    with pytest.raises(CheckpointInvalid, match=next(iter(config))):
+        load_model(model_file)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [({"width": 10_000_000}, r"size mismatch"), ({"depth": 10_000_000}, r"`model.depth` must be at most \d+")],
+)
+def test_sizes_that_are_not_stored_take_no_memory(model_file: Path, config: dict[str, int], message: str):
+    contents = torch.load(model_file, weights_only=True)
+    rewritten(model_file, config=contents["config"] | config)
+    with pytest.raises(CheckpointInvalid, match=message):
+        load_model(model_file)
+
+
+def test_tensors_that_are_not_stored_in_full_are_named(model_file: Path):
+    state = torch.load(model_file, weights_only=True)["state"]
+    state["gaussians.means"] = torch.zeros(1).expand(1_000_000_000_000, 3)
+    rewritten(model_file, state=state)
+    with pytest.raises(CheckpointInvalid, match=r"`gaussians.means` of shape .* isn't stored in full"):
+        load_model(model_file)
+
+
+class Unsavable:
+    def __reduce__(self) -> tuple:
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_save_leaves_the_old_file_alone(model_file: Path):
+    before = model_file.read_bytes()
+    with pytest.raises(KeyboardInterrupt):
+        save_atomic(model_file, {"tensor": torch.zeros(1000), "then": Unsavable()})
+    assert model_file.read_bytes() == before
+    assert list(model_file.parent.iterdir()) == [model_file]
+
+
+def test_any_plain_values_can_be_saved(tmp_path: Path):
+    save_atomic(tmp_path / "state.pt", {"step": 3, "rng": torch.get_rng_state(), "nested": [{"lr": 1e-3}]})
+    assert load(tmp_path / "state.pt")["nested"] == [{"lr": 1e-3}]

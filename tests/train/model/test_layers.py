@@ -1,0 +1,241 @@
+"""The deformation layers against the paper's sizes and a plain float64 reading of its equations."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from msdgs_train.gaussians.modulation import Modulation
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.heads import Heads
+from msdgs_train.layers.mlp import MLPLayer, PositionalEncoding, octaves
+from tests.support.tolerances import assert_close, tolerance
+
+PAPER_LAYER_PARAMETERS = 235_561
+PAPER_MODULATION_PARAMETERS = 1_155
+
+
+def parameters(module: torch.nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def random_layer(seed: int, **sizes: Any) -> MLPLayer:
+    torch.manual_seed(seed)
+    defaults: dict[str, Any] = {"width": 16, "depth": 3, "time_width": 8, "time_features": 5}
+    layer = MLPLayer(**(defaults | sizes)).double()
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter.normal_(std=0.2)
+    return layer
+
+
+def plain_encoding(x: np.ndarray, frequencies: int) -> np.ndarray:
+    phases = [x * 2.0**k for k in range(frequencies)]
+    return np.concatenate([x, *(np.sin(p) for p in phases), *(np.cos(p) for p in phases)], axis=-1)
+
+
+def plain_step(layer: MLPLayer, means: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Equations 7 and 10 with the time features repeated for every Gaussian: deltas [N, 10] and weights [N, 1]."""
+
+    def linear(module: torch.nn.Module, value: np.ndarray) -> np.ndarray:
+        assert isinstance(module, torch.nn.Linear)
+        return value @ module.weight.detach().numpy().T + module.bias.detach().numpy()
+
+    time = np.maximum(linear(layer.time_hidden, plain_encoding(np.array([[t]]), layer.time_octaves.shape[1])), 0)
+    features = np.repeat(linear(layer.time_output, time), len(means), axis=0)
+    inputs = np.concatenate([plain_encoding(means, layer.xyz_octaves.shape[1] // 3), features], axis=1)
+    hidden = np.maximum(linear(layer.first, inputs), 0)
+    for i, module in enumerate(layer.trunk, start=1):
+        read = np.concatenate([inputs, hidden], axis=1) if i == layer.skip else hidden
+        hidden = np.maximum(linear(module, read), 0)
+    heads = linear(layer.heads, hidden)
+    return heads[:, :10], 1 / (1 + np.exp(-heads[:, 10:]))
+
+
+def test_a_layer_has_the_papers_number_of_parameters():
+    assert parameters(MLPLayer()) == PAPER_LAYER_PARAMETERS
+    assert parameters(MultiStepDeformation(MLPLayer() for _ in range(2))) == 2 * PAPER_LAYER_PARAMETERS
+
+
+def test_the_modulation_has_the_papers_number_of_parameters_and_starts_at_one():
+    modulation = Modulation()
+    assert parameters(modulation) == PAPER_MODULATION_PARAMETERS
+    factors = modulation(torch.randn(7, 32))
+    assert torch.equal(factors.present()["scales"], torch.ones(7, 3))
+    assert list(factors.present()) == ["scales"]
+
+
+def test_the_modulation_stays_bounded():
+    modulation = Modulation()
+    with torch.no_grad():
+        modulation.output.bias[:] = torch.tensor([200.0, -200.0, 1.0])
+    scales = modulation(torch.randn(7, 32)).scales
+    torch.testing.assert_close(scales, torch.tensor([2.0, -2.0, 1.0]).exp().expand(7, 3))
+
+
+def test_a_new_layer_moves_nothing_but_has_weights():
+    torch.manual_seed(0)
+    step = MLPLayer(depth=2)(torch.randn(9, 3), torch.tensor(0.3))
+    for delta in (step.delta_means, step.delta_scales, step.delta_quats):
+        assert not delta.any()
+    assert step.weight.shape == (9, 1)
+    assert ((step.weight > 0) & (step.weight < 1)).all()
+    assert step.weight.unique().numel() > 1
+
+
+@pytest.mark.parametrize(("dimensions", "frequencies"), [(3, 10), (1, 6), (3, 1)])
+def test_encoding_is_value_sines_cosines(dimensions: int, frequencies: int):
+    x = torch.rand(50, dimensions, dtype=torch.float64) * 4 - 2
+    got = PositionalEncoding.apply(x, octaves(dimensions, frequencies).double())
+    assert got.shape[1] == dimensions * (1 + 2 * frequencies)
+    assert_close(got, plain_encoding(x.numpy(), frequencies), "encoding.float64")
+
+
+def test_encoding_in_float32_is_precise_at_the_highest_frequency():
+    x = torch.rand(20_000, 3) * 4 - 2
+    got = PositionalEncoding.apply(x, octaves(3, 10))
+    assert_close(got, plain_encoding(x.double().numpy(), 10), "encoding.float32")
+
+
+def test_encoding_gradient():
+    x = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(PositionalEncoding.apply, (x, octaves(3, 4).double()))
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {},
+        {"depth": 1},
+        {"width": 1},
+        {"xyz_frequencies": 2, "time_frequencies": 1},
+        {"skip": 1},
+        {"depth": 5, "skip": 3},
+    ],
+)
+def test_layer_agrees_with_a_plain_reading(sizes: dict[str, int]):
+    layer = random_layer(1, **sizes)
+    means = torch.randn(20, 3, dtype=torch.float64)
+    step = layer(means, torch.tensor(0.7, dtype=torch.float64))
+    deltas, weight = plain_step(layer, means.numpy(), 0.7)
+    got = torch.cat([step.delta_means, step.delta_scales, step.delta_quats], dim=1)
+    assert_close(got.detach(), deltas, "network.float64")
+    assert_close(step.weight.detach(), weight, "network.float64")
+
+
+def test_without_a_weight_every_step_counts_in_full():
+    """Under a wrong wiring (a weight that is 1 but still learned, or a step that is halved) these would differ."""
+    torch.manual_seed(3)
+    weighted = MLPLayer(width=16, depth=2).double()
+    full = MLPLayer(width=16, depth=2, outputs=Heads(weight=False)).double()
+    with torch.no_grad():
+        weighted.heads.weight.normal_()
+        full.load_state_dict(weighted.state_dict() | {
+            "heads.weight": weighted.heads.weight[:-1], "heads.bias": weighted.heads.bias[:-1],
+        })  # fmt: skip
+    assert parameters(weighted) - parameters(full) == 16 + 1
+    means, t = torch.randn(9, 3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)
+    steps = [MultiStepDeformation([layer])(means, t).means for layer in (weighted, full)]
+    weight = weighted(means, t).weight
+    assert torch.equal(full(means, t).weight, torch.ones(9, 1, dtype=torch.float64))
+    assert_close(steps[0].detach(), (weight * steps[1]).detach(), "network.float64")
+    gradients = [
+        torch.autograd.grad(s.sum(), layer.heads.bias)[0] for s, layer in zip(steps, (weighted, full), strict=True)
+    ]
+    assert_close(gradients[1], [9.0] * 3 + [0.0] * 7, "network.float64")  # a step moves a mean by all of its delta
+    assert_close(gradients[0][:3], [weight.detach().sum()] * 3, "network.float64")
+    assert gradients[0][-1] != 0  # and the weight learns
+
+
+def test_heads_of_opacity_and_sh_change_only_these():
+    torch.manual_seed(4)
+    layer = MLPLayer(width=16, depth=2, outputs=Heads(opacity=True, sh=4)).double()
+    assert layer.heads.out_features == 10 + 1 + 12 + 1
+    with torch.no_grad():
+        layer.heads.bias[10] = 0.5
+        layer.heads.bias[11:23] = torch.arange(12.0)
+    deltas = MultiStepDeformation([layer, layer])(torch.randn(5, 3).double(), torch.tensor(0.3).double())
+    weight = layer(torch.randn(5, 3).double(), torch.tensor(0.3).double()).weight
+    assert deltas.opacities is not None
+    assert deltas.sh is not None
+    assert deltas.sh.shape == (5, 4, 3)
+    assert not any(delta.any() for delta in deltas[:3])
+    assert_close((deltas.sh[:, 0, 1] / deltas.opacities).detach(), [2.0] * 5, "network.float64")
+    assert ((deltas.opacities > 0) & (deltas.opacities < 1)).all()
+    assert ((weight > 0) & (weight < 1)).all()
+
+
+def test_layer_gradients():
+    layer = random_layer(2, width=4, depth=2, time_width=3, time_features=2, xyz_frequencies=1, time_frequencies=1)
+    means = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
+    t = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda *x: tuple(layer(*x[:2])[:4]), (means, t, *layer.parameters()))
+
+
+@pytest.mark.parametrize("steps", [None, 0, 1, 2, 3])
+def test_steps_are_weighted_and_summed(steps: int | None):
+    layers = [random_layer(seed) for seed in range(3)]
+    means = torch.randn(20, 3, dtype=torch.float64)
+    deltas = MultiStepDeformation(layers)(means, torch.tensor(0.2, dtype=torch.float64), steps)
+    moved, total = means.numpy(), np.zeros((20, 10))
+    for layer in layers[:steps]:
+        step, weight = plain_step(layer, moved, 0.2)  # equation 7
+        moved = moved + weight * step[:, :3]  # equation 8
+        total = total + weight * step  # equation 9
+    assert_close(torch.cat(deltas[:3], dim=1).detach(), total, "network.float64")
+    assert np.abs(moved - means.numpy() - total[:, :3]).max() < tolerance("network.float64")
+
+
+def test_no_layers_and_no_gaussians():
+    for deformation in (MultiStepDeformation([]), MultiStepDeformation([MLPLayer(width=8)])):
+        deltas = deformation(torch.empty(0, 3), torch.tensor(0.0))
+        assert [tuple(d.shape) for d in deltas[:3]] == [(0, 3), (0, 3), (0, 4)]
+
+
+def last_features(layer: MLPLayer, places: torch.Tensor, t: float) -> torch.Tensor:
+    features = []
+    hook = layer.heads.register_forward_pre_hook(lambda module, inputs: features.append(inputs[0]))
+    with torch.no_grad():
+        layer(places, torch.tensor(t))
+    hook.remove()
+    return features[0]
+
+
+@pytest.mark.parametrize(
+    "sizes", [{}, {"depth": 8}, {"width": 96, "depth": 2, "time_width": 64}, {"width": 64, "depth": 3}]
+)
+def test_some_last_unit_answers_everywhere(sizes: dict[str, Any]):
+    places = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 2.6 - 1.3
+    torch.manual_seed(0)
+    layer = MLPLayer(**sizes)
+    for t in (0.0, 0.3, 1.0):
+        silent = (last_features(layer, places, t) == 0).all(dim=1)
+        assert silent.float().mean() < tolerance("silent_places")
+
+
+def mean_cosines(layer: MLPLayer) -> tuple[float, float]:
+    """Between the last features of one place at times 0.1 apart, and of places one unit apart at one time."""
+    places = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    here = last_features(layer, places, 0.5)
+    later = last_features(layer, places, 0.6)
+    elsewhere = last_features(layer, places + torch.tensor([1.0, 0.0, 0.0]), 0.5)
+    in_time, in_space = (torch.cosine_similarity(here, other).mean().item() for other in (later, elsewhere))
+    return in_time, in_space
+
+
+def test_a_new_layer_is_local_in_time_and_space():
+    def small_layer(seed: int) -> MLPLayer:
+        torch.manual_seed(seed)
+        return MLPLayer(width=96, depth=2, xyz_frequencies=4, time_width=64)
+
+    ours = torch.tensor([mean_cosines(small_layer(seed)) for seed in range(8)]).mean(dim=0)
+    torchs_own = []
+    for seed in range(8):
+        layer = small_layer(seed)
+        for module in layer.modules():
+            if isinstance(module, torch.nn.Linear):
+                module.reset_parameters()
+        torchs_own.append(mean_cosines(layer))
+    assert (ours < torch.tensor([0.65, 0.5])).all(), ours
+    assert (torch.tensor(torchs_own).mean(dim=0) > torch.tensor([0.95, 0.75])).all(), torchs_own

@@ -1,0 +1,264 @@
+"""Canonical Gaussians and the posed ones that a model makes of them."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbour_distances
+from msdgs_train.gaussians.model import SMALLEST_SCALE, DynamicGaussians, ModelConfig, unit_quats
+from tests.support.models import random_model, small_config
+from tests.support.tolerances import assert_close
+
+
+def test_canonical_gaussians_are_activated_only():
+    model = random_model()
+    g, posed = model.gaussians, model.pose(0.3, deform=False)
+    assert torch.equal(posed.means, g.means)
+    assert torch.equal(posed.scales, g.log_scales.exp())
+    assert torch.equal(posed.opacities, g.raw_opacities.sigmoid())
+    assert torch.equal(posed.sh, torch.cat([g.sh_dc, g.sh_rest], dim=1))
+    for got, same in zip(model.pose(0.9, steps=0), posed, strict=True):
+        assert torch.equal(got, same)
+
+
+def test_deltas_are_added_before_activation():
+    model = random_model().double()
+    g, posed = model.gaussians, model.pose(0.3)
+    deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
+    quats = g.raw_quats / g.raw_quats.norm(dim=1, keepdim=True) + deltas.quats
+    assert model.modulation is not None
+    log_scales = g.log_scales + model.modulation(g.embeddings).scales * deltas.scales  # equation 12
+    for got, want in (
+        (posed.means, g.means + deltas.means),
+        (posed.scales, log_scales.exp()),
+        (posed.quats, quats / quats.norm(dim=1, keepdim=True)),
+    ):
+        assert_close(got.detach(), want.detach(), "network.float64")
+
+
+def changed(config: dict[str, Any]) -> set[str]:
+    """What a modulation by other embeddings changes."""
+    model = random_model(**config)
+    before = model.pose(0.3)
+    with torch.no_grad():
+        assert model.gaussians.embeddings is not None
+        model.gaussians.embeddings.add_(1.0)
+    after = model.pose(0.3)
+    return {name for name in before._fields if not torch.equal(getattr(before, name), getattr(after, name))}
+
+
+@pytest.mark.parametrize(
+    "targets", [("means",), ("scales",), ("quats",), ("means", "quats"), ("quats", "scales", "means")]
+)
+@pytest.mark.parametrize("delta_space", ["raw", "activated"])
+def test_modulation_changes_its_targets_only(targets: tuple[str, ...], delta_space: str):
+    assert changed({"modulate": targets, "delta_space": delta_space}) == set(targets)
+
+
+@pytest.mark.parametrize("targets", [("means",), ("scales",), ("quats",), ("means", "scales", "quats")])
+def test_modulation_multiplies_the_sums_once(targets: tuple[Any, ...]):
+    model = random_model(modulate=targets).double()
+    g, posed = model.gaussians, model.pose(0.3)
+    deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
+    assert model.modulation is not None
+    factors = model.modulation(g.embeddings).present()
+    assert list(factors) == [name for name in ("means", "scales", "quats") if name in targets]
+    assert all((f - 1).abs().max() > 1e-3 for f in factors.values())
+    means, scales, quats = (factors.get(name, 1.0) * getattr(deltas, name) for name in ("means", "scales", "quats"))
+    assert_close(posed.means.detach(), (g.means + means).detach(), "network.float64")
+    assert_close(posed.scales.detach(), (g.log_scales + scales).exp().detach(), "network.float64")
+    assert_close(posed.quats.detach(), unit_quats(unit_quats(g.raw_quats) + quats).detach(), "network.float64")
+
+
+def test_deltas_may_be_added_to_scales_themselves():
+    model = random_model(delta_space="activated", noise=0.2).double()
+    g, posed = model.gaussians, model.pose(0.3)
+    deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
+    assert model.modulation is not None
+    wanted = g.log_scales.exp() + model.modulation(g.embeddings).scales * deltas.scales
+    floored = wanted < SMALLEST_SCALE
+    assert 0 < floored.sum() < floored.numel() / 2
+    assert_close(posed.scales[~floored].detach(), wanted[~floored].detach(), "network.float64")
+    assert (posed.scales[floored] == SMALLEST_SCALE).all()
+    assert (random_model(delta_space="raw", noise=0.2).pose(0.3).scales.double() - posed.scales).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("heads", [{"opacity_head": True}, {"sh_head": True}, {"opacity_head": True, "sh_head": True}])
+@pytest.mark.parametrize("layers", [("mlp", "mlp"), ("plane",), ("plane", "mlp")])
+def test_heads_of_opacity_and_colour(heads: dict[str, bool], layers: tuple[str, ...]):
+    model = random_model(layers=layers, **heads)
+    early, late, canonical = model.pose(0.1), model.pose(0.9), model.pose(0.1, deform=False)
+    for name, head in (("opacities", "opacity_head"), ("sh", "sh_head")):
+        moves = not torch.equal(getattr(early, name), getattr(late, name))
+        assert moves == heads.get(head, False)
+        assert torch.equal(getattr(early, name), getattr(canonical, name)) != moves
+    assert ((late.opacities > 0) & (late.opacities < 1)).all()
+    assert torch.equal(model.pose(0.1, sh_degree=1).sh, early.sh[:, :4])
+
+
+def test_a_model_without_weights_has_none():
+    with_weights, without = random_model(), random_model(weights=False)
+    fewer = sum(p.numel() for p in with_weights.parameters()) - sum(p.numel() for p in without.parameters())
+    assert fewer == 2 * (32 + 1)
+
+
+@pytest.mark.parametrize("count", [1, 3, 10])
+def test_any_number_of_layers(count: int):
+    model = random_model(layers=("mlp",) * count, noise=0.02)
+    assert len(model.deformation) == count
+    before = model.pose(0.4).means
+    with torch.no_grad():
+        model.get_parameter(f"deformation.layers.{count - 1}.heads.bias")[:3] += 1.0
+    assert not torch.equal(model.pose(0.4).means, before), "the last layer counts"
+
+
+def test_stopping_after_a_step_is_a_model_of_fewer_layers():
+    model, shorter = random_model(layers=("mlp",) * 3), random_model(layers=("mlp",))
+    shorter.load_state_dict(model.state_dict(), strict=False)
+    for got, want in zip(model.pose(0.6, steps=1), shorter.pose(0.6), strict=True):
+        assert torch.equal(got, want)
+
+
+def test_a_model_without_layers_is_static():
+    model = random_model(layers=())
+    for early, late in zip(model.pose(0.0), model.pose(1.0), strict=True):
+        assert torch.equal(early, late)
+
+
+def test_a_model_without_modulation():
+    model = random_model(embedding_size=0)
+    assert model.modulation is None
+    assert not any("embed" in name or "modulation" in name for name in model.state_dict())
+    assert model.pose(0.5).scales.isfinite().all()
+
+
+def test_time_as_number_and_as_tensor_agree():
+    model = random_model()
+    assert torch.equal(model.pose(0.25).means, model.pose(torch.tensor(0.25)).means)
+
+
+def test_ids_pose_only_these():
+    model = random_model().double()
+    ids = torch.tensor([7, 0, 299, 7])
+    for some, every in zip(model.pose(0.5, ids=ids), model.pose(0.5), strict=True):
+        assert_close(some.detach(), every[ids].detach(), "network.float64")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_sh_bands_above_a_degree_are_left_out(degree: int):
+    model = random_model()
+    assert torch.equal(model.pose(0.5, sh_degree=degree).sh, model.pose(0.5).sh[:, : (degree + 1) ** 2])
+    assert random_model(sh_degree=degree).pose(0.5).sh.shape == (300, (degree + 1) ** 2, 3)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_gaussians(count: int):
+    posed = random_model(count).pose(0.5)
+    assert [len(tensor) for tensor in posed] == [count] * 5
+    assert all(tensor.isfinite().all() for tensor in posed)
+
+
+def test_every_parameter_is_reached_by_gradients():
+    model = random_model()
+    for t in (0.1, 0.5, 0.9):
+        torch.stack([tensor.square().sum() for tensor in model.pose(t)]).sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.any(), name
+
+
+def test_detached_means_get_the_gradient_of_a_shift():
+    for detach in (True, False):
+        model = random_model(detach_means=detach)
+        gradient = torch.autograd.grad(model.pose(0.3).means.sum(), model.gaussians.means)[0]
+        assert torch.equal(gradient, torch.ones(300, 3)) == detach
+
+
+def test_quaternions_without_direction_become_identity():
+    raw = torch.tensor([[0.0, 0, 0, 0], [1e-9, 0, 0, 0], [0, 3.0, 0, -4.0]], requires_grad=True)
+    quats = unit_quats(raw)
+    assert torch.equal(quats, torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0], [0, 0.6, 0, -0.8]]))
+    quats[:, 1].sum().backward()
+    assert raw.grad is not None
+    assert raw.grad.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("sh_degree", 4),
+        ("sh_degree", -1),
+        ("layers", -1),
+        ("layers", 1.5),
+        ("width", 0),
+        ("depth", 0),
+        ("time_width", 0),
+        ("embedding_size", -1),
+        ("layers", True),
+        ("layers", ("mlp", "grid")),
+        ("layers", "mlp"),
+        ("plane_space_nodes", 1),
+        ("plane_channels", 0),
+        ("delta_space", "linear"),
+        ("skip", 4),
+        ("weights", 1),
+        ("modulate", ()),
+        ("modulate", ("scales", "scales")),
+        ("modulate", ("opacities",)),
+        ("plane_scales", ()),
+        ("plane_scales", (1, 0)),
+    ],
+)
+def test_impossible_sizes_are_refused_by_name(field: str, value: Any):
+    with pytest.raises(InvalidInput, match=f"model.{field}"):
+        ModelConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "change"),
+    [
+        ("log_scales", {"count": 4}),
+        ("sh_rest", {"sh_degree": 2}),
+        ("embeddings", {"embedding_size": 0}),
+        ("embeddings", {"embedding_size": 9}),
+    ],
+)
+def test_tensors_that_disagree_are_refused_by_name(field: str, change: dict[str, int]):
+    sizes = {"count": 5, "half_extent": 1.0, "sh_degree": 3, "embedding_size": 8, "seed": 0}
+    gaussians = CanonicalGaussians.random_in_cube(**sizes)
+    other = CanonicalGaussians.random_in_cube(**(sizes | change))
+    setattr(gaussians, field, getattr(other, field))
+    with pytest.raises(InvalidInput, match=f"gaussians.{field}"):
+        DynamicGaussians(small_config(), gaussians)
+
+
+def test_random_start_fills_the_cube_and_repeats():
+    a, b, c = (CanonicalGaussians.random_in_cube(500, 1.3, 3, 8, seed) for seed in (1, 1, 2))
+    assert torch.equal(a.means, b.means)
+    assert not torch.equal(a.means, c.means)
+    assert 1.2 < a.means.abs().max() <= 1.3
+    assert torch.allclose(a.raw_opacities.sigmoid(), torch.tensor(0.1))
+    assert torch.equal(a.log_scales[:, 0].exp().log(), a.log_scales[:, 2].exp().log())
+
+
+@pytest.mark.parametrize("spread", ["uniform", "clustered", "plane", "line"])
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 300])
+def test_neighbour_distances_against_all_pairs(spread: str, count: int):
+    generator = torch.Generator().manual_seed(count)
+    points = torch.rand(count, 3, generator=generator)
+    points = {
+        "uniform": points,
+        "clustered": points * 1e-3 + (points[:, :1] > 0.5) * 5.0,
+        "plane": points * torch.tensor([0.0, 1.0, 1.0]),
+        "line": points * torch.tensor([1.0, 0.0, 0.0]),
+    }[spread]
+    pairs = (points[:, None] - points[None]).double().norm(dim=2).sort(dim=1).values
+    want = pairs[:, 1 : min(count, 4)].mean(dim=1)
+    assert_close(neighbour_distances(points), want.float(), "neighbour_distances")
+
+
+def test_points_in_one_place_have_a_scale():
+    gaussians = CanonicalGaussians.from_points(torch.zeros(5, 3), torch.rand(5, 3), 0, 0, torch.Generator())
+    assert gaussians.log_scales.isfinite().all()

@@ -1,0 +1,157 @@
+"""The plane layer against a slow one in float64, and its gradients against finite differences."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from msdgs_train.layers.heads import Heads
+from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
+
+
+def layer(dtype: torch.dtype = torch.float64, scales: tuple[int, ...] = (1,)) -> PlaneLayer:
+    torch.manual_seed(0)
+    made = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8, half_extent=1.3, scales=scales)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    return made.to(dtype)
+
+
+def places(n: int = 40) -> Tensor:
+    """Inside, outside, and on the nodes at both ends."""
+    means = 1.6 * (2 * torch.rand(n, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 1)
+    means[0], means[1] = 1.3, -1.3
+    return means
+
+
+def slow_features(planes: PlaneGrid, means: Tensor, t: float) -> np.ndarray:
+    space, time = (p.detach().double().numpy() for p in (planes.space, planes.time))
+    s, nodes = space.shape[1], time.shape[1]
+    out = np.ones((len(means), space.shape[3]))
+    for n, mean in enumerate(means.double().numpy()):
+        across = mean * planes.cells.numpy() + (s - 1) / 2
+        places = [*np.clip(across, 0, s - 1), np.clip(t * (nodes - 1), 0, nodes - 1)]
+        hats = [
+            [max(0.0, 1 - abs(p - k)) for k in range(count)] for p, count in zip(places, [s, s, s, nodes], strict=True)
+        ]
+        for plane, (a, b) in enumerate([(0, 1), (0, 2), (1, 2)]):
+            out[n] *= np.einsum("i,j,ijc->c", hats[a], hats[b], space[plane])
+        for axis in range(3):
+            out[n] *= np.einsum("t,j,tjc->c", hats[3], hats[axis], time[axis])
+    return out
+
+
+def test_parameters_at_the_papers_sizes() -> None:
+    assert sum(p.numel() for p in PlaneLayer().parameters()) == 131_083
+
+
+def test_parameters_of_4dgs() -> None:
+    """3.38 M in table 4, which counts the heads of opacity and SH that 4DGS leaves out unless asked for."""
+    sizes: dict[str, Any] = {"channels": 32, "space_nodes": 64, "time_nodes": 75, "width": 64, "scales": (1, 2)}
+    for outputs, count in ((Heads(weight=False), 3_365_770), (Heads(False, True, 16), 3_377_275)):
+        assert sum(p.numel() for p in PlaneLayer(**sizes, outputs=outputs).parameters()) == count
+
+
+@pytest.mark.parametrize("scales", [(1,), (1, 2), (2, 1, 3)])
+@pytest.mark.parametrize("t", [0.0, 0.37, 0.5, 1.0, -0.2, 1.7])
+def test_features_are_products_of_interpolated_planes(t: float, scales: tuple[int, ...]) -> None:
+    planes, seen = layer(scales=scales), {}
+    planes.features.register_forward_pre_hook(lambda _, inputs: seen.update(features=inputs[0]))
+    planes(places(), torch.tensor(t, dtype=torch.float64))
+    slow = np.concatenate([slow_features(grid, places(), t) for grid in planes.plane_grids()], axis=1)
+    assert [grid.space.shape[1] for grid in planes.plane_grids()] == [6 * scale for scale in scales]
+    np.testing.assert_allclose(seen["features"].detach().numpy(), slow, rtol=1e-12)
+
+
+def test_the_whole_time_range_is_used() -> None:
+    planes = PlaneGrid(16, 32, 5, 1.0, (2.0, 6.0))
+    with torch.no_grad():
+        planes.time[:] = torch.arange(5.0)[None, :, None, None]
+    for t, expected in [(2.0, 0.0), (3.5, 1.5), (6.0, 4.0), (9.0, 4.0)]:
+        torch.testing.assert_close(planes.lines(torch.tensor(t)), torch.full((3, 32, 16), expected))
+
+
+def test_gradients_match_finite_differences() -> None:
+    planes = layer(scales=(1, 2))
+    means = places(6).requires_grad_(True)
+    t = torch.tensor(0.43, dtype=torch.float64)
+
+    def run(means: Tensor, *parameters: Tensor) -> Tensor:
+        named = dict(zip(dict(planes.named_parameters()), parameters, strict=True))
+        step = torch.func.functional_call(planes, named, (means, t))
+        return torch.cat(step[:4], dim=1)
+
+    means = means.detach()[2:].clamp(-1.2, 1.2).requires_grad_(True)  # a border has two slopes
+    assert torch.autograd.gradcheck(run, (means, *planes.parameters()), eps=1e-6, atol=1e-7)
+
+
+def test_a_place_outside_has_no_slope() -> None:
+    planes = layer()
+    means = torch.tensor([[2.0, 0.1, 0.1]], dtype=torch.float64, requires_grad=True)
+    torch.cat(planes(means, torch.tensor(0.5, dtype=torch.float64))[:4], dim=1).sum().backward()
+    assert means.grad is not None
+    assert means.grad[0, 0] == 0
+    assert means.grad[0, 1] != 0
+
+
+def test_no_gaussians_at_all() -> None:
+    planes = layer()
+    step = planes(torch.empty(0, 3, dtype=torch.float64), torch.tensor(0.5, dtype=torch.float64))
+    assert step.delta_quats.shape == (0, 4)
+    torch.cat(step[:4], dim=1).sum().backward()
+
+
+def test_a_new_layer_moves_nothing_and_float32_works() -> None:
+    step = PlaneLayer()(places().float(), torch.tensor(0.5))
+    assert not any(delta.any() for delta in step[:3])
+    torch.testing.assert_close(step.weight, torch.full((40, 1), 0.5), atol=0.2, rtol=0)
+
+
+def test_the_same_bits_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gradients(threads: str) -> list[Tensor]:
+        monkeypatch.setenv("MSDGS_THREADS", threads)
+        planes = layer(torch.float32)
+        torch.cat(planes(places(500).float(), torch.tensor(0.3))[:4], dim=1).square().sum().backward()
+        return [p.grad for p in planes.grids.parameters() if p.grad is not None]
+
+    for one, several in zip(gradients("1"), gradients("3"), strict=True):
+        assert torch.equal(one, several)
+
+
+def test_what_enters_the_time_window_goes_on_from_its_border() -> None:
+    planes = PlaneGrid(16, 32, 11, 1.0, (0.0, 1.0))
+    with torch.no_grad():
+        planes.time[:] = torch.arange(11.0)[None, :, None, None]
+    planes.carry_outwards(0.12, 0.31)
+    # before: times 0.38 to 0.62 read nodes 3 to 7; after: 0.19 to 0.81, nodes 1 to 9
+    assert planes.time[0, :, 0, 0].tolist() == [0, 3, 3, 3, 4, 5, 6, 7, 7, 7, 10]
+
+
+def test_flat_grids_and_straight_lines_in_time_are_smooth() -> None:
+    planes = PlaneGrid(16, 32, 9, 1.0, (0.0, 1.0))
+    with torch.no_grad():
+        planes.space[:] = 0.3
+        planes.time[:] = torch.linspace(1, 5, 9)[None, :, None, None]
+        assert float(planes.time_bends() + planes.space_slopes() + planes.space_bends()) < 1e-12
+        assert float(planes.time_offsets()) == pytest.approx(2)
+        planes.time[:, 4] += 1
+        planes.space[:, 3] += 1
+        assert float(planes.time_bends()) == pytest.approx((1 + 4 + 1) / 7)
+        assert float(planes.time_offsets()) == pytest.approx(2 + 1 / 9)
+        assert float(planes.space_slopes()) == pytest.approx(2 / 31)
+        assert float(planes.space_bends()) == pytest.approx((1 + 4 + 1) / 30)
+
+
+def test_grids_of_before_there_were_several_or_boxes_are_read() -> None:
+    planes = layer()
+    old = {name.replace("grids.0.", ""): value for name, value in planes.state_dict().items()}
+    old["cells"] = old["cells"][0]
+    del old["origin"]
+    read = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8)
+    read.load_state_dict(old)
+    t = torch.tensor(0.2)
+    for got, want in zip(read.double()(places(), t)[:4], planes(places(), t)[:4], strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-6, atol=1e-6)
