@@ -99,8 +99,8 @@ async def add_scene(
     replace: Annotated[bool, Query(description="whether a scene of this name may be replaced")] = False,
     sha256: Sha256 = None,
 ) -> SceneAdded:
-    """Takes a scene file as the body. It is checked, and posed in a process of its own, before it takes its place; who draws
-    the scene that it replaces is not disturbed. Only where the service was started with `--uploads`."""
+    """Takes a scene file as the body. It is checked, and posed in a process of its own, before it takes its place;
+    who draws the scene that it replaces is not disturbed. Only where the service was started with `--uploads`."""
     service.check_uploads()
     incoming = service.store.incoming(uuid.uuid4().hex)
     try:
