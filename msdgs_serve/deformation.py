@@ -148,7 +148,7 @@ class DeformationSession:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3  # its warnings are about how graphs are written, not about scenes
+        options.log_severity_level = 4  # its errors are raised as well, its warnings are about how graphs are written
         try:
             return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors share no base below it

@@ -34,7 +34,7 @@ def _check_depth(text: str) -> None:
 
 
 def _whole(digits: str) -> int:
-    if len(digits) > MAX_DIGITS + 1:
+    if len(digits.lstrip("-")) > MAX_DIGITS:
         raise ValueError(f"a whole number has {len(digits):,} digits, more than {MAX_DIGITS}")
     return int(digits)
 

@@ -84,7 +84,7 @@ OPERATORS: Mapping[str, Operator] = {
     "Min": Operator((_FLOAT, _FLOAT)),
     "Mul": Operator((_NUMBER, _NUMBER)),
     "Pow": Operator((_FLOAT, _FLOAT), work=FUNCTION),
-    "QuantizeLinear": Operator((_FLOAT, _FACTOR, Operand((UINT8, INT8), constant=True)), rules.quantize, _AXIS, like=2),
+    "QuantizeLinear": Operator((_FLOAT, _FACTOR, Operand((UINT8, INT8), constant=True)), rules.quantize, like=2),
     "ReduceProd": Operator((_FLOAT, _LENGTHS), rules.reduce, {"keepdims": (0, 1)}),
     "Relu": _function(1),
     "Reshape": Operator((_NUMBER, _LENGTHS), rules.reshape),
