@@ -2,8 +2,9 @@
 and how protobuf writes them. The same seed gives the same file."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -31,20 +32,20 @@ REAL = (0.0, -0.0, 1e-45, -1.0, 1e30, 3.4e38, -3.4e38, float("nan"), float("inf"
 ELEMENTS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 16, 17, 22, 99)
 
 
-def pick(rng: Rng, values: object) -> object:
+def pick(rng: Rng, values: Iterable[Any]) -> Any:
     """One of them."""
-    values = list(values)  # pyright: ignore[reportArgumentType]
+    values = list(values)
     return values[int(rng.integers(len(values)))]
 
 
 def _node(model: onnx.ModelProto, rng: Rng) -> onnx.NodeProto:
     if not model.graph.node:
         model.graph.node.append(helper.make_node("Identity", ["sh"], ["again"]))
-    return pick(rng, model.graph.node)  # pyright: ignore[reportReturnType]
+    return pick(rng, model.graph.node)
 
 
 def _constant(model: onnx.ModelProto, rng: Rng) -> onnx.TensorProto:
-    return pick(rng, model.graph.initializer)  # pyright: ignore[reportReturnType]
+    return pick(rng, model.graph.initializer)
 
 
 def _names(model: onnx.ModelProto) -> list[str]:
@@ -177,7 +178,7 @@ def repeat_a_constant(model: onnx.ModelProto, rng: Rng) -> None:
 def move_a_constant_elsewhere(model: onnx.ModelProto, rng: Rng) -> None:
     name = _constant(model, rng).name
     location = pick(rng, (0, 1, 2, 2**32 + 1, 2**63 + 1))
-    model.graph.initializer.append(TensorProto.FromString(elsewhere(name, CANARY, location)))  # pyright: ignore
+    model.graph.initializer.append(TensorProto.FromString(elsewhere(name, CANARY, location)))
 
 
 def rename(model: onnx.ModelProto, rng: Rng) -> None:
@@ -266,7 +267,7 @@ def mutated(sound: bytes, rng: Rng) -> bytes:
     only_wire = rng.random() < WIRE / 2
     for _ in range(0 if only_wire else int(rng.choice([1, 2, 3], p=[0.7, 0.2, 0.1]))):
         try:
-            pick(rng, SUBTLE if rng.random() < 0.5 else MUTATIONS)(model, rng)  # pyright: ignore[reportCallIssue]
+            pick(rng, SUBTLE if rng.random() < 0.5 else MUTATIONS)(model, rng)
         except (ValueError, TypeError):
             continue  # an earlier change left nothing that this one could change
     contents = model.SerializeToString()

@@ -1,5 +1,6 @@
 """Types, shapes and cost of a graph before it runs: every node is looked up in the table of operators."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,8 +10,8 @@ from msdgs_serve.scene.onnx.cost import PRODUCT, CallCost, GraphLimits
 from msdgs_serve.scene.onnx.model import DTYPES, Model, Node, Tensor, element_name
 from msdgs_serve.scene.onnx.operators import OPERATORS, Operator
 from msdgs_serve.scene.onnx.rules import Call, Result
-from msdgs_serve.scene.onnx.schema import MAX_RANK
-from msdgs_serve.scene.onnx.shapes import Shape, ShapeInvalid, count, fixed
+from msdgs_serve.scene.onnx.schema import MAX_ELEMENTS, MAX_RANK
+from msdgs_serve.scene.onnx.shapes import Shape, ShapeInvalid, count, fixed, text
 from msdgs_serve.scene.onnx.wire import ModelInvalid
 
 
@@ -50,8 +51,8 @@ def infer(
         for name, shape in zip(node.outputs, result.shapes, strict=True):
             if not name or name in values:
                 raise ModelInvalid(node.name, f"writes `{name}`, which is there already or has no name")
-            if len(shape) > MAX_RANK:
-                raise ModelInvalid(node.name, f"makes an array of {len(shape)} dimensions, more than {MAX_RANK}")
+            if len(shape) > MAX_RANK or math.prod(max(dim.at(ids), 1) for dim in shape) > MAX_ELEMENTS:
+                raise ModelInvalid(node.name, f"makes an array of shape {text(shape)}, which is too large")
             values[name] = Value(element, shape, varies)
         cost = cost.plus(*_cost(operator, result, element, ids))
         if problem := cost.problem(limits, calls):

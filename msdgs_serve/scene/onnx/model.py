@@ -148,7 +148,9 @@ def _tensor(part: memoryview) -> Tensor:
         known = ", ".join(element_name(each) for each in CONSTANT_ELEMENTS)
         raise ModelInvalid(name, f"is a constant of {element_name(element)}, not of {known}")
     data, size = fields.get("raw_data", memoryview(b"")), DTYPES[element].itemsize
-    if any(length < 0 for length in shape) or len(data) != math.prod(shape) * size:
+    if min(shape, default=0) < 0 or math.prod(max(length, 1) for length in shape) > schema.MAX_ELEMENTS:
+        raise ModelInvalid(name, f"has the lengths {shape}, which no array has")
+    if len(data) != math.prod(shape) * size:
         raise ModelInvalid(name, f"of shape {shape} has {len(data):,} bytes")
     return Tensor(name, element, shape, data)
 

@@ -93,7 +93,7 @@ def concat(call: Call) -> Result:
     """Arrays side by side."""
     first = call.shapes[0]
     axis = axis_of(call.attributes.get("axis", 0), len(first))
-    if any((*s[:axis], *s[axis + 1 :]) != (*first[:axis], *first[axis + 1 :]) for s in call.shapes):
+    if any(len(s) != len(first) or s[:axis] + s[axis + 1 :] != first[:axis] + first[axis + 1 :] for s in call.shapes):
         raise ShapeInvalid(f"can't put {' and '.join(text(shape) for shape in call.shapes)} side by side")
     return Result([(*first[:axis], added(shape[axis] for shape in call.shapes), *first[axis + 1 :])])
 

@@ -12,6 +12,8 @@ MAX_PORTS = 64
 MAX_OPERANDS = 64
 """Inputs and outputs of a node."""
 MAX_RANK = 8
+MAX_ELEMENTS = 1 << 40
+"""Of an array, lengths of 0 counted as 1: an empty one of huge lengths overflows in libraries."""
 MAX_PROPERTIES = 64
 
 _MANY = 1 << 16
