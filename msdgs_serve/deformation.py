@@ -1,7 +1,8 @@
 """A scene file in onnxruntime: time and ids in, posed Gaussians out."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,18 @@ class DeformationSession:
         """All Gaussians at time `t`, moving and static, ready to draw; moving ones as `pose` has them."""
         return self.scene.gaussians(*self.pose(t, steps=steps))
 
+    @contextmanager
+    def answering_for(self, t: float) -> Iterator[None]:
+        """Turn `InvalidInput` about this scene's Gaussians at `t` into `SceneFileInvalid`: only the first and the last
+        time are looked at when a file is loaded."""
+        try:
+            yield
+        except InvalidInput as error:
+            if not error.field.startswith("gaussians."):
+                raise
+            name = error.field.removeprefix("gaussians.")
+            raise SceneFileInvalid(self._file, name, f"can't be used at t = {t}: {error}") from error
+
     def _checked_time(self, t: float) -> float:
         t0, t1 = self.scene.metadata.time_range
         if not t0 <= t <= t1:
@@ -157,11 +170,8 @@ class DeformationSession:
     def _check_sample(self, t: float) -> None:
         sample = slice(min(self.scene.moving_count, 64))
         posed = self.pose(t, np.arange(sample.stop))
-        try:
+        with self.answering_for(t):
             Gaussians(*posed, self.scene.opacities[sample], self.scene.sh[sample]).validate()
-        except InvalidInput as error:
-            name = error.field.removeprefix("gaussians.")
-            raise SceneFileInvalid(self._file, name, f"can't be used at t = {t}: {error}") from error
 
     def _run(self, t: float, ids: npt.NDArray[np.int64], steps: float | None = None) -> list[FloatArray]:
         inputs = {"t": np.array([t], np.float32), "ids": ids}
