@@ -58,16 +58,14 @@ def test_attacks_are_refused_by_name_before_onnxruntime_sees_them(tmp_path: Path
     assert NAMED[name] in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["file_read_inside_a_function", "loop_that_never_ends_in_the_middle"])
-def test_attacks_are_models_that_onnxruntime_takes(tmp_path: Path, sound: onnx.ModelProto, name: str):
-    secret = tmp_path / "secret"
-    heights = np.arange(6, dtype=np.float32)
-    secret.write_bytes(heights.tobytes())
-    path = tmp_path / "attack.onnx"
-    path.write_bytes(ATTACKS[name](sound, Path("secret")))
-    session = onnxruntime.InferenceSession(path)
-    means = session.run(["means"], {"t": np.zeros(1, np.float32)})[0]
-    assert np.isfinite(np.asarray(means)).all()
+@pytest.mark.parametrize("name", ["file_read_by_a_truncated_location", "file_read_inside_a_function"])
+def test_onnxruntime_itself_hands_out_other_files(tmp_path: Path, sound: onnx.ModelProto, name: str):
+    """What the reader is for: with this library alone the bytes of the file are rendered as positions."""
+    (tmp_path / "secret").write_bytes(b"root:x:0:0:root:/root:/bin")
+    (tmp_path / "attack.onnx").write_bytes(ATTACKS[name](sound, Path("secret")))
+    session = onnxruntime.InferenceSession(tmp_path / "attack.onnx")
+    means = np.asarray(session.run(["means"], {"t": np.zeros(1, np.float32)})[0])
+    assert bytes(means[0].astype(np.uint8)) == b"roo"
 
 
 @pytest.mark.usefixtures("unseen")

@@ -37,8 +37,8 @@ def with_graph(model: onnx.ModelProto, graph: bytes) -> bytes:
 
 
 def elsewhere(name: str, secret: Path, location: int) -> bytes:
-    """A tensor of heights [1, 3] whose values are the first bytes of a file; `location` is what says so."""
-    tensor = onnx.TensorProto(name=name, data_type=TensorProto.FLOAT, dims=[2, 3])
+    """A tensor [8, 3] whose values are the first bytes of a file; `location` is what says so."""
+    tensor = onnx.TensorProto(name=name, data_type=TensorProto.UINT8, dims=[SECRET_BYTES // 3, 3])
     for key, value in {"location": str(secret), "offset": "0", "length": str(SECRET_BYTES)}.items():
         tensor.external_data.add(key=key, value=value)
     return tensor.SerializeToString() + field(14, location)
@@ -55,7 +55,8 @@ def without_constant(model: onnx.ModelProto, name: str) -> onnx.GraphProto:
 def file_read_by_a_truncated_location(model: onnx.ModelProto, secret: Path) -> bytes:
     """2³² + 1 in 32 bits is 1: EXTERNAL."""
     graph = without_constant(model, "base")
-    return with_graph(model, graph.SerializeToString() + field(5, elsewhere("base", secret, 2**32 + 1)))
+    graph.node.insert(0, helper.make_node("Cast", ["bytes"], ["base"], to=TensorProto.FLOAT))
+    return with_graph(model, graph.SerializeToString() + field(5, elsewhere("bytes", secret, 2**32 + 1)))
 
 
 def location_of_33_bits(model: onnx.ModelProto, secret: Path) -> bytes:
@@ -67,9 +68,12 @@ def location_of_33_bits(model: onnx.ModelProto, secret: Path) -> bytes:
 def file_read_inside_a_function(model: onnx.ModelProto, secret: Path) -> bytes:
     """The constant lies in a function of the model."""
     value = onnx.TensorProto.FromString(elsewhere("value", secret, 1))
-    constant = helper.make_node("Constant", [], ["heights"], value=value)
+    nodes = [
+        helper.make_node("Constant", [], ["bytes"], value=value),
+        helper.make_node("Cast", ["bytes"], ["heights"], to=TensorProto.FLOAT),
+    ]
     opsets = [helper.make_opsetid("", 20)]
-    model.functions.append(helper.make_function("local", "Heights", [], ["heights"], [constant], opsets))
+    model.functions.append(helper.make_function("local", "Heights", [], ["heights"], nodes, opsets))
     model.opset_import.append(helper.make_opsetid("local", 1))
     model.graph.initializer.remove(next(each for each in model.graph.initializer if each.name == "base"))
     model.graph.node.insert(0, helper.make_node("Heights", [], ["base"], domain="local"))
@@ -80,7 +84,8 @@ def constant_node_in_another_file(model: onnx.ModelProto, secret: Path) -> bytes
     """A `Constant` of the graph itself."""
     value = onnx.TensorProto.FromString(elsewhere("value", secret, 1))
     model.graph.initializer.remove(next(each for each in model.graph.initializer if each.name == "base"))
-    model.graph.node.insert(0, helper.make_node("Constant", [], ["base"], value=value))
+    model.graph.node.insert(0, helper.make_node("Cast", ["bytes"], ["base"], to=TensorProto.FLOAT))
+    model.graph.node.insert(0, helper.make_node("Constant", [], ["bytes"], value=value))
     return model.SerializeToString()
 
 
