@@ -1,4 +1,4 @@
-"""What deformation and drawing take of a frame, of scene files in turns, at several picture sizes."""
+"""What deformation and drawing take of a frame, of scene files in turns, at several image sizes."""
 
 import statistics
 import sys
@@ -28,7 +28,7 @@ def main(
 
     Args:
         scenes: Files of contract msdgs/1 with at least one camera.
-        sizes: Widths of pictures in pixels; the scene's first camera is scaled to them.
+        sizes: Widths of images in pixels; the scene's first camera is scaled to them.
         repeats: Frames of each file and size, at other times each.
     """
     console = Console(soft_wrap=True, highlight=False)
@@ -43,7 +43,7 @@ def main(
             for size in sizes:
                 lap = _lap(session, size, (turn * GOLDEN) % 1)
                 found[path, size] += [lap] if turn else []  # the first frames load and compile
-    table = Table("scene", "plan", "moving", "picture", "deform ms, min", "median", "draw ms, min", "median", box=None)
+    table = Table("scene", "plan", "moving", "image", "deform ms, min", "median", "draw ms, min", "median", box=None)
     for (path, size), laps in found.items():
         scene = sessions[path].scene
         parts = [f"{f(part):.1f}" for part in zip(*laps, strict=True) for f in (min, statistics.median)]

@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int, default=100_000, help="Gaussians")
-    parser.add_argument("--size", type=int, default=800, help="pixels of its cameras' pictures")
+    parser.add_argument("--size", type=int, default=800, help="pixels of its cameras' images")
     options = parser.parse_args()
     cloud = options.folder / "point_cloud" / f"iteration_{ITERATION}" / "point_cloud.ply"
     network = options.folder / "deform" / f"iteration_{ITERATION}" / "deform.pth"
@@ -75,8 +75,8 @@ def state() -> dict[str, Tensor]:
 
 def octave_weights(dimensions: int, frequencies: int) -> Tensor:
     """Of x, sin x, cos x, sin 2x, cos 2x, …"""
-    octaves = [torch.full((2 * dimensions,), DAMPING**k) for k in range(frequencies)]
-    return torch.cat([torch.ones(dimensions), *octaves])
+    frequency_matrix = [torch.full((2 * dimensions,), DAMPING**k) for k in range(frequencies)]
+    return torch.cat([torch.ones(dimensions), *frequency_matrix])
 
 
 def camera(number: int, size: int) -> dict[str, object]:

@@ -10,7 +10,7 @@ OPTIONS = {
     "model.point_sprites.type": "gaussian",
     "model.point_sprites.absolute_size": True,  # scales are in scene units, not in parts of the scene's size
     "model.point_sprites.size": 1.0,
-    "model.coloring": "direct",  # each splat's own colour and opacity, without light
+    "model.coloring": "direct",  # each splat's own color and opacity, without light
     "render.effect.blending.mode": "sort",
     "render.background.color": (0.0, 0.0, 0.0),
     "ui.loader_progress": False,
@@ -28,15 +28,15 @@ def main() -> None:
     view = f3d.CameraState(**{name: tuple(job[name]) for name in ("position", "focal_point", "view_up")})
     view.view_angle = job["view_angle"]
     print(json.dumps({"version": engine.get_lib_info().version}), flush=True)
-    picture = None
+    image = None
     for order in sys.stdin:
         if order.strip() == "save":
-            picture.save(job["image"])  # pyright: ignore[reportOptionalMemberAccess]
+            image.save(job["image"])  # pyright: ignore[reportOptionalMemberAccess]
             print(json.dumps({"saved": True}), flush=True)
             continue
         window.camera.state = view
         start = time.perf_counter()
-        picture = window.render_to_image()
+        image = window.render_to_image()
         seconds = time.perf_counter() - start
         window.camera.azimuth(20)  # F3D keeps its depth order until the view has turned by 3°
         window.render_to_image()

@@ -27,14 +27,14 @@ def main() -> None:
     scene.camera.set_projection(job["view_angle"], width / height, far * 1e-4, far, rendering.Camera.FovType.Vertical)
     scene.camera.look_at(job["focal_point"], job["position"], job["view_up"])
     print(json.dumps({"version": open3d.__version__}), flush=True)
-    picture = None
+    image = None
     for order in sys.stdin:
         if order.strip() == "save":
-            open3d.io.write_image(job["image"], picture)
+            open3d.io.write_image(job["image"], image)
             print(json.dumps({"saved": True}), flush=True)
             continue
         start = time.perf_counter()
-        picture = renderer.render_to_image()
+        image = renderer.render_to_image()
         print(json.dumps({"seconds": time.perf_counter() - start}), flush=True)
 
 

@@ -18,7 +18,7 @@ FOLDER = Path(__file__).resolve().parent
 SCRIPTS = {"F3D": FOLDER / "draw_with_f3d.py", "Open3D": FOLDER / "draw_with_open3d.py"}
 
 AS_DRAWN_BY: dict[str, RasterizerOptions] = {
-    # F3D adds 0.3 / size² to a covariance in clip space, where the picture is 2 wide and not 1. It has neither the cut
+    # F3D adds 0.3 / size² to a covariance in clip space, where the image is 2 wide and not 1. It has neither the cut
     # at alpha 1/255 nor that at transmittance 1e-4, but ends a splat at 3 sigma.
     "F3D": GSPLAT._replace(eps2d=0.3 / 4),
     "Open3D": GSPLAT,
@@ -81,7 +81,7 @@ class Drawer:
         """Seconds that a frame took."""
         return float(self._ask("draw", "seconds"))
 
-    def picture(self) -> np.ndarray:
+    def image(self) -> np.ndarray:
         """[H, W, 3] of the last frame."""
         self._ask("save", "saved")
         if self._image.suffix == ".npy":
@@ -103,7 +103,7 @@ class Drawer:
         raise SystemExit(f"{self.name} did not draw:\n{self._errors.read()[-3000:]}")
 
 
-def psnr(picture: np.ndarray, other: np.ndarray) -> float:
-    """dB of two pictures in [0, 1], infinite where they are the same."""
-    error = float(np.mean((np.clip(picture, 0, 1).astype(float) - np.clip(other, 0, 1)) ** 2))
+def psnr(image: np.ndarray, other: np.ndarray) -> float:
+    """dB of two images in [0, 1], infinite where they are the same."""
+    error = float(np.mean((np.clip(image, 0, 1).astype(float) - np.clip(other, 0, 1)) ** 2))
     return -10 * np.log10(error) if error else float("inf")

@@ -1,4 +1,4 @@
-"""Files of other programs, imported, served and drawn through POST /render, side by side in one picture:
+"""Files of other programs, imported, served and drawn through POST /render, side by side in one image:
 
 python benchmarks/imported_formats.py data/splats data/splat_sequence_monkey -o docs/images/formats.png
 
@@ -36,9 +36,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("inputs", nargs="+", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--size", type=int, default=400, help="pixels of each picture")
+    parser.add_argument("--size", type=int, default=400, help="pixels of each image")
     options = parser.parse_args()
-    pictures, failed = [], []
+    images, failed = [], []
     with tempfile.TemporaryDirectory() as folder:
         sources = {}
         for i, (source, kind) in enumerate(each for path in options.inputs for each in recognised(path)):
@@ -52,11 +52,11 @@ def main() -> int:
                 for t, pixels in rendered(client, scene, options.size):
                     seen = float((pixels[..., 3] > 0.5).mean())
                     count = len(DeformationSession(scene).scene)
-                    print(f"{name}  {kind}  t = {t:g}  {count:,} Gaussians, fill {seen:.0%} of the picture")
-                    pictures.append((f"{name}, {kind}" + (f", t = {t:g}" if t else ""), pixels))
+                    print(f"{name}  {kind}  t = {t:g}  {count:,} Gaussians, fill {seen:.0%} of the image")
+                    images.append((f"{name}, {kind}" + (f", t = {t:g}" if t else ""), pixels))
                     failed += [] if 0.01 < seen < 0.99 else [name]
-    write(options.output, pictures)
-    print(f"{len(pictures)} pictures; failed: {', '.join(failed) or 'none'}")
+    write(options.output, images)
+    print(f"{len(images)} images; failed: {', '.join(failed) or 'none'}")
     return bool(failed)
 
 
@@ -73,7 +73,7 @@ def recognised(path: Path) -> Iterator[tuple[Path, str]]:
 
 
 def rendered(client: httpx.Client, scene: Path, size: int) -> Iterator[tuple[float, np.ndarray]]:
-    """Times and [H, W, 4] pictures, as the service sends them."""
+    """Times and [H, W, 4] images, as the service sends them."""
     session = DeformationSession(scene)
     t0, t1 = session.scene.metadata.time_range
     for part in ALONG if session.scene.moving_count else ALONG[:1]:
@@ -85,13 +85,13 @@ def rendered(client: httpx.Client, scene: Path, size: int) -> Iterator[tuple[flo
         yield t, plt.imread(io.BytesIO(answer.content))
 
 
-def write(output: Path, pictures: list[tuple[str, np.ndarray]]) -> None:
+def write(output: Path, images: list[tuple[str, np.ndarray]]) -> None:
     """The sheet."""
-    rows = -(-len(pictures) // COLUMNS)
+    rows = -(-len(images) // COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(INCHES * COLUMNS, (INCHES + 0.3) * rows), squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
-    for axis, (title, pixels) in zip(axes.flat, pictures, strict=False):
+    for axis, (title, pixels) in zip(axes.flat, images, strict=False):
         axis.imshow(pixels[..., :3] * pixels[..., 3:] + BEHIND * (1 - pixels[..., 3:]))
         axis.set_title(title, fontsize=6)
     figure.tight_layout(pad=0.3)

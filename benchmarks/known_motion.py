@@ -1,5 +1,5 @@
 """How well the systems of a comparison can follow motion at all: their layers are taught where points of the synthetic
-scene are, which is known, instead of photographs."""
+scene are, which is known, instead of images."""
 
 import statistics
 import sys
@@ -22,7 +22,7 @@ from msdgs_train.datasets.synthetic.motion import OBJECTS, world_positions
 from msdgs_train.datasets.synthetic.trajectories import surface_points
 from msdgs_train.engine.optimizer import learning_rates, make_optimizer, set_learning_rates
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import Domain, DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, SceneBounds
 
 MOVING = OBJECTS[2:]
 HALF_EXTENT = 1.3  # scene units
@@ -89,13 +89,13 @@ def errors_of(system: System, seed: int, points: int) -> np.ndarray:
 
 def _new_model(system: System, seed: int, canonical: Tensor) -> DynamicGaussians:
     sizes, generator = system.config.model, torch.Generator().manual_seed(seed)
-    rest = (sizes.sh_degree, sizes.embedding_size, generator, sizes.motions)
+    rest = (sizes.sh_degree, sizes.embedding_dim, generator, sizes.motions)
     gaussians = CanonicalGaussians.from_points(canonical, torch.full_like(canonical, 0.5), *rest)
     gaussians.requires_grad_(requires_grad=False)
     if gaussians.embeddings is not None:
         gaussians.embeddings.requires_grad_()
     torch.manual_seed(seed)
-    return DynamicGaussians(sizes, gaussians, Domain(HALF_EXTENT))
+    return DynamicGaussians(sizes, gaussians, SceneBounds(HALF_EXTENT))
 
 
 def _places(local: list[np.ndarray], t: float) -> Tensor:

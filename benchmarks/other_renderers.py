@@ -1,4 +1,4 @@
-"""One scene drawn by this project's rasterizer and by others: how far the pictures differ, and the times, in turns.
+"""One scene drawn by this project's rasterizer and by others: how far the images differ, and the times, in turns.
 
 python -m venv .venv-f3d && .venv-f3d/bin/pip install f3d==4.0.0
 python benchmarks/other_renderers.py --f3d-python .venv-f3d/bin/python
@@ -6,7 +6,7 @@ python benchmarks/other_renderers.py --f3d-python .venv-f3d/bin/python
 F3D (https://f3d.app, 80 MB from PyPI, glibc 2.34 or newer) draws splats by OpenGL through EGL; without a GPU, Mesa's
 software does (Debian, Ubuntu: `apt install libegl1 libgl1-mesa-dri`). Open3D (https://www.open3d.org, 400 MB from PyPI,
 from version 0.20, `--open3d-python`) does by Vulkan (`apt install mesa-vulkan-drivers libusb-1.0-0`). Both read .splat
-files, so all get the numbers of one: colours, opacities and rotations of 8 bits, no harmonics beyond the constant.
+files, so all get the numbers of one: colors, opacities and rotations of 8 bits, no harmonics beyond the constant.
 """
 
 import argparse
@@ -47,13 +47,13 @@ def main() -> None:
             for drawer in drawers:
                 seconds[drawer.name].append(drawer.draw())
         versions = {drawer.name: drawer.version for drawer in drawers}
-        pictures = {drawer.name: drawer.picture() for drawer in drawers}
+        images = {drawer.name: drawer.image() for drawer in drawers}
     print(f"{len(records)} Gaussians, {camera.width}×{camera.height}")
     for name, taken in seconds.items():
         title = f"{name} {versions.get(name, '')}"
         print(f"{title:14} first frame {taken[0] * 1e3:8.1f} ms, best of {len(taken)} {min(taken) * 1e3:8.1f} ms")
     panels = []
-    for name, theirs in pictures.items():
+    for name, theirs in images.items():
         options = AS_DRAWN_BY[name]._replace(alpha_min=arguments.alpha_min)
         ours = np.clip(rasterize(gaussians, camera, options=options).rgb, 0, 1)
         difference = np.abs(ours - theirs)
@@ -76,7 +76,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--target", type=float, nargs=3, help="what it looks at; default: the median Gaussian")
     parser.add_argument("--up", type=float, nargs=3, default=(0.0, -1.0, 0.0))
     parser.add_argument("--alpha-min", type=float, default=GSPLAT.alpha_min, help="ours: where a splat ends")
-    parser.add_argument("--out", type=Path, help="a picture: ours, theirs, 20 × the difference; a row a renderer")
+    parser.add_argument("--out", type=Path, help="an image: ours, theirs, 20 × the difference; a row a renderer")
     return parser.parse_args()
 
 
@@ -99,15 +99,15 @@ def seeded(count: int, seed: int) -> np.ndarray:
 
 
 def camera_for(means: np.ndarray, arguments: argparse.Namespace) -> Camera:
-    """As asked for, or so far away that nine in ten Gaussians are in a picture of 40°."""
+    """As asked for, or so far away that nine in ten Gaussians are in an image of 40°."""
     target = np.array(arguments.target) if arguments.target else np.median(means, axis=0).astype(float)
     radius = np.quantile(np.linalg.norm(means - target, axis=1), 0.9)
     eye = np.array(arguments.eye) if arguments.eye else target - [0, 0, 3 * radius]
     return Camera.from_look_at(eye, target, np.array(arguments.up), arguments.size, arguments.size, 40.0)
 
 
-def write(path: Path, picture: np.ndarray) -> None:
-    buffer = oiio.ImageBuf(np.clip(picture, 0, 1).astype(np.float32))
+def write(path: Path, image: np.ndarray) -> None:
+    buffer = oiio.ImageBuf(np.clip(image, 0, 1).astype(np.float32))
     if not buffer.write(str(path), "uint8"):
         raise SystemExit(f"could not write {path}: {buffer.geterror()}")
 

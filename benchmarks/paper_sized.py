@@ -247,8 +247,8 @@ def grown(small: DynamicGaussians) -> DynamicGaussians:
     config = replace(
         paper,
         sh_degree=small.config.sh_degree,
-        embedding_size=small.config.embedding_size,
-        modulate=small.config.modulate,
+        embedding_dim=small.config.embedding_dim,
+        modulation_targets=small.config.modulation_targets,
         delta_space=small.config.delta_space,
     )
     torch.manual_seed(0)
@@ -273,9 +273,9 @@ def _grown(layer: MLPLayer, trained: MLPLayer) -> None:
     """Make a larger layer compute what a smaller one does. Its other hidden units stay as they are drawn, unread."""
     if layer.outputs != trained.outputs or len(layer.trunk) < len(trained.trunk):
         raise InvalidInput("model", "of layers with the paper's heads, four hidden layers at most", "others")
-    width, places = trained.first.out_features, _columns(layer.xyz_octaves, trained.xyz_octaves)
+    width, places = trained.first.out_features, _columns(layer.xyz_frequency_matrix, trained.xyz_frequency_matrix)
     times = layer.xyz_features + torch.arange(trained.time_output.out_features)
-    _copy(layer.time_hidden, trained.time_hidden, _columns(layer.time_octaves, trained.time_octaves))
+    _copy(layer.time_hidden, trained.time_hidden, _columns(layer.time_frequency_matrix, trained.time_frequency_matrix))
     _copy(layer.time_output, trained.time_output, torch.arange(trained.time_output.in_features))
     _copy(layer.first, trained.first, torch.cat([places, times]))
     for i, linear in enumerate(_linears(layer)):
@@ -293,9 +293,9 @@ def _linears(layer: MLPLayer) -> list[nn.Linear]:
     return [linear for linear in layer.trunk if isinstance(linear, nn.Linear)]
 
 
-def _columns(octaves: Tensor, fewer: Tensor) -> Tensor:
+def _columns(frequency_matrix: Tensor, fewer: Tensor) -> Tensor:
     """Columns of a longer encoding, value, sines, cosines, that are those of a shorter one."""
-    size, many, few = octaves.shape[0], octaves.shape[1], fewer.shape[1]
+    size, many, few = frequency_matrix.shape[0], frequency_matrix.shape[1], fewer.shape[1]
     if few > many:
         raise InvalidInput("model", f"with at most {many // size} frequencies", few // size)
     first = torch.arange(size + few)
@@ -331,7 +331,7 @@ def _train(fit: Fit, seconds: float, saved: Path, console: Console) -> None:
 
 @torch.no_grad()
 def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
-    """How near the field came to the smoothed motion and to the small model's pictures, and what each layer adds."""
+    """How near the field came to the smoothed motion and to the small model's images, and what each layer adds."""
     ids = torch.arange(0, len(fit.model.gaussians), 37)
     t0, t1 = fit.info.time_range
     errors = torch.cat([fit.errors(t, ids)[:, MEANS].norm(dim=1) for t in np.linspace(t0, t1, 17)])
@@ -353,7 +353,7 @@ def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
     for view in deciding_views(cameras_of(fit.info), fit.info.time_range, 9):
         frames = [shown(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
         psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
-    console.print(f"pictures against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
+    console.print(f"images against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
 
 
 def _pixel(model: DynamicGaussians, info: SceneInfo) -> float:

@@ -71,8 +71,8 @@ class Benchmark:
     """The same frames in turns with a renderer written by hand for AVX-512; needs g++ and such a processor."""
     splats: tuple[Path, ...] = ()
     """Files of real splats, .splat or INRIA's .ply, to draw at 800x800 beside the seeded scenes."""
-    pictures: Path | None = None
-    """Folder for the pictures of those."""
+    images: Path | None = None
+    """Folder for the images of those."""
     f3d_python: Path | None = None
     """An interpreter that can import f3d: frames of 100,000 and 300,000 Gaussians at 800x800 in turns with ours."""
     open3d_python: Path | None = None
@@ -111,7 +111,7 @@ class Run:
             real = [Subject(path.name, gaussians := read_gaussians(path), around(gaussians)) for path in options.splats]
             self._time_stages("real", real)
             predict(self.result["real"], self.result["frames"])
-            self._save_pictures(real)
+            self._save_images(real)
         if options.knobs:
             self._time_knobs()
         pythons = {"F3D": options.f3d_python, "Open3D": options.open3d_python}
@@ -145,15 +145,15 @@ class Run:
                     row_of(*figures, machine) for figures in zip(subjects, times, work, memory, strict=True)
                 ]
 
-    def _save_pictures(self, subjects: list[Subject]) -> None:
-        if not self.options.pictures:
+    def _save_images(self, subjects: list[Subject]) -> None:
+        if not self.options.images:
             return
         from matplotlib.image import imsave
 
-        self.options.pictures.mkdir(parents=True, exist_ok=True)
+        self.options.images.mkdir(parents=True, exist_ok=True)
         for subject in subjects:
             rgb = rasterize(subject.gaussians, subject.camera).rgb
-            imsave(self.options.pictures / f"{subject.name}.png", np.clip(rgb, 0, 1))
+            imsave(self.options.images / f"{subject.name}.png", np.clip(rgb, 0, 1))
 
     def _time_knobs(self) -> None:
         runs = KnobRuns(object_scene(KNOB_COUNT, self.options.seed), square_camera())
@@ -187,11 +187,11 @@ class Run:
                         times.time("msdgs", rasterize, gaussians, camera)
                     for drawer in drawers:
                         times.add(drawer.name, drawer.draw())
-                pictures = {drawer.name: drawer.picture() for drawer in drawers}
+                images = {drawer.name: drawer.image() for drawer in drawers}
                 versions = {drawer.name: drawer.version for drawer in drawers}
             milliseconds = times.milliseconds()
             rows = [{"name": "msdgs", "count": count, "milliseconds": milliseconds["msdgs"], "times_ours": 1.0}]
-            for name, picture in pictures.items():
+            for name, picture in images.items():
                 ours = rasterize(gaussians, camera, options=AS_DRAWN_BY[name]).rgb
                 times_ours = milliseconds[name]["min"] / milliseconds["msdgs"]["min"]
                 rows.append({"name": f"{name} {versions[name]}", "count": count, "milliseconds": milliseconds[name]})
@@ -215,10 +215,10 @@ class Run:
                 for turn in self._turns(f"checkouts, {count:,}", self.options.repeats):
                     for drawer in drawers if turn % 2 else drawers[::-1]:
                         times.add(drawer.name, drawer.draw())
-                pictures = [drawer.picture() for drawer in drawers]
+                images = [drawer.image() for drawer in drawers]
             milliseconds = times.milliseconds()
             ratio = milliseconds["the other"]["min"] / milliseconds["this one"]["min"]
-            error = psnr(*pictures)
+            error = psnr(*images)
             row = {"count": count, "milliseconds": milliseconds, "ratio": ratio}
             row["psnr"] = error if np.isfinite(error) else None
             self.result["checkouts"].append(row)

@@ -22,7 +22,7 @@ from msdgs_serve.scene import Camera, Gaussians
 from tests.support.reference import render
 
 WITHOUT_THRESHOLDS = GSPLAT._replace(alpha_min=1e-6, transmittance_min=0.0)
-FLOAT16 = {"all numbers": int(X), "all but the place": int(ROOT_A), "colour and depth": int(RED)}
+FLOAT16 = {"all numbers": int(X), "all but the place": int(ROOT_A), "color and depth": int(RED)}
 """The first column of a record that is rounded."""
 BLACK = np.zeros(3, np.float32)
 
@@ -149,7 +149,7 @@ class KnobRuns:
         exact = as_float64(gaussians)
         self._exact = rasterize(exact, camera).rgb
         self._limitless = rasterize(exact, camera, options=WITHOUT_THRESHOLDS).rgb
-        self._pictures = [knob.draw(*self._scene) for knob in self._knobs]
+        self._images = [knob.draw(*self._scene) for knob in self._knobs]
 
     def draw_all(self) -> None:
         """One turn, in an order of its own."""
@@ -166,9 +166,9 @@ class KnobRuns:
                 "value": knob.value,
                 "milliseconds": milliseconds[str(k)],
                 "of_usual": milliseconds[str(k)]["min"] / usual,
-                "psnr": psnr(picture, self._exact),
-                "worst": float(np.abs(picture - self._exact).max()),
-                "psnr_without_thresholds": psnr(picture, self._limitless),
+                "psnr": psnr(image, self._exact),
+                "worst": float(np.abs(image - self._exact).max()),
+                "psnr_without_thresholds": psnr(image, self._limitless),
             }
-            for k, (knob, picture) in enumerate(zip(self._knobs, self._pictures, strict=True))
+            for k, (knob, image) in enumerate(zip(self._knobs, self._images, strict=True))
         ]

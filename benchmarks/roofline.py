@@ -13,7 +13,7 @@ from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
 FLOPS_A_PAIR = 37
 """Of one splat in one pixel, an fma counted twice: dx, dy 2; root times that 4; squares and log2 of the opacity 4;
-2^x 13 (rounding 3, polynomial of degree 5: 10); two cuts 2; transmittance 3, going on 1; three colours and depth 8."""
+2^x 13 (rounding 3, polynomial of degree 5: 10); two cuts 2; transmittance 3, going on 1; three colors and depth 8."""
 
 CHAINS = 8
 ROUNDS = 200_000

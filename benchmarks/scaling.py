@@ -37,7 +37,7 @@ SCENES, TIMES = 8, 64  # of the trace that is measured
 CLIENTS = 4
 CACHE_MEGABYTES = 32
 IN_TURN = 25  # frames
-MAX_ERROR = 0.15
+MIN_PSNR = 0.15
 LOAD = 0.7  # of what all cores could draw without any cache
 REPLICAS = (1, 3, 10, 30, 100, 300, 1000)
 CATALOGUE, MOMENTS = 200, 300  # scenes and times of a large service
@@ -77,7 +77,7 @@ def main() -> int:
     )
     print(f"measured {best.rate:.1f} frames a second, hit rate {best.hit_rate:.2f}")
     print(f"simulated {simulated.rate:.1f} frames a second, hit rate {simulated.hit_rate:.2f}: {100 * error:+.1f} %")
-    if abs(error) > MAX_ERROR:
+    if abs(error) > MIN_PSNR:
         print("the simulation doesn't reproduce what was measured; nothing is extrapolated", file=sys.stderr)
         return 1
     trace = heavy_tailed(options.requests, CATALOGUE, MOMENTS)

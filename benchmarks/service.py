@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import service_promises as promises
 from benchmarks.service_load import Health, Tally, at_rate, overload, saturate
 from benchmarks.service_process import Connection, Running, make_scenes, service
-from benchmarks.service_requests import Offline, Wanted, digest, mixed, pictures
+from benchmarks.service_requests import Offline, Wanted, digest, images, mixed
 from msdgs_serve.api.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -119,7 +119,7 @@ def _overheads(running: Running, repeats: int) -> tuple[list[float], float]:
     """Milliseconds of calls beyond `pose` and `draw`, and what the client's own work is of a call (processor time)."""
     connection, beyond = Connection(running.port), []
     worked = time.process_time()
-    for number, wanted in enumerate(pictures(repeats + 5, FIRST)):
+    for number, wanted in enumerate(images(repeats + 5, FIRST)):
         if number == 5:
             worked = time.process_time()
         started = time.perf_counter()
@@ -181,7 +181,7 @@ def too_much(setting: Setting) -> Iterator[Row]:
 
     All and too much in turns: a machine's speed may change by a half within a minute.
     """
-    requests = pictures(1000, FIRST)
+    requests = images(1000, FIRST)
     seconds = setting.overload_seconds / OVERLOAD_TURNS
     with service(setting.folder) as running:
         peaks, tallies, health = [saturate(running, requests, 8, 5).frames_a_second], list[Tally](), list[Health]()
@@ -213,7 +213,7 @@ def too_much(setting: Setting) -> Iterator[Row]:
     yield Row(f"{title}: p99 of /live and /ready, the worst turn", "< 250 ms, all 200", measured, fine)
 
 
-def unkind(setting: Setting) -> Iterator[Row]:
+def faults(setting: Setting) -> Iterator[Row]:
     """Clients that leave, are slow or ask for too much; scenes that change; an end while there is work."""
     free = promises.seconds_until_free(setting.scene)
     measured = ", ".join(f"{seconds:.2f}" for seconds in free) + " s"
@@ -257,7 +257,7 @@ PARTS: dict[str, Callable[[Setting], Iterator[Row]]] = {
     "overhead": overhead,
     "load": load,
     "overload": too_much,
-    "unkind": unkind,
+    "faults": faults,
     "changes": changes,
     "kills": kills,
     "counts": counts,

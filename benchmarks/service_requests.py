@@ -46,7 +46,7 @@ def mixed(count: int, scenes: Sequence[str]) -> list[Wanted]:
     ]  # fmt: skip
 
 
-def pictures(count: int, scene: str) -> list[Wanted]:
+def images(count: int, scene: str) -> list[Wanted]:
     """JPEGs of 400 × 400 pixels of one moment."""
     return [Wanted(scene, float(37 * number % 360), 0.5, 400, "jpeg") for number in range(count)]
 

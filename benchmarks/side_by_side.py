@@ -1,4 +1,4 @@
-"""Held-out photographs beside what one or more models make of them, with the PSNR under each picture.
+"""Held-out images beside what one or more models make of them, with the PSNR under each image.
 
 python benchmarks/side_by_side.py DATA runs/one_step/model.pt runs/two_steps/model.pt --size 200 --out side_by_side.png
 """
@@ -21,7 +21,7 @@ from msdgs_train.gaussians.model_file import LoadedModel, load_model
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Draw a contact sheet: a row a photograph, the photograph first, then each model's rendering."""
+    """Draw a contact sheet: a row an image, the image first, then each model's rendering."""
 
     data: tyro.conf.Positional[Path]
     """Folder of a dataset that `msdgs-train fit` reads."""
@@ -31,9 +31,9 @@ class SideBySide:
     split: str = "test"
     """train, val or test."""
     size: int | None = None
-    """Width in pixels; the photographs' own if not given."""
+    """Width in pixels; the images' own if not given."""
     rows: int = 5
-    """Photographs shown, evenly spread over the split."""
+    """Images shown, evenly spread over the split."""
 
 
 def main(options: SideBySide) -> None:
@@ -46,20 +46,20 @@ def main(options: SideBySide) -> None:
     psnrs: list[list[float]] = [[] for _ in models]
     for index, frame in enumerate(frames):
         truth = torch.from_numpy(composite(frame.load_rgba(), models[0].scene.background))
-        pictures = [render(model, frame) for model in models]
-        for column, rgb in enumerate(pictures):
+        images = [render(model, frame) for model in models]
+        for column, rgb in enumerate(images):
             psnrs[column].append(quality(rgb, truth).psnr)
         if index in shown:
-            titles = [f"photograph, t = {frame.t:.2f}"]
+            titles = [f"image, t = {frame.t:.2f}"]
             titles += [f"{name(model)}, {values[-1]:.1f} dB" for model, values in zip(models, psnrs, strict=True)]
-            for picture, title in zip([truth, *pictures], titles, strict=True):
+            for image, title in zip([truth, *images], titles, strict=True):
                 axis = next(axes)
-                axis.imshow(picture.numpy())
+                axis.imshow(image.numpy())
                 axis.set_title(title, fontsize=9)
                 axis.axis("off")
     figure.savefig(options.out, dpi=110)
     for model, values in zip(models, psnrs, strict=True):
-        print(f"{name(model)}: {np.mean(values):.2f} dB over {len(frames)} {options.split} photographs")
+        print(f"{name(model)}: {np.mean(values):.2f} dB over {len(frames)} {options.split} images")
     print(f"wrote {options.out}")
 
 

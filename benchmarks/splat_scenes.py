@@ -46,7 +46,7 @@ def object_camera(width: int, height: int, turn: float = 0.6) -> Camera:
 
 
 def around(gaussians: Gaussians, width: int = 800, height: int = 800) -> Camera:
-    """Along +z, so far away that nine in ten Gaussians are in a picture `CAMERA_ANGLE_X` wide."""
+    """Along +z, so far away that nine in ten Gaussians are in an image `CAMERA_ANGLE_X` wide."""
     target = np.median(gaussians.means, axis=0).astype(float)
     radius = np.quantile(np.linalg.norm(gaussians.means - target, axis=1), 0.9)
     focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)

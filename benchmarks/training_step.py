@@ -6,7 +6,7 @@ python benchmarks/training_step.py data/scene --preset msdgs-mlp --gaussians 300
 
 Without a folder it trains on a synthetic scene that it makes. The parts are measured one after the other on the same
 step, repeat after repeat; least and median of the repeats are printed, and what the parts add up to beside whole steps.
-In turns with them, steps of several photographs side by side.
+In turns with them, steps of several images side by side.
 """
 
 import argparse
@@ -46,7 +46,7 @@ def main() -> None:
     """Measure and print."""
     arguments = parse_arguments()
     with tempfile.TemporaryDirectory() as made:
-        several, trainer = (make_trainer(arguments, Path(made), n) for n in (arguments.photographs, 1))
+        several, trainer = (make_trainer(arguments, Path(made), n) for n in (arguments.batch_size, 1))
         for _ in range(3):  # compiled, and Adam has its moments
             trainer.step()
             several.step()
@@ -56,17 +56,17 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, nargs="?", help="a folder of photographs; default: a synthetic scene")
+    parser.add_argument("data", type=Path, nargs="?", help="a folder of images; default: a synthetic scene")
     parser.add_argument("--preset", default="msdgs-small", help="whose networks are trained")
     parser.add_argument("--gaussians", type=int, default=10_000)
-    parser.add_argument("--size", type=int, default=200, help="width of the photographs in pixels")
+    parser.add_argument("--size", type=int, default=200, help="width of the images in pixels")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--photographs", type=int, default=4, help="side by side, to compare with one after the other")
+    parser.add_argument("--batch-size", type=int, default=4, help="side by side, to compare with one after the other")
     parser.add_argument("--repeats", type=int, default=15)
     return parser.parse_args()
 
 
-def make_trainer(arguments: argparse.Namespace, made: Path, photographs: int) -> Trainer:
+def make_trainer(arguments: argparse.Namespace, made: Path, batch_size: int) -> Trainer:
     """A trainer at a step at which all of the model takes part."""
     data = arguments.data
     if data is None:
@@ -76,22 +76,22 @@ def make_trainer(arguments: argparse.Namespace, made: Path, photographs: int) ->
     count = arguments.gaussians
     config = replace(
         preset(arguments.preset),
-        init_count=count,
+        init_num_pts=count,
         max_gaussians=count,
-        photographs=photographs,
+        batch_size=batch_size,
         threads=arguments.threads,
-        warmup_fraction=0.0,
-        densify_until_fraction=0.0,
+        static_fraction=0.0,
+        refine_stop_fraction=0.0,
     )
     return Trainer(config, load_scene(data, arguments.size))
 
 
 def measured(trainer: Trainer, several: Trainer) -> Iterator[tuple[str, float]]:
-    """Seconds by part of a step of one photograph, then of a whole one, and of one of several."""
+    """Seconds by part of a step of one image, then of a whole one, and of one of several."""
     torch.set_num_threads(trainer.config.threads)
     model, frame = trainer.model, trainer.frames[0]
     background = torch.zeros(3)
-    truth = trainer._photograph(frame, background)
+    target = trainer._image(frame, background)
 
     def timed(function: Callable[[], Any]) -> tuple[Any, float]:
         start = time.perf_counter()
@@ -110,7 +110,7 @@ def measured(trainer: Trainer, several: Trainer) -> Iterator[tuple[str, float]]:
     )
     yield "blending", seconds
     rgb = torch.from_numpy(drawn.rgb).requires_grad_()
-    loss, seconds = timed(lambda: photometric_loss(rgb, truth, trainer.config.l1_weight))
+    loss, seconds = timed(lambda: photometric_loss(rgb, target, trainer.config.l1_weight))
     yield "loss", seconds
     _, seconds = timed(loss.backward)
     yield "loss gradient", seconds
@@ -156,9 +156,9 @@ def show(repeats: list[dict[str, float]], arguments: argparse.Namespace) -> None
     console.print(f"rasterizer: gradient / forward = {gradient / render:.2f}")
     step = least["whole step"] / (render + least["deformation"])
     console.print(f"whole step / (forward rendering + deformation) = {step:.2f}")
-    each = least["several"] / arguments.photographs
+    each = least["several"] / arguments.batch_size
     console.print(
-        f"{arguments.photographs} photographs side by side: {each:.1f} ms each, "
+        f"{arguments.batch_size} images side by side: {each:.1f} ms each, "
         f"{least['whole step'] / each:.2f} times as many a second"
     )
 

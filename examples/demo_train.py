@@ -1,4 +1,4 @@
-"""The whole path on a scene made on the spot: photographs → training → ONNX scene → service → a frame no one saw.
+"""The whole path on a scene made on the spot: images → training → ONNX scene → service → a frame no one saw.
 
 python examples/demo_train.py --once
 """
@@ -20,24 +20,24 @@ from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
 from msdgs_train.datasets.common.images import read_rgba
 from msdgs_train.engine.metrics_log import write_png
-from msdgs_train.evaluation.metrics import mean_quality, quality
+from msdgs_train.evaluation.metrics import mean_metrics, quality
 from serving import get, render, say, serving, stay_up
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = str(Path(sys.executable).with_name("msdgs-train"))
 EXPORT = str(ROOT / "export" / "to_onnx.py")
 MINIMUM_PSNR = 19.0
-"""dB on the held-out photographs, below which the demo counts as broken; an empty frame has about 10."""
+"""dB on the held-out images, below which the demo counts as broken; an empty frame has about 10."""
 
 
 def main() -> None:
-    """Make, train, export, serve, compare with the held-out photographs, wait for Ctrl-C."""
+    """Make, train, export, serve, compare with the held-out images, wait for Ctrl-C."""
     arguments = parse_arguments()
     folder = arguments.out.with_suffix("")
     shutil.rmtree(folder, ignore_errors=True)
     data, run, scene = folder / "data", folder / "run", folder / "toy.onnx"
     folder.mkdir(parents=True)
-    step("a small moving scene, photographed", TRAIN, "synthetic", data, "--size", arguments.size)
+    step("a small moving scene, captured", TRAIN, "synthetic", data, "--size", arguments.size)
     step("training", TRAIN, "fit", data, run, *fit_flags(arguments))
     step("export", sys.executable, EXPORT, run / "model.pt", "--quick", "--output", scene)
     with serving(scene, arguments.port) as url:
@@ -48,14 +48,14 @@ def main() -> None:
 
 def fit_flags(arguments: argparse.Namespace) -> list[object]:
     """Settings for minutes rather than for quality: few Gaussians, narrow layers, too small to share among threads."""
-    sizes = ["--init-count", 2500, "--max-gaussians", 4000, "--model.width", 48, "--model.time-width", 32]
-    pace = ["--densify-from", 200, "--densify-gradient", 1e-3, "--sh-interval", 500, "--field-rate-end", 2e-4]
-    rest = ["--window-until-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500, "--threads", 1]
+    sizes = ["--init-num-pts", 2500, "--max-gaussians", 4000, "--model.width", 48, "--model.time-width", 32]
+    pace = ["--refine-start", 200, "--grow-grad2d", 1e-3, "--sh-degree-interval", 500, "--deform-lr-final", 2e-4]
+    rest = ["--window-full-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500, "--threads", 1]
     return ["--steps", arguments.steps, "--max-minutes", arguments.minutes, *sizes, *pace, *rest]
 
 
 def compare(url: str, frames: list[Frame], folder: Path, out: Path) -> None:
-    """Ask the service for every held-out photograph's camera and time; write one pair, photograph at the left."""
+    """Ask the service for every held-out image's camera and time; write one pair, image at the left."""
     (scene,) = get(f"{url}/scenes")["scenes"]
     background = get(f"{url}/scenes/{scene['name']}")["background"]
     folder.mkdir()
@@ -67,12 +67,12 @@ def compare(url: str, frames: list[Frame], folder: Path, out: Path) -> None:
     qualities = [quality(torch.from_numpy(rgb), torch.from_numpy(truth)) for truth, rgb in pairs]
     shown = len(frames) // 2
     write_png(out, np.concatenate(pairs[shown], axis=1))
-    mean = mean_quality(qualities)
-    say(f"wrote {out}: photograph | render, {frames[shown].name} at t = {frames[shown].t:.3f}")
+    mean = mean_metrics(qualities)
+    say(f"wrote {out}: image | render, {frames[shown].name} at t = {frames[shown].t:.3f}")
     say(f"  this frame: PSNR {qualities[shown].psnr:.2f} dB, SSIM {qualities[shown].ssim:.4f}")
     say(f"  all {len(frames)} held-out frames: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
     if not mean.psnr >= MINIMUM_PSNR:
-        raise SystemExit(f"the frames do not look like the photographs: {mean.psnr:.2f} dB < {MINIMUM_PSNR} dB")
+        raise SystemExit(f"the frames do not look like the images: {mean.psnr:.2f} dB < {MINIMUM_PSNR} dB")
 
 
 def request_for(frame: Frame) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def parse_arguments() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description="Make a moving scene, train on it, export, serve, compare.")
     parser.add_argument("--port", type=int, default=8000, help="another one is used where it is taken")
-    parser.add_argument("--size", type=int, default=100, help="width and height of the photographs")
+    parser.add_argument("--size", type=int, default=100, help="width and height of the images")
     parser.add_argument("--steps", type=int, default=2500, help="of training")
     parser.add_argument("--minutes", type=float, default=3.0, help="of training, at most")
     parser.add_argument("--out", type=Path, default=Path("out/demo_train.png"))

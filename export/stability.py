@@ -30,7 +30,7 @@ def main(
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
     plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
     times: int = 20,
-    max_error: float = 50.0,
+    min_psnr: float = 50.0,
 ) -> int:
     """Measure how stable a trained model's deformation is in float32 and in less.
 
@@ -50,12 +50,12 @@ def main(
         json: Write the figures to this file.
         plot: Draw growth, amplification and errors into this PNG.
         times: At how many times to compare, both ends of the scene's time among them.
-        max_error: PSNR in dB of the worst frame against float64, below which an error counts as visible.
+        min_psnr: PSNR in dB of the worst frame against float64, below which an error counts as visible.
     """
     console = Console(soft_wrap=True, highlight=False)
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
-        return _report(model, json, plot, times, max_error, console, errors)
+        return _report(model, json, plot, times, min_psnr, console, errors)
     except KeyboardInterrupt:
         errors.print("stopped; nothing was written", markup=False)
         return 130
@@ -65,12 +65,12 @@ def main(
 
 
 def _report(
-    model: Path, json: Path | None, plot: Path | None, times: int, max_error: float, console: Console, errors: Console
+    model: Path, json: Path | None, plot: Path | None, times: int, min_psnr: float, console: Console, errors: Console
 ) -> int:
     if times < 2:
         raise InvalidInput("times", "2 or more", times)
-    if not 0 < max_error < 100:
-        raise InvalidInput("max_error", "between 0 and 100 dB", max_error)
+    if not 0 < min_psnr < 100:
+        raise InvalidInput("min_psnr", "between 0 and 100 dB", min_psnr)
     with errors.status("loading torch and the kernels"):
         from export.measure.stability import assess  # heavy: seconds, so not before --help
         from export.precision.formats import FORMATS
@@ -82,7 +82,7 @@ def _report(
         report = assess(
             loaded.model,
             loaded.scene,
-            max_error=max_error,
+            min_psnr=min_psnr,
             times=times,
             formats=FORMATS,
             on_time=lambda: progress.advance(task),

@@ -27,7 +27,7 @@ def main(
     model: Annotated[Path, tyro.conf.Positional],
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
     kind: Annotated[str | None, tyro.conf.arg(name="from", metavar="KIND")] = None,
-    max_error: float = 50.0,
+    min_psnr: float = 50.0,
     plan: str | None = None,
     quick: Off = False,
     data: Path | None = None,
@@ -44,7 +44,7 @@ def main(
 
     Ways to compute the motion (plans) and things that the scene could do without (trimming) are tried together. Frames
     of each are compared with those of the exact network in float64, and timed. The fastest whose worst frame is within
-    --max-error is written, and beside it a report as .json, .md and .png: error against run time.
+    --min-psnr is written, and beside it a report as .json, .md and .png: error against run time.
 
     Type this:
 
@@ -66,11 +66,11 @@ def main(
         output: The scene file to write; by default beside the model, ending in .onnx.
         kind: What the input is, where it isn't recognised: model, ply, spz, spz:unturned, sog, splat, ksplat, sequence,
             sequence:blend, sequence:switch, deformgs, 4dgs.
-        max_error: PSNR in dB that the worst frame must have against the exact network; differences are invisible from
+        min_psnr: PSNR in dB that the worst frame must have against the exact network; differences are invisible from
             about 50. Lower is faster and less exact.
         plan: Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all.
         quick: No sweep and no report: the plan `network`, trimmed.
-        data: The folder of the photographs. Its training cameras are measured at, and held-out photographs compared.
+        data: The folder of the images. Its training cameras are measured at, and held-out images compared.
         no_unseen: Keep Gaussians that never contribute to a frame.
         no_still: Keep in the graph Gaussians that never move visibly.
         no_layers: Keep layers whose weighted step is invisible.
@@ -99,7 +99,7 @@ def main(
         plan = "network" if quick and plan is None else plan
         with model_or_import(model, kind, output, console) as source:
             if source is not None:
-                export(Settings(source, output, max_error, plan, data, off, tolerance, times), console)
+                export(Settings(source, output, min_psnr, plan, data, off, tolerance, times), console)
     except KeyboardInterrupt:
         console.print(f"stopped; {output} is as it was", markup=False)
         return 130

@@ -28,7 +28,7 @@ class CacheUse:
 class PoseCache:
     """At most `capacity` bytes of posed Gaussians, used last stay. Safe to use from several threads.
 
-    Opacities and colours don't depend on time and are shared with the scene, so that they don't count.
+    Opacities and colors don't depend on time and are shared with the scene, so that they don't count.
     """
 
     def __init__(self, capacity: int) -> None:

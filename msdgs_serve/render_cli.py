@@ -42,7 +42,7 @@ examples:
   msdgs-render scene.onnx frames/                           one turn around the scene while its time runs, as PNG
   msdgs-render scene.onnx turn.mp4 --frames 96 --fps 24     the same as a film
   msdgs-render scene.onnx walk.webm --path camera_path.json a path drawn in nerfstudio's viewer
-  msdgs-render scene.onnx frames/ --format exr              colour, alpha and depth as numbers, for compositing
+  msdgs-render scene.onnx frames/ --format exr              color, alpha and depth as numbers, for compositing
   msdgs-render views.json frames/                           a path whose cameras each name their "scene"
   msdgs-render scene.onnx frames/ --ray auto                drawn by the Ray cluster of this machine; else ADDRESS
 
@@ -106,7 +106,7 @@ def _run(options: argparse.Namespace) -> None:
     if is_film:
         unfinished = options.out.with_name(f".{options.out.name}.part")
         with unfinished.open("wb") as file:
-            write_video(_pictures(files), fps, cast(VideoFormat, video), file)
+            write_video(_images(files), fps, cast(VideoFormat, video), file)
         os.replace(unfinished, options.out)
         shutil.rmtree(folder)
     print(f"wrote {options.out}: {len(files)} frames of {first.width} × {first.height}")
@@ -189,7 +189,7 @@ def _show_progress(done: int, count: int, seconds: float) -> None:
         print(text, end=end, file=sys.stderr, flush=True)
 
 
-def _pictures(files: Sequence[Path]) -> Iterator[np.ndarray]:
+def _images(files: Sequence[Path]) -> Iterator[np.ndarray]:
     """[H, W, 3] uint8 each."""
     for file in files:
         reader = oiio.ImageInput.open(str(file))

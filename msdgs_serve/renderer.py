@@ -43,7 +43,7 @@ class Shutter:
 class RenderOptions:
     """How a frame is drawn."""
 
-    background: Background = "scene"  # an sRGB-encoded colour, what the scene was trained on, or none
+    background: Background = "scene"  # an sRGB-encoded color, what the scene was trained on, or none
     shutter: Shutter | None = None  # motion blur; None: one moment
     motion_dt: float | None = None  # draw motion vectors too, to this much later; not together with a shutter
     depth: bool = False  # draw how far what is seen is too
@@ -121,7 +121,7 @@ class Renderer:
 
 
 def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarray:
-    """[N, 2] how far each centre goes in the picture of `camera`, pixels to the right and down.
+    """[N, 2] how far each centre goes in the image of `camera`, pixels to the right and down.
 
     0 for those that are behind the camera at one of the times.
     """
@@ -153,7 +153,7 @@ def _times(t: float, shutter: Shutter | None, motion_dt: float | None) -> Iterat
 
 
 def resolve_background(session: DeformationSession, background: Background) -> Color:
-    """The colour to draw over; black where transparent, which makes the colours premultiplied."""
+    """The color to draw over; black where transparent, which makes the colors premultiplied."""
     if background == "transparent":
         return (0.0, 0.0, 0.0)
     if background == "scene":

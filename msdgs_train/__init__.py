@@ -1,1 +1,1 @@
-"""Fit multi-step deformable 3D Gaussians to photographs of a moving scene (torch)."""
+"""Fit multi-step deformable 3D Gaussians to images of a moving scene (torch)."""

@@ -25,7 +25,7 @@ PRIMITIVE = {
 
 
 def write_gltf(file: Path, gaussians: Gaussians) -> None:
-    """All Gaussians, activated, float32; axes right, up, back. Viewers without the extension see coloured points."""
+    """All Gaussians, activated, float32; axes right, up, back. Viewers without the extension see colored points."""
     means, quats, sh = from_right_up_back(gaussians.means, gaussians.quats, gaussians.sh)
     colors = np.concatenate([SH_C0 * sh[:, 0] + 0.5, gaussians.opacities[:, None]], axis=1)
     attributes = {

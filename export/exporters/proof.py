@@ -1,4 +1,4 @@
-"""Is what was written the scene? It is read back, drawn, and compared with the scene's own pictures."""
+"""Is what was written the scene? It is read back, drawn, and compared with the scene's own images."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +25,7 @@ class ConversionFailed(MsdgsError):
 
 
 class Proof:
-    """Pictures of a scene, to compare others with."""
+    """Images of a scene, to compare others with."""
 
     def __init__(self, session: DeformationSession, *, mip: bool = True) -> None:
         """`mip`: whether the other format knows the anti-aliasing of Mip-Splatting."""
@@ -40,7 +40,7 @@ class Proof:
         self._background = metadata.background
 
     def psnr(self, got: Gaussians, t: float) -> float:
-        """dB of the worst view; pictures are compared as they are shown, cut to [0, 1]."""
+        """dB of the worst view; images are compared as they are shown, cut to [0, 1]."""
         expected = self._session.gaussians(t)
         return min(self._psnr(got, expected, camera) for camera in self._cameras)
 

@@ -56,7 +56,7 @@ def _interface_problems(model: onnx.ModelProto) -> list[str]:
     if not rows or rows % MULTIPLE:
         problems.append(f"{rows} rows are no multiple of {MULTIPLE}")
     others = [name for name in outputs if name not in expected and any(word in name for word in RESERVED)]
-    return problems + [f"output `{name}` would be taken for colours" for name in others]
+    return problems + [f"output `{name}` would be taken for colors" for name in others]
 
 
 def _graph_problems(model: onnx.ModelProto) -> list[str]:

@@ -26,7 +26,7 @@ from export.trajectories.splines import design
 from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.gaussians.model import SMALLEST_SCALE
+from msdgs_train.gaussians.model import MIN_SCALE
 
 CONSTANT = 0.02
 """Opacities and SH coefficients may differ by this between frames that are blended: two steps of 8 bits."""
@@ -114,7 +114,7 @@ def of_the_moment(gaussians: Gaussians, plan: str) -> Gaussians:
     """Without those of other frames, which scenes of the plan `frames:n` park far below."""
     if not is_switched(plan):
         return gaussians
-    here = np.flatnonzero((gaussians.scales > SMALLEST_SCALE).any(axis=1))
+    here = np.flatnonzero((gaussians.scales > MIN_SCALE).any(axis=1))
     return Gaussians(*(getattr(gaussians, part)[here] for part in ("means", "quats", "scales", "opacities", "sh")))
 
 
@@ -216,7 +216,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
     column = graph.constant("frames.column", np.array([1], np.int64))
     shown = graph.node("Unsqueeze", [graph.node("Equal", [own, number], "ids.is_now"), column], "ids.shown")
     away = graph.constant("frames.away", parked.astype(np.float32)[None])
-    least = graph.constant("frames.least", np.array([[SMALLEST_SCALE]], np.float32))
+    least = graph.constant("frames.least", np.array([[MIN_SCALE]], np.float32))
     stored = {"means": means, "scales": scales, "quats": quats}
     of_ids = {n: graph.node("Gather", [graph.constant(f"frames.{n}", a), "ids"], f"ids.{n}") for n, a in stored.items()}
     graph.node("Where", [shown, of_ids["means"], away], "means")

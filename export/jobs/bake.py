@@ -37,8 +37,8 @@ class Moving:
     scale_modulation: FloatArray | None  # [M, 3] factors of equation 12; None where the model has none
     mean_modulation: FloatArray | None = None  # [M, 3]
     quat_modulation: FloatArray | None = None  # [M, 4]
-    basis_weights: FloatArray | None = None  # [M, F] of shared motions that each follows, rows sum to 1; None: none
-    basis_ids: npt.NDArray[np.int64] | None = None  # [M, F] which ones these are
+    skinning_weights: FloatArray | None = None  # [M, F] of motion bases that each follows, rows sum to 1; None: none
+    node_ids: npt.NDArray[np.int64] | None = None  # [M, F] which ones these are
 
     def __len__(self) -> int:
         return len(self.means)
@@ -89,8 +89,8 @@ def _moving(model: DynamicGaussians) -> Moving:
         scale_modulation=factors["scales"],
         mean_modulation=factors["means"],
         quat_modulation=factors["quats"],
-        basis_weights=None if followed is None else _array(followed.basis_weights),
-        basis_ids=None if followed is None else followed.basis_ids.numpy(),
+        skinning_weights=None if followed is None else _array(followed.skinning_weights),
+        node_ids=None if followed is None else followed.node_ids.numpy(),
     )
 
 

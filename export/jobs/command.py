@@ -27,7 +27,7 @@ from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:
-    from export.measure.images import Photographs
+    from export.measure.images import Images
 
 LEAST_ERROR = 10.0
 """dB. Under it a frame isn't one of the scene any more."""
@@ -45,7 +45,7 @@ class Settings:
 
     model: Path
     output: Path
-    max_error: float  # dB on the worst frame
+    min_psnr: float  # dB on the worst frame
     plan: str | None  # None: the sweep chooses
     data: Path | None
     off: frozenset[str]  # rules of trimming
@@ -68,15 +68,15 @@ def export(settings: Settings, console: Console) -> None:
             task = progress.add_task(what, total=steps)
             return lambda: progress.advance(task)
 
-        photographs = _photographs(settings, track)
+        photographs = _images(settings, track)
         rules = [rule for rule in RULES if rule not in settings.off]
         training = photographs.training if photographs else []
         job = Job(
-            settings.model, Path(folder), max_error=settings.max_error, rules=rules, training=training, progress=track
+            settings.model, Path(folder), min_psnr=settings.min_psnr, rules=rules, training=training, progress=track
         )
         contents = None
         if settings.plan is None:
-            result = Sweep(job, settings.max_error, photographs).run()
+            result = Sweep(job, settings.min_psnr, photographs).run()
             contents = report(job, result)
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
         else:
@@ -99,9 +99,9 @@ def export(settings: Settings, console: Console) -> None:
 
 
 def _check(settings: Settings) -> None:
-    error = settings.max_error
+    error = settings.min_psnr
     if not (math.isfinite(error) and LEAST_ERROR <= error <= MAX_PSNR):
-        raise InvalidInput("max_error", f"a PSNR in dB from {LEAST_ERROR:g} to {MAX_PSNR:g}; 50 is invisible", error)
+        raise InvalidInput("min_psnr", f"a PSNR in dB from {LEAST_ERROR:g} to {MAX_PSNR:g}; 50 is invisible", error)
     if not settings.tolerance >= 0:
         raise InvalidInput("tolerance", "0 or more", settings.tolerance)
     if settings.times < 2:
@@ -112,17 +112,17 @@ def _check(settings: Settings) -> None:
         raise InvalidInput("output", "in a folder that exists", str(settings.output))
 
 
-def _photographs(settings: Settings, track: Callable[[str, int], Callable[[], object]]) -> Photographs | None:
+def _images(settings: Settings, track: Callable[[str, int], Callable[[], object]]) -> Images | None:
     if settings.data is None:
         return None
     try:
         from export.measure.images import (
-            Photographs,  # of the trainer's own readers, which the export alone doesn't need
+            Images,  # of the trainer's own readers, which the export alone doesn't need
         )
     except ModuleNotFoundError as error:
         raise InvalidInput("data", "left out, or pip install '.[train,export]'", f"no module {error.name}") from None
     info = load_model(settings.model).scene
-    return Photographs(settings.data, info, lambda count: track("photographs", count))
+    return Images(settings.data, info, lambda count: track("images", count))
 
 
 def _planned(job: Job, settings: Settings) -> tuple[Candidate, RenderedError]:
@@ -130,15 +130,15 @@ def _planned(job: Job, settings: Settings) -> tuple[Candidate, RenderedError]:
     assert settings.plan is not None
     whole = job.candidate(settings.plan, None)
     best = job.error(whole)
-    if best.psnr_worst < settings.max_error:
+    if best.psnr_worst < settings.min_psnr:
         reachable = f"at most {math.floor(10 * best.psnr_worst) / 10:.1f}, which the plan {settings.plan} reaches"
-        raise Unreachable("max_error", f"{reachable} on its worst frame", settings.max_error)
+        raise Unreachable("min_psnr", f"{reachable} on its worst frame", settings.min_psnr)
     if job.rules:
-        left = 10 ** (-settings.max_error / 10) - 10 ** (-best.psnr_worst / 10)
+        left = 10 ** (-settings.min_psnr / 10) - 10 ** (-best.psnr_worst / 10)
         for share in (1.0, 0.5, 0.25) if left > 0 else ():
             trimmed = job.candidate(settings.plan, -10 * math.log10(share * left))
             error = job.error(trimmed)
-            if error.psnr_worst >= settings.max_error:
+            if error.psnr_worst >= settings.min_psnr:
                 return trimmed, error
     return whole, best
 

@@ -22,7 +22,7 @@ def draw(contents: dict[str, Any], path: Path) -> None:
     """Write the diagram of a report as PNG."""
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
-    points, budget = contents["points"], contents["max_error"]
+    points, budget = contents["points"], contents["min_psnr"]
     axes.set_xscale("log")
     axes.set_yscale("log")
     _front_line(axes, points)

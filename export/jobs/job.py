@@ -10,7 +10,7 @@ import numpy as np
 
 from export.jobs.bake import Baked
 from export.measure.rendered_error import ExactFrames, RenderedError, posed
-from export.measure.stability import MAX_ERROR, StabilityReport, assess
+from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, deciding_views, measuring_views
 from export.plans.registry import build, parse
 from export.pruning import RULES, Cut, Evidence, TrimmedModel, trim, trimmed_model, whole
@@ -68,7 +68,7 @@ class Candidate:
 
     @property
     def sh_degree(self) -> int:
-        """Of its colours."""
+        """Of its colors."""
         return self.trimmed.moving.config.sh_degree
 
     @property
@@ -90,13 +90,13 @@ class Job:
         checkpoint: Path,
         folder: Path,
         *,
-        max_error: float = MAX_ERROR,
+        min_psnr: float = MIN_PSNR,
         rules: Collection[str] = tuple(RULES),
         training: Sequence[Camera] = (),
         progress: Progress = no_progress,
     ) -> None:
-        """`training` are the cameras of the training photographs, where at hand. Raises `CheckpointInvalid`."""
-        self.folder, self.max_error, self.rules, self.progress = folder, max_error, rules, progress
+        """`training` are the cameras of the training images, where at hand. Raises `CheckpointInvalid`."""
+        self.folder, self.min_psnr, self.rules, self.progress = folder, min_psnr, rules, progress
         self.model, self.info, _ = load_model(checkpoint)
         with checkpoint.open("rb") as file:
             self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
@@ -151,7 +151,7 @@ class Job:
         """How far float32 is from float64 where layers run when a frame is served."""
         if self._stability is None:
             on_time = self.progress("stability of the layers", STABILITY_TIMES)
-            found = assess(self.model, self.info, max_error=self.max_error, times=STABILITY_TIMES, on_time=on_time)
+            found = assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
             self._stability = found
         return self._stability
 

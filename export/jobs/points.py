@@ -44,7 +44,7 @@ class Point:
     time: FrameTime
     error: RenderedError
     memory: int | None  # bytes at the peak of a frame
-    photographs_db: float | None
+    images_db: float | None
 
     @property
     def milliseconds(self) -> float:
@@ -62,7 +62,7 @@ class Point:
             "memory_bytes": self.memory,
             "milliseconds": self.time.to_plain(),
             "error": self.error.to_plain(),
-            "photographs_psnr": self.photographs_db,
+            "photographs_psnr": self.images_db,
             "left_out": list(scene.metadata.left_out),
         }
 
@@ -87,7 +87,7 @@ def front(points: Sequence[Point]) -> list[int]:
     return kept
 
 
-def choose(points: Sequence[Point], max_error: float) -> int | None:
-    """The index of the fastest point whose worst frame is within `max_error` dB, which lies on the front."""
-    within = [i for i in front(points) if points[i].error.psnr_worst >= max_error]
+def choose(points: Sequence[Point], min_psnr: float) -> int | None:
+    """The index of the fastest point whose worst frame is within `min_psnr` dB, which lies on the front."""
+    within = [i for i in front(points) if points[i].error.psnr_worst >= min_psnr]
     return within[0] if within else None

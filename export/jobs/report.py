@@ -16,7 +16,7 @@ from msdgs_train.engine.files import replacing, write_text
 
 FORMAT = "msdgs-report/1"
 COLUMNS = ("", "plan", "trimmed to", "SH", "rasterizer", "moving", "still", "ms", "median", "deform", "draw", "MB",
-           "memory", "worst frame", "mean", "worst pixel", "position", "px", "photographs")  # fmt: skip
+           "memory", "worst frame", "mean", "worst pixel", "position", "px", "images")  # fmt: skip
 LEGEND = """\
 - **◆ on the front**: no other point is both faster and closer. **★ chosen**: the fastest within the error allowed.
 - **trimmed to**: dB on the worst frame that leaving things out may cost; "–": nothing was left out.
@@ -25,7 +25,7 @@ LEGEND = """\
 - **worst frame**, **mean**: PSNR in dB against frames of the exact network, deformation and rasterizer in float64.
 - **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: how far a Gaussian is at most from
   where it belongs, in scene units and in pixels, faint and hidden ones included.
-- **photographs**: mean PSNR in dB against photographs that training has not seen.
+- **images**: mean PSNR in dB against images that training has not seen.
 - Points with other rasterizer options show what these would buy; no file asks for them, so none is chosen.
 """
 
@@ -41,7 +41,7 @@ def report(job: Job, result: SweepResult) -> dict[str, Any]:
         "package_version": __version__,
         "checkpoint_sha256": job.sha256,
         "machine": {"processor": processor(), "threads": thread_count(), "system": platform.platform()},
-        "max_error": job.max_error,
+        "min_psnr": job.min_psnr,
         "views": {
             "cameras": len(job.cameras),
             "measured_frames": len(job.exact.views),
@@ -51,7 +51,7 @@ def report(job: Job, result: SweepResult) -> dict[str, Any]:
             "width": job.exact.views[0].camera.width,
             "height": job.exact.views[0].camera.height,
         },
-        "exact_photographs_psnr": result.exact_photographs_db,
+        "exact_photographs_psnr": result.exact_images_db,
         "points": points,
         "dropped": [look.to_plain() for look in result.looks],
         "refused": [{"plan": plan, "why": why} for plan, why in result.refused],
@@ -77,8 +77,8 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
     where = [
         f"{machine['processor']}, {machine['threads']} threads.",
         f"{views['measured_frames']} frames of {views['width']} × {views['height']} were compared.",
-        f"Allowed: {contents['max_error']:g} dB on the worst frame.",
-        f"The exact network has {exact:.2f} dB against the photographs." if exact is not None else "",
+        f"Allowed: {contents['min_psnr']:g} dB on the worst frame.",
+        f"The exact network has {exact:.2f} dB against the images." if exact is not None else "",
     ]
     lines = [
         f"# {scene}: error against run time",
@@ -125,7 +125,7 @@ def rows(contents: dict[str, Any]) -> list[Sequence[str]]:
 def _row(point: dict[str, Any]) -> list[str]:
     times, error = point["milliseconds"], point["error"]
     mark = "★" if point["chosen"] else "◆" if point["front"] else ""
-    memory, photographs = point["memory_bytes"], point["photographs_psnr"]
+    memory, images = point["memory_bytes"], point["photographs_psnr"]
     return [
         mark,
         point["plan"],
@@ -145,7 +145,7 @@ def _row(point: dict[str, Any]) -> list[str]:
         f"{error['worst_pixel']:.3f}",
         f"{error['position']:.1e}",
         f"{error['position_pixels']:.2g}",
-        "–" if photographs is None else f"{photographs:.2f}",
+        "–" if images is None else f"{images:.2f}",
     ]
 
 

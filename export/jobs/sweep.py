@@ -19,7 +19,7 @@ from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
 
 if TYPE_CHECKING:
-    from export.measure.images import Photographs
+    from export.measure.images import Images
 
 FITTED = ("lowrank:0.5", "lowrank:0.1", "keyframes:2.0", "keyframes:0.5", "keyframes:0.1", "keyframes:0.03")
 """By the pixels that they may be off by. Besides them `network`, every prefix of it, and `int8` are tried."""
@@ -32,7 +32,7 @@ TRIM_STEPS = (20.0, 10.0, 5.0, 1.0, -5.0, -10.0, -15.0)
 """dB above or below the error allowed, at which trimming is tried."""
 
 WORTH_DB, WORST_DB = 25.0, 20.0
-"""Trimming isn't tried under the first, and a candidate under the second is no longer a picture of the scene."""
+"""Trimming isn't tried under the first, and a candidate under the second is no longer an image of the scene."""
 
 HEADROOM = (2.0, -3.0)
 """With trimming to so many dB goes the fastest plan that alone is better by the first, and the one by the second; of
@@ -59,14 +59,14 @@ class SweepResult(NamedTuple):
     looks: list[Look]  # candidates that were left after a quick look
     chosen: int  # index of a point
     refused: list[tuple[str, str]]  # plans that this scene can't have, and why
-    exact_photographs_db: float | None
+    exact_images_db: float | None
 
 
 class Sweep:
     """One sweep over a job's candidates."""
 
-    def __init__(self, job: Job, max_error: float, photographs: "Photographs | None" = None) -> None:
-        self.job, self.max_error, self.photographs = job, max_error, photographs
+    def __init__(self, job: Job, min_psnr: float, photographs: "Images | None" = None) -> None:
+        self.job, self.min_psnr, self.images = job, min_psnr, photographs
         self.looks: list[Look] = []
         self.refused: list[tuple[str, str]] = []
         views = job.exact.views
@@ -77,7 +77,7 @@ class Sweep:
 
         Raises `Unreachable` where even the whole network in float32 is further from float64 than allowed.
         """
-        levels = [self.max_error + step for step in TRIM_STEPS if self.max_error + step >= WORTH_DB]
+        levels = [self.min_psnr + step for step in TRIM_STEPS if self.min_psnr + step >= WORTH_DB]
         self._reachable(self._look("network", None))
         # the most careful trimming that leaves anything out: plans are fitted to what moves, not to still ground
         careful = next((level for level in levels if self.job.trimmed(level).left_out), None)
@@ -113,7 +113,7 @@ class Sweep:
 
     def _dear(self, plan: str, trim_db: float | None) -> str | None:
         """Why a plan that runs layers when a frame is served isn't worth a try, where it isn't."""
-        enough = [look for look in self.looks if look.worst_db >= self.max_error and parse(look.candidate.plan).fitted]
+        enough = [look for look in self.looks if look.worst_db >= self.min_psnr and parse(look.candidate.plan).fitted]
         fastest = min(enough, key=lambda look: look.cpu, default=None)
         if fastest is None or parse(plan).fitted:
             return None
@@ -137,10 +137,10 @@ class Sweep:
         if look is None:  # its layers can't be run in float32; other plans may still do
             return
         best = self.job.error(look.candidate)
-        if best.psnr_worst < self.max_error:
+        if best.psnr_worst < self.min_psnr:
             reachable = math.floor(10 * best.psnr_worst) / 10
             expected = f"at most {reachable:.1f}, which the whole network in float32 reaches on its worst frame"
-            raise Unreachable("max_error", expected, self.max_error)
+            raise Unreachable("min_psnr", expected, self.min_psnr)
 
     def _pairs(self, alone: list[Look], level: float) -> set[tuple[str, float]]:
         """The plans worth trying with trimming to `level` dB."""
@@ -174,23 +174,23 @@ class Sweep:
         ahead = sorted(self._undominated(), key=lambda look: look.cpu)[:MOST_POINTS]
         ahead += [] if baseline in ahead else [baseline]
         points = self._points([look.candidate for look in ahead])
-        best = choose(points, self.max_error)
+        best = choose(points, self.min_psnr)
         if best is None:  # looks were at some of the frames only
-            raise Unreachable("max_error", f"at most {max(p.error.psnr_worst for p in points):.1f}", self.max_error)
+            raise Unreachable("min_psnr", f"at most {max(p.error.psnr_worst for p in points):.1f}", self.min_psnr)
         left = [look for look in self.looks if look not in ahead]
-        return SweepResult(points, left, best, self.refused, self._exact_photographs())
+        return SweepResult(points, left, best, self.refused, self._exact_images())
 
     def _points(self, candidates: list[Candidate]) -> list[Point]:
         """All measured in full, and the one that looks like the choice with other rasterizer options as well."""
         errors = self._errors(candidates)
-        within = [c for c, error in zip(candidates, errors, strict=True) if error.psnr_worst >= self.max_error]
+        within = [c for c, error in zip(candidates, errors, strict=True) if error.psnr_worst >= self.min_psnr]
         names = [DEFAULT_RASTERIZER] * len(candidates)
         if within:  # candidates are in the order of their processor times
             usual = within[0].options
             variants = [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
             candidates, names = [*candidates, *variants], [*names, *RASTERIZERS]
             errors += self._errors(variants)
-        photographs = [self._photographs_db(candidate) for candidate in candidates]
+        photographs = [self._images_db(candidate) for candidate in candidates]
         background, on_repeat = self.job.info.background, self.job.progress("timing", REPEATS)
         times = time_frames(candidates, self._timed, background, on_repeat=on_repeat)
         memory = frame_memory(
@@ -207,11 +207,11 @@ class Sweep:
             on_error()
         return errors
 
-    def _photographs_db(self, candidate: Candidate) -> float | None:
-        return self.photographs.psnr(candidate.session.gaussians, candidate.options) if self.photographs else None
+    def _images_db(self, candidate: Candidate) -> float | None:
+        return self.images.psnr(candidate.session.gaussians, candidate.options) if self.images else None
 
-    def _exact_photographs(self) -> float | None:
-        return self.photographs.psnr(self.job.exact_pose, self.job.model.rasterizer) if self.photographs else None
+    def _exact_images(self) -> float | None:
+        return self.images.psnr(self.job.exact_pose, self.job.model.rasterizer) if self.images else None
 
     def _tell(self, what: str, calls: list[tuple[Callable[..., object], tuple]]) -> None:
         on_call = self.job.progress(what, len(calls))

@@ -1,4 +1,4 @@
-"""A layer of shared motions as a graph: splines once a call, then one product and a few sums for each Gaussian."""
+"""A layer of motion bases as a graph: splines once a call, then one product and a few sums for each Gaussian."""
 
 import numpy as np
 from onnx import TensorProto
@@ -40,12 +40,14 @@ def basis_deltas(
 
 def _blended(graph: GraphBuilder, name: str, moving: Moving, motions: str) -> str:
     """[M, 16] the mean of the motions [B, 16] that each Gaussian follows."""
-    assert moving.basis_weights is not None  # `bake` has seen to it
-    assert moving.basis_ids is not None
-    small = np.uint8 if moving.basis_ids.max(initial=0) < 256 else np.int64
-    ids = graph.node("Gather", [graph.constant("basis_ids", moving.basis_ids.astype(small)), "ids"], "ids.basis_ids")
+    assert moving.skinning_weights is not None  # `bake` has seen to it
+    assert moving.node_ids is not None
+    small = np.uint8 if moving.node_ids.max(initial=0) < 256 else np.int64
+    ids = graph.node("Gather", [graph.constant("node_ids", moving.node_ids.astype(small)), "ids"], "ids.node_ids")
     ids = graph.node("Cast", [ids], f"{name}.followed", to=TensorProto.INT64)
-    weights = graph.node("Gather", [graph.constant("basis_weights", moving.basis_weights), "ids"], "ids.basis_weights")
+    weights = graph.node(
+        "Gather", [graph.constant("skinning_weights", moving.skinning_weights), "ids"], "ids.skinning_weights"
+    )
     axis = graph.constant(f"{name}.axis", np.array([1], np.int64))
     row = graph.node("Unsqueeze", [weights, axis], f"{name}.row")
     picked = graph.node("Gather", [motions, ids], f"{name}.picked")

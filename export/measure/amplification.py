@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from msdgs_train.layers.chain import MultiStepDeformation, step_of
-from msdgs_train.supports.nodes import Carried
+from msdgs_train.supports.nodes import SkinningInputs
 
 UNIT_ROUNDOFF = 2.0**-24
 """Of float32: the largest relative error of one rounding."""
@@ -31,7 +31,11 @@ class Growth(NamedTuple):
 
 
 def growth(
-    double: MultiStepDeformation, single: MultiStepDeformation, means: Tensor, t: float, carried: Carried | None = None
+    double: MultiStepDeformation,
+    single: MultiStepDeformation,
+    means: Tensor,
+    t: float,
+    carried: SkinningInputs | None = None,
 ) -> Growth:
     """Follow float64 `means`, [M, 3], through the layers at time `t`; `single` are the same layers in float32.
     `carried` are the same Gaussians as a layer of kind `bases` wants them.
@@ -78,18 +82,18 @@ def spectral_norm(matrices: Tensor) -> Tensor:
     return torch.where(finite, sizes * (middle + 2 * width * angle.cos()).clamp_min(0).sqrt(), math.inf)
 
 
-def _moved(layer: torch.nn.Module, means: Tensor, t: float, carried: Carried | None) -> Tensor:
+def _moved(layer: torch.nn.Module, means: Tensor, t: float, carried: SkinningInputs | None) -> Tensor:
     """[M, 3] x + w f(x, t)."""
     if carried is not None:
         carried = carried._replace(
-            means=means, quats=carried.quats.to(means.dtype), basis_weights=carried.basis_weights.to(means.dtype)
+            means=means, quats=carried.quats.to(means.dtype), skinning_weights=carried.skinning_weights.to(means.dtype)
         )
     step = step_of(layer, means, torch.tensor(t, dtype=means.dtype), carried)
     return torch.addcmul(means, step.weight, step.delta_means)
 
 
 def _moved_and_jacobian(
-    layer: torch.nn.Module, means: Tensor, t: float, carried: Carried | None
+    layer: torch.nn.Module, means: Tensor, t: float, carried: SkinningInputs | None
 ) -> tuple[Tensor, Tensor]:
     """x + w f(x, t), [M, 3], and its derivative with respect to x, [M, 3, 3]."""
     with torch.enable_grad():
@@ -101,7 +105,7 @@ def _moved_and_jacobian(
 
 @torch.no_grad()
 def _own_error(
-    layer: torch.nn.Module, rounded: torch.nn.Module, means: Tensor, t: float, carried: Carried | None
+    layer: torch.nn.Module, rounded: torch.nn.Module, means: Tensor, t: float, carried: SkinningInputs | None
 ) -> Tensor:
     """[M] distance of a layer's float32 result from its float64 one, both from the same float32 means."""
     start = means.float()

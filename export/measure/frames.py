@@ -23,7 +23,7 @@ FALLBACK_SIZE = 256
 
 @dataclass(frozen=True)
 class ImageGap:
-    """Two pictures of the same moment, displayed values in [0, 1]."""
+    """Two images of the same moment, displayed values in [0, 1]."""
 
     psnr: float  # dB, at most 100
     worst_pixel: float  # largest difference of a channel
@@ -76,13 +76,13 @@ def views_of(scene: SceneInfo) -> list[Camera]:
 
 
 def image_gap(got: np.ndarray, expected: np.ndarray) -> ImageGap:
-    """Of two pictures [H, W, 3]."""
+    """Of two images [H, W, 3]."""
     difference = got.astype(np.float64) - expected
     return ImageGap(psnr_from_mse(float(np.square(difference).mean())), float(np.abs(difference).max(initial=0)))
 
 
-def in_picture(means: np.ndarray, camera: Camera) -> np.ndarray:
-    """[N] whether a Gaussian's centre is inside of the picture and beyond the near plane."""
+def in_image(means: np.ndarray, camera: Camera) -> np.ndarray:
+    """[N] whether a Gaussian's centre is inside of the image and beyond the near plane."""
     return _project(means, camera)[1]
 
 
@@ -92,7 +92,7 @@ def _to_camera(means: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _project(means: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 2] pixels, and [N] whether that is inside of the picture and beyond the near plane."""
+    """[N, 2] pixels, and [N] whether that is inside of the image and beyond the near plane."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         points = _to_camera(means, camera)
         places = points[:, :2] / points[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]

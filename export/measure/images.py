@@ -1,4 +1,4 @@
-"""Photographs of a scene that training has not seen, to compare an export's frames with."""
+"""Images of a scene that training has not seen, to compare an export's frames with."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,11 +13,11 @@ from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MOST = 24
-"""Photographs compared with; of more, evenly spread ones."""
+"""Images compared with; of more, evenly spread ones."""
 
 
-class Photographs:
-    """Held-out photographs over the scene's background, and the cameras of those that were trained on."""
+class Images:
+    """Held-out images over the scene's background, and the cameras of those that were trained on."""
 
     def __init__(self, folder: Path, info: SceneInfo, begin: Callable[[int], Callable[[], object]]) -> None:
         """Raises `DatasetInvalid` or `InvalidInput` where the folder holds no dataset."""
@@ -28,13 +28,13 @@ class Photographs:
         chosen = np.linspace(0, len(held_out) - 1, min(MOST, len(held_out))).round().astype(int)
         self._frames: list[tuple[Frame, np.ndarray]] = []
         self._background = info.background
-        on_photograph = begin(len(chosen))
+        on_image = begin(len(chosen))
         for i in chosen:
             self._frames.append((held_out[i], composite(held_out[i].load_rgba(), info.background)))
-            on_photograph()
+            on_image()
 
     def psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
-        """Mean PSNR in dB over the photographs, as papers report it; None where there are none."""
+        """Mean PSNR in dB over the images, as papers report it; None where there are none."""
         values = []
         for frame, truth in self._frames:
             rgb = shown(pose(frame.t), frame.camera, self._background, options)

@@ -17,7 +17,7 @@ from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
 
 MEMORY = 768e6
-"""Bytes of exact frames and poses that are kept; with larger pictures fewer views are."""
+"""Bytes of exact frames and poses that are kept; with larger images fewer views are."""
 
 POSE_BYTES = 52
 """Of a Gaussian at one time: its mean in float64, the rest in float32."""
@@ -34,14 +34,14 @@ class WorstFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class RenderedError:
-    """How far frames are from exact ones. Pictures are compared as they are shown, cut to [0, 1]."""
+    """How far frames are from exact ones. Images are compared as they are shown, cut to [0, 1]."""
 
     psnr_mean: float  # dB, mean over frames of their PSNR; at most 100
     psnr_worst: float  # dB, of the worst frame
     worst_frame: WorstFrame | None  # None where nothing was drawn
     worst_pixel: float  # largest difference of a channel, in [0, 1]
     position: float  # largest distance of a Gaussian that is left from where it belongs, scene units
-    position_pixels: float  # the same in a picture, of the Gaussians that lie within it
+    position_pixels: float  # the same in an image, of the Gaussians that lie within it
     frames: int
 
     def to_plain(self) -> dict[str, Any]:
@@ -140,16 +140,16 @@ def as_gaussians(pose: PosedGaussians) -> Gaussians:
 
 
 def shown(gaussians: Gaussians, camera: Camera, background: Sequence[float], options: RasterizerOptions) -> FloatArray:
-    """[H, W, 3] the frame as a picture shows it, in [0, 1]."""
+    """[H, W, 3] the frame as an image shows it, in [0, 1]."""
     return np.clip(rasterize(gaussians, camera, background=background, options=options).rgb, 0, 1)
 
 
 def _pixel_distances(camera: Camera, got: FloatArray, exact: FloatArray) -> FloatArray:
-    """[M] how far apart two sets of points are in a picture, of those that lie within it."""
-    pictured, depths = _projected(camera, exact)
-    inside = (depths > GSPLAT.near_plane) & (pictured >= 0).all(axis=1)
-    inside &= (pictured < [camera.width, camera.height]).all(axis=1)
-    return np.linalg.norm(_projected(camera, got[inside])[0] - pictured[inside], axis=1)
+    """[M] how far apart two sets of points are in an image, of those that lie within it."""
+    imaged, depths = _projected(camera, exact)
+    inside = (depths > GSPLAT.near_plane) & (imaged >= 0).all(axis=1)
+    inside &= (imaged < [camera.width, camera.height]).all(axis=1)
+    return np.linalg.norm(_projected(camera, got[inside])[0] - imaged[inside], axis=1)
 
 
 def _projected(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:

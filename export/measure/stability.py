@@ -18,7 +18,7 @@ from msdgs_serve.scene.camera import Camera
 from msdgs_train.gaussians.model import DynamicGaussians, carried
 from msdgs_train.gaussians.model_file import SceneInfo
 
-MAX_ERROR = 50.0
+MIN_PSNR = 50.0
 """dB. Errors above it are invisible: the export's own default."""
 
 TIMES = 20
@@ -27,7 +27,7 @@ SAMPLED = 2_000
 
 FRAME_TIMES = 2
 FRAME_CAMERAS = 2
-"""Pictures are drawn at the times and from the cameras where float32 is furthest off."""
+"""Images are drawn at the times and from the cameras where float32 is furthest off."""
 
 WORST_PART = 0.001
 """The Gaussians looked at one by one."""
@@ -39,23 +39,23 @@ def assess(
     model: DynamicGaussians,
     scene: SceneInfo,
     *,
-    max_error: float = MAX_ERROR,
+    min_psnr: float = MIN_PSNR,
     times: int = TIMES,
     formats: Sequence[Format] = (FLOAT32,),
     on_time: Callable[[], object] = lambda: None,
 ) -> StabilityReport:
-    """Compare the model in float32, and in `formats`, with itself in float64: poses at `times` times, pictures at the
-    worst of them. `max_error`, in dB, is what counts as visible. The model isn't changed."""
+    """Compare the model in float32, and in `formats`, with itself in float64: poses at `times` times, images at the
+    worst of them. `min_psnr`, in dB, is what counts as visible. The model isn't changed."""
     if not len(model.deformation) or not len(model.gaussians):
         on_time()
-        return _at_rest(model, scene, max_error, times)
+        return _at_rest(model, scene, min_psnr, times)
     with np.errstate(over="ignore", invalid="ignore"):  # here they are findings
-        return _Assessment(model, scene, max_error, formats).run(times, on_time)
+        return _Assessment(model, scene, min_psnr, formats).run(times, on_time)
 
 
 class _Assessment:
-    def __init__(self, model: DynamicGaussians, scene: SceneInfo, max_error: float, formats: Sequence[Format]) -> None:
-        self.model, self.scene, self.max_error = model, scene, max_error
+    def __init__(self, model: DynamicGaussians, scene: SceneInfo, min_psnr: float, formats: Sequence[Format]) -> None:
+        self.model, self.scene, self.min_psnr = model, scene, min_psnr
         self.size = half_diagonal(scene.bounds)
         self.count = len(model.gaussians)
         self.formats = (FLOAT32, *(f for f in formats if f is not FLOAT32))
@@ -80,7 +80,7 @@ class _Assessment:
             gaussians=self.count,
             layers=list(self.model.config.layers),
             times=times,
-            max_error=self.max_error,
+            min_psnr=self.min_psnr,
             median_amplification=float(np.median(samples.amplification)),
             worst_amplification=float(samples.amplification.max()),
             layer_growth=[[_quantile(a, q) for q in (0.5, NEAR_WORST, 1.0)] for a in samples.after],
@@ -113,17 +113,17 @@ class _Assessment:
     def _unsteady(self, gap: FormatGap, predicted: float) -> list[str]:
         if gap.overflowed:
             return [f"{gap.overflowed:,} Gaussians overflow in float32"]
-        if gap.psnr < self.max_error:
-            return [f"float32 round-off is visible: {gap.psnr:.1f} dB in the worst frame, under {self.max_error:g}"]
-        if predicted < self.max_error:
+        if gap.psnr < self.min_psnr:
+            return [f"float32 round-off is visible: {gap.psnr:.1f} dB in the worst frame, under {self.min_psnr:g}"]
+        if predicted < self.min_psnr:
             seen = (
                 f"none was at the times tried ({gap.psnr:.1f} dB), but its amplification lets expect {predicted:.1f} dB"
             )
-            return [f"float32 round-off may be visible: {seen}, under {self.max_error:g}"]
+            return [f"float32 round-off may be visible: {seen}, under {self.min_psnr:g}"]
         return []
 
     def _frames(self, moment: "_Moment", samples: Samples) -> tuple[dict[str, "_FrameGap"], float, WorstGaussians]:
-        """Pictures of one time: gaps by format, dB of the predicted displacement, the worst Gaussians of float32."""
+        """Images of one time: gaps by format, dB of the predicted displacement, the worst Gaussians of float32."""
         exact = pose_arrays(self.double, moment.t)
         posed = {name: pose_arrays(model, moment.t) for name, model in self.models.items()}
         cameras = self._cameras(posed[FLOAT32.name], exact)
@@ -142,11 +142,12 @@ class _Assessment:
         self, posed: PosedArrays, exact: PosedArrays, pictures: list[tuple[Camera, np.ndarray]]
     ) -> "_FrameGap":
         worst = _worst_ids(posed, exact, self.size)
-        healed = {name: array.copy() for name, array in posed.items()}
-        for name, array in healed.items():
+        outliers_replaced = {name: array.copy() for name, array in posed.items()}
+        for name, array in outliers_replaced.items():
             array[worst] = exact[name][worst]
         frames = [
-            (image_gap(self.view.draw(posed, c), p), image_gap(self.view.draw(healed, c), p).psnr) for c, p in pictures
+            (image_gap(self.view.draw(posed, c), p), image_gap(self.view.draw(outliers_replaced, c), p).psnr)
+            for c, p in pictures
         ]
         gap, without = min(frames, key=lambda frame: frame[0].psnr)
         pixels = max(float(self.view.pixel_gaps(posed, exact, c).max(initial=0)) for c, _ in pictures)
@@ -215,7 +216,7 @@ def _mean_factors(model: DynamicGaussians) -> np.ndarray:
     return np.ones(len(model.gaussians)) if factors is None else factors.amax(dim=1).numpy()
 
 
-def _at_rest(model: DynamicGaussians, scene: SceneInfo, max_error: float, times: int) -> StabilityReport:
+def _at_rest(model: DynamicGaussians, scene: SceneInfo, min_psnr: float, times: int) -> StabilityReport:
     """Of a model that has nothing to deform."""
     none = np.ones(0)
     hidden = len(model.gaussians) and View(scene).hidden_by_near_plane(model.gaussians.means.detach().numpy())
@@ -223,7 +224,7 @@ def _at_rest(model: DynamicGaussians, scene: SceneInfo, max_error: float, times:
         gaussians=len(model.gaussians),
         layers=[],
         times=times,
-        max_error=max_error,
+        min_psnr=min_psnr,
         median_amplification=1.0,
         worst_amplification=1.0,
         layer_growth=[],

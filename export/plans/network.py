@@ -12,7 +12,7 @@ from export.layers.plane import plane_heads
 from export.layers.spline import basis_deltas
 from export.plans.scene_graph import finished, new_graph, unit_quats
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, SMALLEST_SCALE
+from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, MIN_SCALE
 from msdgs_train.layers.mlp import MLPLayer
 from msdgs_train.layers.plane import PlaneLayer
 from msdgs_train.supports.nodes import BasisLayer
@@ -102,7 +102,7 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_spac
         graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "scales")
     else:
         canonical = graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "ids.scales")
-        least = graph.constant("scales.min", np.array(SMALLEST_SCALE, np.float32))
+        least = graph.constant("scales.min", np.array(MIN_SCALE, np.float32))
         graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], "scales")
 
 
@@ -132,7 +132,10 @@ def _layer(
 
 def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str, rows: np.ndarray) -> str:
     """[M, len(rows)] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
-    encoded, code = _encode(graph, f"{name}.xyz", means, layer.xyz_octaves), _time_code(graph, name, layer, time)
+    encoded, code = (
+        _encode(graph, f"{name}.xyz", means, layer.xyz_frequency_matrix),
+        _time_code(graph, name, layer, time),
+    )
     hidden = _read_input(graph, f"{name}.first", layer, layer.first, encoded, code)
     hidden = graph.node("Relu", [hidden], f"{name}.first.relu")
     for i, linear in enumerate(layer.trunk):
@@ -151,7 +154,7 @@ def _mlp_heads(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time
 
 def _time_code(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:
     """[1, time_features] what the layer knows of the time: one row a call, whatever the number of ids."""
-    encoded = _encode(graph, f"{name}.time", time, layer.time_octaves)
+    encoded = _encode(graph, f"{name}.time", time, layer.time_frequency_matrix)
     hidden = graph.node(
         "Relu", [_linear(graph, f"{name}.time_hidden", layer.time_hidden, encoded)], f"{name}.time_relu"
     )
@@ -170,9 +173,11 @@ def _read_input(
     return graph.node("Gemm", [encoded, weight_xyz, time_bias], f"{name}.read", transB=1)
 
 
-def _encode(graph: GraphBuilder, name: str, value: str, octaves: torch.Tensor) -> str:
+def _encode(graph: GraphBuilder, name: str, value: str, frequency_matrix: torch.Tensor) -> str:
     """`PositionalEncoding`: value, sines, cosines side by side."""
-    phases = graph.node("MatMul", [value, graph.constant(f"{name}.octaves", to_numpy(octaves))], f"{name}.phases")
+    phases = graph.node(
+        "MatMul", [value, graph.constant(f"{name}.octaves", to_numpy(frequency_matrix))], f"{name}.phases"
+    )
     sines = graph.node("Sin", [phases], f"{name}.sines")
     cosines = graph.node("Cos", [phases], f"{name}.cosines")
     return graph.node("Concat", [value, sines, cosines], f"{name}.encoded", axis=1)

@@ -11,7 +11,7 @@ from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.gaussians.model import SMALLEST_SCALE
+from msdgs_train.gaussians.model import MIN_SCALE
 
 
 def new_graph(baked: Baked) -> GraphBuilder:
@@ -52,7 +52,7 @@ def still(baked: Baked, plan: str) -> onnx.ModelProto:
 def activated(graph: GraphBuilder, pose: str) -> None:
     """All outputs of raw poses, [M, 10]: means, scales that may have come out negative, quaternions of any length."""
     graph.split(pose, ["means", "raw_scales", "raw_quats"], [3, 3, 4])
-    graph.node("Max", ["raw_scales", graph.constant("scales.min", np.array(SMALLEST_SCALE, np.float32))], "scales")
+    graph.node("Max", ["raw_scales", graph.constant("scales.min", np.array(MIN_SCALE, np.float32))], "scales")
     unit_quats(graph, "raw_quats")
 
 

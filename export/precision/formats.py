@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.supports.nodes import Carried
+from msdgs_train.supports.nodes import SkinningInputs
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,16 @@ class _Emulated(MultiStepDeformation):
         self.layers = exact.layers
         self.number_format = number_format
 
-    def forward(self, means: Tensor, t: Tensor, steps: int | None = None, carried: Carried | None = None) -> Deltas:
+    def forward(
+        self, means: Tensor, t: Tensor, steps: int | None = None, carried: SkinningInputs | None = None
+    ) -> Deltas:
         with torch.no_grad(), _Rounding(self.number_format):
             return super().forward(means, t, steps, carried)
 
 
 _PRODUCTS = ("aten::addmm", "aten::addmv", "aten::linear")
 """Of the layers. `aten::mm` makes the encoding's phases, which are exact in every format that holds their means, and
-blends shared motions, which no reader would do in less than float32: there is little of it."""
+blends motion bases, which no reader would do in less than float32: there is little of it."""
 
 
 class _Rounding(TorchDispatchMode):

@@ -65,7 +65,7 @@ class StabilityReport:
     gaussians: int
     layers: list[str]
     times: int
-    max_error: float  # dB
+    min_psnr: float  # dB
     median_amplification: float
     worst_amplification: float
     layer_growth: list[list[float]]  # for each layer median, 99.9th percentile and maximum of ‖J_k … J_1‖

@@ -24,7 +24,7 @@ def print_report(report: StabilityReport, console: Console) -> None:
             console.print(f"{gap.name}: {gap.meaning}", style="dim", markup=False)
         console.print(
             "median to largest: relative error of a pose. dB, value: the worst frame, and its worst pixel. "
-            f"Healed: with the worst 0.1 % in float64. Red: under {report.max_error:g} dB",
+            f"Healed: with the worst 0.1 % in float64. Red: under {report.min_psnr:g} dB",
             style="dim",
         )
     if report.worst is not None:
@@ -42,7 +42,7 @@ def _growth_table(report: StabilityReport) -> Table:
 
 
 def _format_table(report: StabilityReport) -> Table:
-    columns = ("median", "99.9 %", "largest", "pixels", "dB", "healed", "value")
+    columns = ("median", "99.9 %", "largest", "pixels", "dB", "outliers_replaced", "value")
     table = Table(Column("against float64", no_wrap=True), *columns, box=None)
     for gap in report.formats:
         table.add_row(
@@ -52,9 +52,9 @@ def _format_table(report: StabilityReport) -> Table:
             decibels(gap.psnr, ""),
             decibels(gap.psnr_without_worst, ""),
             f"{gap.worst_pixel:.1e}",
-            style="" if gap.psnr >= report.max_error else "red",
+            style="" if gap.psnr >= report.min_psnr else "red",
         )
-    table.add_row("foretold", *[""] * 4, decibels(report.predicted_psnr, ""), "", "")
+    table.add_row("predicted", *[""] * 4, decibels(report.predicted_psnr, ""), "", "")
     return table
 
 
@@ -65,7 +65,7 @@ def _print_worst(report: StabilityReport, console: Console) -> None:
     console.print(
         f"the {len(worst.ids):,} Gaussians that float32 gets most wrong, at t = {worst.t:.4g}: around ({place}), "
         f"{worst.spread:.0%} of the scene's half diagonal wide, {worst.outside_bounds:,} outside of its bounds; moved "
-        f"by {worst.moved:.1%} of it; off by at most {worst.pixels:.2g} pixels. The picture with against without them: "
+        f"by {worst.moved:.1%} of it; off by at most {worst.pixels:.2g} pixels. The image with against without them: "
         f"{decibels(worst.drawn_psnr)}. Ids {', '.join(map(str, worst.ids[:8]))}{' …' if len(worst.ids) > 8 else ''}",
         markup=False,
     )
@@ -99,8 +99,10 @@ def draw(report: StabilityReport, path: Path) -> None:
     histogram.set(xscale="log", xlabel="amplification, largest product of Jacobians", ylabel="Gaussians × times")
     shown = np.isfinite(samples.distance) & (samples.distance > 0) & (amplification < 1e30)
     gaps.loglog(amplification[shown], samples.distance[shown], ".", markersize=2, alpha=0.3, label="measured")
-    foretold = shown & np.isfinite(samples.predicted) & (samples.predicted < 1e30)
-    gaps.loglog(amplification[foretold], samples.predicted[foretold], ".", markersize=2, alpha=0.15, label="foretold")
+    predicted = shown & np.isfinite(samples.predicted) & (samples.predicted < 1e30)
+    gaps.loglog(
+        amplification[predicted], samples.predicted[predicted], ".", markersize=2, alpha=0.15, label="predicted"
+    )
     ends = np.array([1.0, top])
     gaps.loglog(ends, UNIT_ROUNDOFF * ends, color="black", label="amplification × 2⁻²⁴")
     gaps.set(xlabel="amplification", ylabel="float32 against float64, scene units")

@@ -10,11 +10,11 @@ from export.pruning.statistics import Evidence
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.supports.nodes import BasisLayer
-from msdgs_train.supports.skinning_kernels import FOLLOWED
+from msdgs_train.supports.skinning_kernels import K_NEAREST
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12
-BASIS_BYTES = FOLLOWED * (4 + 1)
+BASIS_BYTES = K_NEAREST * (4 + 1)
 """Of a Gaussian in a scene file: pose, opacity, an SH coefficient; and where it moves, its id and its modulation, or
 the motions that it follows and their weights."""
 

@@ -113,14 +113,14 @@ def _model(model: DynamicGaussians, network: Network, which: slice | torch.Tenso
     if not network.modulated:
         tensors.pop("embeddings", None)
     if not any(model.config.layers[k] == "bases" for k in network.layers):
-        tensors.pop("basis_logits", None)
-        tensors.pop("basis_ids", None)
+        tensors.pop("skinning_logits", None)
+        tensors.pop("node_ids", None)
     layers = [model.deformation.layers[k] for k in network.layers]
     config = replace(
         model.config,
         layers=tuple(model.config.layers[k] for k in network.layers),
         sh_degree=sh_degree,
-        embedding_size=model.config.embedding_size if network.modulated else 0,
+        embedding_dim=model.config.embedding_dim if network.modulated else 0,
     )
     with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are not kept
         smaller = DynamicGaussians(config, CanonicalGaussians(**tensors))

@@ -91,7 +91,7 @@ def still(evidence: Evidence, cut: Cut, enough: float) -> Cut:
 
 
 def bands(evidence: Evidence, cut: Cut, enough: float) -> Cut:
-    """Upper bands of the spherical harmonics that change no colour visibly."""
+    """Upper bands of the spherical harmonics that change no color visibly."""
     for degree in range(cut.sh_degree):
         lower = cut.without(sh_degree=degree)
         if evidence.worst_db(lower, enough) >= enough:

@@ -10,9 +10,9 @@ from export.jobs.bake import Baked
 from export.plans.network import network
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.gaussians.model import SMALLEST_SCALE, activated_scales, unit_quats
+from msdgs_train.gaussians.model import MIN_SCALE, activated_scales, unit_quats
 from msdgs_train.layers.chain import MultiStepDeformation, operations
-from msdgs_train.supports.nodes import Carried
+from msdgs_train.supports.nodes import SkinningInputs
 
 POSE = 10
 """Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""
@@ -32,8 +32,10 @@ class ExactPoses:
         factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
         self._factors = [None if f is None else _double(f) for f in factors]
         self._carried = None
-        if m.basis_weights is not None and m.basis_ids is not None:
-            self._carried = Carried(self._means, self._quats, _double(m.basis_weights), torch.from_numpy(m.basis_ids))
+        if m.skinning_weights is not None and m.node_ids is not None:
+            self._carried = SkinningInputs(
+                self._means, self._quats, _double(m.skinning_weights), torch.from_numpy(m.node_ids)
+            )
         self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
 
     @property
@@ -57,7 +59,7 @@ class ExactPoses:
         if self._raw:
             scales = activated_scales(log_scales + of_scales)
         else:
-            scales = (activated_scales(log_scales) + of_scales).clamp_min(SMALLEST_SCALE)
+            scales = (activated_scales(log_scales) + of_scales).clamp_min(MIN_SCALE)
         return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).numpy()
 
 
@@ -68,7 +70,7 @@ def _double(array: np.ndarray) -> torch.Tensor:
 def pixel(baked: Baked) -> float:
     """What one pixel of the scene's nearest camera spans in scene units at the middle of what moves.
 
-    Errors of plans are chosen in this unit. Without cameras: of a picture of 400 pixels across the scene's bounds.
+    Errors of plans are chosen in this unit. Without cameras: of an image of 400 pixels across the scene's bounds.
     """
     low, high = np.array(baked.scene.metadata.bounds)
     middle = np.median(baked.moving.means, axis=0) if len(baked.moving) else (low + high) / 2

@@ -1,4 +1,4 @@
-"""`max_error`: of the files that one model was exported to, the fastest whose measured error fits."""
+"""`min_psnr`: of the files that one model was exported to, the fastest whose measured error fits."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_serve.scene_report import read_report
 from msdgs_serve.store import SceneStore, ServedScene
 
-FIELD = "max_error"
+FIELD = "min_psnr"
 
 
 def fastest_within(store: SceneStore, scene: ServedScene, decibels: float) -> ServedScene:

@@ -62,8 +62,8 @@ class FramePlan:
 def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     """Check everything that can be wrong with a request; may load its scene. Raises the domain's errors."""
     scene = service.scene(request.scene)
-    if request.max_error is not None:
-        scene = fastest_within(service.store, scene, request.max_error)
+    if request.min_psnr is not None:
+        scene = fastest_within(service.store, scene, request.min_psnr)
     camera = resolve_camera(request, scene)
     times = request.t if isinstance(request.t, list) else [request.t]
     _check_amounts(service, request, camera, len(times))

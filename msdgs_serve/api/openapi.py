@@ -132,9 +132,9 @@ def _examples(served: ServedScene, scene: dict[str, str]) -> Examples:
         "Without background, WebP": {
             "camera": around, "t": t, **size, "format": "webp", "quality": 80, "background": "transparent"
         },
-        "Linear colour, alpha and depth, EXR": {"camera": around, "t": t, **size, "format": "exr"},
-        "Depth as a picture": {"camera": around, "t": t, **size, "channels": ["depth"]},
-        "Colour and depth as a NumPy array": {
+        "Linear color, alpha and depth, EXR": {"camera": around, "t": t, **size, "format": "exr"},
+        "Depth as an image": {"camera": around, "t": t, **size, "channels": ["depth"]},
+        "Color and depth as a NumPy array": {
             "camera": around, "t": t, **size, "format": "npy", "channels": ["rgb", "depth"]
         },
     }  # fmt: skip

@@ -72,13 +72,13 @@ class MatrixCamera(Strict):
 
 
 class LookAtCamera(Strict):
-    """A camera at `eye` that sees `target` in the middle of the picture."""
+    """A camera at `eye` that sees `target` in the middle of the image."""
 
     type: Literal["look_at"]
     eye: Vector = Field(description="where the camera is, world")
     target: Vector | None = Field(default=None, description="what it looks at, world; default: the middle of the scene")
     up: Direction | None = Field(
-        default=None, description="which direction is up in the picture, world; default: the scene's"
+        default=None, description="which direction is up in the image, world; default: the scene's"
     )
     fov_y: FieldOfView | None = Field(
         default=None, description="vertical, degrees; default: that of the scene's first camera"
@@ -149,7 +149,7 @@ class RenderRequest(Strict):
     """A frame to draw, or one for each time."""
 
     scene: Name | None = Field(default=None, description="which scene; may be left out where only one is served")
-    max_error: Decibels | None = Field(
+    min_psnr: Decibels | None = Field(
         default=None,
         description="takes the fastest file of the scene's model whose worst frame has at least this PSNR in dB: "
         "`walk.onnx`, or beside it `walk.….onnx`. `Msdgs-Scene`, `-Plan` and `-Error` say which it was",
@@ -171,17 +171,17 @@ class RenderRequest(Strict):
         default="png",
         description="`png`: 8-bit sRGB. `jpeg`, `webp`: the same, lossy. `exr`: 32-bit float scene-linear Rec.709 "
         "R G B A, premultiplied, and depth Z along the camera axis in scene units, infinite where nothing is. `npy`: "
-        "a NumPy array [H, W, C], float32, as rendered: sRGB-encoded colour, premultiplied where transparent",
+        "a NumPy array [H, W, C], float32, as rendered: sRGB-encoded color, premultiplied where transparent",
     )
     channels: Channels | None = Field(
         default=None,
         description="`rgb`, `alpha`, `depth`, `motion`, `gaussians`, in the order of the file. Default for `exr` and "
-        "`npy`: the first three. The others hold a single one as a picture; depth is lighter the nearer it is, the "
+        "`npy`: the first three. The others hold a single one as an image; depth is lighter the nearer it is, the "
         "hue of motion is its direction. Motion is in pixels to the right and down, in `exr` as forward.u and "
         "forward.v. `gaussians` is how many add to each pixel: where the time goes",
     )
     depth_range: tuple[Number, Number] | None = Field(
-        default=None, description="depths drawn white and darkest in a picture of depth; default: those of the frame"
+        default=None, description="depths drawn white and darkest in an image of depth; default: those of the frame"
     )
     dt: Number | None = Field(
         default=None, description="`motion` leads to where things are at `t + dt`; needed for it, scene time"
@@ -197,7 +197,7 @@ class RenderRequest(Strict):
     )
     background: Background = Field(
         default="auto",
-        description="`scene`: the colour that the scene was trained on. `transparent` or null: none, and the frame "
+        description="`scene`: the color that the scene was trained on. `transparent` or null: none, and the frame "
         "has an alpha channel (not in `jpeg`). `[r, g, b]`: sRGB-encoded, 0 to 1. `auto`: `transparent` for `exr`, "
         "`scene` for the others. An opaque frame has no alpha, or alpha 1 in `exr`",
     )
@@ -209,7 +209,7 @@ class RenderQuery(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     scene: Name | None = Field(default=None, description="may be left out where only one is served")
-    max_error: Annotated[float, Field(allow_inf_nan=False, ge=0, le=200)] | None = Field(
+    min_psnr: Annotated[float, Field(allow_inf_nan=False, ge=0, le=200)] | None = Field(
         default=None, description="dB, as in `POST /render`"
     )
     t: LaxNumber | None = Field(default=None, description="default: the scene's first time")

@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 from msdgs_serve.imaging.exr_header import camera_attributes
 from msdgs_serve.imaging.formats import CHANNELS, DEFAULT_QUALITY, FORMATS, Channel, ImageFormat, default_channels
 from msdgs_serve.imaging.image import Image
-from msdgs_serve.imaging.pictures import DepthRange, channel_of, picture
+from msdgs_serve.imaging.images import DepthRange, channel_of, display_image
 from msdgs_serve.scene import InvalidInput, MsdgsError
 
 Attributes = dict[str, int | float | str]
@@ -62,10 +62,10 @@ def encode(
 ) -> bytes:
     """The image as a file of `image_format`.
 
-    PNG, JPEG and WebP hold an 8-bit picture: sRGB with straight alpha where the image is transparent (JPEG can't be),
+    PNG, JPEG and WebP hold an 8-bit image: sRGB with straight alpha where the image is transparent (JPEG can't be),
     or a single channel. EXR holds any channels as 32-bit floats: scene-linear Rec.709 premultiplied R, G, B, A and
     depth Z, motion as forward.u and forward.v, gaussians, with the camera and the time in its header. NPY holds float32
-    [H, W, C] as rendered: sRGB-encoded colour.
+    [H, W, C] as rendered: sRGB-encoded color.
     `quality` in [1, 100] is for JPEG and WebP. Raises `InvalidInput` naming the parameter.
     """
     check_encodable(image.width, image.height, image.transparent, image_format, quality, channels)
@@ -74,7 +74,7 @@ def encode(
         return npy(numbers(image, channels))
     if image_format == "exr":
         return _write(_exr_pixels(image, channels), _exr_spec(image, channels), image_format)
-    pixels = picture(image, channels[0], depth_range)
+    pixels = display_image(image, channels[0], depth_range)
     if pixels.shape[2] == 1 and not traits.holds_grey:
         pixels = np.repeat(pixels, 3, axis=2)
     spec = oiio.ImageSpec(image.width, image.height, pixels.shape[2], oiio.UINT8)
@@ -114,7 +114,7 @@ def check_encodable(
 
 
 def numbers(image: Image, channels: Sequence[Channel]) -> np.ndarray:
-    """[H, W, C] float32: the channels as rendered, in the order asked for; colour sRGB-encoded."""
+    """[H, W, C] float32: the channels as rendered, in the order asked for; color sRGB-encoded."""
     parts = [channel_of(image, channel) for channel in channels]
     return np.dstack(parts).astype(np.float32, copy=False)
 

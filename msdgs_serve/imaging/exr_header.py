@@ -16,7 +16,7 @@ def camera_attributes(camera: Camera, t: float) -> TypedAttributes:
     """OpenEXR's `worldToCamera` and `worldToNDC`, under the names that OpenImageIO has for them, and ours.
 
     OpenEXR multiplies row vectors from the left, so that matrices are transposed. NDC is (0, 0) at the upper left
-    corner of the picture and (1, 1) at the lower right. `msdgs:camera_to_world` has OpenCV axes; it is transposed too.
+    corner of the image and (1, 1) at the lower right. `msdgs:camera_to_world` has OpenCV axes; it is transposed too.
     """
     world_to_camera = camera.world_to_camera
     to_ndc = np.array(

@@ -17,9 +17,9 @@ class FormatTraits:
     extension: str
     plugin: str | None  # OpenImageIO's name for the writer; None: written by NumPy
     holds_alpha: bool
-    holds_grey: bool  # a picture of one channel
+    holds_grey: bool  # an image of one channel
     takes_quality: bool  # lossy, with a quality from 1 to 100
-    holds_float: bool  # any channels as numbers; others hold one picture, of colour or of one channel
+    holds_float: bool  # any channels as numbers; others hold one image, of color or of one channel
     max_side: int  # pixels
 
 
@@ -36,5 +36,5 @@ DEFAULT_QUALITY = 90
 
 
 def default_channels(image_format: ImageFormat) -> tuple[Channel, ...]:
-    """What a file holds where nothing is said: colour, alpha and depth as numbers, or a picture."""
+    """What a file holds where nothing is said: color, alpha and depth as numbers, or an image."""
     return ("rgb", "alpha", "depth") if FORMATS[image_format].holds_float else ("rgb",)

@@ -1,4 +1,4 @@
-"""An image of named float channels, and the colour arithmetic its encoders need."""
+"""An image of named float channels, and the color arithmetic its encoders need."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -57,7 +57,7 @@ class Image:
     def linear_rgb(self) -> FloatArray:
         """[H, W, 3] scene-linear Rec.709, premultiplied by alpha where `transparent`.
 
-        The transfer function is not linear, so that it is undone on straight colour, between taking alpha out and
+        The transfer function is not linear, so that it is undone on straight color, between taking alpha out and
         putting it back.
         """
         if not self.transparent:
@@ -66,7 +66,7 @@ class Image:
 
 
 def average(images: Iterable[Image]) -> Image:
-    """The mean of frames of one camera: colour in linear light, depth weighted by alpha, numbers of
+    """The mean of frames of one camera: color in linear light, depth weighted by alpha, numbers of
     Gaussians. Keeps one frame at a time."""
     count, first = 0, None
     light = coverage = depth = gaussians = np.zeros(())
@@ -108,5 +108,5 @@ def linear_to_srgb(linear: FloatArray) -> FloatArray:
 
 
 def _straight(premultiplied: FloatArray, alpha: FloatArray) -> FloatArray:
-    """[H, W, 3] colour with alpha taken out; where alpha is 0, premultiplied colour is 0 and stays so."""
+    """[H, W, 3] color with alpha taken out; where alpha is 0, premultiplied color is 0 and stays so."""
     return premultiplied / np.where(alpha > 0, alpha, 1)[..., None]

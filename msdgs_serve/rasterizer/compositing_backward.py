@@ -125,7 +125,7 @@ def _tiles_backward(
     """Write the sums of each pair of splat and tile, of tiles `first_tile` to `past_tile`, and how many pairs of a tile
     have been: those behind what hides them are left out. Whether all these tiles are done.
 
-    `images` are colour, alpha, and the gradients of both.
+    `images` are color, alpha, and the gradients of both.
     """
     state = np.empty(8 * PIXELS, records.dtype)
     record = np.empty(RECORD, records.dtype)

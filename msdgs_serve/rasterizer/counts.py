@@ -1,4 +1,4 @@
-"""How many splats each pixel blends: a picture of where a frame's work is. Apart from the drawing, which it slows."""
+"""How many splats each pixel blends: an image of where a frame's work is. Apart from the drawing, which it slows."""
 
 from typing import NamedTuple
 

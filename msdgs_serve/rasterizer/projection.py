@@ -1,4 +1,4 @@
-"""3D Gaussians to 2D splats: position, depth, inverse covariance, footprint and colour, 16 Gaussians at a time.
+"""3D Gaussians to 2D splats: position, depth, inverse covariance, footprint and color, 16 Gaussians at a time.
 
 Computed in float64, stored as the Gaussians' dtype: the arithmetic is once a Gaussian, and needles and giants lose
 nothing to cancellation.
@@ -60,7 +60,7 @@ class Splats(NamedTuple):
     """N projected Gaussians. Of one that isn't drawn the record is 0 and the rectangle empty.
 
     A record: the mean X, Y in pixels; the root [[A, B], [0, C]] of the inverse 2D covariance times `ROOT_SCALE`²,
-    1/px; log2 of the opacity; the colour seen from the camera, 0 or more; the depth along the camera's axis, scene
+    1/px; log2 of the opacity; the color seen from the camera, 0 or more; the depth along the camera's axis, scene
     units; half the size of the box outside of which alpha < alpha_min, pixels.
     """
 

@@ -23,7 +23,7 @@ class Rendering(NamedTuple):
     alpha: np.ndarray  # [H, W] 1 - transmittance
     depth: np.ndarray  # [H, W] expected distance along the camera axis, infinite where alpha is 0; [0, 0] unasked
     median_depth: np.ndarray  # [H, W] distance of the splat that takes half of the light, else infinite; [0, 0] unasked
-    extra: np.ndarray  # [H, W, C] what was asked for besides, weighted as colours are; divide by alpha for a mean
+    extra: np.ndarray  # [H, W, C] what was asked for besides, weighted as colors are; divide by alpha for a mean
     counts: np.ndarray  # [H, W] Gaussians that add to each pixel; [0, 0] unasked
 
 
@@ -39,11 +39,11 @@ def rasterize(
     counts: bool = False,
     options: RasterizerOptions = GSPLAT,
 ) -> Rendering:
-    """Draw the Gaussians (equations 1 and 2) over a background colour.
+    """Draw the Gaussians (equations 1 and 2) over a background color.
 
-    Colour and alpha are drawn always. Depths are in scene units; with the median the expected depth is drawn too.
-    `extra` [N, C] is any C numbers of each Gaussian, drawn as if they were colours over nothing; three of them take as
-    long as the colours do. `counts` take a pass of their own.
+    Color and alpha are drawn always. Depths are in scene units; with the median the expected depth is drawn too.
+    `extra` [N, C] is any C numbers of each Gaussian, drawn as if they were colors over nothing; three of them take as
+    long as the colors do. `counts` take a pass of their own.
 
     Safe to call from several threads; the same input gives the same bytes, whatever the number of threads.
 
@@ -82,7 +82,7 @@ def _checked_extra(extra: np.ndarray | None, gaussians: Gaussians) -> np.ndarray
 def _drawn_extra(
     extra: np.ndarray, splats: Splats, tiles: TileLists, camera: Camera, options: RasterizerOptions
 ) -> np.ndarray:
-    """Three channels at a time in the place of the colours."""
+    """Three channels at a time in the place of the colors."""
     channels = extra.shape[1]
     dtype = splats.records.dtype
     drawn = np.empty((camera.height, camera.width, channels), dtype)

@@ -116,7 +116,7 @@ class Camera:
     def from_look_at(
         cls, eye: np.ndarray, target: np.ndarray, up: np.ndarray, width: int, height: int, fov_y: float
     ) -> "Camera":
-        """A camera at `eye` that sees `target` in its centre, with `up` (world direction) upwards in the picture."""
+        """A camera at `eye` that sees `target` in its centre, with `up` (world direction) upwards in the image."""
         return cls.from_fov(look_at(eye, target, up), width, height, fov_y)
 
     @classmethod

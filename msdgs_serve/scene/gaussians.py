@@ -19,7 +19,7 @@ class Gaussians:
     quats: FloatArray  # [N, 4] rotations, wxyz, unit
     scales: FloatArray  # [N, 3] standard deviations, scene units, > 0
     opacities: FloatArray  # [N] in [0, 1]
-    sh: FloatArray  # [N, (degree + 1)², 3] INRIA order; colour = SH + 0.5, clamped at 0
+    sh: FloatArray  # [N, (degree + 1)², 3] INRIA order; color = SH + 0.5, clamped at 0
 
     def __len__(self) -> int:
         return len(self.means)

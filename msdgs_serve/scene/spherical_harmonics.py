@@ -19,7 +19,7 @@ SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 
 
 def sh_coefficients(degree: int) -> int:
-    """Number of coefficients a colour channel has up to and including `degree`."""
+    """Number of coefficients a color channel has up to and including `degree`."""
     return (degree + 1) ** 2
 
 
@@ -52,7 +52,7 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def sh_to_rgb(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Colours, shape (*, 3), of coefficients, shape (*, (degree + 1)², 3), seen along unit directions, shape (*, 3)."""
+    """Colors, shape (*, 3), of coefficients, shape (*, (degree + 1)², 3), seen along unit directions, shape (*, 3)."""
     basis = sh_basis(directions, SH_DEGREES[sh.shape[-2]])
     return np.maximum(np.einsum("...k,...kc->...c", basis, sh) + 0.5, 0)
 

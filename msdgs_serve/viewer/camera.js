@@ -10,7 +10,7 @@ export class Camera {
   constructor(view) {
     this.view = view;
     this.up = unit(view.up);
-    this.aspect = 1; // of the picture, width to height; the stage sets it
+    this.aspect = 1; // of the image, width to height; the stage sets it
     // azimuth 0 lies along the world axis that is most level, as the service has it
     const tilts = this.up.map(Math.abs);
     const axis = [0, 0, 0];
@@ -55,7 +55,7 @@ export class Camera {
     return add(this.target, this.outwards, this.distance);
   }
 
-  /** Right, up and forward in the picture, world. */
+  /** Right, up and forward in the image, world. */
   get axes() {
     const forward = scaled(this.outwards, -1);
     const right = unit(cross(forward, this.up));
@@ -76,7 +76,7 @@ export class Camera {
     this.target = add(eye, this.outwards, -this.distance);
   }
 
-  /** Parts of the picture's height, to the right and up. */
+  /** Parts of the image's height, to the right and up. */
   pan(right, above) {
     this.sceneCamera = null;
     const height = 2 * this.distance * this.half;
@@ -90,7 +90,7 @@ export class Camera {
     this.distance = Math.min(Math.max(this.distance * factor, 1e-3 * all), 1e3 * all);
   }
 
-  /** Parts of the scene's distance, along the picture's axes. */
+  /** Parts of the scene's distance, along the image's axes. */
   fly(right, above, forward) {
     this.sceneCamera = null;
     const axes = this.axes;
@@ -100,7 +100,7 @@ export class Camera {
     }
   }
 
-  /** Half the height of the picture at distance 1; in a narrow one a square of the scene stays visible. */
+  /** Half the height of the image at distance 1; in a narrow one a square of the scene stays visible. */
   get half() {
     return Math.tan(this.fovY / DEGREES / 2) * Math.max(1, Math.min(this.proportion, 1) / this.aspect);
   }

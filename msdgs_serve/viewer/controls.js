@@ -1,6 +1,6 @@
 // Mouse, touch and keys, as movements of the camera and commands.
 
-const ORBIT_SPEED = 200; // degrees for a drag as long as the picture is high
+const ORBIT_SPEED = 200; // degrees for a drag as long as the image is high
 const LOOK_SPEED = 50;
 const WHEEL_SPEED = 0.0012; // of a pixel of scrolling, as a logarithm of the distance
 const WHEEL_PIXELS = [1, 16, 400]; // by the event's deltaMode: pixels, lines, pages

@@ -17,13 +17,13 @@ const KINDS = ["network", "prefix", "int8", "lowrank", "keyframes"];
 export function drawDiagram(svg, report, tell) {
   const points = report.points.map(pointOf).sort((a, b) => a.milliseconds - b.milliseconds);
   const across = scale(points.map((point) => Math.log(point.milliseconds)), [LEFT + 8, WIDTH - RIGHT - 8]);
-  const upwards = scale([...points.map((point) => point.psnr), report.max_error], [TOP + 8, HEIGHT - BOTTOM - 8]);
+  const upwards = scale([...points.map((point) => point.psnr), report.min_psnr], [TOP + 8, HEIGHT - BOTTOM - 8]);
   const x = (milliseconds) => across(Math.log(milliseconds));
   svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
   svg.replaceChildren(
     ...timeAxis(points, x),
     ...errorAxis(points, upwards),
-    ...allowed(report.max_error, upwards(report.max_error)),
+    ...allowed(report.min_psnr, upwards(report.min_psnr)),
     frontLine(points, x, upwards),
     ...points.map((point) => dot(point, x(point.milliseconds), upwards(point.psnr), tell)),
   );

@@ -24,11 +24,11 @@ const find = (id) => document.getElementById(id);
 const layers = new Layers({ changed: () => changed() });
 const state = { scene: null, camera: null, player: new Player(), layers, view: "rgb" };
 const pace = new Pace();
-const stage = new Stage(find("picture"), find("status"));
+const stage = new Stage(find("image"), find("status"));
 const timeline = new Timeline(state.player, { changed: () => changed(), started: run });
 const connection = new Connection(find("banner"), { recovered, keyNeeded: () => find("key-dialog").showModal() });
 const scenes = new SceneList(find("scenes"), { open: (name) => guarded(() => open(name)), isIdle });
-const controls = new Controls(find("picture"), { camera: () => state.camera, moved: () => moved(), command });
+const controls = new Controls(find("image"), { camera: () => state.camera, moved: () => moved(), command });
 const frames = new Frames(
   {
     size: () => stage.size(state),
@@ -116,7 +116,7 @@ function show(bitmap, facts) {
   if (facts.isNews) scenes.renew(state.scene.name);
 }
 
-/** Whether there is nothing better to do than small pictures. */
+/** Whether there is nothing better to do than small images. */
 function isIdle() {
   return !connection.isLost && (frames.shown || frames.paused) && !frames.inFlight;
 }

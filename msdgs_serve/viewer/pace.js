@@ -37,7 +37,7 @@ export class Pace {
   }
 }
 
-/** Few different sizes, so that the picture's sharpness doesn't flicker. */
+/** Few different sizes, so that the image's sharpness doesn't flicker. */
 const steps = (scale) => (scale >= 1 ? 1 : 2 ** (Math.floor(4 * Math.log2(scale)) / 4));
 
 const sized = (pixels) => Math.max(1, Math.round(pixels));

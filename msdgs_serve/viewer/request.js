@@ -21,7 +21,7 @@ function motionTimes(player) {
   return { t: Math.min(player.t, last), dt };
 }
 
-/** The same for a file that holds numbers: colour, alpha and depth, and what else is looked at. */
+/** The same for a file that holds numbers: color, alpha and depth, and what else is looked at. */
 export function numbersBody(state) {
   const { depth_range: _, channels, ...body } = frameBody(state);
   const all = new Set(["rgb", "alpha", "depth", ...(channels ?? [])]);

@@ -1,11 +1,11 @@
-// The list of scenes, with a small picture of each.
+// The list of scenes, with a small image of each.
 
 import { call, getJson } from "./api.js";
 
 const THUMBNAIL = { width: 96, height: 72 };
 
 export class SceneList {
-  /** `host` has: open(name); isIdle(), whether a picture may be asked for now. */
+  /** `host` has: open(name); isIdle(), whether an image may be asked for now. */
   constructor(list, host) {
     this.list = list;
     this.host = host;
@@ -50,7 +50,7 @@ export class SceneList {
     }
   }
 
-  /** Draw a scene's small picture again. */
+  /** Draw a scene's small image again. */
   renew(name) {
     if (this.items.has(name)) this.waiting.add(name);
   }
@@ -60,8 +60,8 @@ export class SceneList {
     item.dataset.scene = name;
     item.querySelector(".name").textContent = name;
     item.querySelector("button").addEventListener("click", () => this.host.open(name));
-    const picture = item.querySelector("canvas");
-    [picture.width, picture.height] = [2 * THUMBNAIL.width, 2 * THUMBNAIL.height];
+    const image = item.querySelector("canvas");
+    [image.width, image.height] = [2 * THUMBNAIL.width, 2 * THUMBNAIL.height];
     this.items.set(name, item);
     this.observer.observe(item);
     return item;
@@ -80,11 +80,11 @@ export class SceneList {
     this.isDrawing = true;
     this.waiting.delete(name);
     try {
-      const picture = this.items.get(name).querySelector("canvas");
-      const query = new URLSearchParams({ scene: name, width: picture.width, height: picture.height, format: "jpeg" });
+      const image = this.items.get(name).querySelector("canvas");
+      const query = new URLSearchParams({ scene: name, width: image.width, height: image.height, format: "jpeg" });
       const bitmap = await createImageBitmap(await (await call(`render?${query}`)).blob());
-      picture.getContext("2d").drawImage(bitmap, 0, 0);
-      this.observer.unobserve(this.items.get(name) ?? picture);
+      image.getContext("2d").drawImage(bitmap, 0, 0);
+      this.observer.unobserve(this.items.get(name) ?? image);
     } catch {
       // the frame itself tells what is wrong
     } finally {

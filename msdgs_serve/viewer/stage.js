@@ -1,4 +1,4 @@
-// The picture, and the line below that says what it took.
+// The image, and the line below that says what it took.
 
 const SHARPEST = 2; // device pixels to one of the page, more than that nobody sees
 
@@ -28,7 +28,7 @@ export class Stage {
     return { width: Math.max(1, Math.round(width)), height: Math.max(1, Math.round(height)) };
   }
 
-  /** Around the picture: the scene's own, sRGB from 0 to 1. */
+  /** Around the image: the scene's own, sRGB from 0 to 1. */
   background(color) {
     this.canvas.style.background = `rgb(${color.map((x) => Math.round(255 * x)).join(" ")})`;
   }

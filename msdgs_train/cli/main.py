@@ -1,4 +1,4 @@
-"""`msdgs-train`: fit a moving scene to photographs, judge and look at what came out, or make a scene to try it on."""
+"""`msdgs-train`: fit a moving scene to images, judge and look at what came out, or make a scene to try it on."""
 
 import argparse
 import contextlib
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from msdgs_train.viewer.training_view import TrainingView
     from msdgs_train.viewer.viewer import Viewer
 
-PresetName = Literal["msdgs-small", "msdgs-mlp", "msdgs-plane", "deformgs", "4dgs", "msdgs-bases", "static"]
+PresetName = Literal["msdgs-small", "msdgs-mlp", "msdgs-plane", "deformgs", "4dgs", "motion-bases", "static"]
 """Written out, so that `--help` and shells know them."""
 
 EXIT_INVALID = 2
@@ -33,8 +33,8 @@ console = Console()
 
 @dataclass(frozen=True)
 class Fit:
-    """Train on a folder of photographs; RUN gets config.json, run.json, metrics.jsonl, curve.png, renders/,
-    checkpoint.pt, model.pt (the last) and best.pt (of the highest PSNR on held-out photographs).
+    """Train on a folder of images; RUN gets config.json, run.json, metrics.jsonl, curve.png, renders/,
+    checkpoint.pt, model.pt (the last) and best.pt (of the highest PSNR on held-out images).
 
     Ctrl-C finishes the step, saves a checkpoint and stops. The same command with --resume goes on from there, with
     the same bits as if it had never stopped; more --steps, another --max-minutes and the like may be given then.
@@ -78,7 +78,7 @@ class Synthetic:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The folder to make."""
     size: int = 128
-    """Width and height of the photographs in pixels."""
+    """Width and height of the images in pixels."""
     train_frames: int = 64
     """At evenly spaced times, from all around."""
     test_frames: int = 12
@@ -89,10 +89,10 @@ class Synthetic:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Judge the last and the best model of a run on held-out photographs: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR where
+    """Judge the last and the best model of a run on held-out images: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR where
     something moves, since a static background hides what is wrong with the motion.
 
-    RUN/eval gets numbers for every image (<split>.json), a table (<split>.md) and a contact sheet of photographs,
+    RUN/eval gets numbers for every image (<split>.json), a table (<split>.md) and a contact sheet of images,
     renderings and errors (<split>.png). LPIPS and ꟻLIP are left out where their packages or weights are not on this
     machine; nothing is downloaded.
 
@@ -104,7 +104,7 @@ class Evaluate:
     data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = None
     """The dataset, where it is not any more where the run found it."""
     split: Literal["test", "val", "train"] = "test"
-    """Which photographs."""
+    """Which images."""
 
 
 @dataclass(frozen=True)
@@ -121,9 +121,9 @@ class Steps:
     out: Path = Path("steps.png")
     """The PNG to write."""
     size: int = 400
-    """Width of each picture in pixels, the height in proportion."""
+    """Width of each image in pixels, the height in proportion."""
     camera: str | None = None
-    """Name of a camera that the model holds; left out: the one whose photograph is nearest in time."""
+    """Name of a camera that the model holds; left out: the one whose image is nearest in time."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Compare:
     stopped goes on with the same command; finished runs aren't trained again.
 
     Example:  msdgs-train compare deformgs 4dgs mine.toml --data data/a data/b --out runs/all --steps 3000 --size 200
-    --init-count 5000 --max-gaussians 10000
+    --init-num-pts 5000 --max-gaussians 10000
 
     where mine.toml holds:  [k2]  preset = "msdgs-small"  [k4]  model.layers = ["mlp", "mlp", "mlp", "mlp"]
     """
@@ -167,12 +167,12 @@ class Compare:
     """Each is a run of its own; the table shows mean and spread."""
     steps: int = 3000
     """The budget of each run in optimiser steps, whatever a preset says. Schedules that are parts of a run shrink with
-    it; those in steps (sh_interval, densify_from, opacity_reset_every, average_steps) don't."""
+    it; those in steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
     minutes: float | None = None
     """A run also ends after so many minutes. Learning rates fall over --steps, so choose these to be just reached."""
     size: int | None = None
-    """Width in pixels of all photographs."""
-    init_count: int | None = None
+    """Width in pixels of all images."""
+    init_num_pts: int | None = None
     """Gaussians at the start, for all systems; left out: each its own."""
     max_gaussians: int | None = None
     """Gaussians at most, for all systems; left out: each its own."""
@@ -269,7 +269,7 @@ def _fit(command: Fit) -> int:
         if view is not None and outcome.status != "interrupted":
             with contextlib.suppress(KeyboardInterrupt):
                 console.print("the page stays, with the last model; Ctrl-C ends it")
-                view.stay()
+                view.wait_for_interrupt()
     return EXIT_INTERRUPTED if outcome.status == "interrupted" else 0
 
 
@@ -346,8 +346,8 @@ def _rich_table(
 def _steps(command: Steps) -> int:
     from msdgs_train.evaluation.layer_strip import write_steps
 
-    pictures = write_steps(command.model, command.out, t=command.t, size=command.size, camera=command.camera)
-    console.print(f"wrote {command.out}: k = 0 to {len(pictures) - 1}", soft_wrap=True)
+    images = write_steps(command.model, command.out, t=command.t, size=command.size, camera=command.camera)
+    console.print(f"wrote {command.out}: k = 0 to {len(images) - 1}", soft_wrap=True)
     return 0
 
 
@@ -358,7 +358,7 @@ def _view(command: View) -> int:
     loaded = load_model(command.model)
     with _viewer(command.host, command.port) as viewer, contextlib.suppress(KeyboardInterrupt):
         show_model(viewer, loaded, str(command.model))
-        viewer.stay()
+        viewer.wait_for_interrupt()
     return 0
 
 
@@ -372,7 +372,7 @@ def _compare(command: Compare) -> int:
     from msdgs_train.comparison.runner import train_all
 
     budget = Budget(
-        command.steps, command.minutes, command.size, command.threads, command.init_count, command.max_gaussians
+        command.steps, command.minutes, command.size, command.threads, command.init_num_pts, command.max_gaussians
     )
     runs = make_runs(read_systems(command.systems, budget), command.data, command.seeds, command.out)
     if command.jobs is not None and command.jobs < 1:

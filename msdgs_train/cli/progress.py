@@ -13,10 +13,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from msdgs_train.comparison.matrix import Run
-from msdgs_train.comparison.pools import Ended
-from msdgs_train.engine.run import Observer, Outcome
+from msdgs_train.comparison.pools import RunEnd
+from msdgs_train.engine.run import Observer, RunResult
 from msdgs_train.engine.trainer import StepResult
-from msdgs_train.evaluation.metrics import Quality
+from msdgs_train.evaluation.metrics import ImageMetrics
 
 UPDATE_SECONDS = 0.5
 PLAIN_LINE_SECONDS = 10.0  # between lines where the output is not a terminal
@@ -42,7 +42,7 @@ class FitProgress(Observer):
             console=console,
             disable=not console.is_terminal,
         )
-        self._task = self._bar.add_task("fit", total=steps, state="reading photographs, compiling kernels")
+        self._task = self._bar.add_task("fit", total=steps, state="reading images, compiling kernels")
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
@@ -74,14 +74,14 @@ class FitProgress(Observer):
             left = (self._steps - result.step) / speed if speed else 0.0
             self._console.print(f"step {result.step:,}/{self._steps:,}  {state}  {left:.0f} s left", soft_wrap=True)
 
-    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
         self._console.print(
             f"step {step:,}: {split} PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}", soft_wrap=True
         )
 
-    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+    def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
         self._console.print(
-            f"{reason}; going back to step {step:,} with learning rates times {rate_factor:g}",
+            f"{reason}; going back to step {step:,} with learning rates times {lr_factor:g}",
             style="yellow",
             soft_wrap=True,
         )
@@ -95,7 +95,7 @@ class FitProgress(Observer):
         self._stop.set()
 
 
-def print_outcome(console: Console, outcome: Outcome, data: Path, run: Path) -> None:
+def print_outcome(console: Console, outcome: RunResult, data: Path, run: Path) -> None:
     """How a run has ended, what it has left, and how to go on with it."""
     console.print(
         f"{outcome.status} at step {outcome.step:,}, {outcome.gaussians:,} Gaussians, {outcome.seconds:.0f} s"
@@ -129,7 +129,7 @@ class ComparisonProgress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def ended(self, run: Run, ended: Ended) -> None:
+    def ended(self, run: Run, ended: RunEnd) -> None:
         """A run is over, one way or another."""
         self._bar.advance(self._task)
         line = f"{run.name}: {ended.status}" + (f", {ended.message}" if ended.message else "")

@@ -12,7 +12,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.presets import DEFAULT, PRESETS, preset
 
-EVALUATIONS = 10  # of the held-out photographs while training: points of a curve
+EVALUATIONS = 10  # of the held-out images while training: points of a curve
 LOG_LINES = 100
 
 
@@ -24,7 +24,7 @@ class Budget:
     minutes: float | None = None
     size: int | None = None
     threads: int = 1
-    init_count: int | None = None
+    init_num_pts: int | None = None
     max_gaussians: int | None = None
 
     def settings(self) -> dict[str, Any]:
@@ -38,7 +38,7 @@ class Budget:
             "checkpoint_every": every,
             "log_every": max(self.steps // LOG_LINES, 1),
         }
-        optional = {name: getattr(self, name) for name in ("size", "init_count", "max_gaussians")}
+        optional = {name: getattr(self, name) for name in ("size", "init_num_pts", "max_gaussians")}
         return given | {name: value for name, value in optional.items() if value is not None}
 
 

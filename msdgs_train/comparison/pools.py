@@ -22,7 +22,7 @@ POLL_SECONDS = 0.5
 _stop: Event | None = None  # of a worker process, set by its parent
 
 
-class Ended(NamedTuple):
+class RunEnd(NamedTuple):
     """How a run has ended: "finished", "out of time", "interrupted", "was finished", or "failed" with its message."""
 
     status: str
@@ -42,7 +42,7 @@ class Pool(Protocol):
         """Begin, or go on with it."""
         ...
 
-    def ended(self) -> Iterator[tuple[Run, Ended]]:
+    def ended(self) -> Iterator[tuple[Run, RunEnd]]:
         """What has ended, after waiting a moment for it."""
         ...
 
@@ -75,7 +75,7 @@ class _Processes:
     def __init__(self, jobs: int, executor: ProcessPoolExecutor, stop: Event) -> None:
         self.jobs = jobs
         self._executor, self._stop = executor, stop
-        self._going: dict[Future[Ended], Run] = {}
+        self._going: dict[Future[RunEnd], Run] = {}
 
     def __len__(self) -> int:
         return len(self._going)
@@ -83,7 +83,7 @@ class _Processes:
     def submit(self, run: Run) -> None:
         self._going[self._executor.submit(_train_here, run)] = run
 
-    def ended(self) -> Iterator[tuple[Run, Ended]]:
+    def ended(self) -> Iterator[tuple[Run, RunEnd]]:
         for future in wait(self._going, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED).done:
             yield self._going.pop(future), future.result()
 
@@ -97,7 +97,7 @@ class _RayPool:
 
         self.jobs = jobs
         self._flag = ray.remote(num_cpus=0)(_Flag).remote()
-        self._tasks: RayTasks[Run, Ended] = RayTasks(_train_on_ray, [self._flag], cores=threads)
+        self._tasks: RayTasks[Run, RunEnd] = RayTasks(_train_on_ray, [self._flag], cores=threads)
         self._given: dict[Path, Run] = {}
 
     def __len__(self) -> int:
@@ -108,7 +108,7 @@ class _RayPool:
         self._given[there.folder] = run
         self._tasks.submit(there)
 
-    def ended(self) -> Iterator[tuple[Run, Ended]]:
+    def ended(self) -> Iterator[tuple[Run, RunEnd]]:
         for there, how in self._tasks.ended(POLL_SECONDS):
             yield self._given.pop(there.folder), how
 
@@ -149,11 +149,11 @@ class _AskingParent(Observer):
         return _is_orphan() or (_stop is not None and _stop.is_set())
 
 
-def _train_on_ray(flag: list[Any], run: Run) -> Ended:
+def _train_on_ray(flag: list[Any], run: Run) -> RunEnd:
     return _train(run, _AskingFlag(flag[0]))
 
 
-def _train_here(run: Run) -> Ended:
+def _train_here(run: Run) -> RunEnd:
     ended = _train(run, _AskingParent())
     if _is_orphan():
         os._exit(1)  # the executor would wait for more for ever
@@ -165,15 +165,15 @@ def _is_orphan() -> bool:
     return parent is not None and not parent.is_alive()
 
 
-def _train(run: Run, observer: Observer) -> Ended:
+def _train(run: Run, observer: Observer) -> RunEnd:
     """One run, begun or gone on with."""
     os.environ[THREADS_VARIABLE] = str(run.config.threads)
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
         outcome = fit(run.config, run.data, run.folder, resume=(run.folder / CHECKPOINT).exists(), observer=observer)
     except MsdgsError as error:
-        return Ended("failed", str(error))
-    return Ended(outcome.status)
+        return RunEnd("failed", str(error))
+    return RunEnd(outcome.status)
 
 
 def _prepare(stop: Event) -> None:

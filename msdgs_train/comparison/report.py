@@ -71,7 +71,7 @@ def as_markdown(results: Sequence[Result], missing: int) -> str:
     lines += ["| " + " | ".join(row) + " |" for row in table(results)]
     budget = results[0].run.config
     limit = f", at most {budget.max_minutes:g} minutes a run" if budget.max_minutes is not None else ""
-    under = f"{budget.steps:,} steps{limit}; {budget.threads} thread(s) a run; held-out photographs of "
+    under = f"{budget.steps:,} steps{limit}; {budget.threads} thread(s) a run; held-out images of "
     under += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
     machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     notes = [under, f"Measured on {date.today().isoformat()}: {machine}."]
@@ -95,7 +95,7 @@ def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
 
 
 def draw_time(results: Sequence[Result]) -> Figure:
-    """Error on held-out photographs against training time: a panel a scene, a line a system, the mean of its seeds."""
+    """Error on held-out images against training time: a panel a scene, a line a system, the mean of its seeds."""
     figure, panels = _panels(results, "seconds of training")
     styles = _styles(_names(results, lambda r: r.run.system))
     for axes, of_scene in panels:

@@ -13,7 +13,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.runner import final_metrics, is_finished
 from msdgs_train.engine.metrics_log import read_metrics
-from msdgs_train.engine.run import CHOOSING_SPLITS, MODEL
+from msdgs_train.engine.run import MODEL, SELECTION_SPLITS
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 
@@ -22,7 +22,7 @@ FIRST_SPLIT = "test"
 
 
 class CurvePoint(NamedTuple):
-    """The quality on held-out photographs at one moment of training."""
+    """The quality on held-out images at one moment of training."""
 
     step: int
     seconds: float
@@ -68,9 +68,9 @@ def collect(runs: Sequence[Run]) -> list[Result]:
 
 def _result(run: Run) -> Result:
     metrics = final_metrics(run) or {}
-    split = next((name for name in (FIRST_SPLIT, *CHOOSING_SPLITS) if name in metrics["splits"]), None)
+    split = next((name for name in (FIRST_SPLIT, *SELECTION_SPLITS) if name in metrics["splits"]), None)
     if split is None:
-        raise InvalidInput("data", "scenes with held-out photographs", run.data)
+        raise InvalidInput("data", "scenes with held-out images", run.data)
     lines = read_metrics(run.folder)
     loaded = load_model(run.folder / MODEL)
     return Result(

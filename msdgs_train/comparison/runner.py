@@ -10,11 +10,11 @@ from typing import Any
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
-from msdgs_train.comparison.pools import Ended, Pool
+from msdgs_train.comparison.pools import Pool, RunEnd
 from msdgs_train.engine.run import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
 
 
-def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, Ended], None]) -> bool:
+def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, RunEnd], None]) -> bool:
     """Train what isn't finished yet; False where Ctrl-C has stopped it, with all checkpoints saved.
 
     Raises `InvalidInput` before anything is trained where a folder holds a run with other settings.
@@ -24,7 +24,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
     waiting = []
     for run in runs:
         if is_finished(run):
-            on_end(run, Ended("was finished"))
+            on_end(run, RunEnd("was finished"))
         else:
             waiting.append(run)
     if not waiting:

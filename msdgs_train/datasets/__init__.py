@@ -1,8 +1,8 @@
-"""Photographs with cameras and times, read from the layouts in which other people publish them. One file a format."""
+"""Images with cameras and times, read from the layouts in which other people publish them. One file a format."""
 
 from pathlib import Path
 
-from msdgs_train.datasets.colmap.loader import LAST_NUMBER, SPARSE, load_colmap
+from msdgs_train.datasets.colmap.loader import SPARSE, TRAILING_NUMBER, load_colmap
 from msdgs_train.datasets.common.images import composite
 from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
@@ -21,10 +21,10 @@ LAYOUTS = (
 """The name of each, what tells it, and who reads it; COLMAP's comes after them, since others are made from it."""
 
 
-def load_scene(path: Path | str, size: int | None = None, time_pattern: str | None = LAST_NUMBER) -> SceneData:
+def load_scene(path: Path | str, size: int | None = None, time_pattern: str | None = TRAILING_NUMBER) -> SceneData:
     """Read the dataset in folder `path`, whatever its layout.
 
-    `size` is the width in pixels that photographs are reduced to, height in proportion. Pixels are read later, by
+    `size` is the width in pixels that images are reduced to, height in proportion. Pixels are read later, by
     `Frame.load_rgba`. `time_pattern` is for COLMAP's layout, which has no times: see `load_colmap`. Raises
     `DatasetInvalid` naming file and field, and `InvalidInput` where `size` or `time_pattern` can't be.
     """

@@ -1,4 +1,4 @@
-"""D-NeRF layout: `transforms_{train,val,test}.json` beside the photographs.
+"""D-NeRF layout: `transforms_{train,val,test}.json` beside the images.
 
 Each JSON has `camera_angle_x` (horizontal field of view, radians) and `frames`; each frame has `file_path` (with or
 without extension, relative to the folder), `transform_matrix` (camera to world, OpenGL axes) and `time`. A scene whose
@@ -21,7 +21,7 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 def load_dnerf(folder: Path | str, size: int | None = None) -> SceneData:
     """Read the cameras, times and image sizes of a D-NeRF scene; val and test may be missing.
 
-    `size` is the width in pixels that photographs are reduced to. Raises `DatasetInvalid` naming file and field.
+    `size` is the width in pixels that images are reduced to. Raises `DatasetInvalid` naming file and field.
     """
     entries = {split: _read_split(Path(folder), split) for split in SPLITS}
     check_times([entry for split in SPLITS for entry in entries[split]])
@@ -40,5 +40,5 @@ def _read_split(folder: Path, split: str) -> list[Entry]:
 def _frame(entry: Entry, size: int | None) -> Frame:
     for key in DISTORTION:
         if entry.get(key):
-            raise entry.invalid(key, "must be 0: photographs have to be undistorted first")
+            raise entry.invalid(key, "must be 0: images have to be undistorted first")
     return read_frame(entry, size)

@@ -1,4 +1,4 @@
-"""HyperNeRF layout, which is nerfies' with other scenes: one JSON a camera, photographs in several sizes.
+"""HyperNeRF layout, which is nerfies' with other scenes: one JSON a camera, images in several sizes.
 
 - `dataset.json`: `train_ids` and `val_ids`; the latter are the test split.
 - `metadata.json`: for each id its `time_id` or, without one, its `warp_id`; t is that divided by the largest of all
@@ -6,8 +6,8 @@
 - `scene.json`: `scale` and `center`. The scene's axes are the file's, its origin is the centre and its unit is
   1 / scale of the file's: x becomes (x - center) · scale, for cameras and points alike. `near` and `far` are not used.
 - `camera/ID.json`: below.
-- `rgb/Nx/ID.png`: photographs, reduced to a 1/N of the size that cameras speak of.
-- `points.npy`, which may be missing: sparse points [M, 3], without colours.
+- `rgb/Nx/ID.png`: images, reduced to a 1/N of the size that cameras speak of.
+- `points.npy`, which may be missing: sparse points [M, 3], without colors.
 
 A camera is nerfies' `Camera`. `orientation` maps world to camera: its rows are the camera's axes right, down, forward.
 `position` is where it stands; pixel centres are at half-integers, and fy = `focal_length` · `pixel_aspect_ratio`. As in
@@ -26,11 +26,11 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.distortion import Distortion
-from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import ImageSize
 from msdgs_train.datasets.common.json_file import read_json
 from msdgs_train.datasets.common.npy import read_table
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, image_size, reduced
 
 DATASET_FILE = "dataset.json"
 METADATA_FILE = "metadata.json"
@@ -41,7 +41,7 @@ POINTS_FILE = "points.npy"
 def load_hypernerf(folder: Path | str, size: int | None = None) -> SceneData:
     """Read the cameras, times, splits and sparse points of a HyperNeRF scene.
 
-    `size` is the width in pixels that photographs are reduced to: from the smallest copy that is wide enough, or with
+    `size` is the width in pixels that images are reduced to: from the smallest copy that is wide enough, or with
     None the largest copy as it is. Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't
     be.
     """
@@ -58,7 +58,7 @@ def load_hypernerf(folder: Path | str, size: int | None = None) -> SceneData:
     }
     points = _read_points(folder / POINTS_FILE, world)
     frames = [frame for members in splits.values() for frame in members]
-    extent = half_extent(points, [frame.camera for frame in frames])
+    extent = scene_half_size(points, [frame.camera for frame in frames])
     return SceneData(splits, (min(times.values()), max(times.values())), extent, points)
 
 
@@ -118,33 +118,31 @@ def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
     """The folder of the smallest copies that are `size` pixels wide or more, or of the largest."""
     copies = [path for path in folder.glob("*x") if re.fullmatch(r"\d+x", path.name) and path.is_dir()]
     if not copies:
-        raise DatasetInvalid(folder, "folder", "must have the photographs in 1x, 2x or the like, and has none")
+        raise DatasetInvalid(folder, "folder", "must have the images in 1x, 2x or the like, and has none")
     copies.sort(key=lambda path: int(path.name[:-1]))
     if size is None:
         return copies[0]
-    wide_enough = [path for path in copies if photograph_size(path / f"{id_}.png").width >= size]
+    wide_enough = [path for path in copies if image_size(path / f"{id_}.png").width >= size]
     return wide_enough[-1] if wide_enough else copies[0]
 
 
 def _frame(file: Path, image_path: Path, t: float, world: _World, size: int | None) -> Frame:
     content = read_json(file)
-    camera = _camera(file, content, world, photograph_size(image_path))
+    camera = _camera(file, content, world, image_size(image_path))
     distortion = _distortion(file, content)
     if distortion is not None and distortion.folds(camera):
-        raise DatasetInvalid(
-            file, "radial_distortion", f"{distortion} would show places twice: undistort the photographs"
-        )
+        raise DatasetInvalid(file, "radial_distortion", f"{distortion} would show places twice: undistort the images")
     return Frame(image_path.stem, reduced(camera, size, image_path), t, image_path, distortion)
 
 
-def _camera(file: Path, content: dict[str, Any], world: _World, photograph: ImageSize) -> Camera:
-    """In pixels of the photograph as it is stored."""
+def _camera(file: Path, content: dict[str, Any], world: _World, image: ImageSize) -> Camera:
+    """In pixels of the image as it is stored."""
     if _numbers(file, content, "skew", ()) != 0:
         raise DatasetInvalid(file, "skew", f"must be 0, got {content['skew']}")
     width, height = _numbers(file, content, "image_size", (2,))
     stated = ImageSize(round(width), round(height))
-    if not stated.has_shape_of(photograph):
-        raise DatasetInvalid(file, "image_size", f"is {stated}, but the photograph is {photograph}")
+    if not stated.has_shape_of(image):
+        raise DatasetInvalid(file, "image_size", f"is {stated}, but the image is {image}")
     focal = float(_numbers(file, content, "focal_length", ()))
     aspect = float(_numbers(file, content, "pixel_aspect_ratio", ()))
     cx, cy = _numbers(file, content, "principal_point", (2,))
@@ -152,7 +150,7 @@ def _camera(file: Path, content: dict[str, Any], world: _World, photograph: Imag
     pose[:3, :3] = _numbers(file, content, "orientation", (3, 3)).T
     pose[:3, 3] = world.apply(_numbers(file, content, "position", (3,)))
     try:
-        return Camera(focal, focal * aspect, cx, cy, *stated, pose).resized(*photograph)
+        return Camera(focal, focal * aspect, cx, cy, *stated, pose).resized(*image)
     except InvalidInput as error:
         raise DatasetInvalid(file, _KEYS.get(error.field, "orientation"), f"is no camera's: {error}") from None
 

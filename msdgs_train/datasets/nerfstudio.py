@@ -1,4 +1,4 @@
-"""nerfstudio layout: one `transforms.json` beside the photographs.
+"""nerfstudio layout: one `transforms.json` beside the images.
 
 The JSON has `frames`; each has `file_path` (relative to the folder), `transform_matrix` (camera to world, OpenGL axes)
 and maybe `time`, which may be outside [0, 1]. A scene whose frames have no `time` is static, t = 0. `fl_x`, `fl_y`,
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from msdgs_train.datasets.common.distortion import Distortion
-from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.ply_points import read_ply_points
 from msdgs_train.datasets.common.scene_data import SPLITS, DatasetInvalid, Frame, SceneData, hold_out
 from msdgs_train.datasets.common.transforms import Entry, check_times, read_entries, read_frame
@@ -31,7 +31,7 @@ CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV
 def load_nerfstudio(folder: Path | str, size: int | None = None) -> SceneData:
     """Read the cameras, times, splits and sparse points of a nerfstudio scene.
 
-    `size` is the width in pixels that photographs are reduced to. Raises `DatasetInvalid` naming file and field, and
+    `size` is the width in pixels that images are reduced to. Raises `DatasetInvalid` naming file and field, and
     `InvalidInput` where `size` can't be.
     """
     file = Path(folder) / TRANSFORMS_FILE
@@ -43,7 +43,7 @@ def load_nerfstudio(folder: Path | str, size: int | None = None) -> SceneData:
     used = [frame for split in SPLITS for frame in splits[split]]
     times = [frame.t for frame in used]
     points, colors = _points(file, shared)
-    extent = half_extent(points, [frame.camera for frame in used])
+    extent = scene_half_size(points, [frame.camera for frame in used])
     return SceneData(splits, (min(times), max(times)), extent, points, colors)
 
 
@@ -51,7 +51,7 @@ def _frame(entry: Entry, size: int | None) -> Frame:
     distortion = _distortion(entry)
     frame = read_frame(entry, size)
     if distortion is not None and distortion.folds(frame.camera):
-        raise entry.invalid("k1", f"and the rest of {distortion} would show places twice: undistort the photographs")
+        raise entry.invalid("k1", f"and the rest of {distortion} would show places twice: undistort the images")
     name = "_".join(PurePosixPath(entry.file_path()).with_suffix("").parts)
     return replace(frame, name=name, distortion=distortion)
 
@@ -61,9 +61,9 @@ def _distortion(entry: Entry) -> Distortion | None:
     if model not in CAMERA_MODELS:
         raise entry.invalid("camera_model", f"must be one of {', '.join(CAMERA_MODELS)}, got {model!r}")
     if entry.get("is_fisheye"):
-        raise entry.invalid("is_fisheye", "must be false: fisheye photographs have to be undistorted first")
+        raise entry.invalid("is_fisheye", "must be false: fisheye images have to be undistorted first")
     if entry.has("k4") and entry.number("k4") != 0:
-        raise entry.invalid("k4", "must be 0: photographs have to be undistorted first")
+        raise entry.invalid("k4", "must be 0: images have to be undistorted first")
     distortion = Distortion(*(entry.number(key) if entry.has(key) else 0.0 for key in Distortion._fields))
     return distortion if any(distortion) else None
 

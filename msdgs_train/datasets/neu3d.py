@@ -1,9 +1,9 @@
-"""Neu3D (DyNeRF) layout: `poses_bounds.npy` and, for each of some fixed cameras, a video or a folder of photographs.
+"""Neu3D (DyNeRF) layout: `poses_bounds.npy` and, for each of some fixed cameras, a video or a folder of images.
 
 `poses_bounds.npy` is LLFF's: a row of 17 numbers for each camera, in the order of the cameras' names. Those are a 3×5
 matrix, row by row, and the nearest and furthest depth. The matrix's columns are the camera's axes in world space (down,
-right, back), its position, and height, width and focal length in pixels; the principal point is the picture's centre.
-World axes stay what they are in the file. Photographs may be a reduced copy of the size that the matrix states.
+right, back), its position, and height, width and focal length in pixels; the principal point is the image's centre.
+World axes stay what they are in the file. Images may be a reduced copy of the size that the matrix states.
 
 A camera is `cam07.mp4`, or a folder `cam07/` or `cam07/images/`, which is preferred as it needs no decoding. Cameras
 run in step: all have F frames, frame i is at t = i / (F - 1). The first camera, cam00, is the test view.
@@ -16,11 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize
 from msdgs_train.datasets.common.npy import read_table
 from msdgs_train.datasets.common.ply_points import read_ply_points
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, photograph_size, reduced
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, image_size, reduced
 from msdgs_train.datasets.common.video import VideoFrame, read_info
 
 POSES_FILE = "poses_bounds.npy"
@@ -36,7 +36,7 @@ CAMERA_NAME = re.compile(r"cam\d+")
 def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
     """Read the cameras of a Neu3D scene and, where there is a `.ply` file, its sparse points.
 
-    `size` is the width in pixels that photographs are reduced to. Videos are decoded later, by `Frame.load_rgba`.
+    `size` is the width in pixels that images are reduced to. Videos are decoded later, by `Frame.load_rgba`.
     Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't be.
     """
     folder = Path(folder)
@@ -52,13 +52,13 @@ def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
                 f"cut all cameras to the frames that they have in common",
             )
     points, colors = _read_points(folder)
-    extent = half_extent(points, [view[0].camera for view in views])
+    extent = scene_half_size(points, [view[0].camera for view in views])
     splits = {"train": [frame for view in views[1:] for frame in view], "val": [], "test": views[0]}
     return SceneData(splits, (0.0, views[0][-1].t), extent, points, colors)
 
 
 class _Source(NamedTuple):
-    """Where a camera's photographs come from: a video, or files in the order of time."""
+    """Where a camera's images come from: a video, or files in the order of time."""
 
     name: str
     video: Path | None
@@ -131,11 +131,11 @@ def _view(file: Path, row: int, source: _Source, pose: np.ndarray, size: int | N
 
 
 def _image_frames(file: Path, row: int, source: _Source, pose: np.ndarray, size: int | None) -> list[Frame]:
-    photograph = photograph_size(source.images[0])
+    image = image_size(source.images[0])
     for path in source.images:
-        if photograph_size(path) != photograph:
-            raise DatasetInvalid(path, "image", f"is {photograph_size(path)}, but {source.images[0]} is {photograph}")
-    camera = reduced(_camera(file, row, pose, photograph), size, source.images[0])
+        if image_size(path) != image:
+            raise DatasetInvalid(path, "image", f"is {image_size(path)}, but {source.images[0]} is {image}")
+    camera = reduced(_camera(file, row, pose, image), size, source.images[0])
     return [
         Frame(f"{source.name}_{path.stem}", camera, _time(index, len(source.images)), path)
         for index, path in enumerate(source.images)
@@ -146,18 +146,18 @@ def _time(index: int, count: int) -> float:
     return index / (count - 1) if count > 1 else 0.0
 
 
-def _camera(file: Path, row: int, values: np.ndarray, photograph: ImageSize) -> Camera:
+def _camera(file: Path, row: int, values: np.ndarray, image: ImageSize) -> Camera:
     down, right, back, position, (height, width, focal) = values[:15].reshape(3, 5).T
     near, far = values[15:]
     if not 0 < near < far:
         raise _invalid_row(file, row, f"must end in 0 < near < far, got {near:g} and {far:g}")
     stated = ImageSize(round(width), round(height))
-    if not stated.has_shape_of(photograph):
-        raise _invalid_row(file, row, f"states a size of {stated}, but the photograph is {photograph}")
+    if not stated.has_shape_of(image):
+        raise _invalid_row(file, row, f"states a size of {stated}, but the image is {image}")
     pose = np.eye(4)
     pose[:3] = np.stack([right, down, -back, position], axis=1)
     try:
-        return Camera(focal, focal, width / 2, height / 2, *stated, pose).resized(*photograph)
+        return Camera(focal, focal, width / 2, height / 2, *stated, pose).resized(*image)
     except InvalidInput as error:
         raise _invalid_row(file, row, f"is no camera: {error}") from None
 

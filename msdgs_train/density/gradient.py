@@ -1,6 +1,6 @@
 """Adaptive density control of 3D Gaussian Splatting (Kerbl et al. 2023, section 5.2), on the canonical Gaussians.
 
-Gradients are gathered where the Gaussians are drawn, posed at the time of each photograph; what is cloned, split,
+Gradients are gathered where the Gaussians are drawn, posed at the time of each image; what is cloned, split,
 faded and removed are their canonical attributes.
 """
 
@@ -30,23 +30,23 @@ class DensityChange(NamedTuple):
 
 
 @dataclass
-class DensityControl:
-    """Gathers gradients over many photographs and, every now and then, adds and removes Gaussians."""
+class GradientStrategy:
+    """Gathers gradients over many images and, every now and then, adds and removes Gaussians."""
 
     config: TrainConfig
     extent: float  # radius of the cameras' positions, scene units
     gradients: Tensor  # [N] sums of norms
-    counts: Tensor  # [N] photographs in which each was drawn
+    counts: Tensor  # [N] images in which each was drawn
     generator: torch.Generator
 
     @classmethod
-    def start(cls, config: TrainConfig, extent: float, count: int) -> "DensityControl":
+    def start(cls, config: TrainConfig, extent: float, count: int) -> "GradientStrategy":
         """With nothing gathered yet, for `count` Gaussians."""
         generator = torch.Generator().manual_seed(config.seed + 1)
         return cls(config, extent, torch.zeros(count), torch.zeros(count), generator)
 
-    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Add one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
+    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Add one image: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
         drawn = radii > 0
         norms = torch.hypot(means2d_grads[:, 0] * (0.5 * width), means2d_grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
@@ -54,7 +54,7 @@ class DensityControl:
 
     def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
         """`densify` and `reset_opacities` where they are due."""
-        if self.config.densifies_after(step):
+        if self.config.refines_at(step):
             self.densify(gaussians, optimizer, step)
         if self.is_reset_due(step):
             self.reset_opacities(gaussians, optimizer)
@@ -69,36 +69,36 @@ class DensityControl:
 
     def is_reset_due(self, step: int) -> bool:
         """Whether `reset_opacities` is to run after this step (counted from 1)."""
-        every = self.config.opacity_reset_every
-        return every > 0 and step < self.config.densify_until and step % every == 0
+        every = self.config.reset_every
+        return every > 0 and step < self.config.refine_stop and step % every == 0
 
     def densify(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> DensityChange:
         """Clone small and split large Gaussians under strong gradients, remove faint and huge ones, start anew."""
         with torch.no_grad():
             pruned = self._to_prune(gaussians, step)
             chosen = self._to_densify(pruned, step)
-            large = gaussians.log_scales.exp().amax(dim=1) > self.config.split_scale * self.extent
+            large = gaussians.log_scales.exp().amax(dim=1) > self.config.grow_scale3d * self.extent
             cloned, split = (torch.nonzero(m)[:, 0] for m in (chosen & ~large, chosen & large))
             halves = self._halves(gaussians, split.repeat(2))
             added = {name: torch.cat([p[cloned], halves[name]]) for name, p in gaussians.named_parameters()}
             kept = torch.nonzero(~pruned & ~(chosen & large))[:, 0]
             replace_rows(optimizer, gaussians, kept, added)
-        self.forget(len(kept) + len(cloned) + 2 * len(split))
+        self.reset(len(kept) + len(cloned) + 2 * len(split))
         return DensityChange(len(cloned), len(split), int(pruned.sum()))
 
     def reset_opacities(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Cut every opacity to 0.01 at most: what the photographs need comes back, the rest is pruned."""
+        """Cut every opacity to 0.01 at most: what the images need comes back, the rest is pruned."""
         ceiling = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
         replace_values(optimizer, gaussians, "raw_opacities", gaussians.raw_opacities.detach().clamp(max=ceiling))
 
-    def forget(self, count: int) -> None:
+    def reset(self, count: int) -> None:
         """Drop what was gathered; there are `count` Gaussians now."""
         self.gradients, self.counts = torch.zeros(count), torch.zeros(count)
 
     def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
-        pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opacity
-        if 0 < self.config.opacity_reset_every < step:
-            pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale * self.extent
+        pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
+        if 0 < self.config.reset_every < step:
+            pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.extent
         if bool(pruned.all()):  # a scene that has faded altogether keeps its Gaussians and may recover
             return torch.zeros_like(pruned)
         return pruned
@@ -106,7 +106,7 @@ class DensityControl:
     def _to_densify(self, pruned: Tensor, step: int) -> Tensor:
         """[N] bool: strong gradients, the strongest first while there is room."""
         mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
-        chosen = mean >= self.config.densify_gradient
+        chosen = mean >= self.config.grow_grad2d
         room = self.config.most_gaussians(step) - int((~pruned).sum())
         if int(chosen.sum()) > room:
             strongest = torch.sort(mean, descending=True, stable=True).indices[: max(room, 0)]

@@ -1,7 +1,7 @@
 """Density control under a budget (3D Gaussian Splatting as Markov Chain Monte Carlo, Kheradmand et al. 2024).
 
 Faint Gaussians move to where opaque ones are, and new ones are added there until the budget is reached. A Gaussian and
-its new companions share its opacity and footprint, so that the picture stays. Faint ones wander. The formulas and
+its new companions share its opacity and footprint, so that the image stays. Faint ones wander. The formulas and
 constants are those of gsplat's `MCMCStrategy`, which itself runs on CUDA only.
 """
 
@@ -19,11 +19,11 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 
 GROWTH = 1.05
 """How many there may be after a round for one before, as long as the budget allows it."""
-MOST_SHARES = 51
+MAX_COPIES = 51
 """A Gaussian that more are put beside is divided as if by so many."""
-MOST_OPAQUE = 1 - torch.finfo(torch.float32).eps
-WANDER_SLOPE = 100.0
-"""How sharply wandering ends above `prune_opacity`."""
+MAX_OPACITY = 1 - torch.finfo(torch.float32).eps
+NOISE_SLOPE = 100.0
+"""How sharply wandering ends above `prune_opa`."""
 
 
 class Relocated(NamedTuple):
@@ -34,21 +34,21 @@ class Relocated(NamedTuple):
 
 
 @dataclass
-class Relocation:
+class MCMCStrategy:
     """Every now and then moves the faint and adds new ones, never more than `max_gaussians` in all."""
 
     config: TrainConfig
     generator: torch.Generator
 
     @classmethod
-    def start(cls, config: TrainConfig) -> "Relocation":
+    def start(cls, config: TrainConfig) -> "MCMCStrategy":
         """With its own randomness, of the settings' seed."""
         return cls(config, torch.Generator().manual_seed(config.seed + 1))
 
-    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Gradients don't matter here."""
 
-    def forget(self, count: int) -> None:
+    def reset(self, count: int) -> None:
         """Nothing was gathered."""
 
     def state(self) -> tuple[Tensor, ...]:
@@ -60,7 +60,7 @@ class Relocation:
 
     def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
         """A round where one is due; and the faint wander by a part of the learning rate of the means."""
-        if self.config.densifies_after(step):
+        if self.config.refines_at(step):
             self.relocate(gaussians, optimizer, step)
         rate = next(group["lr"] for group in optimizer.param_groups if group["name"] == "means")
         self.wander(gaussians, rate)
@@ -69,7 +69,7 @@ class Relocation:
     def relocate(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> Relocated:
         """Put the faint, and what the budget has room for, beside others, drawn by their opacity."""
         opacities = gaussians.raw_opacities.double().sigmoid()
-        alive = torch.nonzero(opacities > self.config.prune_opacity)[:, 0]
+        alive = torch.nonzero(opacities > self.config.prune_opa)[:, 0]
         count = len(opacities)
         added = max(0, min(self.config.most_gaussians(step), int(GROWTH * count)) - count)
         moved = count - len(alive)
@@ -80,7 +80,7 @@ class Relocation:
         companions = torch.bincount(sources, minlength=count)
         shared = torch.nonzero(companions)[:, 0]
         new_opacities, shrink = share(opacities[shared], companions[shared] + 1)
-        new_opacities = new_opacities.clamp(self.config.prune_opacity, MOST_OPAQUE)
+        new_opacities = new_opacities.clamp(self.config.prune_opa, MAX_OPACITY)
         gaussians.raw_opacities[shared] = torch.logit(new_opacities).to(gaussians.raw_opacities)
         gaussians.log_scales[shared] += shrink.log()[:, None].to(gaussians.log_scales)
         forget_rows(optimizer, gaussians, shared)
@@ -90,12 +90,12 @@ class Relocation:
     @torch.no_grad()
     def wander(self, gaussians: CanonicalGaussians, rate: float) -> None:
         """Move each centre by noise of the shape of its covariance, the more the fainter it is (equation 9 there)."""
-        faint = torch.sigmoid(-WANDER_SLOPE * (gaussians.raw_opacities.sigmoid() - self.config.prune_opacity))
+        faint = torch.sigmoid(-NOISE_SLOPE * (gaussians.raw_opacities.sigmoid() - self.config.prune_opa))
         noise = torch.randn(len(gaussians), 3, generator=self.generator)
         quats = functional.normalize(gaussians.raw_quats, dim=1)
         inverse = quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
         shaped = rotate(quats, gaussians.log_scales.exp().square() * rotate(inverse, noise))  # Σ times the noise
-        gaussians.means.add_((rate * self.config.mcmc_noise * faint)[:, None] * shaped)
+        gaussians.means.add_((rate * self.config.noise_lr * faint)[:, None] * shaped)
 
 
 def share(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,10 +111,10 @@ def share(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
         same too: o / Σ_k C(n, k+1) (−1)^k o_n^(k+1) / √(k+1), the double sum of the paper's equation 9 with its
         inner sum of binomials done.
     """
-    opacities = opacities.clamp(max=MOST_OPAQUE)  # the sum loses its digits where all of its terms are large
-    shares = shares.clamp(1, MOST_SHARES).double()
+    opacities = opacities.clamp(max=MAX_OPACITY)  # the sum loses its digits where all of its terms are large
+    shares = shares.clamp(1, MAX_COPIES).double()
     new = -torch.expm1(torch.log1p(-opacities) / shares)
-    terms = torch.arange(1, MOST_SHARES + 1, dtype=torch.float64)
+    terms = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64)
     binomials = torch.exp(
         torch.lgamma(shares + 1)[:, None]
         - torch.lgamma(terms + 1)

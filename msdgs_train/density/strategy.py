@@ -5,13 +5,13 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from msdgs_train.density.gradient import DensityControl
-from msdgs_train.density.mcmc import Relocation
+from msdgs_train.density.gradient import GradientStrategy
+from msdgs_train.density.mcmc import MCMCStrategy
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.optimizer import replace_rows
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 
-SOWING_SEED = 7
+RESEED_SEED = 7
 """Added to that of the settings: not the very places at which training began."""
 
 
@@ -23,11 +23,11 @@ class DensityStrategy(Protocol):
         """All of its randomness."""
         ...
 
-    def gather(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Hear of one photograph: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
+    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Hear of one image: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
         ...
 
-    def forget(self, count: int) -> None:
+    def reset(self, count: int) -> None:
         """Drop what was gathered; there are `count` Gaussians now."""
         ...
 
@@ -44,23 +44,23 @@ class DensityStrategy(Protocol):
         ...
 
 
-def start_density_control(config: TrainConfig, extent: float, count: int) -> DensityStrategy:
+def make_strategy(config: TrainConfig, extent: float, count: int) -> DensityStrategy:
     """The strategy of the settings, for `count` Gaussians; `extent` is the radius of the cameras' positions."""
-    if config.densify_strategy == "mcmc":
-        return Relocation.start(config)
-    return DensityControl.start(config, extent, count)
+    if config.density_strategy == "mcmc":
+        return MCMCStrategy.start(config)
+    return GradientStrategy.start(config, extent, count)
 
 
 @torch.no_grad()
-def sow(
-    gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, config: TrainConfig, half_extent: float
+def reseed(
+    gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, config: TrainConfig, scene_half_size: float
 ) -> None:
-    """Add `config.sown` faint Gaussians, or as many as there is room for, anywhere in [-half_extent, half_extent]³."""
-    model, count = config.model, min(config.sown, config.max_gaussians - len(gaussians))
+    """Add `config.num_reseeded` low-opacity Gaussians, as far as there is room, uniformly in the scene's cube."""
+    model, count = config.model, min(config.num_reseeded, config.max_gaussians - len(gaussians))
     if count <= 0:
         return
     new = CanonicalGaussians.random_in_cube(
-        count, half_extent, model.sh_degree, model.embedding_size, config.seed + SOWING_SEED, model.motions
+        count, scene_half_size, model.sh_degree, model.embedding_dim, config.seed + RESEED_SEED, model.motions
     )
     kept = torch.arange(len(gaussians))
     replace_rows(optimizer, gaussians, kept, {name: values.detach() for name, values in new.named_parameters()})

@@ -1,4 +1,4 @@
-"""The mean of a model over its last steps, each of which fits a few photographs a little at the cost of the others."""
+"""The mean of a model over its last steps, each of which fits a few images a little at the cost of the others."""
 
 import copy
 from typing import Any
@@ -8,7 +8,7 @@ import torch
 from msdgs_train.gaussians.model import DynamicGaussians
 
 
-class MeanModel:
+class WeightAverage:
     """All steps weigh the same until there are `steps`; from then on it is exponential, and about a third of the weight
     is older than `steps`."""
 
@@ -27,7 +27,7 @@ class MeanModel:
             if last.requires_grad:
                 mean.lerp_(last, 1 / self._count)
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """All steps up to now."""
         self.model, self._count = None, 0
 
@@ -37,7 +37,7 @@ class MeanModel:
 
     def load_state(self, state: dict[str, Any] | None, model: DynamicGaussians) -> None:
         """Go on from there; `model` is of the last step."""
-        self.forget()
+        self.reset()
         if state is not None:
             self.model, self._count = copy.deepcopy(model), state["count"]
             self.model.load_state_dict(state["model"])

@@ -1,4 +1,4 @@
-"""What a run leaves to look at: metrics as JSON lines, a curve, and renderings beside their photographs."""
+"""What a run leaves to look at: metrics as JSON lines, a curve, and renderings beside their images."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine.tensorboard_events import FOLDER, TensorBoardEvents
-from msdgs_train.engine.trainer import Evaluated, StepResult
-from msdgs_train.evaluation.metrics import Quality
+from msdgs_train.engine.trainer import EvaluatedFrame, StepResult
+from msdgs_train.evaluation.metrics import ImageMetrics
 
 METRICS = "metrics.jsonl"
 CURVE = "curve.png"
@@ -20,7 +20,7 @@ RENDERS = "renders"
 class MetricsLog:
     """Lines of `metrics.jsonl`: {"kind": "train", "step", "loss", "psnr", …} and {"kind": "eval", "split", …}.
 
-    With `tensorboard` the same numbers also go to event files in `tensorboard/`, and so do pictures.
+    With `tensorboard` the same numbers also go to event files in `tensorboard/`, and so do images.
     """
 
     def __init__(self, run: Path, *, keep_until: int = 0, tensorboard: bool = False) -> None:
@@ -34,12 +34,12 @@ class MetricsLog:
         """One line about the steps so far."""
         self._append({"kind": "train", **result._asdict(), "seconds": round(seconds, 3)})
 
-    def evaluation(self, step: int, split: str, quality: Quality) -> None:
-        """One line about a split of held-out photographs."""
+    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
+        """One line about a split of held-out images."""
         self._append({"kind": "eval", "step": step, "split": split, **quality._asdict()})
 
-    def picture(self, step: int, split: str, evaluated: Evaluated) -> None:
-        """A held-out photograph at the left and its rendering at the right, for TensorBoard only."""
+    def image(self, step: int, split: str, evaluated: EvaluatedFrame) -> None:
+        """A held-out image at the left and its rendering at the right, for TensorBoard only."""
         if self._events is not None:
             self._events.image(step, f"{split}/{_stem(evaluated)}", side_by_side(evaluated))
 
@@ -73,7 +73,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 
 def draw_curve(run: Path) -> None:
-    """Loss, PSNR in training and on held-out photographs, and the number of Gaussians, over the steps."""
+    """Loss, PSNR in training and on held-out images, and the number of Gaussians, over the steps."""
     lines = read_metrics(run)
     train = [line for line in lines if line["kind"] == "train"]
     figure = Figure(figsize=(9, 9))
@@ -81,7 +81,7 @@ def draw_curve(run: Path) -> None:
     loss, psnr, count = figure.subplots(3, 1, sharex=True)
     steps = [line["step"] for line in train]
     loss.semilogy(steps, [line["loss"] for line in train])
-    psnr.plot(steps, [line["psnr"] for line in train], label="train, last photographs")
+    psnr.plot(steps, [line["psnr"] for line in train], label="train, last images")
     for split in sorted({line["split"] for line in lines if line["kind"] == "eval"}):
         points = [(line["step"], line["psnr"]) for line in lines if line["kind"] == "eval" and line["split"] == split]
         psnr.plot(*zip(*points, strict=True), marker="o", label=f"{split}, last {points[-1][1]:.2f} dB")
@@ -94,8 +94,8 @@ def draw_curve(run: Path) -> None:
     figure.savefig(run / CURVE, dpi=110)
 
 
-def write_side_by_side(run: Path, split: str, evaluated: Evaluated) -> Path:
-    """The photograph at the left, the rendering at the right, in `renders/`; returns the PNG's path."""
+def write_side_by_side(run: Path, split: str, evaluated: EvaluatedFrame) -> Path:
+    """The image at the left, the rendering at the right, in `renders/`; returns the PNG's path."""
     folder = run / RENDERS
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{split}_{_stem(evaluated)}.png"
@@ -103,12 +103,12 @@ def write_side_by_side(run: Path, split: str, evaluated: Evaluated) -> Path:
     return path
 
 
-def side_by_side(evaluated: Evaluated) -> np.ndarray:
-    """The photograph at the left, the rendering at the right, [H, 2 W, 3] uint8."""
-    return to_bytes(np.concatenate([evaluated.truth.numpy(), evaluated.rgb.numpy()], axis=1))
+def side_by_side(evaluated: EvaluatedFrame) -> np.ndarray:
+    """The image at the left, the rendering at the right, [H, 2 W, 3] uint8."""
+    return to_bytes(np.concatenate([evaluated.target.numpy(), evaluated.rgb.numpy()], axis=1))
 
 
-def _stem(evaluated: Evaluated) -> str:
+def _stem(evaluated: EvaluatedFrame) -> str:
     return Path(evaluated.frame.name).name
 
 

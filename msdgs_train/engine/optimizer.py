@@ -21,22 +21,22 @@ EPSILON = 1e-15
 """Adam's own default, 1e-8, is as large as the gradients of small Gaussians."""
 
 _CONSTANT_RATES = {
-    "log_scales": "scales_rate",
-    "raw_quats": "quats_rate",
-    "raw_opacities": "opacities_rate",
-    "sh_dc": "sh_dc_rate",
-    "sh_rest": "sh_rest_rate",
+    "log_scales": "scales_lr",
+    "raw_quats": "quats_lr",
+    "raw_opacities": "opacities_lr",
+    "sh_dc": "sh_dc_lr",
+    "sh_rest": "sh_rest_lr",
 }
 _DECAYING_RATES = {
     "means": "means",
     "embeddings": "modulation",
     "modulation": "modulation",
-    "deformation": "field",
-    "grids": "grids",
-    "bases": "bases",
-    "basis_logits": "basis_logits",
+    "deformation": "deform",
+    "grids": "grid",
+    "bases": "spline",
+    "skinning_logits": "skinning",
 }
-_HELD_RATES = ("field", "grids", "bases", "basis_logits")  # as they begin until all times take part
+_HELD_RATES = ("deform", "grid", "spline", "skinning")  # as they begin until all times take part
 
 
 def exponential(start: float, end: float, step: float, steps: float) -> float:
@@ -46,10 +46,10 @@ def exponential(start: float, end: float, step: float, steps: float) -> float:
 
 def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
     """The rate of each group of parameters at one step."""
-    grown = config.grown_steps
+    grown = config.full_window_step
     rates: dict[str, float] = {group: getattr(config, name) for group, name in _CONSTANT_RATES.items()}
     for group, name in _DECAYING_RATES.items():
-        start, end = getattr(config, f"{name}_rate_start"), getattr(config, f"{name}_rate_end")
+        start, end = getattr(config, f"{name}_lr_init"), getattr(config, f"{name}_lr_final")
         held = grown if name in _HELD_RATES else 0
         rates[group] = exponential(start, end, max(step - held, 0), config.steps - held)
     return rates

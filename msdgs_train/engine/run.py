@@ -14,28 +14,28 @@ from msdgs_train.engine.metrics_log import MetricsLog, draw_curve, write_side_by
 from msdgs_train.engine.run_record import Best, RunRecord, read_record, write_record
 from msdgs_train.engine.tensorboard_events import require_tensorboard
 from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
-from msdgs_train.evaluation.metrics import Quality, mean_quality
+from msdgs_train.evaluation.metrics import ImageMetrics, mean_metrics
 
 CONFIG = "config.json"
 CHECKPOINT = "checkpoint.pt"
 MODEL = "model.pt"
 BEST = "best.pt"
 FINAL_METRICS = "metrics.json"
-EVALUATED_SPLITS = ("test", "val")
-CHOOSING_SPLITS = ("val", "test")  # the first that the dataset has decides which model is the best
-RENDERS_WHILE_TRAINING = 4
+EVAL_SPLITS = ("test", "val")
+SELECTION_SPLITS = ("val", "test")  # the first that the dataset has decides which model is the best
+RENDERS_PER_EVAL = 4
 MAX_ROLLBACKS = 3
 PAUSE_SECONDS = 0.05  # between questions whether to go on
 
 Status = Literal["finished", "interrupted", "out of time"]
 
 
-class Outcome(NamedTuple):
+class RunResult(NamedTuple):
     """How a run has ended. It can be resumed unless it is `finished`."""
 
     status: Status
     step: int
-    qualities: dict[str, Quality]  # of each held-out split; none when interrupted
+    qualities: dict[str, ImageMetrics]  # of each held-out split; none when interrupted
     gaussians: int
     seconds: float  # of training in all, evaluations included
     best: Best | None  # what `best.pt` is; None while nothing has been evaluated
@@ -44,16 +44,16 @@ class Outcome(NamedTuple):
 class Observer:
     """Hears of what a run does. This one does nothing; the command line shows a progress bar."""
 
-    def begins(self, trainer: Trainer) -> None:
+    def on_train_start(self, trainer: Trainer) -> None:
         """Before the first step, and again where a rollback has made a new trainer."""
 
     def step(self, result: StepResult, seconds: float) -> None:
         """After every step."""
 
-    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
         """After a split has been evaluated."""
 
-    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+    def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
         """After training has diverged and gone back to `step`, with the settings' learning rates times a factor."""
 
     def should_stop(self) -> bool:
@@ -71,21 +71,21 @@ class Observers(Observer):
     def __init__(self, *observers: Observer) -> None:
         self.observers = observers
 
-    def begins(self, trainer: Trainer) -> None:
+    def on_train_start(self, trainer: Trainer) -> None:
         for observer in self.observers:
-            observer.begins(trainer)
+            observer.on_train_start(trainer)
 
     def step(self, result: StepResult, seconds: float) -> None:
         for observer in self.observers:
             observer.step(result, seconds)
 
-    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
         for observer in self.observers:
             observer.evaluation(step, split, quality)
 
-    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+    def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
         for observer in self.observers:
-            observer.rolled_back(reason, step, rate_factor)
+            observer.rolled_back(reason, step, lr_factor)
 
     def should_stop(self) -> bool:
         return any(observer.should_stop() for observer in self.observers)
@@ -110,8 +110,8 @@ def fit(
     resume: bool = False,
     observer: Observer | None = None,
     tensorboard: bool = False,
-) -> Outcome:
-    """Train on the photographs in `data` and leave everything in the folder `run`.
+) -> RunResult:
+    """Train on the images in `data` and leave everything in the folder `run`.
 
     With `tensorboard`, `run/tensorboard` gets the metrics as events, and held-out renderings at every evaluation.
 
@@ -141,14 +141,14 @@ def fit(
         going.log.close()
 
 
-def _choosing_split(scene: SceneData) -> str | None:
-    return next((split for split in CHOOSING_SPLITS if scene.splits.get(split)), None)
+def _selection_split(scene: SceneData) -> str | None:
+    return next((split for split in SELECTION_SPLITS if scene.splits.get(split)), None)
 
 
 def _best_so_far(run: Path, scene: SceneData) -> Best | None:
     record = read_record(run)
     best = record.best if record else None
-    return best if best and best.split == _choosing_split(scene) and (run / BEST).exists() else None
+    return best if best and best.split == _selection_split(scene) and (run / BEST).exists() else None
 
 
 class _Run:
@@ -169,15 +169,15 @@ class _Run:
         self.trainer = trainer
         self.observer = observer
         self.record = record
-        self.splits = [split for split in EVALUATED_SPLITS if scene.splits.get(split)]
-        self.choosing_split = _choosing_split(scene)
+        self.splits = [split for split in EVAL_SPLITS if scene.splits.get(split)]
+        self.selection_split = _selection_split(scene)
         self.tensorboard = tensorboard
         self.log = self._open_log()
         self.started = time.perf_counter() - seconds
 
-    def execute(self) -> Outcome:
+    def execute(self) -> RunResult:
         status: Status = "finished"
-        self.observer.begins(self.trainer)
+        self.observer.on_train_start(self.trainer)
         while self.trainer.step_count < self.config.steps and status == "finished":
             try:
                 result = self.trainer.step()
@@ -195,7 +195,7 @@ class _Run:
         if qualities:
             self._write_final_metrics(qualities)
         count = len(self.trainer.model.gaussians)
-        return Outcome(status, self.trainer.step_count, qualities, count, self._seconds(), self.record.best)
+        return RunResult(status, self.trainer.step_count, qualities, count, self._seconds(), self.record.best)
 
     def _open_log(self) -> MetricsLog:
         return MetricsLog(self.folder, keep_until=self.trainer.step_count, tensorboard=self.tensorboard)
@@ -215,8 +215,8 @@ class _Run:
         self.log.close()
         self.log = self._open_log()
         self._save()
-        self.observer.begins(self.trainer)
-        self.observer.rolled_back(str(error), self.trainer.step_count, self.trainer.rate_factor)
+        self.observer.on_train_start(self.trainer)
+        self.observer.rolled_back(str(error), self.trainer.step_count, self.trainer.lr_factor)
 
     def _reason_to_stop(self) -> Status:
         self._wait_while_paused()
@@ -239,24 +239,24 @@ class _Run:
         if result.step < self.config.steps:
             if _is_due(result.step, self.config.eval_every) and self.splits:
                 for split in self.splits:
-                    self._evaluate(split, renders=RENDERS_WHILE_TRAINING)
+                    self._evaluate(split, renders=RENDERS_PER_EVAL)
                 draw_curve(self.folder)
             if _is_due(result.step, self.config.checkpoint_every) and not self.trainer.is_skipping:
                 self._save()
 
-    def _evaluate(self, split: str, *, renders: int | None) -> Quality:
-        """The mean quality of a split; the first `renders` frames, or all, are written beside their photographs."""
+    def _evaluate(self, split: str, *, renders: int | None) -> ImageMetrics:
+        """The mean quality of a split; the first `renders` frames, or all, are written beside their images."""
         qualities = []
         for index, evaluated in enumerate(self.trainer.evaluate(split)):
             qualities.append(evaluated.quality)
             if renders is None or index < renders:
                 write_side_by_side(self.folder, split, evaluated)
-            if index < RENDERS_WHILE_TRAINING:
-                self.log.picture(self.trainer.step_count, split, evaluated)
-        quality = mean_quality(qualities)
+            if index < RENDERS_PER_EVAL:
+                self.log.image(self.trainer.step_count, split, evaluated)
+        quality = mean_metrics(qualities)
         self.log.evaluation(self.trainer.step_count, split, quality)
         self.observer.evaluation(self.trainer.step_count, split, quality)
-        if split == self.choosing_split and math.isfinite(quality.psnr):
+        if split == self.selection_split and math.isfinite(quality.psnr):
             self._keep_if_best(Best(split, self.trainer.step_count, quality.psnr))
         return quality
 
@@ -272,7 +272,7 @@ class _Run:
         self.trainer.save_checkpoint(self.folder / CHECKPOINT, self._seconds())
         self.trainer.save_model(self.folder / MODEL)
 
-    def _write_final_metrics(self, qualities: dict[str, Quality]) -> None:
+    def _write_final_metrics(self, qualities: dict[str, ImageMetrics]) -> None:
         metrics = {
             "step": self.trainer.step_count,
             "seconds": round(self._seconds(), 1),

@@ -1,4 +1,4 @@
-"""`run.json`: what a run has to remember besides its settings, where its photographs are and which model was best."""
+"""`run.json`: what a run has to remember besides its settings, where its images are and which model was best."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -21,7 +21,7 @@ class RunInvalid(MsdgsError):
 class Best:
     """Which model `best.pt` is: that of the highest mean PSNR so far."""
 
-    split: str  # the held-out photographs that it was chosen by
+    split: str  # the held-out images that it was chosen by
     step: int
     psnr: float  # dB
 

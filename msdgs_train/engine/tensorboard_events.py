@@ -1,4 +1,4 @@
-"""The lines of `metrics.jsonl`, and renderings beside their photographs, as TensorBoard reads them."""
+"""The lines of `metrics.jsonl`, and renderings beside their images, as TensorBoard reads them."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from msdgs_train.cli.extras import ExtraMissing
 
 FOLDER = "tensorboard"
-TRAIN_SCALARS = ("loss", "psnr", "gaussians", "skipped", "floored", "seconds")
+TRAIN_SCALARS = ("loss", "psnr", "gaussians", "skipped", "clamped_scales", "seconds")
 EVAL_SCALARS = ("psnr", "ssim")
 
 

@@ -1,4 +1,4 @@
-"""A run's models judged on held-out photographs: the last one and the best one, each by name."""
+"""A run's models judged on held-out images: the last one and the best one, each by name."""
 
 import json
 import statistics
@@ -22,7 +22,7 @@ FILES = {"last": MODEL, "best": BEST}
 
 
 class Scores(NamedTuple):
-    """How close renderings are to their photographs; None where a score can't be had."""
+    """How close renderings are to their images; None where a score can't be had."""
 
     psnr: float  # dB, data range 1
     ssim: float  # window 11, σ = 1.5
@@ -31,7 +31,7 @@ class Scores(NamedTuple):
     moving_psnr: float | None  # dB, over the pixels of the moving region; None where nothing moves
 
 
-class JudgedModel(NamedTuple):
+class EvaluatedModel(NamedTuple):
     """One model of a run and its scores."""
 
     name: str  # "last" or "best"
@@ -48,7 +48,7 @@ class JudgedModel(NamedTuple):
         """[H, W, 3] in [0, 1], as the frame's camera sees the model at its time."""
         return self.loaded.render(frame.camera, frame.t).clamp(0, 1)
 
-    def photograph(self, frame: Frame) -> Tensor:
+    def image(self, frame: Frame) -> Tensor:
         """[H, W, 3] in [0, 1], over the background that the model was trained with."""
         return torch.from_numpy(composite(frame.load_rgba(), self.loaded.scene.background))
 
@@ -59,9 +59,9 @@ class Evaluation(NamedTuple):
     data: Path
     split: str
     frames: list[Frame]
-    models: list[JudgedModel]  # last, and best if the run has kept one
+    models: list[EvaluatedModel]  # last, and best if the run has kept one
     best: Best | None  # how the best one was chosen
-    region_source: str  # "photographs" or "model": what the moving region is made from
+    region_source: str  # "images" or "model": what the moving region is made from
     masks: list[np.ndarray]  # [H, W] bool for each frame, the moving region; the same for all models
     unavailable: dict[str, str]  # scores that could not be computed, and why
 
@@ -75,23 +75,23 @@ def evaluate_run(
         run: the folder that `msdgs-train fit` has filled.
         data: the dataset; by default the one that the run was trained on.
         split: "test", "val" or "train".
-        progress: called with pictures done and pictures in all.
+        progress: called with images done and images in all.
 
     Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
     """
-    size = _photograph_width(run)
+    size = _image_width(run)
     loaded = {name: load_model(run / file) for name, file in FILES.items() if name == "last" or (run / file).exists()}
     data = _data_folder(run, data)
     scene = load_scene(data, size)
     frames = _frames(scene, data, split)
     region = moving_region(scene, split, list(loaded.values()))
     perceptual = perceptual_metrics()
-    models = [JudgedModel(name, model, []) for name, model in loaded.items()]
+    models = [EvaluatedModel(name, model, []) for name, model in loaded.items()]
     masks = []
     for index, frame in enumerate(frames):
         masks.append(region.mask(frame))
-        for place, judged in enumerate(models):
-            judged.images.append(scores(judged.render(frame), judged.photograph(frame), masks[-1], perceptual))
+        for place, evaluated in enumerate(models):
+            evaluated.images.append(scores(evaluated.render(frame), evaluated.image(frame), masks[-1], perceptual))
             if progress is not None:
                 progress(index * len(models) + place + 1, len(frames) * len(models))
     record = read_record(run)
@@ -99,15 +99,15 @@ def evaluate_run(
     return Evaluation(data, split, frames, models, best, region.source, masks, perceptual.unavailable)
 
 
-def scores(rgb: Tensor, truth: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
-    """Of one rendering and its photograph, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
-    psnr, ssim = quality(rgb, truth)
-    others = {name: metric(rgb, truth) for name, metric in perceptual.metrics.items()}
-    return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, truth, mask))
+def scores(rgb: Tensor, target: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
+    """Of one rendering and its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
+    psnr, ssim = quality(rgb, target)
+    others = {name: metric(rgb, target) for name, metric in perceptual.metrics.items()}
+    return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, mask))
 
 
-def _photograph_width(run: Path) -> int | None:
-    """The setting that decides what pictures are judged; others may have come and gone between versions."""
+def _image_width(run: Path) -> int | None:
+    """The setting that decides what images are judged; others may have come and gone between versions."""
     path = run / CONFIG
     try:
         return json.loads(path.read_text(encoding="utf-8"))["size"]
@@ -133,5 +133,5 @@ def _data_folder(run: Path, data: Path | None) -> Path:
 def _frames(scene: SceneData, data: Path, split: str) -> list[Frame]:
     if not scene.splits.get(split):
         there = [f"`{name}` with {len(frames)}" for name, frames in scene.splits.items() if frames]
-        raise DatasetInvalid(data, split, f"has no photographs; there are {', '.join(there)}")
+        raise DatasetInvalid(data, split, f"has no images; there are {', '.join(there)}")
     return scene.splits[split]

@@ -17,14 +17,14 @@ DEFAULT_TIME = 0.3  # of the way through the scene: in the middle, where trainin
 def write_steps(
     path: Path, out: Path, *, t: float | None = None, size: int = 400, camera: str | None = None
 ) -> list[np.ndarray]:
-    """Draw the model in `path` at time `t` after each of its layers into the PNG `out`; returns the K + 1 pictures.
+    """Draw the model in `path` at time `t` after each of its layers into the PNG `out`; returns the K + 1 images.
 
     Args:
         path: `model.pt` or `best.pt` of a run.
         out: where to write; its folder is made where there is none. Atomic.
         t: in the scene's time range.
-        size: width of each picture in pixels, the height in proportion.
-        camera: name of one that is stored in the model; by default the one whose photograph is nearest in time.
+        size: width of each image in pixels, the height in proportion.
+        camera: name of one that is stored in the model; by default the one whose image is nearest in time.
 
     Raises `CheckpointInvalid` where the model can't be read, `InvalidInput` naming what is out of range.
     """
@@ -36,23 +36,23 @@ def write_steps(
     if not first <= t <= last:
         raise InvalidInput("t", f"in the scene's time range, [{first:g}, {last:g}]", t)
     entry = _stored_camera(loaded, t, camera)
-    pictures = render_steps(loaded, t, camera_of(entry, size))
-    captions = ["k = 0, canonical", *(f"k = {k}" for k in range(1, len(pictures)))]
-    panels = [Panel(pixels, caption) for pixels, caption in zip(pictures, captions, strict=True)]
+    images = render_steps(loaded, t, camera_of(entry, size))
+    captions = ["k = 0, canonical", *(f"k = {k}" for k in range(1, len(images)))]
+    panels = [Panel(pixels, caption) for pixels, caption in zip(images, captions, strict=True)]
     out.parent.mkdir(parents=True, exist_ok=True)
     draw_sheet(out, f"t = {t:g}, camera {entry['name']}, step {loaded.step:,}", [panels])
-    return pictures
+    return images
 
 
 def render_steps(loaded: LoadedModel, t: float, camera: Camera) -> list[np.ndarray]:
-    """K + 1 pictures, [H, W, 3] uint8: after no layer, after the first, …, after all."""
+    """K + 1 images, [H, W, 3] uint8: after no layer, after the first, …, after all."""
     return [to_bytes(loaded.render(camera, t, k).numpy()) for k in range(len(loaded.model.deformation) + 1)]
 
 
 def _stored_camera(loaded: LoadedModel, t: float, name: str | None) -> dict[str, Any]:
     cameras = {entry["name"]: entry for entry in loaded.scene.cameras}
     if not cameras:
-        raise InvalidInput("model", "one that holds a camera; training stores those of its photographs", "none")
+        raise InvalidInput("model", "one that holds a camera; training stores those of its images", "none")
     if name is None:
         return min(cameras.values(), key=lambda entry: abs(entry["t"] - t))
     if name not in cameras:
@@ -61,7 +61,7 @@ def _stored_camera(loaded: LoadedModel, t: float, name: str | None) -> dict[str,
 
 
 def camera_of(entry: dict[str, Any], width: int) -> Camera:
-    """A camera that a model holds, with pictures `width` pixels wide."""
+    """A camera that a model holds, with images `width` pixels wide."""
     if width < 1:
         raise InvalidInput("size", "a width of 1 pixel or more", width)
     values = {name: entry[name] for name in ("fx", "fy", "cx", "cy", "width", "height")}

@@ -1,4 +1,4 @@
-"""PSNR and SSIM of a rendering against its photograph, as the papers of this field report them."""
+"""PSNR and SSIM of a rendering against its image, as the papers of this field report them."""
 
 import math
 from typing import NamedTuple
@@ -10,25 +10,25 @@ from torch import Tensor
 from msdgs_train.losses.photometric import ssim
 
 MAX_PSNR = 100.0
-"""Reported where two pictures are equal, in dB."""
+"""Reported where two images are equal, in dB."""
 
 
-class Quality(NamedTuple):
-    """How close pictures are to their photographs."""
+class ImageMetrics(NamedTuple):
+    """How close images are to their images."""
 
     psnr: float  # dB, data range 1
     ssim: float  # at most 1
 
 
-def psnr(rgb: Tensor, truth: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of [H, W, 3] pictures with values in [0, 1], over all pixels and channels."""
-    return psnr_from_mse(float((rgb - truth).double().square().mean()))
+def psnr(rgb: Tensor, target: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB of [H, W, 3] images with values in [0, 1], over all pixels and channels."""
+    return psnr_from_mse(float((rgb - target).double().square().mean()))
 
 
-def masked_psnr(rgb: Tensor, truth: Tensor, mask: np.ndarray) -> float | None:
+def masked_psnr(rgb: Tensor, target: Tensor, mask: np.ndarray) -> float | None:
     """PSNR in dB over the pixels of `mask`, [H, W] bool, and all channels of [H, W, 3]; None where there are none."""
     inside = torch.from_numpy(mask)
-    return psnr_from_mse(float((rgb - truth)[inside].double().square().mean())) if mask.any() else None
+    return psnr_from_mse(float((rgb - target)[inside].double().square().mean())) if mask.any() else None
 
 
 def psnr_from_mse(mse: float) -> float:
@@ -36,13 +36,13 @@ def psnr_from_mse(mse: float) -> float:
     return MAX_PSNR if mse <= 10 ** (-MAX_PSNR / 10) else -10 * math.log10(mse)
 
 
-def quality(rgb: Tensor, truth: Tensor) -> Quality:
+def quality(rgb: Tensor, target: Tensor) -> ImageMetrics:
     """PSNR and SSIM of one rendering, clamped to [0, 1] first; both [H, W, 3]."""
     shown = rgb.detach().clamp(0, 1)
-    return Quality(psnr(shown, truth), float(ssim(shown, truth)))
+    return ImageMetrics(psnr(shown, target), float(ssim(shown, target)))
 
 
-def mean_quality(qualities: list[Quality]) -> Quality:
-    """The mean over pictures: of their PSNRs (not the PSNR of their mean error) and of their SSIMs."""
+def mean_metrics(qualities: list[ImageMetrics]) -> ImageMetrics:
+    """The mean over images: of their PSNRs (not the PSNR of their mean error) and of their SSIMs."""
     count = len(qualities)
-    return Quality(sum(q.psnr for q in qualities) / count, sum(q.ssim for q in qualities) / count)
+    return ImageMetrics(sum(q.psnr for q in qualities) / count, sum(q.ssim for q in qualities) / count)

@@ -1,9 +1,9 @@
-"""Where a picture moves. A static background is easy to get right and hides what is wrong with the motion.
+"""Where an image moves. A static background is easy to get right and hides what is wrong with the motion.
 
 The moving region of a frame is where something can be seen, at its time, that moves over the scene's time:
 
-- Where cameras are fixed, it comes from the photographs alone: the pixels of which a channel is more than `MIN_CHANGE`
-  away from its median over the photographs of this camera.
+- Where cameras are fixed, it comes from the images alone: the pixels of which a channel is more than `MIN_CHANGE`
+  away from its median over the images of this camera.
 - Where they are not, it comes from the models: the pixels of which a channel changes by more than `MIN_CHANGE` when the
   Gaussians that move are left out. A Gaussian moves, in the view of a frame, if its centre's projections at `TIMES`
   times, evenly spaced over the scene's, span more than `MIN_TRAVEL` pixels of width or height. What turns or grows
@@ -29,19 +29,19 @@ from msdgs_train.rendering.rasterize import rasterize
 MIN_CHANGE = 0.1  # of the range of a channel
 MIN_TRAVEL = 1.0  # pixels
 TIMES = 9
-FIXED_TIMES = 3  # a camera with photographs at so many times is fixed
-MEDIAN_PHOTOGRAPHS = 25  # at most, evenly chosen
+FIXED_TIMES = 3  # a camera with images at so many times is fixed
+MEDIAN_IMAGES = 25  # at most, evenly chosen
 
 
 class MovingRegion(NamedTuple):
     """Gives a frame's region, [H, W] bool, and says what it is made from."""
 
-    source: Literal["photographs", "model"]
+    source: Literal["images", "model"]
     mask: Callable[[Frame], np.ndarray]
 
 
 def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -> MovingRegion:
-    """From the photographs where each camera of the split has photographs at `FIXED_TIMES` times or more, of any
+    """From the images where each camera of the split has images at `FIXED_TIMES` times or more, of any
     split; otherwise from the models."""
     groups: dict[bytes, list[Frame]] = defaultdict(list)
     for frame in (frame for frames in scene.splits.values() for frame in frames):
@@ -51,7 +51,7 @@ def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -
         background = models[0].scene.background
         medians = {camera: _median(groups[camera], background) for camera in of_split}
         return MovingRegion(
-            "photographs",
+            "images",
             lambda frame: _differs(composite(frame.load_rgba(), background), medians[_identity(frame.camera)]),
         )
     regions = [_ModelRegion(loaded, scene.time_range) for loaded in models]
@@ -94,9 +94,9 @@ def travels(centres: list[Tensor], camera: Camera) -> Tensor:
 
 
 def _median(frames: list[Frame], background: tuple[float, float, float]) -> np.ndarray:
-    """[H, W, 3] over the photographs of one camera."""
+    """[H, W, 3] over the images of one camera."""
     in_time = sorted(frames, key=lambda frame: frame.t)
-    places = np.linspace(0, len(in_time) - 1, min(len(in_time), MEDIAN_PHOTOGRAPHS)).round().astype(int)
+    places = np.linspace(0, len(in_time) - 1, min(len(in_time), MEDIAN_IMAGES)).round().astype(int)
     return np.median([composite(in_time[place].load_rgba(), background) for place in places], axis=0)
 
 

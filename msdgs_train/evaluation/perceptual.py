@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 Metric = Callable[[Tensor, Tensor], float]
-"""Of a rendering and its photograph, both [H, W, 3] in [0, 1]; 0 where they are equal, lower is better."""
+"""Of a rendering and its image, both [H, W, 3] in [0, 1]; 0 where they are equal, lower is better."""
 
 
 class Unavailable(Exception):
@@ -42,14 +42,14 @@ def _load_flip() -> Metric:
     except ImportError:
         raise Unavailable("flip-evaluator isn't installed: pip install flip-evaluator") from None
 
-    def metric(rgb: Tensor, truth: Tensor) -> float:
-        return float(evaluator.evaluate(truth.numpy(), rgb.numpy(), "LDR", applyMagma=False)[1])
+    def metric(rgb: Tensor, target: Tensor) -> float:
+        return float(evaluator.evaluate(target.numpy(), rgb.numpy(), "LDR", applyMagma=False)[1])
 
     return metric
 
 
 def _load_lpips() -> Metric:
-    """LPIPS with VGG-16, through the lpips package or else torchmetrics, on pictures scaled to [−1, 1].
+    """LPIPS with VGG-16, through the lpips package or else torchmetrics, on images scaled to [−1, 1].
 
     This is how LPIPS is defined. The scripts of 3D Gaussian Splatting feed it [0, 1], so that theirs come out lower.
     """
@@ -60,8 +60,8 @@ def _load_lpips() -> Metric:
         raise Unavailable(f"{weights} can't be used: {error}") from None
 
     @torch.no_grad()
-    def metric(rgb: Tensor, truth: Tensor) -> float:
-        return float(network(*(2 * picture.permute(2, 0, 1)[None] - 1 for picture in (rgb, truth))))
+    def metric(rgb: Tensor, target: Tensor) -> float:
+        return float(network(*(2 * image.permute(2, 0, 1)[None] - 1 for image in (rgb, target))))
 
     return metric
 

@@ -9,15 +9,15 @@ import numpy as np
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine.files import write_text
 from msdgs_train.engine.metrics_log import to_bytes
-from msdgs_train.evaluation.evaluate import FILES, Evaluation, JudgedModel, Scores
-from msdgs_train.evaluation.sheets import ColourScale, Panel, colour, draw_sheet
+from msdgs_train.evaluation.evaluate import FILES, EvaluatedModel, Evaluation, Scores
+from msdgs_train.evaluation.sheets import ColourScale, Panel, color, draw_sheet
 
 FOLDER = "eval"
 SHEET_ROWS = 8
-LARGEST_PANEL = 320  # pixels of width; smaller pictures are repeated up to SMALLEST_PANEL
+LARGEST_PANEL = 320  # pixels of width; smaller images are repeated up to SMALLEST_PANEL
 SMALLEST_PANEL = 200
 COLOUR_MAP = "magma"
-FULL_ERROR = 0.25  # mean over the channels, the brightest colour of the map; fixed, so that sheets can be compared
+FULL_ERROR = 0.25  # mean over the channels, the brightest color of the map; fixed, so that sheets can be compared
 OUTLINE = (0, 220, 255)
 
 HEADINGS = {
@@ -33,11 +33,11 @@ def write_evaluation(run: Path, evaluation: Evaluation) -> list[Path]:
     """Write `<split>.png`, `.md` and `.json` to RUN/eval, each atomically and the JSON last; returns their paths."""
     folder = run / FOLDER
     folder.mkdir(exist_ok=True)
-    picture, table, numbers = (folder / f"{evaluation.split}.{kind}" for kind in ("png", "md", "json"))
-    draw_contact_sheet(picture, evaluation)
+    image, table, numbers = (folder / f"{evaluation.split}.{kind}" for kind in ("png", "md", "json"))
+    draw_contact_sheet(image, evaluation)
     write_text(table, as_markdown(evaluation))
     write_text(numbers, json.dumps(as_json(evaluation), indent=2, ensure_ascii=False) + "\n")
-    return [picture, table, numbers]
+    return [image, table, numbers]
 
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
@@ -51,21 +51,21 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
         },
         "unavailable": evaluation.unavailable,
         "best": evaluation.best and {"split": evaluation.best.split, "psnr": evaluation.best.psnr},
-        "models": {judged.name: _model_as_json(evaluation, judged) for judged in evaluation.models},
+        "models": {evaluated.name: _model_as_json(evaluation, evaluated) for evaluated in evaluation.models},
     }
 
 
 def as_markdown(evaluation: Evaluation) -> str:
     """Tables of the means of each model and of its images, and what the columns mean."""
-    rows = [[*_names(judged), *cells(evaluation, judged.mean)] for judged in evaluation.models]
-    parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} photographs of {evaluation.data}"]
+    rows = [[*_names(evaluated), *cells(evaluation, evaluated.mean)] for evaluated in evaluation.models]
+    parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} images of {evaluation.data}"]
     parts += [_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
-    for judged in evaluation.models:
+    for evaluated in evaluation.models:
         images = [
             [frame.name, f"{frame.t:.4g}", *cells(evaluation, scores), f"{100 * mask.mean():.1f} %"]
-            for frame, scores, mask in zip(evaluation.frames, judged.images, evaluation.masks, strict=True)
+            for frame, scores, mask in zip(evaluation.frames, evaluated.images, evaluation.masks, strict=True)
         ]
-        parts += [f"## {judged.name}", _table(["image", "t", *HEADINGS.values(), "moving region"], images)]
+        parts += [f"## {evaluated.name}", _table(["image", "t", *HEADINGS.values(), "moving region"], images)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -82,7 +82,7 @@ def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
 
 def notes(evaluation: Evaluation) -> list[str]:
     """What has to be said below the table."""
-    made_from = {"photographs": "the photographs", "model": "the models"}[evaluation.region_source]
+    made_from = {"images": "the images", "model": "the models"}[evaluation.region_source]
     share = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
     said = [f"Where it moves: {share:.1f} % of the pixels, found in {made_from}; the same for all models."]
     if evaluation.best is not None:
@@ -94,7 +94,7 @@ def notes(evaluation: Evaluation) -> list[str]:
 
 
 def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
-    """A row each for the worst frame of the last model, the best, and some evenly spaced in between: the photograph,
+    """A row each for the worst frame of the last model, the best, and some evenly spaced in between: the image,
     then each model's rendering and its error, with the moving region outlined. Atomic."""
     models = distinct_models(evaluation)
     by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: evaluation.models[0].images[index].psnr)
@@ -102,27 +102,27 @@ def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
     chosen = [by_psnr[round(place)] for place in np.linspace(0, len(by_psnr) - 1, count)]
     rows = [_row(evaluation, models, index) for index in chosen]
     shown = "" if count == len(by_psnr) else f"{count} of "
-    names = " and ".join(f"{judged.name} (step {judged.loaded.step:,})" for judged in models)
+    names = " and ".join(f"{evaluated.name} (step {evaluated.loaded.step:,})" for evaluated in models)
     title = f"{evaluation.split}, {shown}{len(by_psnr)} frames, worst first: {names}"
     draw_sheet(path, title, rows, ColourScale("error", "0", f"≥ {FULL_ERROR}", COLOUR_MAP))
 
 
-def distinct_models(evaluation: Evaluation) -> list[JudgedModel]:
+def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:
     """Without the best one where it is the last one, which need not be looked at twice."""
     last, *others = evaluation.models
-    return [last, *(judged for judged in others if judged.loaded.step != last.loaded.step)]
+    return [last, *(evaluated for evaluated in others if evaluated.loaded.step != last.loaded.step)]
 
 
-def _row(evaluation: Evaluation, models: list[JudgedModel], index: int) -> list[Panel]:
+def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int) -> list[Panel]:
     frame, mask = evaluation.frames[index], evaluation.masks[index]
-    truth = models[0].photograph(frame).numpy()
-    row = [Panel(_fitted(to_bytes(truth)), f"{frame.name}, t = {frame.t:.3g}")]
-    for judged in models:
-        scores, rgb = judged.images[index], judged.render(frame).numpy()
+    target = models[0].image(frame).numpy()
+    row = [Panel(_fitted(to_bytes(target)), f"{frame.name}, t = {frame.t:.3g}")]
+    for evaluated in models:
+        scores, rgb = evaluated.images[index], evaluated.render(frame).numpy()
         moving = "" if scores.moving_psnr is None else f", moving {scores.moving_psnr:.1f}"
-        error = colour(np.abs(rgb - truth).mean(axis=-1) / FULL_ERROR, COLOUR_MAP)
+        error = color(np.abs(rgb - target).mean(axis=-1) / FULL_ERROR, COLOUR_MAP)
         error[_outline(mask)] = OUTLINE
-        row.append(Panel(_fitted(to_bytes(rgb)), f"{judged.name}: {scores.psnr:.1f} dB{moving}"))
+        row.append(Panel(_fitted(to_bytes(rgb)), f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
         row.append(Panel(_fitted(error), "error" + (", moving region outlined" if mask.any() else "")))
     return row
 
@@ -143,22 +143,27 @@ def _fitted(pixels: np.ndarray) -> np.ndarray:
     return resize_area(opaque, LARGEST_PANEL, max(1, round(height * LARGEST_PANEL / width)))[..., :3]
 
 
-def _model_as_json(evaluation: Evaluation, judged: JudgedModel) -> dict[str, Any]:
+def _model_as_json(evaluation: Evaluation, evaluated: EvaluatedModel) -> dict[str, Any]:
     images = [
         {"name": frame.name, "t": frame.t, **scores._asdict(), "moving_share": float(mask.mean())}
-        for frame, scores, mask in zip(evaluation.frames, judged.images, evaluation.masks, strict=True)
+        for frame, scores, mask in zip(evaluation.frames, evaluated.images, evaluation.masks, strict=True)
     ]
     return {
-        "file": FILES[judged.name],
-        "step": judged.loaded.step,
-        "gaussians": len(judged.loaded.model.gaussians),
-        "mean": judged.mean._asdict(),
+        "file": FILES[evaluated.name],
+        "step": evaluated.loaded.step,
+        "gaussians": len(evaluated.loaded.model.gaussians),
+        "mean": evaluated.mean._asdict(),
         "images": images,
     }
 
 
-def _names(judged: JudgedModel) -> list[str]:
-    return [judged.name, FILES[judged.name], f"{judged.loaded.step:,}", f"{len(judged.loaded.model.gaussians):,}"]
+def _names(evaluated: EvaluatedModel) -> list[str]:
+    return [
+        evaluated.name,
+        FILES[evaluated.name],
+        f"{evaluated.loaded.step:,}",
+        f"{len(evaluated.loaded.model.gaussians):,}",
+    ]
 
 
 def _table(header: list[str], rows: list[list[str]]) -> str:

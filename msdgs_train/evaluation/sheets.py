@@ -1,4 +1,4 @@
-"""Sheets of pictures with captions, pixel for pixel."""
+"""Sheets of images with captions, pixel for pixel."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -20,25 +20,25 @@ MAX_SIDE = 2**16 - 1  # matplotlib's own limit
 
 
 class Panel(NamedTuple):
-    """One picture of a sheet."""
+    """One image of a sheet."""
 
     pixels: np.ndarray  # [H, W, 3] uint8, drawn as they are
     caption: str
 
 
 class ColourScale(NamedTuple):
-    """What the colours of a map mean; drawn at the top right."""
+    """What the colors of a map mean; drawn at the top right."""
 
     label: str
     low: str
     high: str
-    colour_map: str  # of matplotlib
+    color_map: str  # of matplotlib
 
 
 def draw_sheet(path: Path, title: str, rows: list[list[Panel]], scale: ColourScale | None = None) -> None:
     """Write a PNG of `rows` of panels with a caption above each. Atomic.
 
-    Raises `InvalidInput` where the sheet would be too large for a picture.
+    Raises `InvalidInput` where the sheet would be too large for an image.
     """
     width, height = sheet_size(rows)
     if max(width, height) > MAX_SIDE:
@@ -72,9 +72,9 @@ def sheet_size(rows: list[list[Panel]]) -> tuple[int, int]:
     return width, panel_corners(rows)[-1][0][1] + max(len(panel.pixels) for panel in rows[-1]) + MARGIN
 
 
-def colour(values: np.ndarray, colour_map: str) -> np.ndarray:
-    """uint8 [H, W, 3] of values in [0, 1], [H, W]; what is above takes the last colour."""
-    return colormaps[colour_map](np.clip(values, 0, 1), bytes=True)[..., :3]
+def color(values: np.ndarray, color_map: str) -> np.ndarray:
+    """uint8 [H, W, 3] of values in [0, 1], [H, W]; what is above takes the last color."""
+    return colormaps[color_map](np.clip(values, 0, 1), bytes=True)[..., :3]
 
 
 def _cell_width(rows: list[list[Panel]]) -> int:
@@ -85,6 +85,6 @@ def _draw_scale(figure: Figure, scale: ColourScale, width: int, height: int) -> 
     bar = np.broadcast_to(np.linspace(0, 1, SCALE_WIDTH), (12, SCALE_WIDTH))
     right = width - MARGIN - 8 * len(scale.high)
     x, text_y = right - SCALE_WIDTH, 1 - (MARGIN + 10) / height
-    figure.figimage(colour(bar, scale.colour_map), x, height - MARGIN - len(bar))
+    figure.figimage(color(bar, scale.color_map), x, height - MARGIN - len(bar))
     figure.text((x - 5) / width, text_y, f"{scale.label}   {scale.low}", fontsize=9, ha="right")
     figure.text((right + 5) / width, text_y, scale.high, fontsize=9)

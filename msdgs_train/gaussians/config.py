@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.layers.heads import Heads
-from msdgs_train.supports.skinning_kernels import FOLLOWED
+from msdgs_train.supports.skinning_kernels import K_NEAREST
 
 LayerKind = Literal["mlp", "plane", "bases"]
 ModulationTarget = Literal["means", "scales", "quats"]
@@ -17,12 +17,12 @@ LEAST = {
     "depth": 1,
     "time_width": 1,
     "time_features": 1,
-    "plane_channels": 1,
-    "plane_space_nodes": 2,
-    "plane_time_nodes": 2,
+    "plane_features_dim": 1,
+    "plane_resolution": 2,
+    "plane_time_resolution": 2,
     "plane_width": 1,
-    "basis_count": 1,
-    "basis_knots": 1,
+    "num_nodes": 1,
+    "num_knots": 1,
 }
 """The smallest sizes that make sense; the others may be 0."""
 
@@ -42,32 +42,32 @@ class ModelConfig:
     time_features: int = 30
     skip: int = 0
     """An MLP layer reads its input once more after so many hidden layers, fewer than `depth`; 0: it doesn't."""
-    plane_channels: int = 16
+    plane_features_dim: int = 16
     """This and the following are sizes of layers of kind `plane`, those above of kind `mlp`."""
-    plane_space_nodes: int = 32
-    plane_time_nodes: int = 50
+    plane_resolution: int = 32
+    plane_time_resolution: int = 50
     plane_width: int = 32
-    plane_scales: tuple[int, ...] = (1,)
-    """Grids a layer, with so many times `plane_space_nodes`; their features are put side by side. 4DGS has 1 2."""
-    basis_count: int = 256
+    multires: tuple[int, ...] = (1,)
+    """Grids a layer, with so many times `plane_resolution`; their features are put side by side. 4DGS has 1 2."""
+    num_nodes: int = 256
     """Motions of a layer of kind `bases`, each of which many Gaussians follow. Such a layer is the first."""
-    basis_knots: int = 36
+    num_knots: int = 36
     """Of their splines, over the time range of the scene."""
-    basis_stretches: bool = True
+    affine: bool = True
     """They stretch what follows them; else they are rigid."""
     weights: bool = True
     """Each layer predicts how much its step counts (equation 8); without, all steps count in full."""
-    embedding_size: int = 32
+    embedding_dim: int = 32
     """Numbers a Gaussian that the modulation reads; 0: no modulation."""
-    modulate: tuple[ModulationTarget, ...] = ("scales",)
+    modulation_targets: tuple[ModulationTarget, ...] = ("scales",)
     """Which summed deltas the modulation multiplies, one or more of means, scales and quats."""
     delta_space: DeltaSpace = "raw"
     """Where deltas of scales are added: `raw`, to their logarithms; `activated`, to the scales, as in DeformGS."""
     opacity_head: bool = False
     """Layers also change opacities, before the sigmoid. Such a model can't be exported yet."""
     sh_head: bool = False
-    """Layers also change colours, as SH coefficients. Such a model can't be exported yet."""
-    detach_means: bool = True
+    """Layers also change colors, as SH coefficients. Such a model can't be exported yet."""
+    detach_deform_input: bool = True
     """Photometric gradients through the layers' input don't reach the canonical means, as in DeformGS."""
     eps2d: float = 0.3
     """Added to the diagonal of projected covariances, px², so that nothing is missed between pixels: 0.3 in the field.
@@ -75,8 +75,8 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         self._check_list("layers", get_args(LayerKind))
-        self._check_list("modulate", get_args(ModulationTarget))
-        self._check_list("plane_scales", None)
+        self._check_list("modulation_targets", get_args(ModulationTarget))
+        self._check_list("multires", None)
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type is int and not (type(value) is int and value >= LEAST.get(field.name, 0)):
@@ -87,10 +87,12 @@ class ModelConfig:
             raise InvalidInput("model.eps2d", "finite and 0 or above", self.eps2d)
         if self.sh_degree > 3:
             raise InvalidInput("model.sh_degree", "0, 1, 2 or 3", self.sh_degree)
-        if not self.modulate or len(set(self.modulate)) < len(self.modulate):
-            raise InvalidInput("model.modulate", "one target or more, each once; embedding_size 0: none", self.modulate)
-        if not self.plane_scales:
-            raise InvalidInput("model.plane_scales", "one grid or more", self.plane_scales)
+        if not self.modulation_targets or len(set(self.modulation_targets)) < len(self.modulation_targets):
+            raise InvalidInput(
+                "model.modulate", "one target or more, each once; embedding_dim 0: none", self.modulation_targets
+            )
+        if not self.multires:
+            raise InvalidInput("model.multires", "one grid or more", self.multires)
         if self.skip >= self.depth:
             raise InvalidInput("model.skip", f"fewer than the {self.depth} hidden layers of `depth`", self.skip)
         if "bases" in self.layers[1:]:
@@ -113,8 +115,8 @@ class ModelConfig:
 
     @property
     def motions(self) -> int:
-        """Shared motions that each Gaussian may follow."""
-        return min(FOLLOWED, self.basis_count) if "bases" in self.layers else 0
+        """Motion bases that each Gaussian may follow."""
+        return min(K_NEAREST, self.num_nodes) if "bases" in self.layers else 0
 
     @property
     def heads(self) -> Heads:

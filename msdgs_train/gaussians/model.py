@@ -16,24 +16,24 @@ from msdgs_train.gaussians.modulation import Factors, Modulation
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.mlp import MLPLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
-from msdgs_train.supports.nodes import BasisLayer, Carried
+from msdgs_train.supports.nodes import BasisLayer, SkinningInputs
 
 LOG_SCALE_LIMIT = 20.0
 """Scales stay within e^-20 and e^20: where a layer flings a Gaussian away its scale may vanish or overflow, and 0 · inf
 is NaN."""
 
-SMALLEST_SCALE = math.exp(-LOG_SCALE_LIMIT)
+MIN_SCALE = math.exp(-LOG_SCALE_LIMIT)
 """Where deltas are added to scales themselves, a scale may come out negative; it becomes this, far below a pixel."""
 
 
-class Domain(NamedTuple):
+class SceneBounds(NamedTuple):
     """Where and when a model's scene takes place: what the grids of plane layers span. Stored with their weights."""
 
-    half_extent: float = 1.0  # of a cube around the origin, scene units
+    scene_half_size: float = 1.0  # of a cube around the origin, scene units
     time_range: tuple[float, float] = (0.0, 1.0)
 
 
-DEFAULT_DOMAIN = Domain()
+DEFAULT_BOUNDS = SceneBounds()
 
 
 class PosedGaussians(NamedTuple):
@@ -49,14 +49,16 @@ class PosedGaussians(NamedTuple):
 class DynamicGaussians(nn.Module):
     """Gaussians that move: `pose(t)` gives them at any time."""
 
-    def __init__(self, config: ModelConfig, gaussians: CanonicalGaussians, domain: Domain = DEFAULT_DOMAIN) -> None:
+    def __init__(
+        self, config: ModelConfig, gaussians: CanonicalGaussians, bounds: SceneBounds = DEFAULT_BOUNDS
+    ) -> None:
         super().__init__()
         _check_shapes(config, gaussians)
         self.config = config
         self.gaussians = gaussians
-        self.deformation = MultiStepDeformation(_new_layer(kind, config, domain) for kind in config.layers)
-        size = config.embedding_size
-        self.modulation = Modulation(size, targets=config.modulate) if size else None
+        self.deformation = MultiStepDeformation(_new_layer(kind, config, bounds) for kind in config.layers)
+        size = config.embedding_dim
+        self.modulation = Modulation(size, targets=config.modulation_targets) if size else None
 
     def plane_grids(self) -> list[PlaneGrid]:
         """Those of all plane layers."""
@@ -70,7 +72,7 @@ class DynamicGaussians(nn.Module):
 
     @property
     def bases(self) -> BasisLayer | None:
-        """The layer of shared motions, if there is one."""
+        """The layer of motion bases, if there is one."""
         return next((layer for layer in self.deformation.layers if isinstance(layer, BasisLayer)), None)
 
     def pose(
@@ -93,7 +95,7 @@ class DynamicGaussians(nn.Module):
         if not (deform and len(self.deformation) and steps != 0):
             return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)
         time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
-        places = means.detach() if self.config.detach_means else means
+        places = means.detach() if self.config.detach_deform_input else means
         deltas = self.deformation(places, time, steps, carried(g))
         deltas = self._modulated(deltas, g.embeddings)
         if deltas.opacities is not None:
@@ -118,16 +120,16 @@ class DynamicGaussians(nn.Module):
     def _deformed_scales(self, log_scales: Tensor, deltas: Tensor) -> Tensor:
         if self.config.delta_space == "raw":
             return activated_scales(log_scales + deltas)
-        return (activated_scales(log_scales) + deltas).clamp_min(SMALLEST_SCALE)
+        return (activated_scales(log_scales) + deltas).clamp_min(MIN_SCALE)
 
 
-def carried(gaussians: CanonicalGaussians | StoredGaussians) -> Carried | None:
+def carried(gaussians: CanonicalGaussians | StoredGaussians) -> SkinningInputs | None:
     """Gaussians as a layer of kind `bases` wants them, None where there is none."""
-    g, logits, ids = gaussians, gaussians.basis_logits, gaussians.basis_ids
+    g, logits, ids = gaussians, gaussians.skinning_logits, gaussians.node_ids
     if logits is None or ids is None:
         return None
     weights = logits.T.contiguous().softmax(dim=0).T  # of 18,000 rows of 8: a seventh of the time that `dim=1` takes
-    return Carried(g.means, unit_quats(g.raw_quats), weights, ids)
+    return SkinningInputs(g.means, unit_quats(g.raw_quats), weights, ids)
 
 
 def activated_scales(log_scales: Tensor) -> Tensor:
@@ -135,9 +137,9 @@ def activated_scales(log_scales: Tensor) -> Tensor:
     return log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
 
 
-def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer | PlaneLayer | BasisLayer:
+def _new_layer(kind: LayerKind, config: ModelConfig, bounds: SceneBounds) -> MLPLayer | PlaneLayer | BasisLayer:
     if kind == "bases":
-        return BasisLayer(config.basis_count, config.basis_knots, domain.time_range, config.basis_stretches)
+        return BasisLayer(config.num_nodes, config.num_knots, bounds.time_range, config.affine)
     if kind == "mlp":
         return MLPLayer(
             config.width,
@@ -150,12 +152,12 @@ def _new_layer(kind: LayerKind, config: ModelConfig, domain: Domain) -> MLPLayer
             config.heads,
         )
     return PlaneLayer(
-        config.plane_channels,
-        config.plane_space_nodes,
-        config.plane_time_nodes,
+        config.plane_features_dim,
+        config.plane_resolution,
+        config.plane_time_resolution,
         config.plane_width,
-        *domain,
-        config.plane_scales,
+        *bounds,
+        config.multires,
         config.heads,
     )
 
@@ -176,9 +178,9 @@ def _check_shapes(config: ModelConfig, gaussians: CanonicalGaussians) -> None:
         "raw_opacities": (n,),
         "sh_dc": (n, 1, 3),
         "sh_rest": (n, sh_coefficients(config.sh_degree) - 1, 3),
-        "embeddings": (n, config.embedding_size) if config.embedding_size else None,
-        "basis_logits": (n, config.motions) if config.motions else None,
-        "basis_ids": (n, config.motions) if config.motions else None,
+        "embeddings": (n, config.embedding_dim) if config.embedding_dim else None,
+        "skinning_logits": (n, config.motions) if config.motions else None,
+        "node_ids": (n, config.motions) if config.motions else None,
     }
     for name, shape in expected.items():
         tensor = getattr(gaussians, name)

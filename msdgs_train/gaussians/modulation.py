@@ -33,17 +33,17 @@ class Modulation(nn.Module):
     """
 
     def __init__(
-        self, embedding_size: int = 32, hidden: int = 32, targets: Sequence[ModulationTarget] = ("scales",)
+        self, embedding_dim: int = 32, hidden: int = 32, targets: Sequence[ModulationTarget] = ("scales",)
     ) -> None:
         super().__init__()
         self.targets = [name for name in get_args(ModulationTarget) if name in targets]
-        self.hidden = nn.Linear(embedding_size, hidden)
+        self.hidden = nn.Linear(embedding_dim, hidden)
         self.output = nn.Linear(hidden, sum(COLUMNS[name] for name in self.targets))
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
     def forward(self, embeddings: Tensor) -> Factors:
-        """Factors in [e^-2, e^2] of embeddings, [N, embedding_size]."""
+        """Factors in [e^-2, e^2] of embeddings, [N, embedding_dim]."""
         logs = self.output(self.hidden(embeddings).relu_()).clamp(-MAX_LOG_FACTOR, MAX_LOG_FACTOR)
         columns = logs.exp().split([COLUMNS[name] for name in self.targets], dim=1)
         found = dict(zip(self.targets, columns, strict=True))

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_train.layers.mlp import LayerStep
-from msdgs_train.supports.nodes import BasisLayer, Carried
-from msdgs_train.supports.skinning_kernels import FOLLOWED, MOTION
+from msdgs_train.supports.nodes import BasisLayer, SkinningInputs
+from msdgs_train.supports.skinning_kernels import K_NEAREST, MOTION
 
 CHUNK = 4096
 """Gaussians at a time where no gradient is wanted: activations stay in a core's cache. 1.3 times as fast in float32
@@ -35,7 +35,9 @@ class MultiStepDeformation(nn.Module):
     def __len__(self) -> int:
         return len(self.layers)
 
-    def forward(self, means: Tensor, t: Tensor, steps: int | None = None, carried: Carried | None = None) -> Deltas:
+    def forward(
+        self, means: Tensor, t: Tensor, steps: int | None = None, carried: SkinningInputs | None = None
+    ) -> Deltas:
         """Deltas of canonical means, [N, 3], at time `t`, a scalar tensor; after the first `steps` layers if given.
 
         `carried` are the same Gaussians as a layer of kind `bases` wants them.
@@ -48,7 +50,7 @@ class MultiStepDeformation(nn.Module):
         columns = [[column for column in columns if column is not None] for columns in zip(*parts, strict=True)]
         return Deltas(*(torch.cat(column) if column else None for column in columns))  # pyright: ignore
 
-    def _chain(self, means: Tensor, t: Tensor, steps: int | None, carried: Carried | None) -> Deltas:
+    def _chain(self, means: Tensor, t: Tensor, steps: int | None, carried: SkinningInputs | None) -> Deltas:
         deltas = Deltas(torch.zeros_like(means), torch.zeros_like(means), means.new_zeros(len(means), 4))
         for layer in self.layers[:steps]:
             step = step_of(layer, means + deltas.means, t, carried)  # equations 7 and 8
@@ -62,7 +64,7 @@ class MultiStepDeformation(nn.Module):
         return deltas
 
 
-def step_of(layer: nn.Module, means: Tensor, t: Tensor, carried: Carried | None) -> LayerStep:
+def step_of(layer: nn.Module, means: Tensor, t: Tensor, carried: SkinningInputs | None) -> LayerStep:
     """What a layer proposes for means, [N, 3], as the layers before it have moved them."""
     if isinstance(layer, BasisLayer):
         assert carried is not None  # the model's configuration has seen to it
@@ -81,5 +83,5 @@ def operations(layers: Iterable[nn.Module]) -> int:
     a motion that it follows."""
     modules = [module for layer in layers for module in layer.modules()]
     linears = sum(module.weight.numel() for module in modules if isinstance(module, nn.Linear))
-    blends = sum(MOTION * min(FOLLOWED, len(module.pivots)) for module in modules if isinstance(module, BasisLayer))
+    blends = sum(MOTION * min(K_NEAREST, len(module.pivots)) for module in modules if isinstance(module, BasisLayer))
     return 2 * (linears + blends)

@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from msdgs_train.layers.heads import PAPER_HEADS, Heads
 
-SILENCE, PLACE_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
+HIDDEN_BIAS, XYZ_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
 """Of a new layer: bias of the hidden units, and what the first Linear's columns are multiplied by."""
 
 
@@ -32,7 +32,7 @@ class LayerStep(NamedTuple):
         return cls(means, scales, quats, weight, opacities, sh.unflatten(1, (heads.sh, 3)) if heads.sh else None)
 
 
-def octaves(dimensions: int, frequencies: int) -> Tensor:
+def frequency_matrix(dimensions: int, frequencies: int) -> Tensor:
     """The matrix F, [D, frequencies · D], for which x @ F is 1x, 2x, 4x, … side by side, each of D columns.
 
     Powers of two times one coordinate: exact in float32, so every reader of a model sees the same phases.
@@ -47,19 +47,19 @@ class PositionalEncoding(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, octave_matrix: Tensor) -> Tensor:
-        phases = x @ octave_matrix  # 12x faster than a broadcast product of shape [N, F, 3] on a CPU
+    def forward(ctx: Any, x: Tensor, frequency_matrix_: Tensor) -> Tensor:
+        phases = x @ frequency_matrix_  # 12x faster than a broadcast product of shape [N, F, 3] on a CPU
         sines, cosines = phases.sin(), phases.cos_()
-        ctx.save_for_backward(sines, cosines, octave_matrix)
+        ctx.save_for_backward(sines, cosines, frequency_matrix_)
         return torch.cat([x, sines, cosines], dim=-1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        sines, cosines, octave_matrix = ctx.saved_tensors
-        d, n = octave_matrix.shape
+        sines, cosines, frequency_matrix_ = ctx.saved_tensors
+        d, n = frequency_matrix_.shape
         grad_phases = (grad[..., d : d + n] * cosines).addcmul_(grad[..., d + n :], sines, value=-1)
-        return torch.addmm(grad[..., :d], grad_phases, octave_matrix.t()), None
+        return torch.addmm(grad[..., :d], grad_phases, frequency_matrix_.t()), None
 
 
 class MLPLayer(nn.Module):
@@ -71,8 +71,8 @@ class MLPLayer(nn.Module):
     """
 
     kind = "mlp"
-    xyz_octaves: Tensor
-    time_octaves: Tensor
+    xyz_frequency_matrix: Tensor
+    time_frequency_matrix: Tensor
 
     def __init__(
         self,
@@ -89,8 +89,8 @@ class MLPLayer(nn.Module):
         super().__init__()
         self.outputs = outputs
         self.skip = skip
-        self.register_buffer("xyz_octaves", octaves(3, xyz_frequencies), persistent=False)
-        self.register_buffer("time_octaves", octaves(1, time_frequencies), persistent=False)
+        self.register_buffer("xyz_frequency_matrix", frequency_matrix(3, xyz_frequencies), persistent=False)
+        self.register_buffer("time_frequency_matrix", frequency_matrix(1, time_frequencies), persistent=False)
         self.xyz_features = 3 * (1 + 2 * xyz_frequencies)
         self.input_features = self.xyz_features + time_features
         self.time_hidden = nn.Linear(1 + 2 * time_frequencies, time_width)
@@ -111,12 +111,12 @@ class MLPLayer(nn.Module):
         """
         for linear in (self.time_hidden, self.first, *trunk):
             nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
-            nn.init.constant_(linear.bias, SILENCE)
+            nn.init.constant_(linear.bias, HIDDEN_BIAS)
         for linear in trunk[1:]:  # silence grows with depth: at depth 4 no last unit would answer anywhere
             nn.init.zeros_(linear.bias)
         nn.init.kaiming_normal_(self.time_output.weight, nonlinearity="linear")
         nn.init.zeros_(self.time_output.bias)
-        self.first.weight[:, : self.xyz_features] *= PLACE_GAIN
+        self.first.weight[:, : self.xyz_features] *= XYZ_GAIN
         self.first.weight[:, self.xyz_features :] *= TIME_GAIN
         deltas = sum(self.outputs.sizes[:-1])
         self.heads.weight[:deltas] = 0  # a new layer moves nothing; its weight keeps a random direction to learn from
@@ -124,7 +124,7 @@ class MLPLayer(nn.Module):
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
         """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""
-        encoded, code = PositionalEncoding.apply(means, self.xyz_octaves), self.time_code(t)
+        encoded, code = PositionalEncoding.apply(means, self.xyz_frequency_matrix), self.time_code(t)
         hidden = self._read_input(self.first, encoded, code).relu_()
         for i, linear in enumerate(self.trunk, start=1):
             if i == self.skip:
@@ -137,7 +137,7 @@ class MLPLayer(nn.Module):
 
     def time_code(self, t: Tensor) -> Tensor:
         """[time_features] of time `t`, the same for all Gaussians."""
-        encoded = PositionalEncoding.apply(t.reshape(1, 1), self.time_octaves)
+        encoded = PositionalEncoding.apply(t.reshape(1, 1), self.time_frequency_matrix)
         return self.time_output(self.time_hidden(encoded).relu_())[0]
 
     def _read_input(self, linear: nn.Module, encoded: Tensor, code: Tensor) -> Tensor:

@@ -30,12 +30,14 @@ class PlaneGrid(nn.Module):
     time_cells: Tensor
 
     def __init__(
-        self, channels: int, space_nodes: int, time_nodes: int, half_extent: float, time_range: tuple[float, float]
+        self, channels: int, space_nodes: int, time_nodes: int, scene_half_size: float, time_range: tuple[float, float]
     ) -> None:
         super().__init__()
         self.space = nn.Parameter(torch.empty(3, space_nodes, space_nodes, channels).uniform_(*SPACE_INIT))
         self.time = nn.Parameter(torch.ones(3, time_nodes, space_nodes, channels))
-        self.register_buffer("cells", torch.full((3,), (space_nodes - 1) / (2 * half_extent)))  # a scene unit, by axis
+        self.register_buffer(
+            "cells", torch.full((3,), (space_nodes - 1) / (2 * scene_half_size))
+        )  # a scene unit, by axis
         self.register_buffer("origin", torch.full((3,), (space_nodes - 1) / 2))  # where (0, 0, 0) is, in cells
         first, last = time_range
         self.register_buffer("first_time", torch.tensor(first))
@@ -55,7 +57,7 @@ class PlaneGrid(nn.Module):
         return torch.lerp(self.time[:, index], self.time[:, index + 1], place - below)
 
     @torch.no_grad()
-    def carry_outwards(self, before: float, after: float) -> None:
+    def on_window(self, before: float, after: float) -> None:
         """Copy what is known outwards when training's time window, around the middle of the range, widens.
 
         `before` and `after` are half its widths, as parts of the range. A node of time that enters takes the values
@@ -69,19 +71,19 @@ class PlaneGrid(nn.Module):
         self.time[:, new_low:low] = self.time[:, low : low + 1]
         self.time[:, high + 1 : new_high + 1] = self.time[:, high : high + 1]
 
-    def time_bends(self) -> Tensor:
+    def time_smoothness(self) -> Tensor:
         """Mean squared second difference along time."""
         return self.time.diff(n=2, dim=1).square().mean()
 
-    def time_offsets(self) -> Tensor:
+    def l1_time_planes(self) -> Tensor:
         """Mean distance of the planes over time from 1, at which they change nothing."""
         return (1 - self.time).abs().mean()
 
-    def space_slopes(self) -> Tensor:
+    def plane_tv(self) -> Tensor:
         """Mean squared first difference along space, the sum of both axes of a plane."""
         return self.space.diff(dim=1).square().mean() + self.space.diff(dim=2).square().mean()
 
-    def space_bends(self) -> Tensor:
+    def plane_smoothness(self) -> Tensor:
         """Mean squared second difference along space, the sum of both axes of a plane."""
         return self.space.diff(n=2, dim=1).square().mean() + self.space.diff(n=2, dim=2).square().mean()
 
@@ -102,7 +104,7 @@ class PlaneLayer(nn.Module):
         space_nodes: int = 32,
         time_nodes: int = 50,
         width: int = 32,
-        half_extent: float = 1.0,
+        scene_half_size: float = 1.0,
         time_range: tuple[float, float] = (0.0, 1.0),
         scales: tuple[int, ...] = (1,),
         outputs: Heads = PAPER_HEADS,
@@ -111,7 +113,7 @@ class PlaneLayer(nn.Module):
         super().__init__()
         self.outputs = outputs
         self.grids = nn.ModuleList(
-            PlaneGrid(channels, space_nodes * scale, time_nodes, half_extent, time_range) for scale in scales
+            PlaneGrid(channels, space_nodes * scale, time_nodes, scene_half_size, time_range) for scale in scales
         )
         self.features = nn.Linear(channels * len(scales), width)
         sizes = [size for size in outputs.sizes if size]

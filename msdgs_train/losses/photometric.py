@@ -1,4 +1,4 @@
-"""The photometric loss, L = λ L1 + (1 − λ) D-SSIM (equation 13), in one pass of kernels over the picture, and others.
+"""The photometric loss, L = λ L1 + (1 − λ) D-SSIM (equation 13), in one pass of kernels over the image, and others.
 
 A dense or convolutional SSIM in torch spends most of its time on five blurred maps and forty elementwise tensors.
 Here both come from fused loops: 200×200 forward and backward takes 2.2 ms on one core, 8 ms with banded matrix
@@ -20,12 +20,12 @@ RADIUS = 5  # of the window, 11 pixels wide
 SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
-ELSEWHERE = 0.25
-"""Mean difference of a pixel's colours where something has moved away, or come."""
-EVEN = 4.0
+CHANGE_THRESHOLD = 0.25
+"""Mean difference of a pixel's colors where something has moved away, or come."""
+MSE_SCALE = 4.0
 """Squared errors times this are as large as L1 where a channel is off by a quarter."""
 BLOCKS = (8, 16, 32)
-"""Widths in pixels that pictures are averaged over to see what is far from its place."""
+"""Widths in pixels that images are averaged over to see what is far from its place."""
 
 
 def _gaussian_window() -> np.ndarray:
@@ -37,57 +37,57 @@ def _gaussian_window() -> np.ndarray:
 _TAPS = _gaussian_window()
 
 
-def photometric_loss(rgb: Tensor, truth: Tensor, l1_weight: float, squares_part: float = 0.0) -> Tensor:
+def photometric_loss(rgb: Tensor, target: Tensor, l1_weight: float, mse_fraction: float = 0.0) -> Tensor:
     """λ L1 + (1 − λ)(1 − SSIM), a scalar (equation 13), but for a part that is squared errors instead.
 
     Args:
         rgb: [H, W, 3] the rendering, float32 or float64; the loss is differentiable in it.
-        truth: [H, W, 3] the photograph, same dtype, values in [0, 1].
+        truth: [H, W, 3] the image, same dtype, values in [0, 1].
         l1_weight: λ; the field uses 0.8.
-        squares_part: of the loss; 0 is equation 13, 1 is `EVEN` times the mean squared error.
+        mse_fraction: of the loss; 0 is equation 13, 1 is `MSE_SCALE` times the mean squared error.
     """
-    _check_pair(rgb, truth)
-    off = rgb - truth
+    _check_pair(rgb, target)
+    off = rgb - target
     loss = l1_weight * off.abs().mean()
     if l1_weight < 1.0:
-        loss = loss + (1 - l1_weight) * (1 - ssim(rgb, truth))
-    if squares_part == 0.0:
+        loss = loss + (1 - l1_weight) * (1 - ssim(rgb, target))
+    if mse_fraction == 0.0:
         return loss
-    return (1 - squares_part) * loss + squares_part * EVEN * off.square().mean()
+    return (1 - mse_fraction) * loss + mse_fraction * MSE_SCALE * off.square().mean()
 
 
-def blocks_loss(rgb: Tensor, truth: Tensor) -> Tensor:
-    """L1 of two pictures, [H, W, 3], averaged over blocks that overlap: a scalar, the sum over `BLOCKS`.
+def pooled_l1(rgb: Tensor, target: Tensor) -> Tensor:
+    """L1 of two images, [H, W, 3], averaged over blocks that overlap: a scalar, the sum over `BLOCKS`.
 
     Pixel by pixel, what is out of place by more than its own size isn't pulled there; its blocks still touch.
     """
-    _check_pair(rgb, truth)
-    off = (rgb - truth).permute(2, 0, 1)
+    _check_pair(rgb, target)
+    off = (rgb - target).permute(2, 0, 1)
     widths = [min(width, *off.shape[1:]) for width in BLOCKS]
     return torch.stack([avg_pool2d(off, width, max(width // 4, 1)).abs().mean() for width in widths]).sum()
 
 
-def still_loss(rgb: Tensor, truth: Tensor, l1_weight: float) -> Tensor:
-    """λ L1 where two pictures, [H, W, 3], show the same: none of the pixels two apart is off by `ELSEWHERE` or more."""
-    _check_pair(rgb, truth)
-    off = (rgb - truth).abs()
+def masked_l1(rgb: Tensor, target: Tensor, l1_weight: float) -> Tensor:
+    """λ L1 where two images, [H, W, 3], agree: no pixel at most two away is off by `CHANGE_THRESHOLD` or more."""
+    _check_pair(rgb, target)
+    off = (rgb - target).abs()
     worst = max_pool2d(off.detach().mean(dim=2)[None], kernel_size=5, stride=1, padding=2)[0]
-    return l1_weight * (off * (worst < ELSEWHERE)[:, :, None]).mean()
+    return l1_weight * (off * (worst < CHANGE_THRESHOLD)[:, :, None]).mean()
 
 
-def ssim(rgb: Tensor, truth: Tensor) -> Tensor:
+def ssim(rgb: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity, a scalar, differentiable in `rgb`.
 
     Window 11, σ = 1.5, data range 1, and zeros beyond the border, as the 3D Gaussian projects compute it.
     """
-    _check_pair(rgb, truth)
-    return _Ssim.apply(rgb, truth)
+    _check_pair(rgb, target)
+    return _Ssim.apply(rgb, target)
 
 
 class _Ssim(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rgb: Tensor, truth: Tensor) -> Tensor:
-        x, y = (np.ascontiguousarray(v.detach().cpu().numpy()).reshape(len(v), -1) for v in (rgb, truth))
+    def forward(ctx: Any, rgb: Tensor, target: Tensor) -> Tensor:
+        x, y = (np.ascontiguousarray(v.detach().cpu().numpy()).reshape(len(v), -1) for v in (rgb, target))
         taps = _TAPS.astype(x.dtype)
         total, pulls = _ssim_sum_and_pulls(x, y, taps)
         ctx.kept = (x, y, taps, pulls, rgb.shape, rgb.device)
@@ -100,11 +100,13 @@ class _Ssim(torch.autograd.Function):
         return torch.from_numpy(gradient).reshape(shape).to(device), None
 
 
-def _check_pair(rgb: Tensor, truth: Tensor) -> None:
+def _check_pair(rgb: Tensor, target: Tensor) -> None:
     if rgb.ndim != 3 or rgb.shape[-1] != 3 or math.prod(rgb.shape) == 0:
         raise InvalidInput("rgb", "of shape [H, W, 3], not empty", tuple(rgb.shape))
-    if truth.shape != rgb.shape or truth.dtype != rgb.dtype:
-        raise InvalidInput("truth", f"{rgb.dtype} of shape {tuple(rgb.shape)}", f"{truth.dtype} {tuple(truth.shape)}")
+    if target.shape != rgb.shape or target.dtype != rgb.dtype:
+        raise InvalidInput(
+            "target", f"{rgb.dtype} of shape {tuple(rgb.shape)}", f"{target.dtype} {tuple(target.shape)}"
+        )
 
 
 @kernel
@@ -142,7 +144,7 @@ def _blur_row(maps: np.ndarray, taps: np.ndarray, i: int, padded: np.ndarray, ou
 
 @kernel
 def _ssim_sum_and_pulls(x: np.ndarray, y: np.ndarray, taps: np.ndarray) -> tuple[float, np.ndarray]:
-    """The sum of SSIM over [H, W * 3] pictures, and its derivatives [3, H, W * 3] in blur(x), blur(x²), blur(xy)."""
+    """The sum of SSIM over [H, W * 3] images, and its derivatives [3, H, W * 3] in blur(x), blur(x²), blur(xy)."""
     height, width = x.shape
     c1, c2 = x.dtype.type(C1), x.dtype.type(C2)
     one, two = x.dtype.type(1), x.dtype.type(2)

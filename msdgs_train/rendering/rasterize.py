@@ -43,7 +43,7 @@ def rasterize(
         opacities: [N] in (0, 1).
         sh: [N, (degree + 1)², 3].
         camera: pinhole, OpenCV axes.
-        background: [3] colour behind everything.
+        background: [3] color behind everything.
         options: rasterizer constants; on CUDA gsplat's limits of alpha and transmittance are fixed.
 
     Returns:
@@ -60,7 +60,7 @@ def rasterize(
 
 
 BACKGROUND = 5
-"""Its place among the arguments; summing its gradient takes as long as half of the rest where a picture is large."""
+"""Its place among the arguments; summing its gradient takes as long as half of the rest where an image is large."""
 
 
 class _Rasterize(torch.autograd.Function):

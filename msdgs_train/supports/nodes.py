@@ -15,39 +15,39 @@ from torch.autograd.function import once_differentiable
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_serve.threads import run_parallel, split_evenly
 from msdgs_train.layers.mlp import LayerStep, to_array
-from msdgs_train.supports.skinning_kernels import DELTAS, FOLLOWED, carry, carry_backward
+from msdgs_train.supports.skinning_kernels import DELTAS, K_NEAREST, carry, carry_backward
 
-OPAQUE = 0.3
+NODE_MIN_OPACITY = 0.3
 """Opacity from which a Gaussian may be the pivot of a motion."""
-REACH = 0.5
+NODE_RADIUS = 0.5
 """Standard deviation of a motion's first weights, in distances between pivots."""
-LEAST_LOGIT = -12.0
+MIN_INITIAL_LOGIT = -12.0
 """Of these, at first: little enough, and still enough of a gradient to come back."""
-LEAST_REACH = 1e-3  # scene units
+MIN_NODE_RADIUS = 1e-3  # scene units
 NEIGHBOURS = 4
 SHORTEST = 0.01  # scene units, added to distances between pivots
 TURNS_COUNT = 0.3  # scene units that a quaternion's unit is worth, and a stretch by as much again
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
 
 
-class Carried(NamedTuple):
+class SkinningInputs(NamedTuple):
     """N canonical Gaussians as motions carry them."""
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4] wxyz, unit
-    basis_weights: Tensor  # [N, F] of the motions that each follows; rows sum to 1
-    basis_ids: Tensor  # [N, F] int64, which of the layer's motions these are
+    skinning_weights: Tensor  # [N, F] of the motions that each follows; rows sum to 1
+    node_ids: Tensor  # [N, F] int64, which of the layer's motions these are
 
-    def rows(self, ids: Tensor | slice) -> "Carried":
+    def rows(self, ids: Tensor | slice) -> "SkinningInputs":
         """Some of them."""
-        return Carried(*(tensor[ids] for tensor in self))
+        return SkinningInputs(*(tensor[ids] for tensor in self))
 
 
 class BasisLayer(nn.Module):
     """B motions, each a stretch, a turn and a shift about a pivot: cubic B-splines of evenly spread knots.
 
     It moves canonical Gaussians, so it is the first of a chain. Gradients reach the means as they are turned, whatever
-    `detach_means` says, which is for layers that read means as places in a field.
+    `detach_deform_input` says, which is for layers that read means as places in a field.
     """
 
     kind = "bases"
@@ -74,7 +74,7 @@ class BasisLayer(nn.Module):
         self.register_buffer("first_time", torch.tensor(first))
         self.register_buffer("time_knots", torch.tensor(knots / ((last - first) or 1.0)))  # a unit of time
 
-    def forward(self, carried: Carried, t: Tensor) -> LayerStep:
+    def forward(self, carried: SkinningInputs, t: Tensor) -> LayerStep:
         """The step of N Gaussians at time `t`, a scalar tensor of the same dtype and device."""
         means, scales, quats = _Carry.apply(*carried, self.motions(t)).split((3, 3, 4), dim=1)
         return LayerStep(means, scales, quats, means.new_ones(len(means), 1))
@@ -109,7 +109,7 @@ class BasisLayer(nn.Module):
             means: [N, 3].
             opacities: [N] in (0, 1).
         """
-        opaque = means[opacities > OPAQUE] if bool((opacities > OPAQUE).any()) else means
+        opaque = means[opacities > NODE_MIN_OPACITY] if bool((opacities > NODE_MIN_OPACITY).any()) else means
         chosen = int((opaque - opaque.mean(dim=0)).norm(dim=1).argmin())
         distances = torch.full((len(opaque),), torch.inf)
         for k in range(len(self.pivots)):
@@ -118,13 +118,13 @@ class BasisLayer(nn.Module):
             chosen = int(distances.argmax())
         near = torch.cdist(self.pivots, self.pivots).topk(self.neighbours.shape[1] + 1, largest=False)
         self.neighbours.copy_(near.indices[:, 1:])
-        reach = max(REACH * float(distances.max()), LEAST_REACH)
+        reach = max(NODE_RADIUS * float(distances.max()), MIN_NODE_RADIUS)
         logits = -0.5 * (torch.cdist(means, self.pivots) / reach).square()
-        nearest = logits.topk(min(FOLLOWED, logits.shape[1]), dim=1)
-        return (nearest.values - nearest.values[:, :1]).clamp_min(LEAST_LOGIT), nearest.indices
+        nearest = logits.topk(min(K_NEAREST, logits.shape[1]), dim=1)
+        return (nearest.values - nearest.values[:, :1]).clamp_min(MIN_INITIAL_LOGIT), nearest.indices
 
     @torch.no_grad()
-    def carry_outwards(self, before: float, after: float) -> None:
+    def on_window(self, before: float, after: float) -> None:
         """Go on with what is known when training's time window, around the middle of the range, widens from half a
         width of `before` to `after`, parts of the range.
 

@@ -37,7 +37,7 @@ class Snapshot:
         """
         posed, options = self._pose(t, layers), self.model.rasterizer
         drawn = rasterize(posed, camera, background=self.background, depth=channel == "depth", options=options)
-        return _picture(drawn, channel)
+        return _image_of(drawn, channel)
 
     @torch.no_grad()
     def _pose(self, t: float, layers: int) -> Gaussians:
@@ -50,7 +50,7 @@ class Snapshot:
 
 def snapshot_of_training(trainer: Trainer) -> Snapshot:
     """A copy of the model as it would be judged and saved now. Not to be called while a step is done."""
-    model = copy.deepcopy(trainer.kept_model)
+    model = copy.deepcopy(trainer.eval_model)
     return Snapshot(model, trainer.config.evaluation_background, *trainer.parts_in_use)
 
 
@@ -59,7 +59,7 @@ def snapshot_of_file(loaded: LoadedModel) -> Snapshot:
     return Snapshot(loaded.model, loaded.scene.background)
 
 
-def _picture(rendering: Rendering, channel: Channel) -> np.ndarray:
+def _image_of(rendering: Rendering, channel: Channel) -> np.ndarray:
     match channel:
         case "rgb":
             return to_bytes(rendering.rgb)

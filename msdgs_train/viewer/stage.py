@@ -15,25 +15,25 @@ from msdgs_train.gaussians.model_file import LoadedModel
 DEFAULT_FOV = 50.0  # degrees, vertical
 
 
-class Stage(NamedTuple):
+class SceneView(NamedTuple):
     """What a viewer has to know before it shows anything. World axes, scene units."""
 
     time_range: tuple[float, float]
     layers: int  # K
     eye: np.ndarray  # [3]
-    target: np.ndarray  # [3] in the middle of the first picture; the camera turns around it
+    target: np.ndarray  # [3] in the middle of the first image; the camera turns around it
     up: np.ndarray  # [3] unit
     fov_y: float  # radians
 
 
-def stage_of_data(scene: SceneData, layers: int) -> Stage:
-    """Seen as in the first photograph."""
+def view_of_data(scene: SceneData, layers: int) -> SceneView:
+    """Seen as in the first image."""
     middle = np.zeros(3) if scene.points is None or not len(scene.points) else np.median(scene.points, axis=0)
     cameras = [frame.camera for frame in scene.splits["train"]]
     return _seen_by(cameras, middle, scene.time_range, layers)
 
 
-def stage_of_file(loaded: LoadedModel) -> Stage:
+def view_of_file(loaded: LoadedModel) -> SceneView:
     """Seen by the first camera that the model holds, or where it has none from aside, z upwards."""
     low, high = np.array(loaded.scene.bounds)
     cameras = [camera_of(entry, entry["width"]) for entry in loaded.scene.cameras]
@@ -44,7 +44,7 @@ def stage_of_file(loaded: LoadedModel) -> Stage:
     return _seen_by(cameras, (low + high) / 2, loaded.scene.time_range, len(loaded.model.deformation))
 
 
-def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[float, float], layers: int) -> Stage:
+def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[float, float], layers: int) -> SceneView:
     """By the first of them; the target is the point of its axis that is nearest to `middle`, [3]."""
     first = cameras[0]
     forward = first.camera_to_world[:3, 2]
@@ -54,6 +54,6 @@ def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[fl
     if np.linalg.norm(up) < 1e-3 or np.linalg.norm(np.cross(up, forward)) < 1e-3:
         up = -first.camera_to_world[:3, 1]
     fov_y = 2 * math.atan(first.height / (2 * first.fy))
-    return Stage(
+    return SceneView(
         time_range, layers, first.position, first.position + distance * forward, up / np.linalg.norm(up), fov_y
     )

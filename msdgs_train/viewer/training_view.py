@@ -2,9 +2,9 @@
 
 from msdgs_train.engine.run import Observer
 from msdgs_train.engine.trainer import StepResult, Trainer
-from msdgs_train.evaluation.metrics import Quality
+from msdgs_train.evaluation.metrics import ImageMetrics
 from msdgs_train.viewer.snapshot import snapshot_of_training
-from msdgs_train.viewer.stage import stage_of_data
+from msdgs_train.viewer.stage import view_of_data
 from msdgs_train.viewer.viewer import Viewer
 
 SHARE = 0.25  # of the time, for drawing, unless somebody moves the slider
@@ -20,9 +20,9 @@ class TrainingView(Observer):
         self._trainer: Trainer | None = None
         self._told: tuple[int, float] | None = None  # step and seconds of the text that is shown
         self._judged = ""
-        viewer.say("reading photographs, compiling kernels")
+        viewer.set_status("reading images, compiling kernels")
 
-    def begins(self, trainer: Trainer) -> None:
+    def on_train_start(self, trainer: Trainer) -> None:
         is_first, self._trainer, self._told = self._trainer is None, trainer, None
         if not is_first:
             return
@@ -32,7 +32,7 @@ class TrainingView(Observer):
             self._paused = gui.add_checkbox("pause", False)
             hint = "of the time that drawing may take away from training"
             self._share = gui.add_slider("share", 0.05, 0.9, 0.05, SHARE, hint=hint)
-        self._viewer.open(stage_of_data(trainer.scene, len(trainer.model.deformation)))
+        self._viewer.open(view_of_data(trainer.scene, len(trainer.model.deformation)))
         self._hand_over()
 
     def step(self, result: StepResult, seconds: float) -> None:
@@ -46,12 +46,12 @@ class TrainingView(Observer):
             return
         self._told = result.step, seconds
         speed = (result.step - step) / max(seconds - before, 1e-9)
-        self._viewer.say(
+        self._viewer.set_status(
             f"**step {result.step:,}** of {self._steps:,}, {speed:.1f} steps/s  \n"
             f"{result.gaussians:,} Gaussians  \ntrain PSNR {result.psnr:.2f} dB{self._judged}"
         )
 
-    def evaluation(self, step: int, split: str, quality: Quality) -> None:
+    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
         self._judged = f"  \n{split} PSNR {quality.psnr:.2f} dB at step {step:,}"
 
     def is_paused(self) -> bool:
@@ -61,12 +61,12 @@ class TrainingView(Observer):
             self._hand_over()
         return paused
 
-    def stay(self) -> None:
+    def wait_for_interrupt(self) -> None:
         """Show what came out of the run until Ctrl-C, which is raised."""
         self._folder.visible = False
         self._viewer.share = 1.0
         self._hand_over()
-        self._viewer.stay()
+        self._viewer.wait_for_interrupt()
 
     def _hand_over(self) -> None:
         if self._trainer is not None:

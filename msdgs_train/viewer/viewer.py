@@ -1,7 +1,7 @@
 """A page on which a model is looked at from all around and at any time, drawn by this project's rasterizer.
 
-viser brings the page, its camera and its controls; pictures are put behind its own empty scene. One thread of this
-process looks at what every browser wants to see and draws what it doesn't show yet: small pictures while something
+viser brings the page, its camera and its controls; images are put behind its own empty scene. One thread of this
+process looks at what every browser wants to see and draws what it doesn't show yet: small images while something
 moves, a large one when nothing does.
 """
 
@@ -20,29 +20,29 @@ from msdgs_serve.scene import Camera, InvalidInput, MsdgsError, quaternion
 from msdgs_train.cli.extras import ExtraMissing
 from msdgs_train.gaussians.model_file import LoadedModel
 from msdgs_train.viewer.snapshot import Channel, Snapshot, snapshot_of_file
-from msdgs_train.viewer.stage import Stage, stage_of_file
+from msdgs_train.viewer.stage import SceneView, view_of_file
 
 LOOK_SECONDS = 1 / 30  # between looks at what browsers want
-STILL_SECONDS = 0.2  # without a change: time for the large picture
-MOVING_PART = 0.5  # of the large picture's sides, while something moves
+STILL_SECONDS = 0.2  # without a change: time for the large image
+MOVING_PART = 0.5  # of the large image's sides, while something moves
 JPEG_QUALITY = 90
 LONGEST_SIDE = 640  # pixels, unless somebody moves the slider
 
 
 class Wanted(NamedTuple):
-    """What a browser is to show; where two are the same, so are the pictures of one model."""
+    """What a browser is to show; where two are the same, so are the images of one model."""
 
     wxyz: tuple[float, ...]  # rotation, camera to world, OpenCV axes
     position: tuple[float, ...]  # world space
     fov_y: float  # radians
-    canvas: tuple[int, int]  # width and height of the browser's picture, pixels
-    longest: int  # side of the picture that is drawn, pixels, at most
+    canvas: tuple[int, int]  # width and height of the browser's image, pixels
+    longest: int  # side of the image that is drawn, pixels, at most
     t: float
     layers: int
     channel: Channel
 
     def camera(self, part: float) -> Camera:
-        """With sides that are this part of the large picture's."""
+        """With sides that are this part of the large image's."""
         longest = part * min(self.longest, max(self.canvas))
         width, height = (max(1, round(longest * side / max(self.canvas))) for side in self.canvas)
         return camera_of_browser(np.array(self.wxyz), np.array(self.position), self.fov_y, width, height)
@@ -52,11 +52,11 @@ class Wanted(NamedTuple):
 class _Browser:
     wanted: Wanted | None = None
     changed: float = 0.0  # when it began to want that
-    drawn: tuple[Wanted, Snapshot, bool] | None = None  # and whether it was the large picture
+    drawn: tuple[Wanted, Snapshot, bool] | None = None  # and whether it was the large image
 
 
 class Viewer:
-    """The page. It is there from the beginning; it has controls from `open` on, and a picture from `show` on."""
+    """The page. It is there from the beginning; it has controls from `open` on, and an image from `show` on."""
 
     def __init__(self, host: str, port: int) -> None:
         """Listens at once; where the port is taken, on one of the next.
@@ -67,7 +67,7 @@ class Viewer:
         self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
         self.share = 1.0
         """Of the time that drawing may take, in (0, 1]; the thread waits for the rest."""
-        self._stage: Stage | None = None
+        self._stage: SceneView | None = None
         self._snapshot: Snapshot | None = None
         self._browsers: dict[int, _Browser] = {}
         self._played: float | None = None  # when time was moved on
@@ -84,7 +84,7 @@ class Viewer:
     ) -> None:
         self.close()
 
-    def open(self, stage: Stage) -> None:
+    def open(self, stage: SceneView) -> None:
         """Add the controls, move all cameras to the first view, and begin to draw."""
         self._stage = stage
         gui, (first, last) = self.server.gui, stage.time_range
@@ -98,7 +98,7 @@ class Viewer:
         layers, hint = stage.layers, "of the deformation; 0 shows the canonical Gaussians"
         self._layers = gui.add_slider("layers", 0, max(layers, 1), 1, layers, visible=layers > 0, hint=hint)
         self._channel = gui.add_dropdown("channel", get_args(Channel))
-        hint = "longest side of the picture in pixels; half of it while something moves"
+        hint = "longest side of the image in pixels; half of it while something moves"
         self._longest = gui.add_slider("resolution", 64, 2048, 32, LONGEST_SIDE, hint=hint)
         self.server.scene.set_up_direction(stage.up)
         early = [client.camera for client in self.server.get_clients().values()]
@@ -120,11 +120,11 @@ class Viewer:
             self._snapshot is None and bool(self.server.get_clients())
         )
 
-    def say(self, markdown: str) -> None:
+    def set_status(self, markdown: str) -> None:
         """Above the controls."""
         self._status.content = markdown
 
-    def stay(self) -> None:
+    def wait_for_interrupt(self) -> None:
         """Until Ctrl-C, which is raised."""
         self._closing.wait()
 
@@ -195,8 +195,8 @@ class Viewer:
 
 def show_model(viewer: Viewer, loaded: LoadedModel, name: str) -> None:
     """What a file holds, and nothing else from then on."""
-    viewer.say(f"**{name}**  \nstep {loaded.step:,}, {len(loaded.model.gaussians):,} Gaussians")
-    viewer.open(stage_of_file(loaded))
+    viewer.set_status(f"**{name}**  \nstep {loaded.step:,}, {len(loaded.model.gaussians):,} Gaussians")
+    viewer.open(view_of_file(loaded))
     viewer.show(snapshot_of_file(loaded))
 
 
@@ -207,8 +207,8 @@ def camera_of_browser(wxyz: np.ndarray, position: np.ndarray, fov_y: float, widt
         wxyz: [4] quaternion, rotates OpenCV camera axes (x right, y down, z forward) into world axes.
         position: [3] world space.
         fov_y: vertical field of view in radians.
-        width: of the picture in pixels.
-        height: of the picture in pixels.
+        width: of the image in pixels.
+        height: of the image in pixels.
     """
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = quaternion.to_matrix(quaternion.normalize(wxyz))

@@ -14,7 +14,7 @@ import onnx
 import torch
 
 from export.jobs.bake import bake
-from export.measure.frames import View, image_gap, in_picture
+from export.measure.frames import View, image_gap, in_image
 from export.measure.gap import half_diagonal, largest_error, pose_arrays, pose_errors
 from export.plans.registry import build
 from export.precision.formats import FLOAT32, in_format
@@ -22,9 +22,9 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.gaussians.model import Domain, DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, SceneBounds
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
-from msdgs_train.layers.mlp import PositionalEncoding, octaves
+from msdgs_train.layers.mlp import PositionalEncoding, frequency_matrix
 from msdgs_train.rendering.rasterize import rasterize as rasterize_for_training
 from tests.export.stability_rows import Row, measured, refused, relative
 from tests.support.exports import export_scene
@@ -35,7 +35,7 @@ from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_
 COUNT = 60
 Change = Callable[[DynamicGaussians], object]
 BACKGROUND = (0.2, 0.6, 0.9)
-MOVES, SCALES, PICTURE = "pose from the scene file", "scales from the file, relative", "float32 picture"
+MOVES, SCALES, IMAGE = "pose from the scene file", "scales from the file, relative", "float32 image"
 
 
 def changed(change: Change = lambda model: None, count: int = COUNT, **config: Any) -> DynamicGaussians:
@@ -67,8 +67,8 @@ def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: Defor
     return worst
 
 
-def picture_error(gaussians: Gaussians, camera: Any) -> float:
-    """dB of the float32 picture against the one of the float64 kernels, which the oracle holds to its loops."""
+def image_error(gaussians: Gaussians, camera: Any) -> float:
+    """dB of the float32 image against the one of the float64 kernels, which the oracle holds to its loops."""
     single, double = (rasterize(as_dtype(gaussians, d), camera, background=BACKGROUND).rgb for d in (np.float32, float))
     return image_gap(single, double).psnr
 
@@ -100,7 +100,7 @@ def traps() -> Iterator[Row]:
         model = changed(lambda m, v=logit: m.get_parameter("modulation.output.bias").fill_(v))
         yield measured(f"exp of the modulation: exponent {logit:g}", MOVES, file_error(model), "export.relative")
     for name, scene in ADVERSARIAL.items():
-        yield measured(f"trap scene `{name}`", PICTURE, picture_error(*scene()), "oracle_db")
+        yield measured(f"trap scene `{name}`", IMAGE, image_error(*scene()), "oracle_db")
     yield measured("opacity → 1: logit 100", "gradients, of the largest", _opaque_gradient(), "gradient.float32")
     yield from _times()
     yield refused("anti-aliasing not recorded", lambda: _opened(antialiasing="none"), "antialiasing")
@@ -108,9 +108,9 @@ def traps() -> Iterator[Row]:
 
 def _encoding() -> Iterator[Row]:
     x = torch.linspace(-1.3, 1.3, 20_001, dtype=torch.double)[:, None].float()
-    exact = PositionalEncoding.apply(x.double(), octaves(1, 10).double())
-    single = PositionalEncoding.apply(x, octaves(1, 10))
-    half = PositionalEncoding.apply(x.half().float(), octaves(1, 10))
+    exact = PositionalEncoding.apply(x.double(), frequency_matrix(1, 10).double())
+    single = PositionalEncoding.apply(x, frequency_matrix(1, 10))
+    half = PositionalEncoding.apply(x.half().float(), frequency_matrix(1, 10))
     yield measured("encoding at 2⁹", "sines in float32", float((single - exact).abs().max()), "encoding.float32")
     types = {t.data_type for t in onnx.load_from_string(_network(changed())).graph.initializer}
     half_types = len(types & {onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16})
@@ -176,7 +176,7 @@ def counts() -> Iterator[Row]:
 
 def a_million() -> Iterator[Row]:
     """A million moving Gaussians, few of which are compared."""
-    small = {"width": 4, "depth": 1, "xyz_frequencies": 1, "time_width": 4, "time_features": 2, "embedding_size": 0}
+    small = {"width": 4, "depth": 1, "xyz_frequencies": 1, "time_width": 4, "time_features": 2, "embedding_dim": 0}
     model = changed(_many, count=2, **small)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.onnx"
@@ -226,7 +226,7 @@ def frames_error(model: DynamicGaussians, scene: SceneInfo, session: Deformation
         got = {name: getattr(drawn, name) for name in ("means", "quats", "scales", "opacities", "sh")}
         exact = pose_arrays(double, float(t))
         for camera in view.cameras:
-            seen = max(seen, int(in_picture(exact["means"], camera).sum()))
+            seen = max(seen, int(in_image(exact["means"], camera).sum()))
             worst = min(worst, image_gap(view.draw(got, camera), view.draw(exact, camera)).psnr)
     return seen, worst
 
@@ -234,7 +234,7 @@ def frames_error(model: DynamicGaussians, scene: SceneInfo, session: Deformation
 def _scaled(kind: str, factor: float) -> tuple[DynamicGaussians, SceneInfo]:
     """A scene, its cameras and all of its motion, `factor` times as large."""
     like = changed(layers=(kind, kind), xyz_frequencies=10)
-    model = DynamicGaussians(like.config, like.gaussians, Domain(1.3 * factor))
+    model = DynamicGaussians(like.config, like.gaussians, SceneBounds(1.3 * factor))
     own = ("cells", "first_time", "time_cells")
     model.load_state_dict({n: v for n, v in like.state_dict().items() if n.split(".")[-1] not in own}, strict=False)
     with torch.no_grad():
@@ -255,11 +255,11 @@ def shapes() -> Iterator[Row]:
         error = _scale_error(math.exp(exponent))
         yield measured(f"scales of e^{exponent}", SCALES, error, "float32.relative")
         gaussians = gaussians_of([[0, 0, 2], [0.3, 0.1, 3]], scales=np.exp([exponent, -2.0]))
-        yield measured(f"scales of e^{exponent}", PICTURE, picture_error(gaussians, front_camera()), "oracle_db")
+        yield measured(f"scales of e^{exponent}", IMAGE, image_error(gaussians, front_camera()), "oracle_db")
     for turn in ((1.0, 0, 0, 0), (0.8, 0.0, 0.0, 0.6), (0.5, 0.5, 0.5, 0.5)):
         needle = gaussians_of([[0, 0, 2]], scales=[[1.0, 1e-6, 1e-6]], quats=turn)
-        error = picture_error(needle, front_camera())
-        yield measured(f"needle of 1e6 : 1, turned {turn}", PICTURE, error, "oracle_db")
+        error = image_error(needle, front_camera())
+        yield measured(f"needle of 1e6 : 1, turned {turn}", IMAGE, error, "oracle_db")
     for logit, opacity in ((200.0, 1.0), (-200.0, 0.0)):
         model = changed(lambda m, v=logit: m.gaussians.raw_opacities.fill_(v))
         error = float(np.abs(exported(model).scene.opacities - opacity).max())
@@ -318,7 +318,7 @@ def broken_files() -> Iterator[Row]:
 
 
 def _contents() -> dict[str, Any]:
-    model = changed(count=3, layers=("mlp", "plane"), width=4, plane_space_nodes=2, plane_time_nodes=2)
+    model = changed(count=3, layers=("mlp", "plane"), width=4, plane_resolution=2, plane_time_resolution=2)
     buffer = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder:
         save_model(Path(folder) / "model.pt", model, SCENE, 1)

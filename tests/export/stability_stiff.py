@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from export.measure.amplification import growth
-from export.measure.frames import View, image_gap, in_picture
+from export.measure.frames import View, image_gap, in_image
 from export.measure.gap import pose_arrays
 from export.measure.stability import assess
 from export.precision.formats import FLOAT32, in_format
@@ -61,7 +61,7 @@ def rougher(factor: float) -> Change:
     def change(model: DynamicGaussians) -> None:
         before = _displacement(model)
         for layer in model.deformation.layers:
-            columns = layer.get_buffer("xyz_octaves").amax(dim=0) >= 32
+            columns = layer.get_buffer("xyz_frequency_matrix").amax(dim=0) >= 32
             upper = torch.cat([torch.zeros(3, dtype=torch.bool), columns, columns])
             layer.get_parameter("first.weight")[:, : len(upper)][:, upper] *= factor
         steps_times(before / _displacement(model))(model)
@@ -85,7 +85,7 @@ def saturated(logit: float) -> Change:
 
 def layers(count: int, kind: str = "mlp") -> dict[str, Any]:
     """Many layers are small ones: their number is what matters here."""
-    small = {"depth": 1, "plane_space_nodes": 6, "plane_time_nodes": 6} if count > 4 else {}
+    small = {"depth": 1, "plane_resolution": 6, "plane_time_resolution": 6} if count > 4 else {}
     return {"layers": (kind,) * count, **small}
 
 
@@ -109,7 +109,7 @@ CASES: dict[str, Callable[[], DynamicGaussians]] = {
 
 
 def rows_of(case: str) -> list[Row]:
-    """What is foretold must cover what is measured, and what is accepted must be exact in pictures not looked at."""
+    """What is foretold must cover what is measured, and what is accepted must be exact in images not looked at."""
     model = CASES[case]()
     report = assess(model, SCENE, times=TIMES if len(model.deformation) < 16 else 2)
     name = f"{case}: amplified × {report.worst_amplification:.2g}"
@@ -139,7 +139,7 @@ def _unseen(model: DynamicGaussians) -> tuple[int, float]:
     camera, seen, worst = view.cameras[0], 0, np.inf
     for t in UNSEEN_TIMES:
         single, exact = pose_arrays(model, t), pose_arrays(double, t)
-        seen = max(seen, int(in_picture(exact["means"], camera).sum()))
+        seen = max(seen, int(in_image(exact["means"], camera).sum()))
         worst = min(worst, image_gap(view.draw(single, camera), view.draw(exact, camera)).psnr)
     return seen, worst
 

@@ -19,7 +19,7 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets import Frame, load_scene
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
-from msdgs_train.evaluation.evaluate import JudgedModel
+from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
 from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
 from msdgs_train.viewer.snapshot import snapshot_of_file
@@ -65,12 +65,12 @@ def expected(loaded: LoadedModel, camera: Camera) -> np.ndarray:
     return narrow
 
 
-def test_pictures_of_a_model(loaded: LoadedModel, camera: Camera, expected: np.ndarray):
+def test_images_of_a_model(loaded: LoadedModel, camera: Camera, expected: np.ndarray):
     frame = Frame("a", camera, T, Path("a.png"))
-    judged = JudgedModel("last", loaded, []).render(frame).numpy()
-    np.testing.assert_allclose(judged, expected, atol=tolerance("served_frame"))
-    np.testing.assert_array_equal(render_steps(loaded, T, camera)[-1], to_bytes(judged))
-    np.testing.assert_array_equal(snapshot_of_file(loaded).draw(camera, T, layers=2), to_bytes(judged))
+    evaluated = EvaluatedModel("last", loaded, []).render(frame).numpy()
+    np.testing.assert_allclose(evaluated, expected, atol=tolerance("served_frame"))
+    np.testing.assert_array_equal(render_steps(loaded, T, camera)[-1], to_bytes(evaluated))
+    np.testing.assert_array_equal(snapshot_of_file(loaded).draw(camera, T, layers=2), to_bytes(evaluated))
 
 
 def test_a_served_frame(folder: Path, camera: Camera, expected: np.ndarray):
@@ -109,7 +109,7 @@ def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
 def test_training_may_begin_with_more(tmp_path: Path):
     """What is saved says what it was trained with, early and late, and going on knows it too."""
     sizes = replace(SHARED_MOTIONS, eps2d=EPS2D)
-    config = training_config(model=sizes, window_until_fraction=0.5, eps2d_start=0.4)
+    config = training_config(model=sizes, window_full_fraction=0.5, eps2d_init=0.4)
     trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))
     assert trainer.model.config.eps2d == 0.4
     seen = []
@@ -126,8 +126,8 @@ def test_training_may_begin_with_more(tmp_path: Path):
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
 def test_a_start_that_cannot_be_is_named(value: float):
-    with pytest.raises(InvalidInput, match=r"config\.eps2d_start"):
-        training_config(eps2d_start=value)
+    with pytest.raises(InvalidInput, match=r"config\.eps2d_init"):
+        training_config(eps2d_init=value)
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf"), "0.3", True])

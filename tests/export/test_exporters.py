@@ -98,7 +98,7 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
         if entry.key == "antialiasing":
             entry.value = f'"{antialiasing}"'
     onnx.save(contents, scene)
-    run(scene, tmp_path / "a.spz")  # which compares pictures, and refuses under 45 dB
+    run(scene, tmp_path / "a.spz")  # which compares images, and refuses under 45 dB
     read = read_splats(tmp_path / "a.spz")
     assert read.antialiasing == antialiasing
     expected = DeformationSession(scene).gaussians(0.0)
@@ -258,7 +258,7 @@ def with_padding_that_shows(model: onnx.ModelProto) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (with_output_for_colors, r"`means_rgb` would be taken for colours"),
+        (with_output_for_colors, r"`means_rgb` would be taken for colors"),
         (with_camera, r"instead of 17 alone; its input must be `time`"),
         (with_300_rows, r"300 rows are no multiple of 256"),
         (with_a_loop, r"Loop is control flow"),

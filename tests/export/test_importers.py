@@ -308,7 +308,7 @@ def shuffled(frames: list[Gaussians]) -> list[Gaussians]:
     return mixed
 
 
-@pytest.mark.parametrize("change", ["order", "count", "one opacity and colour, another order"])
+@pytest.mark.parametrize("change", ["order", "count", "one opacity and color, another order"])
 def test_frames_that_do_not_correspond_are_switched(tmp_path: Path, change: str):
     frames = moving_frames(4)
     if change == "count":

@@ -105,7 +105,7 @@ def test_the_network_is_theirs(tmp_path: Path, scales: tuple[int, ...], lengths:
     assert write_model(run, "4dgs", tmp_path / "model.pt", QUIET) == []
     model, info, step = load_model(tmp_path / "model.pt")
     assert (step, info.background, model.config.delta_space) == (20_000, (1.0, 1.0, 1.0), "raw")
-    assert model.config.plane_time_nodes == TIME - (TIME - 1) // 2
+    assert model.config.plane_time_resolution == TIME - (TIME - 1) // 2
     g = some_gaussians(COUNT, 3)
     means, quats, scales_then = (torch.from_numpy(a).double() for a in (g.means, g.quats, g.scales))
     raw_quats = quats * torch.linspace(1 - lengths, 1 + lengths, COUNT, dtype=torch.float64)[:, None]
@@ -131,7 +131,7 @@ def test_what_its_switches_turn_off_stays(tmp_path: Path):
     assert not torch.equal(early.means, late.means)
 
 
-def test_changing_opacities_and_colours_are_held_and_the_cost_is_said(tmp_path: Path):
+def test_changing_opacities_and_colors_are_held_and_the_cost_is_said(tmp_path: Path):
     state = their_state()
     run = write_run(tmp_path / "run", state, SWITCHES + ", no_do=False, no_dshs=False")
     (lost,) = write_model(run, "4dgs", tmp_path / "model.pt", QUIET)
@@ -162,7 +162,7 @@ def test_a_run_is_exported_and_lists_what_is_held(tmp_path: Path):
     scene = DeformationSession(tmp_path / "scene.onnx")
     assert scene.scene.metadata.layers == ("plane",)
     (held,) = (each for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"] if each["rule"] == "frozen")
-    assert "opacities and colours" in held["what"]
+    assert "opacities and colors" in held["what"]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Damaged files of every kind that is imported: an error by name or a finite picture, in no more time and memory.
+"""Damaged files of every kind that is imported: an error by name or a finite image, in no more time and memory.
 
 `MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` takes so many of each kind, and larger ones.
 """

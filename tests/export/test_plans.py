@@ -22,8 +22,8 @@ from tests.support.tolerances import tolerance
 
 KINDS: dict[str, dict[str, Any]] = {
     "mlp": {"noise": 0.02, "time_frequencies": 2},
-    "plane": {"layers": ("plane",), "plane_time_nodes": 9},
-    "mixed": {"layers": ("mlp", "plane"), "noise": 0.02, "time_frequencies": 2, "plane_time_nodes": 9},
+    "plane": {"layers": ("plane",), "plane_time_resolution": 9},
+    "mixed": {"layers": ("mlp", "plane"), "noise": 0.02, "time_frequencies": 2, "plane_time_resolution": 9},
 }
 FITTED = ("lowrank:1", "lowrank:8", "lowrank", "keyframes:4", "keyframes:12", "keyframes")
 

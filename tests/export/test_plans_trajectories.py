@@ -148,7 +148,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
 
 
 def test_a_scene_is_sampled_once_for_all_plans():
-    model = random_model(5, layers=("plane",), plane_time_nodes=5)
+    model = random_model(5, layers=("plane",), plane_time_resolution=5)
     kept = module.trajectories_of(bake(model, SCENE, "0" * 64))
     assert module.trajectories_of(bake(model, SCENE, "1" * 64)) is kept
     with torch.no_grad():

@@ -141,7 +141,7 @@ def test_the_model_is_not_changed():
     assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
 
 
-def test_the_worst_gaussians_are_named_with_what_they_do_to_the_picture():
+def test_the_worst_gaussians_are_named_with_what_they_do_to_the_image():
     model = random_model(1200, sh_degree=0)
     worst = 77
     with torch.no_grad():  # canonical and delta cancel all but the last digits: see test_export
@@ -162,8 +162,8 @@ def test_the_worst_gaussians_are_named_with_what_they_do_to_the_picture():
     exact, view = pose_arrays(in_format(model, FLOAT32).double(), report.worst.t), View(SCENE)
     others = np.ones(1200, bool)
     others[report.worst.ids] = False
-    pictures = [(view.draw(exact, c, keep=others), view.draw(exact, c)) for c in view.cameras]
-    assert report.worst.drawn_psnr in [image_gap(*pair).psnr for pair in pictures]
+    images = [(view.draw(exact, c, keep=others), view.draw(exact, c)) for c in view.cameras]
+    assert report.worst.drawn_psnr in [image_gap(*pair).psnr for pair in images]
 
 
 @pytest.mark.parametrize(("count", "layers"), [(0, ("mlp",)), (5, ())])
@@ -213,7 +213,7 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path, capsys: pytest.Capt
     path = saved(tmp_path, random_model(30))
     assert main(path, tmp_path / "out.json", tmp_path / "out.png", times=3) == 0
     shown = capsys.readouterr().out
-    for text in ("2 (mlp)", "bfloat16", "foretold", "gets most wrong", "steady: "):
+    for text in ("2 (mlp)", "bfloat16", "predicted", "gets most wrong", "steady: "):
         assert text in shown
     report = json.loads((tmp_path / "out.json").read_text())
     assert report["steady"] is True
@@ -231,7 +231,7 @@ def test_the_command_flags_a_model_that_overflows(tmp_path: Path, capsys: pytest
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"times": 1}, "`times`"), ({"max_error": -1.0}, "`max_error`"), ({"max_error": float("nan")}, "`max_error`")],
+    [({"times": 1}, "`times`"), ({"min_psnr": -1.0}, "`min_psnr`"), ({"min_psnr": float("nan")}, "`min_psnr`")],
 )
 def test_the_command_refuses_settings_that_make_no_sense(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, float], message: str

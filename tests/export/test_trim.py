@@ -192,11 +192,11 @@ def test_cameras_are_added_where_too_few_are_stored(count: int):
         (0, {}, SCENE),
         (1, {}, SCENE),
         (5, {"layers": ()}, SCENE),
-        (5, {"layers": (), "embedding_size": 0}, SCENE),
+        (5, {"layers": (), "embedding_dim": 0}, SCENE),
         (40, {"layers": ("plane", "mlp")}, SCENE),
-        (40, {"layers": ("bases",), "basis_count": 5}, SCENE),
-        (40, {"layers": ("bases", "mlp"), "basis_count": 5}, SCENE),
-        (40, {"weights": False, "modulate": ("means", "scales", "quats")}, SCENE),
+        (40, {"layers": ("bases",), "num_nodes": 5}, SCENE),
+        (40, {"layers": ("bases", "mlp"), "num_nodes": 5}, SCENE),
+        (40, {"weights": False, "modulation_targets": ("means", "scales", "quats")}, SCENE),
         (40, {"delta_space": "activated"}, SCENE),
         (40, {}, SceneInfo(bounds=SCENE.bounds)),
         (40, {}, SceneInfo(time_range=(0.5, 0.5), bounds=SCENE.bounds, cameras=SCENE.cameras[:2])),
@@ -214,7 +214,7 @@ def test_unusual_scenes_are_trimmed_and_written(tmp_path: Path, count: int, chan
 
 
 def test_shared_motions_have_no_heads_to_leave_out(tmp_path: Path):
-    candidate = job_of(tmp_path, random_model(40, layers=("bases",), basis_count=5), SCENE).candidate("network", 50.0)
+    candidate = job_of(tmp_path, random_model(40, layers=("bases",), num_nodes=5), SCENE).candidate("network", 50.0)
     assert "heads" not in {entry["rule"] for entry in candidate.trimmed.left_out}
 
 

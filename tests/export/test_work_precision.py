@@ -58,7 +58,7 @@ measured = st.lists(st.builds(point, st.floats(1, 100), st.floats(20, 100)), min
 
 
 @given(measured, st.floats(20, 100))
-def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], max_error: float):
+def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_psnr: float):
     ahead = front(points)
     assert ahead
     for i, a in enumerate(points):
@@ -69,8 +69,8 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], max_e
             for b in points
         )
         assert not (beaten and i in ahead)
-    best = choose(points, max_error)
-    within = [p for p in points if p.error.psnr_worst >= max_error]
+    best = choose(points, min_psnr)
+    within = [p for p in points if p.error.psnr_worst >= min_psnr]
     assert (best is None) == (not within)
     if best is not None:
         assert best in ahead
@@ -101,7 +101,7 @@ def few_candidates() -> Iterator[None]:
 def new_job(folder: Path) -> Job:
     save_model(folder / "model.pt", moving_object(), SCENE, 1)
     (folder / "candidates").mkdir()
-    return Job(folder / "model.pt", folder / "candidates", max_error=45.0)
+    return Job(folder / "model.pt", folder / "candidates", min_psnr=45.0)
 
 
 def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_the_error(
@@ -168,7 +168,7 @@ def test_the_report_holds_what_it_promises(swept: tuple[Job, SweepResult], tmp_p
     assert [path.name for path in paths] == ["ball.report.json", "ball.report.md", "ball.report.png"]
     read = json.loads(paths[0].read_text())
     assert read == json.loads(json.dumps(contents))
-    assert (read["format"], read["max_error"]) == (FORMAT, 45.0)
+    assert (read["format"], read["min_psnr"]) == (FORMAT, 45.0)
     assert sum(p["chosen"] for p in read["points"]) == 1
     for p in read["points"]:
         assert set(p) == set(POINT_FIELDS)
@@ -183,9 +183,9 @@ def test_the_report_holds_what_it_promises(swept: tuple[Job, SweepResult], tmp_p
     chosen = next(p for p in read["points"] if p["chosen"])  # times decide: all of such small files are fast
     assert ("motion of Gaussians that never move visibly" in page) == (chosen["static"] > 0)
     assert all(len(row) == len(COLUMNS) for row in rows(contents))
-    with Image.open(paths[2]) as picture:
-        assert picture.format == "PNG"
-        assert len(np.unique(np.asarray(picture).reshape(-1, 4), axis=0)) > 10
+    with Image.open(paths[2]) as image:
+        assert image.format == "PNG"
+        assert len(np.unique(np.asarray(image).reshape(-1, 4), axis=0)) > 10
 
 
 def saved(folder: Path, **changes: Any) -> Path:
@@ -193,21 +193,21 @@ def saved(folder: Path, **changes: Any) -> Path:
     return folder / "model.pt"
 
 
-@pytest.mark.parametrize("max_error", [float("nan"), float("inf"), -1.0, 0.0, 101.0])
-def test_an_error_that_cannot_be_meant_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], max_error: float):
-    assert main(saved(tmp_path), tmp_path / "s.onnx", max_error=max_error) == 1
-    assert "`max_error` must be a PSNR in dB from 10 to 100" in capsys.readouterr().err
+@pytest.mark.parametrize("min_psnr", [float("nan"), float("inf"), -1.0, 0.0, 101.0])
+def test_an_error_that_cannot_be_meant_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], min_psnr: float):
+    assert main(saved(tmp_path), tmp_path / "s.onnx", min_psnr=min_psnr) == 1
+    assert "`min_psnr` must be a PSNR in dB from 10 to 100" in capsys.readouterr().err
     assert not (tmp_path / "s.onnx").exists()
 
 
 def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = saved(tmp_path)
-    assert main(path, tmp_path / "s.onnx", plan="prefix:1", max_error=75.0) == 1
+    assert main(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0) == 1
     shown = capsys.readouterr().err
     assert "at most" in shown
     assert "which the plan prefix:1 reaches" in shown
     reachable = float(shown.split("at most ")[1].split(",")[0])
-    assert main(path, tmp_path / "s.onnx", plan="prefix:1", max_error=reachable) == 0
+    assert main(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=reachable) == 0
     metadata = DeformationSession(tmp_path / "s.onnx").scene.metadata
     assert metadata.plan == "prefix:1"
     assert metadata.measured_error["rendered"]["psnr_worst"] >= reachable
@@ -234,7 +234,7 @@ def test_wrong_wishes_are_refused_by_name(
 
 def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
-    assert main(tmp_path / "model.pt", max_error=45.0, no_bands=True) == 0
+    assert main(tmp_path / "model.pt", min_psnr=45.0, no_bands=True) == 0
     shown = capsys.readouterr().err
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene

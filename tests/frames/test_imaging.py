@@ -16,7 +16,7 @@ BACKGROUND = np.array([0.2, 0.5, 1.0], np.float32)
 
 
 def make_image(transparent: bool = False, width: int = WIDTH, height: int = HEIGHT) -> Image:
-    """A smooth colour ramp under a disc of soft coverage; the corners are empty."""
+    """A smooth color ramp under a disc of soft coverage; the corners are empty."""
     y, x = np.mgrid[0:height, 0:width] / np.array([height, width]).reshape(2, 1, 1)
     alpha = np.clip(1.3 - 4 * ((x - 0.5) ** 2 + (y - 0.5) ** 2), 0, 1).astype(np.float32)
     straight = np.stack([x, y, 1 - x * y], axis=2).astype(np.float32)
@@ -62,7 +62,7 @@ def test_transparent_webp_keeps_alpha_exactly():
     assert np.abs(pixels[..., 3] / 255 - image.alpha).max() <= 0.5 / 255 + 1e-6
 
 
-def test_exr_holds_linear_premultiplied_colour_and_depth():
+def test_exr_holds_linear_premultiplied_color_and_depth():
     image = make_image(transparent=True)
     pixels, spec = decode(encode(image, "exr"), "exr")
     assert pixels.dtype == np.float32
@@ -83,13 +83,13 @@ def test_opaque_exr_is_the_display_image_linearised():
     np.testing.assert_array_equal(pixels[..., 4], image.depth)
 
 
-def test_exr_header_says_its_colour_space():
+def test_exr_header_says_its_color_space():
     _, spec = decode(encode(make_image(), "exr"), "exr")
     assert spec.getattribute("oiio:ColorSpace") == "lin_rec709_scene"
     np.testing.assert_allclose(spec.getattribute("chromaticities")[:2], (0.64, 0.33), rtol=1e-6)
 
 
-def test_exr_keeps_colours_above_one_and_8_bits_clip_them():
+def test_exr_keeps_colors_above_one_and_8_bits_clip_them():
     bright = Image(np.full((2, 2, 3), 1.5, np.float32), np.ones((2, 2), np.float32), np.ones((2, 2), np.float32))
     linear, _ = decode(encode(bright, "exr"), "exr")
     np.testing.assert_allclose(linear_to_srgb(linear[..., :3]), 1.5, rtol=1e-5)

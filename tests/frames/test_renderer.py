@@ -88,7 +88,7 @@ def test_a_scene_says_how_it_is_antialiased(tmp_path: Path):
     assert np.abs(image.rgb - rasterize(gaussians, camera, background=background).rgb).max() > 0.001
 
 
-def test_without_background_colours_are_premultiplied(session: DeformationSession):
+def test_without_background_colors_are_premultiplied(session: DeformationSession):
     clear = Renderer().render(session, level_camera(), 0.5, RenderOptions("transparent"))
     opaque = Renderer().render(session, level_camera(), 0.5)
     assert clear.transparent

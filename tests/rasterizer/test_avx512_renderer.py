@@ -1,4 +1,4 @@
-"""The hand-written renderer that ours is timed against draws the same pictures."""
+"""The hand-written renderer that ours is timed against draws the same images."""
 
 import pytest
 

@@ -132,7 +132,7 @@ def test_finite_differences(kind: str, seed: int, options: RasterizerOptions):
 
 
 def test_pixels_at_a_threshold_jump_by_no_more_than_stated():
-    """Where a step of the parameters tips a decision, the picture departs from its gradient by at most the slack."""
+    """Where a step of the parameters tips a decision, the image departs from its gradient by at most the slack."""
     splat = gaussians_of([[0, 0, 2], [0.1, 0, 3]], scales=0.2, opacities=[0.6, 0.9], dtype=np.float64)
     camera, step = front_camera(21, 13), 2e-4
     want = reference.render(splat, camera, BACKGROUND)
@@ -270,8 +270,8 @@ def test_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
     assert all(result == results[0] for result in results[1:])
 
 
-def test_changing_the_picture_in_place_is_noticed():
-    """The backward pass needs the picture as it was drawn."""
+def test_changing_the_image_in_place_is_noticed():
+    """The backward pass needs the image as it was drawn."""
     parameters, camera, _ = small_scene(59)
     rgb, _ = draw(parameters, camera)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):

@@ -43,8 +43,8 @@ def test_the_command(tmp_path: Path):
     command += [
         "--splats",
         str(tmp_path / "some.splat"),
-        "--pictures",
-        str(tmp_path / "pictures"),
+        "--images",
+        str(tmp_path / "images"),
         "--gradient",
         "--avx512",
     ]
@@ -58,4 +58,4 @@ def test_the_command(tmp_path: Path):
     assert checkouts["psnr"] is None  # the same bytes
     assert ("avx512" in result) == (why_not() is None)
     assert (tmp_path / "all.png").stat().st_size > 1000
-    assert (tmp_path / "pictures" / "some.splat.png").exists()
+    assert (tmp_path / "images" / "some.splat.png").exists()

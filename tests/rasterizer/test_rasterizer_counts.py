@@ -11,7 +11,7 @@ from tests.support.scenes import as_dtype, random_scene
 
 
 def blended_one_by_one(records: np.ndarray, order: np.ndarray, width: int, height: int) -> np.ndarray:
-    """[H, W] splats that add to each pixel, splat by splat over the whole picture."""
+    """[H, W] splats that add to each pixel, splat by splat over the whole image."""
     y, x = np.mgrid[:height, :width] + 0.5
     left, stopped, counts = np.ones_like(x), np.zeros(x.shape, bool), np.zeros_like(x)
     for record in records[order]:
@@ -33,10 +33,10 @@ def test_pairs_are_counted_exactly(count: int, width: int, height: int):
     splats = project(as_dtype(gaussians, np.float64), camera, GSPLAT)
     tiles = bin_into_tiles(splats, width, height)
     counts = count_pairs(splats, tiles, width, height, GSPLAT)
-    picture = rasterize(as_dtype(gaussians, np.float64), camera, counts=True)
+    image = rasterize(as_dtype(gaussians, np.float64), camera, counts=True)
     keys = np.concatenate([splats.keys[start:stop] for start, stop in splats.drawn])
     order = (np.sort(keys) & np.uint64(0xFFFFFFFF)).astype(int)
-    np.testing.assert_array_equal(picture.counts, blended_one_by_one(splats.records, order, width, height))
-    assert counts.blended == picture.counts.sum()
+    np.testing.assert_array_equal(image.counts, blended_one_by_one(splats.records, order, width, height))
+    assert counts.blended == image.counts.sum()
     assert counts.visible == len(order)
     assert counts.blended <= counts.lanes <= 256 * counts.tile_entries

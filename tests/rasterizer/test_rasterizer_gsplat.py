@@ -1,4 +1,4 @@
-"""Projection, covariance and colours against gsplat's own plain torch reference: code that no one here wrote."""
+"""Projection, covariance and colors against gsplat's own plain torch reference: code that no one here wrote."""
 
 from dataclasses import replace
 
@@ -82,7 +82,7 @@ def test_what_is_not_drawn_adds_nothing(name: str):
 
 
 @pytest.mark.parametrize("name", ["random", "off_axis_89", "principal_point_outside", "inside_splat"])
-def test_pictures(name: str):
+def test_images(name: str):
     gaussians, camera = scene(name, np.float64)
     background = np.array([0.3, 0.1, 0.7])
     splats = gsplat_projection(gaussians, camera)
@@ -94,14 +94,14 @@ def test_pictures(name: str):
 
 
 def of_model(model: str, camera: Camera) -> Camera:
-    """The same picture, more or less, by a camera of another model."""
+    """The same image, more or less, by a camera of another model."""
     scale = 0.25 if model == "orthographic" else 1.0
     return replace(camera, model=model, fx=scale * camera.fx, fy=scale * camera.fy)
 
 
 @pytest.mark.parametrize("model", ["orthographic", "fisheye"])
 def test_other_cameras(model: str):
-    """Colours aside: gsplat takes an orthographic camera's lines of sight for those of a pinhole."""
+    """Colors aside: gsplat takes an orthographic camera's lines of sight for those of a pinhole."""
     gaussians, camera = scene("random", np.float64)
     camera = of_model(model, camera)
     got, want = project(gaussians, camera, GSPLAT), gsplat_projection(gaussians, camera)
@@ -171,7 +171,7 @@ def test_a_point_on_the_axis_is_drawn_in_the_centre(model: str):
     assert project(axis, camera, GSPLAT).extents[0, 0] == 0
 
 
-def test_orthographic_pictures_do_not_depend_on_distance():
+def test_orthographic_images_do_not_depend_on_distance():
     gaussians, camera = scene("random", np.float64)
     gaussians = replace(gaussians, sh=gaussians.sh[:, :4])
     camera = of_model("orthographic", camera)

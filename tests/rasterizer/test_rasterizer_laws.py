@@ -1,4 +1,4 @@
-"""What must hold for every scene, without knowing the right picture."""
+"""What must hold for every scene, without knowing the right image."""
 
 from dataclasses import replace
 
@@ -141,20 +141,20 @@ def test_background_shows_through_what_is_left(seed: int, dtype: type):
 @DTYPES
 @SEEDS
 def test_alpha_is_the_weight_of_all_splats(seed: int, dtype: type):
-    """White Gaussians over black: the colour is the sum of the weights."""
+    """White Gaussians over black: the color is the sum of the weights."""
     gaussians, camera = scene(seed, dtype)
     white = np.full((len(gaussians), 1, 3), 0.5 / 0.28209479177387814, dtype)
-    picture = draw(replace(gaussians, sh=white), camera)
+    image = draw(replace(gaussians, sh=white), camera)
     for channel in range(3):
-        assert_close(picture.rgb[..., channel], picture.alpha, f"rgb.{np.dtype(dtype).name}")
-    assert picture.alpha.min() >= 0
-    assert picture.alpha.max() <= 1
+        assert_close(image.rgb[..., channel], image.alpha, f"rgb.{np.dtype(dtype).name}")
+    assert image.alpha.min() >= 0
+    assert image.alpha.max() <= 1
 
 
 @DTYPES
 @SEEDS
 def test_colors_are_linear_without_the_clamp(seed: int, dtype: type):
-    """Half the colour, half the picture: weights don't depend on colours."""
+    """Half the color, half the image: weights don't depend on colors."""
     gaussians, camera = scene(seed, dtype)
     bright = gaussians_of(gaussians.means, rgb=np.linspace(0.2, 0.8, 450).reshape(-1, 3), dtype=dtype)
     dim = gaussians_of(gaussians.means, rgb=np.linspace(0.1, 0.4, 450).reshape(-1, 3), dtype=dtype)
@@ -167,7 +167,7 @@ def test_colors_are_linear_without_the_clamp(seed: int, dtype: type):
 
 @DTYPES
 def test_crops_show_the_same_pixels(dtype: type):
-    """Moving the principal point cuts the picture; means stay inside all crops, where no Jacobian is clamped."""
+    """Moving the principal point cuts the image; means stay inside all crops, where no Jacobian is clamped."""
     rng = np.random.default_rng(22)
     means = np.column_stack([rng.uniform(-0.15, 0.15, size=(40, 2)), rng.uniform(1.5, 3, 40)])
     gaussians = gaussians_of(means, scales=rng.uniform(0.02, 1.5, 40), opacities=0.4, dtype=dtype)
@@ -182,15 +182,15 @@ def test_crops_show_the_same_pixels(dtype: type):
 
 
 @SEEDS
-def test_mirrored_picture(seed: int):
-    """The world seen in a mirror at x = 0, by a camera on the axis, is the picture turned left to right."""
+def test_mirrored_image(seed: int):
+    """The world seen in a mirror at x = 0, by a camera on the axis, is the image turned left to right."""
     gaussians, _ = scene(seed, np.float64)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     gaussians = replace(gaussians, means=gaussians.means + np.array([0, 0, 4]), quats=quats, sh=gaussians.sh[:, :1])
     mirrored = replace(gaussians, means=gaussians.means * [-1, 1, 1], quats=quats * [1, 1, -1, -1])
-    picture, camera = draw(gaussians, front_camera()), front_camera()
+    image, camera = draw(gaussians, front_camera()), front_camera()
     turned = draw(mirrored, camera)
-    assert_same(Rendering(*(channel[:, ::-1] for channel in turned)), picture)
+    assert_same(Rendering(*(channel[:, ::-1] for channel in turned)), image)
 
 
 @SEEDS
@@ -205,7 +205,7 @@ def test_float32_is_close_to_float64(seed: int):
 
 @DTYPES
 def test_invisible_gaussians_change_no_byte(dtype: type):
-    """Opacity 0, under the threshold, behind the eye, beside the picture."""
+    """Opacity 0, under the threshold, behind the eye, beside the image."""
     gaussians, camera = scene(20, dtype)
     forward, right = camera.camera_to_world[:3, 2], camera.camera_to_world[:3, 0]
     middle = camera.position + 2 * forward
@@ -218,11 +218,11 @@ def test_invisible_gaussians_change_no_byte(dtype: type):
 @DTYPES
 def test_depth_of_one_splat_is_its_own(dtype: type):
     gaussians = gaussians_of([[0.1, -0.1, 3]], scales=0.5, dtype=dtype)
-    picture = draw(gaussians, front_camera())
-    seen = picture.alpha > 0
+    image = draw(gaussians, front_camera())
+    seen = image.alpha > 0
     assert 0 < seen.mean() < 1
-    assert_close(picture.depth[seen], np.full(seen.sum(), 3.0), "depth.float32.relative")
-    assert np.isinf(picture.depth[~seen]).all()
+    assert_close(image.depth[seen], np.full(seen.sum(), 3.0), "depth.float32.relative")
+    assert np.isinf(image.depth[~seen]).all()
 
 
 @DTYPES
@@ -239,7 +239,7 @@ def test_extra_channels_are_drawn_as_colors_are(channels: int, dtype: type):
     assert got.extra.shape == (camera.height, camera.width, channels)
     for channel in range(channels):
         shifted = np.zeros((len(gaussians), 1, 3), dtype)
-        shifted[:, 0, 0] = (extra[:, channel] + 2 - 0.5) * np.sqrt(4 * np.pi)  # colours can't be below 0
+        shifted[:, 0, 0] = (extra[:, channel] + 2 - 0.5) * np.sqrt(4 * np.pi)  # colors can't be below 0
         red = draw(replace(gaussians, sh=shifted), camera).rgb[:, :, 0]
         assert_close(got.extra[:, :, channel], red - 2 * plain.alpha, f"rgb.{np.dtype(dtype).name}")
 

@@ -14,7 +14,7 @@ BACKGROUND = (0.2, 0.6, 0.9)
 EXACT_DEPTHS = {"equal_depths"}
 
 
-def assert_same_picture(got: Rendering, want: Reference, row: str, least_clean: float = 0.5):
+def assert_same_image(got: Rendering, want: Reference, row: str, least_clean: float = 0.5):
     """Tight where every decision is clear; bounded by the decisions' own effect in the band where it is not."""
     clean = want.slack == 0
     assert clean.mean() >= least_clean, "the comparison would be empty"
@@ -62,17 +62,17 @@ def test_random_scenes(seed: int, count: int, width: int, height: int, degree: i
     assert got.rgb.dtype == got.alpha.dtype == got.depth.dtype == np.float32
     assert got.rgb.shape == (height, width, 3)
     assert got.alpha.shape == got.depth.shape == (height, width)
-    assert_same_picture(got, render(gaussians, camera, BACKGROUND), "float32")
+    assert_same_image(got, render(gaussians, camera, BACKGROUND), "float32")
 
 
 @pytest.mark.parametrize("name", sorted(ADVERSARIAL))
 def test_adversarial_scenes(name: str):
     gaussians, camera = ADVERSARIAL[name]()
     want = render(gaussians, camera, BACKGROUND, depth_band=0.0 if name in EXACT_DEPTHS else DEPTH_BAND)
-    assert_same_picture(draw(gaussians, camera, background=BACKGROUND), want, "float32")
+    assert_same_image(draw(gaussians, camera, background=BACKGROUND), want, "float32")
 
 
-def test_largest_picture():
+def test_largest_image():
     """8192 × 8192, in which a few splats are found where they belong, small, large and at the far corner."""
     side = 8192
     camera = front_camera(side, side, focal=6000.0)
@@ -86,7 +86,7 @@ def test_largest_picture():
         crop = replace(camera, cx=camera.cx - x, cy=camera.cy - y, width=60, height=60)
         want = render(gaussians, crop, BACKGROUND)
         assert want.alpha.any()
-        assert_same_picture(Rendering(*(channel[part] for channel in got)), want, "float32_8192")
+        assert_same_image(Rendering(*(channel[part] for channel in got)), want, "float32_8192")
     assert not got.alpha[:1000, :1000].any()
 
 
@@ -97,7 +97,7 @@ def test_float64_agrees_to_rounding(name: str, options: RasterizerOptions):
     gaussians = as_dtype(gaussians, np.float64)
     got = draw(gaussians, camera, background=BACKGROUND, options=options)
     assert got.rgb.dtype == np.float64
-    assert_same_picture(got, render(gaussians, camera, BACKGROUND, options, depth_band=0.0), "float64")
+    assert_same_image(got, render(gaussians, camera, BACKGROUND, options, depth_band=0.0), "float64")
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -105,8 +105,8 @@ def test_the_median_depth_lies_behind_half_of_the_light(dtype: type):
     """Three sheets of opacity 0.4: the light falls to 0.6, then to 0.36; where there is one sheet, never to a half."""
     sheets = gaussians_of([[0, 0, 2], [0, 0, 3], [0, 0, 4]], scales=1e4, opacities=0.4, dtype=dtype)
     camera = front_camera(20, 20)
-    picture = draw(sheets, camera, median_depth=True)
-    np.testing.assert_array_equal(picture.median_depth, np.full((20, 20), 3, dtype))
+    image = draw(sheets, camera, median_depth=True)
+    np.testing.assert_array_equal(image.median_depth, np.full((20, 20), 3, dtype))
     alone = draw(select(sheets, slice(1)), camera, median_depth=True)
     assert np.isinf(alone.median_depth).all()
     assert draw(sheets, camera).median_depth.shape == (0, 0)

@@ -68,25 +68,25 @@ def test_bad_options_are_refused_by_name(field: str, value: float):
 @pytest.mark.parametrize("degree", range(4))
 def test_no_gaussians_are_the_background(dtype: type, degree: int):
     gaussians, camera = random_scene(30, 0, sh_degree=degree)
-    picture = draw(as_dtype(gaussians, dtype), camera, background=BACKGROUND)
-    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.array(BACKGROUND, dtype), picture.rgb.shape))
-    assert not picture.alpha.any()
-    assert np.isinf(picture.depth).all()
-    assert picture.rgb.dtype == dtype
+    image = draw(as_dtype(gaussians, dtype), camera, background=BACKGROUND)
+    np.testing.assert_array_equal(image.rgb, np.broadcast_to(np.array(BACKGROUND, dtype), image.rgb.shape))
+    assert not image.alpha.any()
+    assert np.isinf(image.depth).all()
+    assert image.rgb.dtype == dtype
 
 
 def test_all_behind_the_camera_are_the_background():
     gaussians = gaussians_of([[0, 0, -1], [0, 0, 0], [0.1, 0, -5]], scales=3.0, opacities=1.0)
-    picture = draw(gaussians, front_camera(), background=BACKGROUND)
-    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.array(BACKGROUND, np.float32), picture.rgb.shape))
+    image = draw(gaussians, front_camera(), background=BACKGROUND)
+    np.testing.assert_array_equal(image.rgb, np.broadcast_to(np.array(BACKGROUND, np.float32), image.rgb.shape))
 
 
 def test_one_pixel_and_one_gaussian():
     camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, np.eye(4))
-    picture = draw(gaussians_of([[0, 0, 2]], opacities=0.5, rgb=[1, 0, 0.5]), camera)
-    np.testing.assert_array_equal(picture.rgb, np.array([[[0.5, 0, 0.25]]], np.float32))
-    assert picture.alpha == 0.5
-    assert picture.depth == 2
+    image = draw(gaussians_of([[0, 0, 2]], opacities=0.5, rgb=[1, 0, 0.5]), camera)
+    np.testing.assert_array_equal(image.rgb, np.array([[[0.5, 0, 0.25]]], np.float32))
+    assert image.alpha == 0.5
+    assert image.depth == 2
 
 
 def test_eye_at_the_mean_of_a_splat():
@@ -111,19 +111,19 @@ def test_eye_at_the_mean_of_a_splat():
 )
 def test_extreme_but_finite_values_leave_no_nan(field: str, value: object, dtype: type):
     gaussians, camera = poisoned(field, value)
-    picture = draw(as_dtype(gaussians, dtype), camera, background=BACKGROUND)
-    for channel in picture:
+    image = draw(as_dtype(gaussians, dtype), camera, background=BACKGROUND)
+    for channel in image:
         assert not np.isnan(channel).any()
-    assert (picture.alpha >= 0).all()
-    assert (picture.alpha <= 1).all()
-    assert (picture.depth > 0).all()
+    assert (image.alpha >= 0).all()
+    assert (image.alpha <= 1).all()
+    assert (image.depth > 0).all()
 
 
 @pytest.mark.parametrize("means", [[0, 0, 1e-30], [1e30, 0, 1e-2], [1e20, 1e20, 1.0], [0, 0, 3e38]])
 def test_extreme_places_leave_no_nan(means: list[float]):
-    picture = draw(gaussians_of([means, [0, 0, 2]], scales=[1e10, 0.1]), front_camera())
-    assert np.isfinite(picture.rgb).all()
-    assert not np.isnan(picture.depth).any()
+    image = draw(gaussians_of([means, [0, 0, 2]], scales=[1e10, 0.1]), front_camera())
+    assert np.isfinite(image.rgb).all()
+    assert not np.isnan(image.depth).any()
 
 
 def test_mixed_dtypes_are_cast():

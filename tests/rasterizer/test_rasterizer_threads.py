@@ -47,8 +47,8 @@ def compiled() -> int:
     return sum(len(kernel.signatures) for kernel in kernels())
 
 
-def bytes_of(picture: Rendering) -> list[bytes]:
-    return [channel.tobytes() for channel in picture]
+def bytes_of(image: Rendering) -> list[bytes]:
+    return [channel.tobytes() for channel in image]
 
 
 @pytest.mark.parametrize("threads", ["1", "2", "3", "7"])
@@ -82,16 +82,16 @@ def test_repeated_calls_give_the_same_bytes():
 def test_second_process_compiles_nothing(tmp_path: Path):
     """The first leaves its kernels in the cache on disk; the second finds all of them there."""
     draw(*random_scene(40, 12, 19, 13))
-    hits, misses = map(int, run_python(COUNT_COMPILATIONS, tmp_path / "picture.npz").split())
+    hits, misses = map(int, run_python(COUNT_COMPILATIONS, tmp_path / "image.npz").split())
     assert misses == 0
     assert hits > 0
 
 
-def test_without_the_compiler_the_picture_is_the_same(tmp_path: Path):
+def test_without_the_compiler_the_image_is_the_same(tmp_path: Path):
     """The kernels are plain Python too: what a debugger and a coverage report see is what runs."""
-    run_python(RENDER_TO_FILE, tmp_path / "picture.npz", NUMBA_DISABLE_JIT="1")
+    run_python(RENDER_TO_FILE, tmp_path / "image.npz", NUMBA_DISABLE_JIT="1")
     expected = draw(*random_scene(40, 12, 19, 13))
-    with np.load(tmp_path / "picture.npz") as plain:
+    with np.load(tmp_path / "image.npz") as plain:
         for name in ("rgb", "alpha", "depth"):
             channel = getattr(expected, name)
             assert_close(plain[name], channel, f"{name}.float32" + (".relative" if name == "depth" else ""))

@@ -155,7 +155,7 @@ assert "torch" not in sys.modules and "onnx" not in sys.modules
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from Linux's /proc")
 def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
     count, width = 60_000, 256
-    model = random_model(1, layers=("mlp",), width=width, sh_degree=0, embedding_size=0)
+    model = random_model(1, layers=("mlp",), width=width, sh_degree=0, embedding_dim=0)
     for name, parameter in list(model.gaussians.named_parameters()):
         setattr(
             model.gaussians, name, torch.nn.Parameter(parameter.detach().repeat(count, *[1] * (parameter.ndim - 1)))

@@ -110,7 +110,7 @@ def test_one_view_said_in_four_ways(client: httpx.Client):
 
 
 def test_cameras_of_other_models(client: httpx.Client):
-    """At five units, the middle of the picture is where a pinhole has it; away from it they differ."""
+    """At five units, the middle of the image is where a pinhole has it; away from it they differ."""
     pose = level_pose()
     matrix = {"type": "matrix", "camera_to_world": pose.tolist(), "fx": 100.0}
     pinhole = render(client, camera=matrix).astype(int)

@@ -25,7 +25,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
-def test_as_numbers_and_as_a_picture(scene: Path):
+def test_as_numbers_and_as_an_image(scene: Path):
     with serving(scene) as http:
         with Client(str(http.base_url)) as client:
             frame = client.render(Orbit(30, 20), 0.1, width=SIZE, height=SIZE, channels=("gaussians", "alpha"))

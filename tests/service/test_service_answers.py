@@ -20,7 +20,7 @@ from msdgs_serve.api.body_limit import BodyLimit
 from msdgs_serve.api.keys import KeyCheck
 from msdgs_serve.api.observe import JsonLines, request_id
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
-from msdgs_serve.imaging.pictures import FARTHEST_GREY
+from msdgs_serve.imaging.images import FARTHEST_GREY
 from tests.service.test_api import eventually
 from tests.service.test_api_poison import check_problem
 from tests.support.images import decode
@@ -104,17 +104,17 @@ def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
     report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": points}
     (tmp_path / "walk.report.json").write_text(json.dumps(report))
     with serving(tmp_path) as client:
-        for max_error, name, error in ((30, "walk.fast", "40.00"), (45, "walk", "60.00"), (None, "walk", "60.00")):
-            answer = post(client, scene="walk", max_error=max_error)
+        for min_psnr, name, error in ((30, "walk.fast", "40.00"), (45, "walk", "60.00"), (None, "walk", "60.00")):
+            answer = post(client, scene="walk", min_psnr=min_psnr)
             assert (answer.status_code, answer.headers["Msdgs-Scene"]) == (200, name)
             assert answer.headers["Msdgs-Error"] == error
-        link = client.get(f"/render?scene=walk&max_error=30&t=0.5&width={SIZE}&height={SIZE}")
+        link = client.get(f"/render?scene=walk&min_psnr=30&t=0.5&width={SIZE}&height={SIZE}")
         assert (link.headers["Msdgs-Scene"], link.headers["Msdgs-Plan"]) == ("walk.fast", "lowrank:1")
-        for scene, max_error in (("walk", 65), ("plain", 10), ("walk", -1)):
-            refused = post(client, scene=scene, max_error=max_error)
+        for scene, min_psnr in (("walk", 65), ("plain", 10), ("walk", -1)):
+            refused = post(client, scene=scene, min_psnr=min_psnr)
             assert refused.status_code == 422
             check_problem(refused)
-            assert refused.json()["errors"][0]["field"] == "max_error"
+            assert refused.json()["errors"][0]["field"] == "min_psnr"
         assert "Msdgs-Error" not in post(client, scene="plain").headers
 
 
@@ -174,7 +174,7 @@ def test_channels_come_in_the_order_asked_for(client: httpx.Client):
     np.testing.assert_array_equal(pixels[..., 0], everything[..., 4])
 
 
-def test_depth_as_a_picture_is_lighter_the_nearer(client: httpx.Client):
+def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
     """White where nearest, `FARTHEST_GREY` where farthest, darker where it is thin, black where nothing is."""
     depth, alpha = (array(client, channels=[name])[..., 0] for name in ("depth", "alpha"))
     seen = np.isfinite(depth)

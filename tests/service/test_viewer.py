@@ -29,7 +29,7 @@ REPORT = {
     "format": "msdgs-report/1",
     "checkpoint_sha256": "0" * 64,
     "machine": {"processor": "a processor", "threads": 2},
-    "max_error": 50.0,
+    "min_psnr": 50.0,
     "points": [
         {
             "plan": plan, "front": True, "chosen": plan == "prefix", "trim_db": None, "bytes": 1e6,
@@ -90,9 +90,9 @@ def modules(browser: Browser, client: httpx.Client) -> Iterator[Page]:
         yield page
 
 
-def picture(page: Page) -> np.ndarray:
+def image(page: Page) -> np.ndarray:
     """What the canvas holds, [H, W, 3] from 0 to 255."""
-    address = page.evaluate("document.getElementById('picture').toDataURL('image/png')")
+    address = page.evaluate("document.getElementById('image').toDataURL('image/png')")
     return decode(base64.b64decode(address.split(",")[1]), "png")[0][..., :3]
 
 
@@ -126,14 +126,14 @@ def test_it_shows_the_scene_as_the_service_draws_it(opened: Page, client: httpx.
     opened.reload()
     wait_until_still(opened)
     frame = client.post("/render", json=asked[-1])
-    np.testing.assert_array_equal(picture(opened), decode(frame.content, "png")[0])
+    np.testing.assert_array_equal(image(opened), decode(frame.content, "png")[0])
     assert opened.title() == "balls · msdgs"
     assert opened.locator("#scenes li").all_inner_texts() == ["balls", "it's"]
     assert opened.locator("#facts").inner_text().startswith("Gaussians")
 
 
 def test_dragging_turns_and_ends_in_full_quality(opened: Page):
-    before, asked = picture(opened), bodies(opened)
+    before, asked = image(opened), bodies(opened)
     opened.mouse.move(200, 200)
     forget(opened)
     opened.mouse.down()
@@ -147,7 +147,7 @@ def test_dragging_turns_and_ends_in_full_quality(opened: Page):
     assert first["width"] <= last["width"]
     assert last["camera"]["azimuth"] != 30
     assert last["camera"]["elevation"] > 20
-    assert np.abs(picture(opened).astype(int) - before).max() > 50
+    assert np.abs(image(opened).astype(int) - before).max() > 50
     assert "at=" in opened.url
 
 
@@ -227,7 +227,7 @@ def test_it_plays_one_request_at_a_time(opened: Page):
 def test_it_stops_at_the_end_without_loop(opened: Page):
     opened.get_by_role("button", name="Loop").click()
     opened.locator("#time").fill("0.9")
-    opened.locator("#picture").focus()
+    opened.locator("#image").focus()
     opened.keyboard.press("Space")
     opened.get_by_role("button", name="Play").wait_for()
     assert opened.locator("#time-text").inner_text() == "t 1.000"
@@ -236,13 +236,13 @@ def test_it_stops_at_the_end_without_loop(opened: Page):
 def test_depth_count_and_motion(opened: Page):
     asked = bodies(opened)
     for label, channel in (("Depth", "depth"), ("Count", "gaussians"), ("Motion", "motion")):
-        before = picture(opened)
+        before = image(opened)
         with opened.expect_response("**/render") as answer:
             opened.get_by_text(label, exact=True).click()
         assert answer.value.status == 200
         opened.wait_for_function("(c) => location.hash.includes(`view=${c}`)", arg=channel)
         assert asked[-1]["channels"] == [channel]
-        assert np.abs(picture(opened).astype(int) - before).max() > 50
+        assert np.abs(image(opened).astype(int) - before).max() > 50
     opened.locator("#time").fill("1")
     opened.wait_for_function("() => location.hash.includes('t=1&')")
     assert asked[-1]["t"] + asked[-1]["dt"] == 1, "motion at the end of time leads beyond it"
@@ -252,12 +252,12 @@ def test_the_slider_of_layers(opened: Page):
     asked = bodies(opened)
     opened.locator("#time").fill("1")
     opened.wait_for_function("() => location.hash.includes('t=1&')")
-    all_layers = picture(opened)
+    all_layers = image(opened)
     opened.locator("#steps").fill("0.5")
     opened.wait_for_function("() => location.hash.includes('steps=0.5&')")
     assert opened.locator("#steps-text").inner_text() == "0.5 of 1"
     assert asked[-1]["steps"] == 0.5
-    assert np.abs(picture(opened).astype(int) - all_layers).max() > 50
+    assert np.abs(image(opened).astype(int) - all_layers).max() > 50
     opened.locator("#steps").fill("1")
     opened.wait_for_function("() => !location.hash.includes('steps')")
     assert "steps" not in asked[-1]
@@ -274,7 +274,7 @@ def test_a_camera_of_the_scene_keeps_its_proportions(opened: Page):
     opened.wait_for_function("() => location.hash.includes('camera=1')")
     assert asked[-1]["camera"] == {"type": "scene", "index": 1}
     assert abs(asked[-1]["width"] / asked[-1]["height"] - 64 / 48) < 0.01
-    opened.locator("#picture").focus()
+    opened.locator("#image").focus()
     opened.keyboard.press("ArrowUp")
     opened.wait_for_function("() => location.hash.includes('at=')")
     taken_over = asked[-1]["camera"]
@@ -312,14 +312,14 @@ def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Cli
         words = shlex.split(page.evaluate("navigator.clipboard.readText()"))
         assert words[:2] == ["curl", str(client.base_url.join("render"))]
         answer = client.post("/render", content=words[-1], headers={"Content-Type": "application/json"})
-        np.testing.assert_array_equal(decode(answer.content, "png")[0], picture(page))
+        np.testing.assert_array_equal(decode(answer.content, "png")[0], image(page))
         files: list[tuple[str, ImageFormat, int]] = [("PNG", "png", 3), ("EXR", "exr", 5)]
         for label, image_format, channels in files:
             with page.expect_download() as download:
                 page.get_by_role("button", name=label, exact=True).click()
             assert download.value.suggested_filename == f"it's-0.5.{image_format}"
             content = Path(download.value.path()).read_bytes()
-            assert decode(content, image_format)[0].shape == (*picture(page).shape[:2], channels)
+            assert decode(content, image_format)[0].shape == (*image(page).shape[:2], channels)
 
 
 def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Path):
@@ -327,7 +327,7 @@ def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Pat
         port = client.base_url.port
         page.goto(f"{client.base_url}/#scene=balls")
         wait_until_still(page)
-    page.locator("#picture").focus()
+    page.locator("#image").focus()
     page.keyboard.press("ArrowLeft")
     page.get_by_text("The service doesn’t answer").wait_for()
     forget(page)
@@ -358,9 +358,9 @@ def strongest_in_the_middle(image: np.ndarray) -> int:
 
 
 def in_time(page: Page, holds: Callable[[np.ndarray], bool]) -> bool:
-    """Whether the picture comes to be so within ten seconds."""
+    """Whether the image comes to be so within ten seconds."""
     for _ in range(100):
-        if holds(picture(page)):
+        if holds(image(page)):
             return True
         page.wait_for_timeout(100)
     return False

@@ -37,9 +37,9 @@ def chromium(*arguments: str) -> Iterator[Browser]:
 
 def forget(page: Page) -> None:
     """That a frame was shown: what `wait_until_still` waits for comes after this."""
-    page.evaluate("document.getElementById('picture').dataset.shown = ''")
+    page.evaluate("document.getElementById('image').dataset.shown = ''")
 
 
 def wait_until_still(page: Page) -> None:
     """Until a frame in full quality is shown."""
-    page.wait_for_selector("#picture[data-shown=full]")
+    page.wait_for_selector("#image[data-shown=full]")

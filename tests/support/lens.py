@@ -1,4 +1,4 @@
-"""What a lens does to points, by the formulas as OpenCV's documentation prints them, and photographs of dots."""
+"""What a lens does to points, by the formulas as OpenCV's documentation prints them, and images of dots."""
 
 import math
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Lens(NamedTuple):
     height: int = 240
 
     def pixel(self, x: float, y: float, z: float) -> tuple[float, float]:
-        """Of a point in OpenCV camera axes; the corner of the picture is (0, 0)."""
+        """Of a point in OpenCV camera axes; the corner of the image is (0, 0)."""
         a, b = x / z, y / z
         r = math.sqrt(a**2 + b**2)
         radial = 1 + self.k1 * r**2 + self.k2 * r**4 + self.k3 * r**6
@@ -42,7 +42,7 @@ class Lens(NamedTuple):
         return Lens(self.fx, self.fy, self.cx, self.cy, width=self.width, height=self.height)
 
     def grid(self) -> np.ndarray:
-        """[12, 3] points in OpenCV camera axes that are spread over the picture, each at another depth."""
+        """[12, 3] points in OpenCV camera axes that are spread over the image, each at another depth."""
         columns, rows = np.meshgrid(np.linspace(40, self.width - 40, 4), np.linspace(40, self.height - 40, 3))
         depths = np.linspace(2.0, 6.0, columns.size)
         x, y = (columns.ravel() - self.cx) / self.fx, (rows.ravel() - self.cy) / self.fy
@@ -50,7 +50,7 @@ class Lens(NamedTuple):
 
 
 def frame_pixels(frame: Frame, points: np.ndarray) -> np.ndarray:
-    """[N, 2] where a frame's photograph, as stored, shows [N, 3] points of the world; `size` not reduced."""
+    """[N, 2] where a frame's image, as stored, shows [N, 3] points of the world; `size` not reduced."""
     camera, local = frame.camera, points @ frame.camera.world_to_camera[:3, :3].T
     x, y, z = (local + frame.camera.world_to_camera[:3, 3]).T
     x, y = x / z, y / z
@@ -59,7 +59,7 @@ def frame_pixels(frame: Frame, points: np.ndarray) -> np.ndarray:
     return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=1)
 
 
-def photograph_of_dots(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+def image_of_dots(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
     """Uint8 [H, W, 4], opaque, black, with a white Gaussian dot at each of [N, 2] pixels."""
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     light = np.zeros((height, width))

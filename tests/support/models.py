@@ -36,7 +36,7 @@ def small_config(**changes: Any) -> ModelConfig:
         "depth": 3,
         "time_width": 16,
         "time_features": 8,
-        "embedding_size": 8,
+        "embedding_dim": 8,
     }
     return ModelConfig(**(sizes | changes))
 
@@ -45,13 +45,13 @@ def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config:
     """A model whose Gaussians and networks all differ from their start by normal noise."""
     settings = small_config(**config)
     gaussians = CanonicalGaussians.random_in_cube(
-        count, 1.3, settings.sh_degree, settings.embedding_size, seed, settings.motions
+        count, 1.3, settings.sh_degree, settings.embedding_dim, seed, settings.motions
     )
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(seed)
         model = DynamicGaussians(settings, gaussians)
-        if gaussians.basis_ids is not None:
-            gaussians.basis_ids.add_(torch.randint(settings.basis_count, (count, 1))).remainder_(settings.basis_count)
+        if gaussians.node_ids is not None:
+            gaussians.node_ids.add_(torch.randint(settings.num_nodes, (count, 1))).remainder_(settings.num_nodes)
         for parameter in model.parameters():
             if parameter.requires_grad and parameter is not gaussians.means:
                 parameter += noise * torch.randn_like(parameter)

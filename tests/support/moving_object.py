@@ -12,7 +12,7 @@ from tests.support.models import small_config
 GROUND, OBJECT = 200, 40
 """Gaussians of each, the ground's first."""
 
-REACH = 0.3
+NODE_RADIUS = 0.3
 """Scene units that the object moves by per unit of time, about."""
 
 
@@ -28,8 +28,8 @@ def moving_object(seed: int = 0, moves: bool = True, **config: Any) -> DynamicGa
     points = 2 * torch.rand(count, 3, generator=generator) - 1
     points[:GROUND, 0] = 0.3 - 1.2 * torch.rand(GROUND, generator=generator)
     points[GROUND:, 0] = 0.9 + 0.3 * torch.rand(OBJECT, generator=generator)
-    colours = torch.rand(count, 3, generator=generator)
-    gaussians = CanonicalGaussians.from_points(points, colours, settings.sh_degree, settings.embedding_size, generator)
+    colors = torch.rand(count, 3, generator=generator)
+    gaussians = CanonicalGaussians.from_points(points, colors, settings.sh_degree, settings.embedding_dim, generator)
     with torch.no_grad():
         gaussians.log_scales.fill_(-2.3)
         gaussians.raw_opacities.fill_(2.0)
@@ -52,5 +52,5 @@ def rise(layer: torch.nn.Module) -> None:
     layer.first.bias[0] = -8
     layer.first.weight[1, 0] = 10
     layer.first.bias[1] = -8
-    layer.heads.weight[1, 0] = -REACH  # units 0 and 1 differ by 4 t where x > 0.8; the weight is a half
-    layer.heads.weight[1, 1] = REACH
+    layer.heads.weight[1, 0] = -NODE_RADIUS  # units 0 and 1 differ by 4 t where x > 0.8; the weight is a half
+    layer.heads.weight[1, 1] = NODE_RADIUS

@@ -4,7 +4,7 @@ It shares no code with the package: rotations, harmonics, projection and blendin
 paper (equations 1 and 2) and the constants in `RasterizerOptions`.
 
 Where float32 may fairly decide otherwise (is alpha above `alpha_min`? has the transmittance run out? which of two
-splats of almost the same depth is in front?) the picture jumps. Such pixels are found here, and `slack` says by how
+splats of almost the same depth is in front?) the image jumps. Such pixels are found here, and `slack` says by how
 much the jump can change the weights of a pixel.
 """
 
@@ -32,7 +32,7 @@ class Reference(NamedTuple):
     slack: (
         np.ndarray
     )  # [H, W] bound on what decisions at a threshold can change in a pixel's weights; 0 almost everywhere
-    color_range: float  # largest difference between two colours in the scene, background included
+    color_range: float  # largest difference between two colors in the scene, background included
 
 
 class Splat(NamedTuple):
@@ -100,7 +100,7 @@ def render(
 def project(
     gaussians: Gaussians, k: int, camera: Camera, color: np.ndarray, options: RasterizerOptions = GSPLAT
 ) -> Splat | None:
-    """Equation 1: Gaussian `k` as an ellipse in the picture, or None where it is culled."""
+    """Equation 1: Gaussian `k` as an ellipse in the image, or None where it is culled."""
     world_to_camera = np.linalg.inv(camera.camera_to_world)
     mean_world = gaussians.means[k].astype(float)
     rotation = world_to_camera[:3, :3]

@@ -1,6 +1,6 @@
 """A plain torch float64 renderer whose gradients come from autograd and whose projection is gsplat's own reference.
 
-Dense: every Gaussian at every pixel, so for small pictures only.
+Dense: every Gaussian at every pixel, so for small images only.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Projection(NamedTuple):
 def project(
     means: Tensor, quats: Tensor, scales: Tensor, sh: Tensor, camera: Camera, options: RasterizerOptions = GSPLAT
 ) -> Projection:
-    """Projection, covariance and colour by gsplat's reference functions."""
+    """Projection, covariance and color by gsplat's reference functions."""
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     assert covars is not None
     view = torch.from_numpy(camera.world_to_camera).to(means.dtype)[None]

@@ -94,5 +94,5 @@ def write_scene(
 
 
 def _constant_color(color: tuple[float, float, float]) -> np.ndarray:
-    """[1, 1, 3]: the same colour from every direction."""
+    """[1, 1, 3]: the same color from every direction."""
     return ((np.array(color) - 0.5) / SH_DC).astype(np.float32).reshape(1, 1, 3)

@@ -86,7 +86,7 @@ def gaussians_of(
     quats: object = IDENTITY_ROTATION,
     dtype: type = np.float32,
 ) -> Gaussians:
-    """Gaussians of degree 0 from lists; colours are told apart by index unless `rgb` says otherwise."""
+    """Gaussians of degree 0 from lists; colors are told apart by index unless `rgb` says otherwise."""
     means = np.asarray(means, float).reshape(-1, 3)
     count = len(means)
     if rgb is None:
@@ -106,7 +106,7 @@ def gaussians_of(
 
 
 def equal_depths() -> Scene:
-    """Ties: forty splats at exactly z = 2, and pairs of identical ones that differ in colour only."""
+    """Ties: forty splats at exactly z = 2, and pairs of identical ones that differ in color only."""
     rng = np.random.default_rng(0)
     means = np.column_stack([rng.uniform(-1.2, 1.2, size=(40, 2)), np.full(40, 2.0)])
     return gaussians_of(np.concatenate([means, means[:10]]), scales=0.25), front_camera()
@@ -128,7 +128,7 @@ def near_plane() -> Scene:
 
 
 def off_axis_89() -> Scene:
-    """Splats at 89° off the axis, on all sides: their Jacobian is clamped, or they would fill the picture."""
+    """Splats at 89° off the axis, on all sides: their Jacobian is clamped, or they would fill the image."""
     angle, around = np.radians(89), np.linspace(0, 2 * np.pi, 8, endpoint=False)
     ring = np.column_stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.full(8, np.cos(angle))])
     return gaussians_of(np.concatenate([2 * ring, [[0, 0, 3]]]), scales=0.4), front_camera()
@@ -141,7 +141,7 @@ def inside_splat() -> Scene:
 
 
 def needles() -> Scene:
-    """Aspect 1,000 and more, in all directions, far longer than the picture."""
+    """Aspect 1,000 and more, in all directions, far longer than the image."""
     rng = np.random.default_rng(2)
     count = 30
     means = np.column_stack([rng.uniform(-1, 1, size=(count, 2)), rng.uniform(2, 4, count)])
@@ -150,7 +150,7 @@ def needles() -> Scene:
 
 
 def giants() -> Scene:
-    """Each covers the whole picture, some a thousand times."""
+    """Each covers the whole image, some a thousand times."""
     means = np.column_stack([np.linspace(-1, 1, 6), np.linspace(1, -1, 6), np.linspace(2, 8, 6)])
     return gaussians_of(means, scales=[1, 3, 10, 30, 100, 1000], opacities=0.2), front_camera()
 
@@ -163,7 +163,7 @@ def subpixel() -> Scene:
 
 
 def opacity_extremes() -> Scene:
-    """Opacity 0, 1, and just above and below what one step of an 8-bit picture can show."""
+    """Opacity 0, 1, and just above and below what one step of an 8-bit image can show."""
     rng = np.random.default_rng(4)
     opacities = np.repeat([0.0, 1e-30, 0.0039, 0.00394, 0.5, 0.999, 1.0], 10)
     means = np.column_stack([rng.uniform(-1, 1, size=(70, 2)), rng.uniform(1.5, 3, 70)])
@@ -180,7 +180,7 @@ def crowd() -> Scene:
 
 
 def needles_of_a_million() -> Scene:
-    """Aspect 1e6 : 1, in all directions; some far longer than the picture, some thinner than float32 sees."""
+    """Aspect 1e6 : 1, in all directions; some far longer than the image, some thinner than float32 sees."""
     rng = np.random.default_rng(8)
     count = 33
     means = np.column_stack([rng.uniform(-1, 1, size=(count, 2)), rng.uniform(2, 4, count)])
@@ -221,7 +221,7 @@ def through_the_near_plane() -> Scene:
 
 
 def principal_point_outside() -> Scene:
-    """The optical axis leaves the picture: only a side view of the scene is seen."""
+    """The optical axis leaves the image: only a side view of the scene is seen."""
     gaussians, camera = random_scene(6, 150)
     return gaussians, Camera(camera.fx, camera.fy, -9.25, camera.height + 4.5, 53, 37, camera.camera_to_world)
 

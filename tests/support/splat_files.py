@@ -107,7 +107,7 @@ def splat_bytes(g: Gaussians) -> bytes:
 
 
 def ksplat_bytes(g: Gaussians) -> bytes:
-    """`.ksplat` 0.1 of one section, degree 0, compression level 0: nothing but colours is rounded."""
+    """`.ksplat` 0.1 of one section, degree 0, compression level 0: nothing but colors is rounded."""
     header, section = bytearray(4096), bytearray(1024)
     header[:2] = (0, 1)
     struct.pack_into("<4I", header, 4, 1, 1, len(g), len(g))

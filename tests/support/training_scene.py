@@ -1,4 +1,4 @@
-"""A moving scene small enough to train on in a test: three blobs, one of which crosses the picture."""
+"""A moving scene small enough to train on in a test: three blobs, one of which crosses the image."""
 
 import json
 import math
@@ -24,19 +24,19 @@ FOV = 40.0
 
 SMALL_MODEL = ModelConfig(
     sh_degree=1, layers=("mlp", "mlp"), width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8,
-    time_features=4, embedding_size=4,
+    time_features=4, embedding_dim=4,
 )  # fmt: skip
 
-SHARED_MOTIONS = ModelConfig(sh_degree=1, layers=("bases",), basis_count=4, basis_knots=8, embedding_size=0)
+SHARED_MOTIONS = ModelConfig(sh_degree=1, layers=("bases",), num_nodes=4, num_knots=8, embedding_dim=0)
 
 
 def small_config(**changes: Any) -> TrainConfig:
     """A run of 24 steps that goes through warm-up, densification, opacity reset and every SH degree."""
     values = {
-        "steps": 24, "threads": 1, "model": SMALL_MODEL, "init_count": 60, "max_gaussians": 90, "warmup_fraction": 0.25,
-        "settling_fraction": 0.0,
-        "sh_interval": 6, "densify_from": 4, "densify_every": 4, "densify_until_fraction": 0.8,
-        "densify_gradient": 1e-5, "opacity_reset_every": 9, "log_every": 1, "eval_every": 10, "checkpoint_every": 0,
+        "steps": 24, "threads": 1, "model": SMALL_MODEL, "init_num_pts": 60, "max_gaussians": 90,
+        "static_fraction": 0.25, "static_window_fraction": 0.0, "sh_degree_interval": 6, "refine_start": 4,
+        "refine_every": 4, "refine_stop_fraction": 0.8,
+        "grow_grad2d": 1e-5, "reset_every": 9, "log_every": 1, "eval_every": 10, "checkpoint_every": 0,
     }  # fmt: skip
     return TrainConfig(**{**values, **changes})
 

@@ -17,24 +17,24 @@ SECONDS = 60.0
 
 
 class PageClient:
-    """A browser with a camera; `pictures` are all that it was sent, [H, W, 3] uint8."""
+    """A browser with a camera; `images` are all that it was sent, [H, W, 3] uint8."""
 
     def __init__(self, camera: Camera) -> None:
         self.client_id = -1
-        self.pictures: list[np.ndarray] = []
+        self.images: list[np.ndarray] = []
         self.scene = SimpleNamespace(set_background_image=self._receive)
         self.camera = SimpleNamespace(look_at=np.zeros(3), up_direction=np.zeros(3))
         self.look_from(camera)
 
     def look_from(self, camera: Camera) -> None:
-        """With a picture of the camera's size; its principal point must be in the middle."""
+        """With an image of the camera's size; its principal point must be in the middle."""
         self.camera.wxyz = quaternion.from_matrix(camera.camera_to_world[:3, :3])
         self.camera.position = np.array(camera.position)
         self.camera.fov = 2 * np.arctan(camera.height / (2 * camera.fy))
         self.camera.image_width, self.camera.image_height = camera.width, camera.height
 
     def _receive(self, pixels: np.ndarray, **encoding: Any) -> None:
-        self.pictures.append(pixels)
+        self.images.append(pixels)
 
 
 class PageServer:

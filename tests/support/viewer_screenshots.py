@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/viewer.md: `python -m tests.support.viewer_screenshots docs/images`."""
+"""Draw the images of docs/viewer.md: `python -m tests.support.viewer_screenshots docs/images`."""
 
 import sys
 from pathlib import Path
@@ -12,7 +12,7 @@ DESKTOP = {"viewport": {"width": 1280, "height": 800}}
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 AT = "t=0.6&at=30,20,3.4,0,0,0"
 SHOTS = (
-    ("colour_light", DESKTOP, "light", "rgb"),
+    ("color_light", DESKTOP, "light", "rgb"),
     ("layers_light", DESKTOP, "light", "rgb&steps=1"),
     ("depth_dark", DESKTOP, "dark", "depth"),
     ("motion_dark", DESKTOP, "dark", "motion"),

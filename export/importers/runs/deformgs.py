@@ -52,7 +52,7 @@ def read_deformgs(
         time_features=time_features,
         skip=depth // 2 + 1,
         weights=False,
-        embedding_size=0,
+        embedding_dim=0,
         delta_space="activated",
     )
     with torch.device("meta"):

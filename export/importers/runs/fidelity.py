@@ -16,7 +16,7 @@ from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
 from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import SMALLEST_SCALE, DynamicGaussians, activated_scales, unit_quats
+from msdgs_train.gaussians.model import MIN_SCALE, DynamicGaussians, activated_scales, unit_quats
 from msdgs_train.gaussians.model_file import SceneInfo
 
 FRAMES = 12
@@ -66,7 +66,7 @@ def bent(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaussians,
     axes, lengths, _ = torch.linalg.svd(_as_it_is(quats) * scales[:, None, :])
     axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
     off = float((torch.linalg.vector_norm(quats, dim=1) - 1).abs().max()) if len(quats) else 0.0
-    turned, sizes = from_matrix(axes.numpy()).astype(np.float32), lengths.clamp_min(SMALLEST_SCALE).float().numpy()
+    turned, sizes = from_matrix(axes.numpy()).astype(np.float32), lengths.clamp_min(MIN_SCALE).float().numpy()
     return Gaussians(ours.means, turned, sizes, ours.opacities, ours.sh), off
 
 
@@ -98,7 +98,7 @@ class Frozen(NamedTuple):
 
     def left_out(self) -> dict[str, Any]:
         """As a scene file lists it."""
-        what = "changes of opacities and colours with time, which are held at their means"
+        what = "changes of opacities and colors with time, which are held at their means"
         n = len(self.model.gaussians)
         return {"rule": "frozen", "what": what, "count": n, "of": n, "worst_frame_db": self.error.psnr_worst}
 
@@ -106,7 +106,7 @@ class Frozen(NamedTuple):
         """For whoever imports it."""
         e = self.error
         return (
-            f"opacities and colours that change with time are held at their means, as a scene file stores them once: "
+            f"opacities and colors that change with time are held at their means, as a scene file stores them once: "
             f"frames are {e.psnr_mean:.1f} dB from the run's, the worst of {e.frames} {e.psnr_worst:.1f} dB"
         )
 
@@ -114,7 +114,7 @@ class Frozen(NamedTuple):
 def frozen(model: DynamicGaussians, info: SceneInfo) -> Frozen:
     """The model without its heads of opacity and SH, each Gaussian as visible and as bright as it is on average.
 
-    Colours count as much as the Gaussian is visible while it has them.
+    Colors count as much as the Gaussian is visible while it has them.
     """
     opacities, sh = _means(model, info.time_range)
     g = model.gaussians

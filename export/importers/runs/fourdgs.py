@@ -22,11 +22,11 @@ HEADS = {"pos_deform": "no_dx", "scales_deform": "no_ds", "rotations_deform": "n
 HEADS |= {"opacity_deform": "no_do", "shs_deform": "no_dshs"}
 """Its networks in the order of `Heads.sizes`, and the switch of each."""
 
-ELSEWHERE = ("no_grid", "grid_pe", "apply_rotation", "static_mlp", "empty_voxel")
+CHANGE_THRESHOLD = ("no_grid", "grid_pe", "apply_rotation", "static_mlp", "empty_voxel")
 """Switches that make another network of it."""
 
 SH_DEGREE = 3
-"""Of what its head of colours changes."""
+"""Of what its head of colors changes."""
 
 SPACE, TIME = (0, 1, 3), (2, 4, 5)
 """Which of its six planes are xy, xz, yz, and xt, yt, zt."""
@@ -53,7 +53,7 @@ def read_4dgs(
     if not file.is_file():
         raise ImportFailed(run, f"has point_cloud/iteration_{iteration} but no deformation.pth in it")
     state = State(file)
-    for name in ELSEWHERE:
+    for name in CHANGE_THRESHOLD:
         if settings.get(name) or any(key.startswith(f"deformation_net.{name}.") for key in state.names()):
             raise ImportFailed(file, f"was trained with {name}, which no layer of this project has")
     if "deformation_net.feature_out.2.weight" in state:
@@ -67,14 +67,14 @@ def read_4dgs(
     config = ModelConfig(
         sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
         layers=("plane",),
-        plane_channels=sizes.channels,
-        plane_space_nodes=base,
-        plane_time_nodes=sizes.time_nodes - first,
+        plane_features_dim=sizes.channels,
+        plane_resolution=base,
+        plane_time_resolution=sizes.time_nodes - first,
         plane_width=sizes.width,
-        plane_scales=tuple(nodes // base for nodes in sizes.nodes),
+        multires=tuple(nodes // base for nodes in sizes.nodes),
         weights=False,
-        embedding_size=1 if scaled else 0,
-        modulate=("quats",),
+        embedding_dim=1 if scaled else 0,
+        modulation_targets=("quats",),
         delta_space="raw",
         opacity_head=not off["no_do"],
         sh_head=not off["no_dshs"],

@@ -68,7 +68,7 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> list[di
     console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
     lost = []
     if model.config.opacity_head or model.config.sh_head:
-        with console.status("holding opacities and colours"), _usable(run):
+        with console.status("holding opacities and colors"), _usable(run):
             held = frozen(model, info)
         model, lost = held.model, [held.left_out()]
         notes.append(held.note())

@@ -96,7 +96,7 @@ def _inria(file: Path, vertex: PlyElement) -> Splats:
 
 
 def _compressed(file: Path, elements: dict[str, PlyElement]) -> Splats:
-    """Positions 11-10-11 bits and scales within ranges of 256 Gaussians, colours and opacities 8 bits each."""
+    """Positions 11-10-11 bits and scales within ranges of 256 Gaussians, colors and opacities 8 bits each."""
     if "chunk" not in elements:
         raise ImportFailed(file, "is a compressed PLY without its element `chunk`")
     vertex, chunk = _Columns(file, elements["vertex"]), _Columns(file, elements["chunk"])

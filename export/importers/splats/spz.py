@@ -37,7 +37,7 @@ class Header(NamedTuple):
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
+        """Bytes of positions, opacities, colors, scales, rotations and harmonics."""
         rotation, rest = (3 if self.version == 2 else 4), 3 * ((self.sh_degree + 1) ** 2 - 1)
         return [self.count * each for each in (9, 1, 3, 3, rotation, rest)]
 

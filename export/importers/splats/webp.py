@@ -1,4 +1,4 @@
-"""Lossless WebP textures that hold numbers, not pictures."""
+"""Lossless WebP textures that hold numbers, not images."""
 
 import struct
 import tempfile

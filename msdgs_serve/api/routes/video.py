@@ -55,17 +55,17 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
 
 async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> bytes:
     """Each frame takes its turn in the queue; so does putting them together."""
-    pictures: list[np.ndarray] = []
+    images: list[np.ndarray] = []
     options, watch = RenderOptions(body.background), Watch()
     for camera, t in path.frames:
 
         def draw(camera=camera, t=t) -> np.ndarray:  # noqa: ANN001  # of this turn of the loop
             return service.renderer.render(scene.session, camera, t, options, watch).display_pixels()
 
-        pictures.append(await service.queue.run(draw, watch))
+        images.append(await service.queue.run(draw, watch))
     file = io.BytesIO()
     fps = body.fps or path.fps
-    await service.queue.run(lambda: write_video(pictures, fps, body.format, file), watch)
+    await service.queue.run(lambda: write_video(images, fps, body.format, file), watch)
     service.metrics.count_stages(watch.seconds)
     return file.getvalue()
 

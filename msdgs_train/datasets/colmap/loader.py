@@ -1,6 +1,6 @@
-"""COLMAP layout: a sparse model in `sparse/0` or `sparse`, binary or text, and the photographs in `images`.
+"""COLMAP layout: a sparse model in `sparse/0` or `sparse`, binary or text, and the images in `images`.
 
-Poses map world to camera in OpenCV axes and pixel centres are at half-integers, both as in `Camera`. Photographs of
+Poses map world to camera in OpenCV axes and pixel centres are at half-integers, both as in `Camera`. Images of
 the models SIMPLE_RADIAL, RADIAL and OPENCV are undistorted by `Frame.load_rgba`, bilinearly, to a pinhole camera with
 the same intrinsics. Where `images` holds reduced copies, intrinsics are scaled to them.
 
@@ -20,19 +20,19 @@ from msdgs_train.datasets.colmap import binary as colmap_binary
 from msdgs_train.datasets.colmap import text as colmap_text
 from msdgs_train.datasets.colmap.model import ModelCamera, ModelImage
 from msdgs_train.datasets.common.distortion import Distortion
-from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import ImageSize
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, hold_out, photograph_size, reduced
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, hold_out, image_size, reduced
 
 SPARSE = "sparse"
-LAST_NUMBER = r"(\d+)[^\d/]*$"
+TRAILING_NUMBER = r"(\d+)[^\d/]*$"
 """The last run of digits in the name of the file itself."""
 
 
-def load_colmap(folder: Path | str, size: int | None = None, time_pattern: str | None = LAST_NUMBER) -> SceneData:
+def load_colmap(folder: Path | str, size: int | None = None, time_pattern: str | None = TRAILING_NUMBER) -> SceneData:
     """Read the cameras, times and sparse points of a COLMAP scene.
 
-    `size` is the width in pixels that photographs are reduced to. `time_pattern` is a regular expression with one
+    `size` is the width in pixels that images are reduced to. `time_pattern` is a regular expression with one
     group, which is the time in any unit; it is searched in the image's name, folders in `images` included and the
     extension left out. With None the scene is static, t = 0, as it is where all numbers are equal. Raises
     `DatasetInvalid` naming file and field, and `InvalidInput` where `size` or `time_pattern` can't be.
@@ -49,7 +49,7 @@ def load_colmap(folder: Path | str, size: int | None = None, time_pattern: str |
         for image, t in zip(images, _times(files[1], images, time_pattern), strict=True)
     ]
     points, colors = _points(files[2], list(read.read_points(files[2])))
-    extent = half_extent(points, [frame.camera for frame in frames])
+    extent = scene_half_size(points, [frame.camera for frame in frames])
     times = [frame.t for frame in frames]
     return SceneData(hold_out(frames), (min(times), max(times)), extent, points, colors)
 
@@ -76,9 +76,9 @@ def _frame(
     image_path = folder / "images" / image.name
     if not image_path.is_file():
         raise DatasetInvalid(files[1], field, f"is in the model, but there is no file {image_path}")
-    photograph, stated = photograph_size(image_path), ImageSize(camera.width, camera.height)
+    photograph, stated = image_size(image_path), ImageSize(camera.width, camera.height)
     if not stated.has_shape_of(photograph):
-        raise DatasetInvalid(files[1], field, f"has a camera for {stated}, but the photograph is {photograph}")
+        raise DatasetInvalid(files[1], field, f"has a camera for {stated}, but the image is {image}")
     pinhole = _pinhole(files, image, camera).resized(*photograph)
     distortion = Distortion(**{key: camera.values.get(key, 0.0) for key in Distortion._fields})
     if distortion.folds(pinhole):
@@ -89,7 +89,7 @@ def _frame(
 
 
 def _pinhole(files: list[Path], image: ModelImage, camera: ModelCamera) -> Camera:
-    """In pixels of the photograph that COLMAP saw."""
+    """In pixels of the image that COLMAP saw."""
     values = camera.values
     fx, fy = (values.get(key, values.get("f", math.nan)) for key in ("fx", "fy"))
     pose = _camera_to_world(files[1], image)

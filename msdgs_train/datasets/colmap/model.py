@@ -35,7 +35,7 @@ class ModelCamera(NamedTuple):
 
 
 class ModelImage(NamedTuple):
-    """A photograph and its pose: x_camera = R(qvec) · x_world + tvec, in OpenCV axes."""
+    """An image and its pose: x_camera = R(qvec) · x_world + tvec, in OpenCV axes."""
 
     name: str  # path below the folder of images
     camera_id: int

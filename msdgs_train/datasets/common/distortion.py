@@ -20,9 +20,9 @@ class Distortion(NamedTuple):
     k3: float = 0.0
 
     def folds(self, camera: Camera) -> bool:
-        """Whether two places in the picture of the pinhole `camera` would be the same place in its photograph.
+        """Whether two places in the image of the pinhole `camera` would be the same place in its image.
 
-        No lens does so: the coefficients are wrong, or were fitted to less than the whole photograph.
+        No lens does so: the coefficients are wrong, or were fitted to less than the whole image.
         """
         x = (np.linspace(0, camera.width, FOLD_GRID) - camera.cx) / camera.fx
         y = (np.linspace(0, camera.height, FOLD_GRID) - camera.cy) / camera.fy
@@ -34,10 +34,10 @@ class Distortion(NamedTuple):
 
 
 def undistort(rgba: np.ndarray, camera: Camera, distortion: Distortion) -> np.ndarray:
-    """What the pinhole `camera` would have photographed: uint8 [H, W, 4], straight alpha, like `rgba`.
+    """What the pinhole `camera` would have captured: uint8 [H, W, 4], straight alpha, like `rgba`.
 
-    `camera` has the intrinsics of the distorted photograph and its size, H×W. Pixels are interpolated bilinearly,
-    colours weighted by alpha. A place that the photograph doesn't show gets the nearest one on its edge.
+    `camera` has the intrinsics of the distorted image and its size, H×W. Pixels are interpolated bilinearly,
+    colors weighted by alpha. A place that the image doesn't show gets the nearest one on its edge.
     """
     result = np.empty_like(rgba)
     _resample(np.ascontiguousarray(rgba), (camera.fx, camera.fy, camera.cx, camera.cy), distortion, result)

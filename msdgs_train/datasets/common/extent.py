@@ -9,7 +9,7 @@ PARALLEL = 1e-3
 """Mean square of the sine between optical axes; below it, about 2°, the point nearest to all of them means nothing."""
 
 
-def half_extent(points: np.ndarray | None, cameras: list[Camera]) -> float:
+def scene_half_size(points: np.ndarray | None, cameras: list[Camera]) -> float:
     """Half the side of the cube around the origin that holds 99 % of the sparse `points`, [M, 3], in scene units.
 
     Without points, it holds a ball around the point nearest to all optical axes, as far as the median camera is from

@@ -1,4 +1,4 @@
-"""Photographs as 8-bit RGBA with straight alpha: reading, reducing and laying over a background."""
+"""Images as 8-bit RGBA with straight alpha: reading, reducing and laying over a background."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +29,7 @@ class ImageSize(NamedTuple):
 
 
 def read_size(path: Path) -> ImageSize:
-    """The size that a photograph's header states. Raises `ImageUnreadable`."""
+    """The size that an image's header states. Raises `ImageUnreadable`."""
     reader = _open(path)
     spec = reader.spec()
     reader.close()
@@ -55,8 +55,8 @@ def read_rgba(path: Path) -> np.ndarray:
 def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
     """Reduce uint8 [H, W, 4] to [height, width, 4]: each new pixel is the mean over the area it covers.
 
-    Colours are weighted by alpha, so that what is behind transparent pixels does not bleed in; where nothing is
-    opaque, the colour is black. For halves this is the exact 2×2 box.
+    Colors are weighted by alpha, so that what is behind transparent pixels does not bleed in; where nothing is
+    opaque, the color is black. For halves this is the exact 2×2 box.
     """
     if rgba.shape[:2] == (height, width):
         return rgba

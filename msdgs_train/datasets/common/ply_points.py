@@ -23,7 +23,7 @@ _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 
 class PlyPoints(NamedTuple):
-    """Points in the file's own axes and units, and what colours it gives them."""
+    """Points in the file's own axes and units, and what colors it gives them."""
 
     points: np.ndarray  # [M, 3] float64, finite
     colors: np.ndarray | None  # [M, 3] float64 in [0, 1]; None where the file has no red, green and blue
@@ -32,7 +32,7 @@ class PlyPoints(NamedTuple):
 def read_ply_points(file: Path) -> PlyPoints:
     """Read `x y z` and, where there are any, `red green blue` of the vertices; other properties are passed over.
 
-    Integer colours are divided by the largest value of their type. Raises `DatasetInvalid` naming file and field.
+    Integer colors are divided by the largest value of their type. Raises `DatasetInvalid` naming file and field.
     """
     try:
         content = file.read_bytes()

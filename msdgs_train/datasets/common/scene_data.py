@@ -25,7 +25,7 @@ class DatasetInvalid(MsdgsError):
 
 @dataclass(frozen=True)
 class Frame:
-    """One photograph: where it was taken, when, and where its pixels are."""
+    """One image: where it was taken, when, and where its pixels are."""
 
     name: str
     camera: Camera  # a pinhole of the size that `load_rgba` returns
@@ -54,13 +54,13 @@ class SceneData:
 
     splits: dict[str, list[Frame]]  # "train" has one frame or more; "val" and "test" may be empty
     time_range: tuple[float, float]  # first and last time of any frame of any split; equal in a static scene
-    half_extent: float  # half the side of the cube around the origin that the scene fills, in scene units
+    scene_half_size: float  # half the side of the cube around the origin that the scene fills, in scene units
     points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
-    point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None where `points` have no colours
+    point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None where `points` have no colors
 
 
-def photograph_size(path: Path) -> ImageSize:
-    """The size that a photograph's header states. Raises `DatasetInvalid` where it can't be read."""
+def image_size(path: Path) -> ImageSize:
+    """The size that an image's header states. Raises `DatasetInvalid` where it can't be read."""
     try:
         return read_size(path)
     except ImageUnreadable as error:
@@ -68,9 +68,9 @@ def photograph_size(path: Path) -> ImageSize:
 
 
 def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
-    """`camera` for photographs `size` pixels wide, height in proportion; as it is if `size` is None.
+    """`camera` for images `size` pixels wide, height in proportion; as it is if `size` is None.
 
-    Raises `InvalidInput` where `size` is not in [1, width of the photograph].
+    Raises `InvalidInput` where `size` is not in [1, width of the image].
     """
     if size is None or size == camera.width:
         return camera

@@ -1,6 +1,6 @@
-"""`transforms*.json`: photographs with poses in OpenGL axes and intrinsics, in the layouts that descend from NeRF.
+"""`transforms*.json`: images with poses in OpenGL axes and intrinsics, in the layouts that descend from NeRF.
 
-Pixels are those of the stored photograph: where it is a reduced copy of what `w` and `h` say, intrinsics are scaled.
+Pixels are those of the stored image: where it is a reduced copy of what `w` and `h` say, intrinsics are scaled.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize
 from msdgs_train.datasets.common.json_file import read_json
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, photograph_size, reduced
+from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, image_size, reduced
 
 
 class Entry(NamedTuple):
@@ -44,7 +44,7 @@ class Entry(NamedTuple):
         return float(value)
 
     def file_path(self) -> str:
-        """What the frame calls its photograph. Raises `DatasetInvalid`."""
+        """What the frame calls its image. Raises `DatasetInvalid`."""
         name = self.values.get("file_path")
         if not isinstance(name, str) or not name:
             raise self.invalid("file_path", "is missing" if name is None else f"must be a file name, got {name!r}")
@@ -76,7 +76,7 @@ def read_frame(entry: Entry, size: int | None) -> Frame:
     Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't be.
     """
     image_path = _image_path(entry)
-    camera = reduced(_camera(entry, photograph_size(image_path)), size, image_path)
+    camera = reduced(_camera(entry, image_size(image_path)), size, image_path)
     t = entry.number("time") if "time" in entry.values else 0.0
     return Frame(image_path.stem, camera, t, image_path)
 
@@ -91,8 +91,8 @@ def _image_path(entry: Entry) -> Path:
     )
 
 
-def _camera(entry: Entry, photograph: ImageSize) -> Camera:
-    width, height = _stated_size(entry, photograph)
+def _camera(entry: Entry, image: ImageSize) -> Camera:
+    width, height = _stated_size(entry, image)
     fx = entry.number("fl_x") if entry.has("fl_x") else _focal_length(entry, "camera_angle_x", width)
     default_fy = _focal_length(entry, "camera_angle_y", height) if entry.has("camera_angle_y") else fx
     fy, cx, cy = (
@@ -100,7 +100,7 @@ def _camera(entry: Entry, photograph: ImageSize) -> Camera:
         for key, default in (("fl_y", default_fy), ("cx", width / 2), ("cy", height / 2))
     )
     try:
-        return Camera.from_opengl(_matrix(entry), width, height, fx=fx, fy=fy, cx=cx, cy=cy).resized(*photograph)
+        return Camera.from_opengl(_matrix(entry), width, height, fx=fx, fy=fy, cx=cx, cy=cy).resized(*image)
     except InvalidInput as error:
         raise entry.invalid(_KEYS.get(error.field, "transform_matrix"), f"is no camera: {error}") from None
 
@@ -108,13 +108,13 @@ def _camera(entry: Entry, photograph: ImageSize) -> Camera:
 _KEYS = {"camera.fx": "fl_x", "camera.fy": "fl_y", "camera.width": "w", "camera.height": "h"}
 
 
-def _stated_size(entry: Entry, photograph: ImageSize) -> ImageSize:
-    """The size that the intrinsics are about: `w` and `h`, or else the photograph's own."""
+def _stated_size(entry: Entry, image: ImageSize) -> ImageSize:
+    """The size that the intrinsics are about: `w` and `h`, or else the image's own."""
     if not (entry.has("w") or entry.has("h")):
-        return photograph
+        return image
     stated = ImageSize(round(entry.number("w")), round(entry.number("h")))
-    if not stated.has_shape_of(photograph):
-        raise entry.invalid("w", f"and h are {stated}, but the photograph is {photograph}")
+    if not stated.has_shape_of(image):
+        raise entry.invalid("w", f"and h are {stated}, but the image is {image}")
     return stated
 
 

@@ -1,4 +1,4 @@
-"""Videos whose frames are photographs: one file a camera, of which training wants any frame at any time.
+"""Videos whose frames are images: one file a camera, of which training wants any frame at any time.
 
 H.264 gives no random access: the way to a frame begins at the keyframe before it, 0.8 s for the 20th frame at 2704×2028
 on two busy cores, against milliseconds from pixels that lie ready. So the first frame that is wanted of a video decodes
@@ -53,7 +53,7 @@ def read_info(video: Path) -> VideoInfo:
     try:
         with av.open(str(video)) as container:
             if not container.streams.video:
-                raise _invalid(video, "has no pictures in it")
+                raise _invalid(video, "has no images in it")
             stream = container.streams.video[0]
             width, height = stream.codec_context.width, stream.codec_context.height
             count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
@@ -127,7 +127,7 @@ def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
 
 
 def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
-    """Contiguous uint8 RGB [height, width, 3], by the colour matrix that the video names, or else BT.601 as by FFmpeg.
+    """Contiguous uint8 RGB [height, width, 3], by the color matrix that the video names, or else BT.601 as by FFmpeg.
 
     Each new pixel is the mean over the area it covers, within 0.5 of 255 of `resize_area` on average. FFmpeg's fast way
     for the full size and its halves leaves out half of the chroma and is off by 1.4 to 5.

@@ -1,4 +1,4 @@
-"""A small moving scene of our own, photographed by ray marching into D-NeRF layout, with its motion known exactly.
+"""A small moving scene of our own, captured by ray marching into D-NeRF layout, with its motion known exactly.
 
 A ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly squashes, twists and bends, a
 pendulum on a thin rod swings in a frame of thin bars, all on a still, tiled ground. As in D-NeRF there is one camera
@@ -38,7 +38,7 @@ CONTACT_SIZE, CONTACT_COLUMNS, CONTACT_ROWS = 128, 6, 4
 
 
 class View(NamedTuple):
-    """A photograph to take."""
+    """An image to take."""
 
     name: str
     camera: Camera
@@ -54,17 +54,17 @@ def generate(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Make the dataset in folder `out`: photographs, transforms_{train,test}.json, trajectories.json, a contact sheet.
+    """Make the dataset in folder `out`: images, transforms_{train,test}.json, trajectories.json, a contact sheet.
 
     Everything is built beside `out` and moved there when complete; an interrupted call leaves `out` as it was. A
     dataset that this function made there before is replaced, anything else is refused with `InvalidInput`.
 
     Args:
-        size: width and height of the photographs in pixels.
-        train_frames: photographs at evenly spaced times in [0, 1], cameras spread over the upper hemisphere.
-        test_frames: photographs at times between, from one smooth turn around the scene.
+        size: width and height of the images in pixels.
+        train_frames: images at evenly spaced times in [0, 1], cameras spread over the upper hemisphere.
+        test_frames: images at times between, from one smooth turn around the scene.
         seed: turns and shifts the cameras; the motion is always the same.
-        progress: called with (done, total) after every photograph.
+        progress: called with (done, total) after every image.
     """
     for name, value, least in (("train_frames", train_frames, 1), ("test_frames", test_frames, 0)):
         if value < least:
@@ -139,7 +139,7 @@ def _thumbnail(rgba: np.ndarray) -> np.ndarray:
 
 
 def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
-    """Up to 24 pictures, evenly taken, in rows."""
+    """Up to 24 images, evenly taken, in rows."""
     count = min(len(thumbnails), CONTACT_COLUMNS * CONTACT_ROWS)
     chosen = [thumbnails[index * len(thumbnails) // count] for index in range(count)]
     columns = min(count, CONTACT_COLUMNS)

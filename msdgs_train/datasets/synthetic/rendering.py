@@ -21,7 +21,7 @@ from msdgs_train.datasets.synthetic.shapes import (
 
 SAMPLES = 2  # rays along each side of a pixel
 MAX_STEPS = 400
-HIT = 2e-4  # scene units; a pixel of an 800-pixel picture is 20 times larger
+HIT = 2e-4  # scene units; a pixel of an 800-pixel image is 20 times larger
 SURFACE_OFFSET = 4e-3  # where shadow rays begin
 PENUMBRA = 7.0  # the larger, the harder
 PENUMBRA_REACH = 0.25  # a shadow ray this far from an object is not dimmed by it
@@ -39,7 +39,7 @@ _MISS = 1e9
 
 
 def render(camera: Camera, t: float) -> np.ndarray:
-    """The scene at time t: [H, W, 4] uint8, sRGB, straight alpha, colour 0 where nothing is hit."""
+    """The scene at time t: [H, W, 4] uint8, sRGB, straight alpha, color 0 where nothing is hit."""
     motion = motion_at(t)
     linear = np.zeros((camera.height, camera.width, 4))
     view = np.ascontiguousarray(camera.camera_to_world)

@@ -1,4 +1,4 @@
-"""What the objects of the synthetic scene are at rest: signed distances and colours, as scalar kernels."""
+"""What the objects of the synthetic scene are at rest: signed distances and colors, as scalar kernels."""
 
 import math
 
@@ -45,7 +45,7 @@ PALETTE = np.array(
         [0.25, 0.26, 0.28],  # 11 steel
     ]
 )
-"""[colours, 3] sRGB in [0, 1]; surfaces are evenly coloured inside each field of their pattern."""
+"""[colors, 3] sRGB in [0, 1]; surfaces are evenly colored inside each field of their pattern."""
 
 
 @kernel
@@ -94,7 +94,7 @@ def color_at_rest(shape: int, x: float, y: float, z: float) -> int:
 
 @kernel
 def _tile(x: float, y: float) -> int:
-    """Square tiles with a few coloured ones between them, inside a ring."""
+    """Square tiles with a few colored ones between them, inside a ring."""
     radius = math.hypot(x, y)
     if radius > 0.97:
         return 2

@@ -14,7 +14,7 @@ import pytest
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from msdgs_train.datasets.common.images import write_png
-from tests.support.lens import Lens, centroids, frame_pixels, photograph_of_dots
+from tests.support.lens import Lens, centroids, frame_pixels, image_of_dots
 from tests.support.tolerances import assert_close
 
 BLACK = np.zeros((240, 320, 3), np.uint8)
@@ -57,7 +57,7 @@ class Pose(NamedTuple):
 def write_model(
     folder: Path, ending: str, names: list[str], model: str = "PINHOLE", pose: Pose | None = None, place: str = "0"
 ) -> Path:
-    """A model with a photograph of black for every image that has none; the second image has seen nothing."""
+    """A model with an image of black for every image that has none; the second image has seen nothing."""
     sparse = folder / "sparse" / place
     sparse.mkdir(parents=True, exist_ok=True)
     write = {"bin": write_binary, "txt": write_text}[ending]
@@ -113,7 +113,7 @@ def test_points_land_where_the_published_formula_puts_them(tmp_path: Path, endin
 def test_dots_lie_at_their_pinhole_projections_after_loading(tmp_path: Path, model: str):
     lens, points = KINDS[model].lens, KINDS[model].lens.grid()
     (tmp_path / "images").mkdir()
-    write_png(tmp_path / "images" / "0.png", photograph_of_dots(lens.pixels(points), 320, 240))
+    write_png(tmp_path / "images" / "0.png", image_of_dots(lens.pixels(points), 320, 240))
     frame = load_scene(write_model(tmp_path, "bin", ["0.png"], model)).splits["train"][0]
     wanted = frame_pixels(replace(frame, distortion=None), Pose().to_world(points))
     assert_close(centroids(frame.load_rgba(), wanted), wanted, "dot_centroid")
@@ -121,13 +121,13 @@ def test_dots_lie_at_their_pinhole_projections_after_loading(tmp_path: Path, mod
 
 @both
 @pytest.mark.parametrize("place", ["0", "."])
-def test_points_colours_and_size_of_the_scene(tmp_path: Path, ending: str, place: str):
+def test_points_colors_and_size_of_the_scene(tmp_path: Path, ending: str, place: str):
     scene = load_scene(write_model(tmp_path, ending, ["0.png"], place=place))
     assert scene.points is not None
     assert scene.point_colors is not None
     assert scene.points.tolist() == [list(position) for position, _ in POINTS]
     assert_close(scene.point_colors, [[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]], "sh_basis")
-    assert 2.0 < scene.half_extent <= 3.0
+    assert 2.0 < scene.scene_half_size <= 3.0
 
 
 @both
@@ -195,7 +195,7 @@ def test_without_points_the_cameras_say_how_large_the_scene_is(tmp_path: Path):
     (folder / "sparse" / "0" / "points3D.txt").write_text("# none\n")
     scene = load_scene(folder)
     assert scene.points is None
-    assert scene.half_extent > 0
+    assert scene.scene_half_size > 0
 
 
 @both
@@ -207,7 +207,7 @@ def test_a_missing_file_is_named(tmp_path: Path, ending: str, part: str):
         load_scene(folder)
 
 
-def test_a_missing_model_and_missing_photographs_are_named(tmp_path: Path):
+def test_a_missing_model_and_missing_images_are_named(tmp_path: Path):
     (tmp_path / "sparse").mkdir()
     with pytest.raises(DatasetInvalid, match=r"sparse: `cameras` is missing: there is no cameras\.bin or cameras\.txt"):
         load_scene(tmp_path)
@@ -297,10 +297,10 @@ def test_what_is_no_text_is_refused(tmp_path: Path):
         load_scene(folder)
 
 
-def test_photographs_of_another_shape_are_refused(tmp_path: Path):
+def test_images_of_another_shape_are_refused(tmp_path: Path):
     folder = write_model(tmp_path, "bin", ["0.png"])
     write_png(folder / "images" / "0.png", BLACK[:, :200].copy())
-    with pytest.raises(DatasetInvalid, match=re.escape("has a camera for 320×240, but the photograph is 200×240")):
+    with pytest.raises(DatasetInvalid, match=re.escape("has a camera for 320×240, but the image is 200×240")):
         load_scene(folder)
 
 

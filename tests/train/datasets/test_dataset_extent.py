@@ -5,7 +5,7 @@ import pytest
 
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import look_at
-from msdgs_train.datasets.common.extent import half_extent
+from msdgs_train.datasets.common.extent import scene_half_size
 from tests.support.tolerances import assert_close
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -22,14 +22,14 @@ def cameras_around(target: tuple[float, float, float], distance: float, count: i
 
 def test_few_points_that_are_far_off_count_for_nothing():
     points = np.random.default_rng(0).uniform(-1, 1, size=(1000, 3))
-    clean = half_extent(points, cameras_around((0, 0, 0), 4.0))
+    clean = scene_half_size(points, cameras_around((0, 0, 0), 4.0))
     points[:5] *= 1e6
-    assert 0.9 < clean < half_extent(points, []) < 1.0
+    assert 0.9 < clean < scene_half_size(points, []) < 1.0
 
 
 def test_without_points_it_is_the_distance_to_where_all_cameras_look():
-    assert_close(half_extent(None, cameras_around((0, 0, 0), 4.0)), 4.0, "rotation")
-    assert_close(half_extent(np.empty((0, 3)), cameras_around((3, -5, 1), 4.0)), 9.0, "rotation")
+    assert_close(scene_half_size(None, cameras_around((0, 0, 0), 4.0)), 4.0, "rotation")
+    assert_close(scene_half_size(np.empty((0, 3)), cameras_around((3, -5, 1), 4.0)), 9.0, "rotation")
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -37,5 +37,5 @@ def test_parallel_axes_meet_nowhere(count: int):
     poses = [np.eye(4) for _ in range(count)]
     for index, pose in enumerate(poses):
         pose[:3, 3] = [2.0 * index, 0, 0]
-    extent = half_extent(None, [Camera.from_fov(pose, 20, 10, 40.0) for pose in poses])
+    extent = scene_half_size(None, [Camera.from_fov(pose, 20, 10, 40.0) for pose in poses])
     assert extent == (4.0 if count == 3 else 1.0)

@@ -1,4 +1,4 @@
-"""Alpha and size: what photographs become when they are read, reduced and laid over a background."""
+"""Alpha and size: what images become when they are read, reduced and laid over a background."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from msdgs_train.datasets.common.images import read_rgba, read_size, resize_area
 from tests.support.tolerances import assert_close
 
 
-def photograph(seed: int, width: int, height: int) -> np.ndarray:
+def image(seed: int, width: int, height: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, size=(height, width, 4), dtype=np.uint8)
 
 
@@ -36,26 +36,26 @@ def area_mean_by_loops(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("width", "height"), [(6, 4), (5, 4), (4, 3), (7, 7), (1, 1), (12, 1)])
 def test_reduction_is_the_mean_over_the_covered_area(width: int, height: int):
-    rgba = photograph(width, 12, 8)
+    rgba = image(width, 12, 8)
     rgba[:3, :5, 3] = 0
     assert_close(resize_area(rgba, width, height), area_mean_by_loops(rgba, width, height), "rounded_to_8bit")
 
 
 def test_the_same_size_changes_nothing():
-    rgba = photograph(0, 12, 8)
+    rgba = image(0, 12, 8)
     rgba[:3, :5, 3] = 0
     assert (resize_area(rgba, 12, 8) == rgba).all()
 
 
 def test_halves_are_the_exact_box():
-    rgba = photograph(0, 16, 8).astype(np.int64)
+    rgba = image(0, 16, 8).astype(np.int64)
     rgba[..., 3] = 255
     got = resize_area(rgba.astype(np.uint8), 8, 4)
     total = rgba[0::2, 0::2] + rgba[1::2, 0::2] + rgba[0::2, 1::2] + rgba[1::2, 1::2]
     assert (got == (total + 2) // 4).all()
 
 
-def test_colour_behind_transparent_pixels_does_not_bleed_in():
+def test_color_behind_transparent_pixels_does_not_bleed_in():
     rgba = np.zeros((2, 2, 4), np.uint8)
     rgba[0, 0] = [200, 100, 50, 255]
     rgba[1, 1] = [0, 255, 0, 0]
@@ -63,8 +63,8 @@ def test_colour_behind_transparent_pixels_does_not_bleed_in():
 
 
 def test_reducing_and_compositing_commute():
-    """As light does: straight colours averaged without their alpha would give a dark rim."""
-    rgba = photograph(3, 40, 20)
+    """As light does: straight colors averaged without their alpha would give a dark rim."""
+    rgba = image(3, 40, 20)
     background = (0.9, 0.3, 0.1)
     first_laid = composite(rgba, background).reshape(10, 2, 20, 2, 3).mean(axis=(1, 3))
     assert_close(composite(resize_area(rgba, 20, 10), background), first_laid, "composite_of_8bit")
@@ -80,8 +80,8 @@ def test_compositing_by_straight_alpha():
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_all_channel_layouts_become_rgba(tmp_path: Path, channels: int):
-    path = tmp_path / "photograph.png"
-    pixels = photograph(channels, 5, 3)[..., :channels].copy()
+    path = tmp_path / "image.png"
+    pixels = image(channels, 5, 3)[..., :channels].copy()
     write_png(path, pixels)
     rgba = read_rgba(path)
     assert read_size(path) == (5, 3)
@@ -90,7 +90,7 @@ def test_all_channel_layouts_become_rgba(tmp_path: Path, channels: int):
 
 
 def test_sixteen_bits_are_read_as_eight(tmp_path: Path):
-    path = tmp_path / "photograph.png"
+    path = tmp_path / "image.png"
     writer = oiio.ImageOutput.create(str(path))
     assert writer
     writer.open(str(path), oiio.ImageSpec(2, 1, 3, "uint16"))

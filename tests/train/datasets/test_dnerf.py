@@ -1,4 +1,4 @@
-"""Photographs in D-NeRF layout: where their cameras look, what their pixels become, and what is wrong with bad ones."""
+"""Images in D-NeRF layout: where their cameras look, what their pixels become, and what is wrong with bad ones."""
 
 import copy
 import json
@@ -21,18 +21,18 @@ POSE = [[0.0, -0.6, 0.8, 3.2], [1.0, 0.0, 0.0, 0.0], [0.0, 0.8, 0.6, 2.4], [0.0,
 
 
 def write_scene(folder: Path, splits: dict[str, Any]) -> Path:
-    """Write the JSON of each split, and for every frame a photograph of its own, 20×10, unless there is one."""
+    """Write the JSON of each split, and for every frame an image of its own, 20×10, unless there is one."""
     for split, content in splits.items():
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
         for index, frame in enumerate(content["frames"]):
             path = folder / f"{frame['file_path']}.png"
             path.parent.mkdir(exist_ok=True)
             if not path.exists():
-                write_png(path, photograph(index))
+                write_png(path, image(index))
     return folder
 
 
-def photograph(seed: int, width: int = 20, height: int = 10) -> np.ndarray:
+def image(seed: int, width: int = 20, height: int = 10) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, size=(height, width, 4), dtype=np.uint8)
 
 
@@ -91,8 +91,8 @@ def test_splits_times_and_names(tmp_path: Path):
     assert [frame.name for frame in scene.splits["test"]] == ["r_0", "r_1"]
     assert scene.splits["val"] == []
     assert scene.time_range == (0.2, 1.0)
-    assert scene.half_extent == 1.3
-    assert (scene.splits["train"][1].load_rgba() == photograph(1)).all()
+    assert scene.scene_half_size == 1.3
+    assert (scene.splits["train"][1].load_rgba() == image(1)).all()
 
 
 def test_a_scene_without_times_is_static(tmp_path: Path):
@@ -111,7 +111,7 @@ def test_a_scene_without_times_is_static(tmp_path: Path):
 def test_file_names_with_and_without_extension(tmp_path: Path, file_path: str, file: str):
     content = transforms("train", [0.0], file_path=file_path)
     (tmp_path / "train").mkdir()
-    write_png(tmp_path / "train" / "whatever.png", photograph(0)[..., :3])
+    write_png(tmp_path / "train" / "whatever.png", image(0)[..., :3])
     (tmp_path / "train" / "whatever.png").rename(tmp_path / "train" / file)  # read by content, not by extension
     (tmp_path / "transforms_train.json").write_text(json.dumps(content))
     assert load_scene(tmp_path).splits["train"][0].image_path.name == file
@@ -132,14 +132,14 @@ def test_intrinsics_of_the_file_serve_all_frames(tmp_path: Path):
 
 
 def test_intrinsics_are_scaled_to_a_reduced_copy(tmp_path: Path):
-    """The JSON speaks of 800×400, the stored photograph is 20×10."""
+    """The JSON speaks of 800×400, the stored image is 20×10."""
     content = transforms("train", [0.0], fl_x=1000.0, cx=380.0, w=800, h=400)
     camera = load_scene(write_scene(tmp_path, {"train": content})).splits["train"][0].camera
     assert (camera.width, camera.height) == (20, 10)
     assert (camera.fx, camera.cx, camera.cy) == (25.0, 9.5, 5.0)
 
 
-def test_size_reduces_photograph_and_camera_together(tmp_path: Path):
+def test_size_reduces_image_and_camera_together(tmp_path: Path):
     folder = write_scene(tmp_path, {"train": transforms("train", [0.0])})
     full, small = (load_scene(folder, size).splits["train"][0] for size in (None, 8))
     assert (small.camera.width, small.camera.height) == (8, 4)
@@ -150,7 +150,7 @@ def test_size_reduces_photograph_and_camera_together(tmp_path: Path):
 
 def test_size_may_be_the_width_but_not_more(tmp_path: Path):
     folder = write_scene(tmp_path, {"train": transforms("train", [0.0])})
-    assert (load_scene(folder, 20).splits["train"][0].load_rgba() == photograph(0)).all()
+    assert (load_scene(folder, 20).splits["train"][0].load_rgba() == image(0)).all()
     for size in (21, 0, -3):
         with pytest.raises(InvalidInput, match="`size` must be") as caught:
             load_scene(folder, size)
@@ -232,7 +232,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, change: Callable[[Any], None], f
 
 def test_a_stated_size_of_another_shape_is_refused(tmp_path: Path):
     folder = write_scene(tmp_path, {"train": transforms("train", [0.0], w=20, h=20)})
-    with pytest.raises(DatasetInvalid, match=r"frames\[0\].w` and h are 20×20, but the photograph is 20×10"):
+    with pytest.raises(DatasetInvalid, match=r"frames\[0\].w` and h are 20×20, but the image is 20×10"):
         load_scene(folder)
 
 
@@ -261,14 +261,14 @@ def test_folders_that_are_no_dataset(tmp_path: Path):
         load_scene(tmp_path / "file")
 
 
-def test_a_photograph_that_is_none_is_refused_before_training(tmp_path: Path):
+def test_an_image_that_is_none_is_refused_before_training(tmp_path: Path):
     folder = write_scene(tmp_path, {"train": transforms("train", [0.0])})
-    (folder / "train" / "r_0.png").write_bytes(b"not a picture")
+    (folder / "train" / "r_0.png").write_bytes(b"not an image")
     with pytest.raises(DatasetInvalid, match=r"r_0\.png: `image` can't be read: "):
         load_scene(folder)
 
 
-def test_a_photograph_that_is_cut_off_is_refused(tmp_path: Path):
+def test_an_image_that_is_cut_off_is_refused(tmp_path: Path):
     folder = write_scene(tmp_path, {"train": transforms("train", [0.0])})
     path = folder / "train" / "r_0.png"
     path.write_bytes(path.read_bytes()[:-60])
@@ -277,7 +277,7 @@ def test_a_photograph_that_is_cut_off_is_refused(tmp_path: Path):
         frame.load_rgba()
 
 
-def test_float_pictures_are_refused(tmp_path: Path):
+def test_float_images_are_refused(tmp_path: Path):
     """Their values would be scene-linear, and splats blend in the display's space."""
     (tmp_path / "train").mkdir()
     path = tmp_path / "train" / "r_0.exr"

@@ -11,7 +11,7 @@ import pytest
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from msdgs_train.datasets.common.images import write_png
-from tests.support.lens import centroids, frame_pixels, photograph_of_dots
+from tests.support.lens import centroids, frame_pixels, image_of_dots
 from tests.support.tolerances import assert_close
 
 WIDTH, HEIGHT = 320, 240
@@ -62,8 +62,8 @@ def write_scene(folder: Path, files: dict[str, Any], copies: tuple[int, ...] = (
     for reduction in copies:
         (folder / "rgb" / f"{reduction}x").mkdir(parents=True)
         for id_ in IDS:
-            picture = np.full((HEIGHT // reduction, WIDTH // reduction, 3), int(id_) % 256, np.uint8)
-            write_png(folder / "rgb" / f"{reduction}x" / f"{id_}.png", picture)
+            image = np.full((HEIGHT // reduction, WIDTH // reduction, 3), int(id_) % 256, np.uint8)
+            write_png(folder / "rgb" / f"{reduction}x" / f"{id_}.png", image)
     return folder
 
 
@@ -112,7 +112,7 @@ def test_dots_lie_at_their_pinhole_projections_after_loading(tmp_path: Path, len
     write_scene(tmp_path, files)
     content = files[f"camera/{IDS[0]}.json"]
     points = points_before(content)
-    dots = photograph_of_dots(nerfies_pixels(content, points), WIDTH, HEIGHT)
+    dots = image_of_dots(nerfies_pixels(content, points), WIDTH, HEIGHT)
     write_png(tmp_path / "rgb" / "1x" / f"{IDS[0]}.png", dots)
     straight = nerfies_pixels({**content, "radial_distortion": [0] * 3, "tangential_distortion": [0] * 2}, points)
     rgba = load_scene(tmp_path).splits["train"][0].load_rgba()
@@ -181,7 +181,7 @@ def test_points_move_with_the_cameras(tmp_path: Path):
     assert scene.points is not None
     assert (scene.points == to_scene(points.astype(np.float64))).all()
     assert scene.point_colors is None
-    assert scene.half_extent <= np.abs(scene.points).max()
+    assert scene.scene_half_size <= np.abs(scene.points).max()
 
 
 def test_bad_points_are_refused(tmp_path: Path):
@@ -227,7 +227,7 @@ WRONG = [
     (CAMERA, "radial_distortion", [-9.0, 0.0, 0.0], "radial_distortion", "would show places twice"),
     (CAMERA, "tangential_distortion", MISSING, "tangential_distortion", "is missing"),
     (CAMERA, "tangential_distortion", [0.0, float("nan")], "tangential_distortion", "must be 2 finite numbers"),
-    (CAMERA, "image_size", [240, 320], "image_size", "is 240×320, but the photograph is 320×240"),
+    (CAMERA, "image_size", [240, 320], "image_size", "is 240×320, but the image is 320×240"),
 ]
 
 
@@ -255,11 +255,11 @@ def test_a_json_that_is_missing_or_none(tmp_path: Path, file: str, text: str | N
     assert caught.value.file == str(path)
 
 
-def test_photographs_that_are_missing_are_named(tmp_path: Path):
+def test_images_that_are_missing_are_named(tmp_path: Path):
     write_scene(tmp_path, contents(), copies=(2,))
     (tmp_path / "rgb" / "2x" / "000040.png").unlink()
     with pytest.raises(DatasetInvalid, match=r"000040\.png: `image` can't be read"):
         load_scene(tmp_path)
-    (tmp_path / "rgb").rename(tmp_path / "pictures")
-    with pytest.raises(DatasetInvalid, match="rgb: `folder` must have the photographs in 1x, 2x or the like"):
+    (tmp_path / "rgb").rename(tmp_path / "images")
+    with pytest.raises(DatasetInvalid, match="rgb: `folder` must have the images in 1x, 2x or the like"):
         load_scene(tmp_path)

@@ -13,7 +13,7 @@ import pytest
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from msdgs_train.datasets.common.images import write_png
-from tests.support.lens import Lens, centroids, frame_pixels, photograph_of_dots
+from tests.support.lens import Lens, centroids, frame_pixels, image_of_dots
 from tests.support.tolerances import assert_close, tolerance
 
 PINHOLE = Lens()
@@ -72,7 +72,7 @@ def test_points_land_where_the_published_formula_puts_them(tmp_path: Path, lens:
 @pytest.mark.parametrize("size", [None, 160])
 def test_dots_lie_at_their_pinhole_projections_after_loading(tmp_path: Path, lens: Lens, size: int | None):
     points, scale = lens.grid(), (size or lens.width) / lens.width
-    rgba = photograph_of_dots(lens.pixels(points), lens.width, lens.height)
+    rgba = image_of_dots(lens.pixels(points), lens.width, lens.height)
     frame = load_scene(write_scene(tmp_path, transforms(1, lens), rgba), size).splits["train"][0]
     loaded = frame.load_rgba()
     wanted = lens.pinhole().pixels(points) * scale
@@ -84,13 +84,13 @@ def test_dots_lie_at_their_pinhole_projections_after_loading(tmp_path: Path, len
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-def test_an_even_photograph_stays_even_up_to_its_corners(tmp_path: Path, lens: Lens):
+def test_an_even_image_stays_even_up_to_its_corners(tmp_path: Path, lens: Lens):
     rgba = np.full((240, 320, 4), [10, 200, 30, 128], np.uint8)
     frame = load_scene(write_scene(tmp_path, transforms(1, lens), rgba)).splits["train"][0]
     assert (frame.load_rgba() == rgba).all()
 
 
-def test_colour_behind_transparent_pixels_does_not_bleed_into_undistorted_ones(tmp_path: Path):
+def test_color_behind_transparent_pixels_does_not_bleed_into_undistorted_ones(tmp_path: Path):
     rgba = np.zeros((240, 320, 4), np.uint8)
     rgba[:] = [255, 0, 0, 0]
     rgba[100:140, 100:220] = [0, 0, 250, 255]
@@ -176,7 +176,7 @@ def ply(encoding: str) -> bytes:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_sparse_points_come_with_their_colours_in_the_axes_of_the_poses(tmp_path: Path, encoding: str):
+def test_sparse_points_come_with_their_colors_in_the_axes_of_the_poses(tmp_path: Path, encoding: str):
     (tmp_path / "points.ply").write_bytes(ply(encoding))
     content = transforms(2, ply_file_path="points.ply", applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
     scene = load_scene(write_scene(tmp_path, content))
@@ -186,7 +186,7 @@ def test_sparse_points_come_with_their_colours_in_the_axes_of_the_poses(tmp_path
     assert_close(scene.point_colors, [[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]], "sh_basis")
 
 
-def without_colour(content: bytes) -> bytes:
+def without_color(content: bytes) -> bytes:
     return content.replace(b"uchar red", b"uchar other")
 
 
@@ -194,9 +194,9 @@ def without_points(content: bytes) -> bytes:
     return content.replace(b"element vertex 2", b"element vertex 0")
 
 
-def test_points_may_lack_colours_and_files_points(tmp_path: Path):
+def test_points_may_lack_colors_and_files_points(tmp_path: Path):
     folder = write_scene(tmp_path, transforms(2, ply_file_path="points.ply"))
-    (tmp_path / "points.ply").write_bytes(without_colour(ply("ascii")))
+    (tmp_path / "points.ply").write_bytes(without_color(ply("ascii")))
     scene = load_scene(folder)
     assert scene.points is not None
     assert scene.point_colors is None
@@ -269,10 +269,10 @@ WRONG = [
     (without("fl_x"), "camera_angle_x", "is missing, and frames[0] has no fl_x"),
     (with_value(math.nan, "cx"), "frames[0].cx", "must be a finite number, got nan"),
     (with_value(-1, "frames", 1, "fl_y"), "frames[1].fl_y", "above 0 pixels, got -1"),
-    (with_value(100, "w"), "frames[0].w", "and h are 100×240, but the photograph is 320×240"),
+    (with_value(100, "w"), "frames[0].w", "and h are 100×240, but the image is 320×240"),
     (without("h"), "frames[0].h", "is missing"),
     (with_value("a", "k1"), "frames[0].k1", "must be a finite number, got 'a'"),
-    (with_value(-2.0, "k1"), "frames[0].k1", "would show places twice: undistort the photographs"),
+    (with_value(-2.0, "k1"), "frames[0].k1", "would show places twice: undistort the images"),
     (with_value(0.1, "frames", 1, "k4"), "frames[1].k4", "must be 0"),
     (with_value("OPENCV_FISHEYE", "camera_model"), "frames[0].camera_model", "got 'OPENCV_FISHEYE'"),
     (with_value("FULL_OPENCV", "frames", 1, "camera_model"), "frames[1].camera_model", "got 'FULL_OPENCV'"),

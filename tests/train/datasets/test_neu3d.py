@@ -148,14 +148,14 @@ def test_a_single_frame_is_static(tmp_path: Path):
 
 
 def waves(width: int, height: int) -> np.ndarray:
-    """Colour changes downwards only: where chroma lies across is another matter in H.264 than in FFmpeg's encoding."""
+    """Color changes downwards only: where chroma lies across is another matter in H.264 than in FFmpeg's encoding."""
     y, x = np.mgrid[0:height, 0:width]
     grey = 128 + 40 * np.sin(x / 9) * np.cos(y / 7)
     return np.stack([grey + 40 * np.sin(y / 6), grey, grey + 40 * np.cos(y / 5)], axis=-1).astype(np.uint8)
 
 
 @pytest.mark.parametrize("size", [160, 80, 40, 67])
-def test_size_reduces_a_video_as_it_does_photographs(tmp_path: Path, size: int):
+def test_size_reduces_a_video_as_it_does_images(tmp_path: Path, size: int):
     pictures = [waves(160, 120), waves(160, 120)[::-1]]
     for name in ("cam00", "cam01"):
         write_video(tmp_path / f"{name}.mp4", pictures)
@@ -166,7 +166,7 @@ def test_size_reduces_a_video_as_it_does_photographs(tmp_path: Path, size: int):
         assert np.abs(frame.load_rgba()[..., :3] - want).mean() < tolerance("video_picture.mean")
 
 
-def test_the_colour_matrix_is_the_one_that_the_video_names(tmp_path: Path):
+def test_the_color_matrix_is_the_one_that_the_video_names(tmp_path: Path):
     np.save(tmp_path / "poses_bounds.npy", poses_bounds(2))
     for camera, (name, number) in enumerate((("ITU601", 5), ("ITU709", 1))):
         with av.open(str(tmp_path / f"cam0{camera}.mp4"), "w") as container:
@@ -270,7 +270,7 @@ WRONG = [
     (changed(0, 16, np.inf), "row 0", "must be finite"),
     (changed(1, 15, -1.0), "row 1", "must end in 0 < near < far, got -1 and 9"),
     (changed(1, 16, 0.1), "row 1", "must end in 0 < near < far, got 0.5 and 0.1"),
-    (changed(1, 4, 1000.0), "row 1", "states a size of 128×1000, but the photograph is 32×24"),
+    (changed(1, 4, 1000.0), "row 1", "states a size of 128×1000, but the image is 32×24"),
     (changed(1, 4, -96.0), "row 1", "states a size of 128×-96"),
     (changed(1, 14, 0.0), "row 1", "above 0 pixels, got 0"),
     (changed(1, 0, 5.0), "row 1", "without scale or mirroring"),
@@ -305,14 +305,14 @@ def test_cameras_out_of_step_are_refused(tmp_path: Path):
         load_scene(tmp_path)
 
 
-def test_photographs_of_a_camera_have_one_size(tmp_path: Path):
+def test_images_of_a_camera_have_one_size(tmp_path: Path):
     write_images(tmp_path)
     write_png(tmp_path / "cam01" / "0002.png", flat(0, 0, 8, 6))
     with pytest.raises(DatasetInvalid, match=r"0002\.png: `image` is 8×6, but .*0000\.png is 32×24"):
         load_scene(tmp_path)
 
 
-def test_a_camera_without_photographs_is_named(tmp_path: Path):
+def test_a_camera_without_images_is_named(tmp_path: Path):
     write_images(tmp_path)
     (tmp_path / "cam02").mkdir()
     with pytest.raises(DatasetInvalid, match=r"cam02: `frames` are missing: there is no cam02\.mp4"):

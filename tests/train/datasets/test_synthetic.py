@@ -1,4 +1,4 @@
-"""The synthetic scene: its photographs show what its known motion says, and its folder is whole or not there."""
+"""The synthetic scene: its images show what its known motion says, and its folder is whole or not there."""
 
 import json
 from dataclasses import replace
@@ -57,7 +57,7 @@ def distances_along_rays(frame: Frame, points: np.ndarray) -> tuple[np.ndarray, 
 
 
 def visible_points(frame: Frame, count: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """World positions and surface colours of material points that the frame's camera sees, inside their patterns."""
+    """World positions and surface colors of material points that the frame's camera sees, inside their patterns."""
     positions, colors = [], []
     for name in ("ground", *MOVING):
         local = surface_points(name, count, seed=1)
@@ -82,10 +82,10 @@ def interpolated(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return (1 - fy) * upper + fy * ((1 - fx) * image[y + 1, x] + fx * image[y + 1, x + 1])
 
 
-def colour_errors(
+def color_errors(
     frame: Frame, t: float | None = None, pose: np.ndarray | None = None, shift: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """Differences in chromaticity between material points and the photograph at their projection.
+    """Differences in chromaticity between material points and the image at their projection.
 
     The points are those visible from the frame's own camera at time `t`; they are projected from `pose`.
     """
@@ -101,26 +101,26 @@ def share_that_fits(errors: list[np.ndarray]) -> float:
     return float((np.concatenate(errors) < 0.2).mean())
 
 
-def test_photographs_show_material_points_where_the_motion_puts_them(scene: SceneData):
+def test_images_show_material_points_where_the_motion_puts_them(scene: SceneData):
     """Those that do not fit lie at the edge of a thing. Wrong axes or the wrong time fit half as well, by chance."""
     frames = [*scene.splits["train"], *scene.splits["test"]]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    assert share_that_fits([colour_errors(frame) for frame in frames]) > 0.75
+    assert share_that_fits([color_errors(frame) for frame in frames]) > 0.75
     wrong = {
-        "OpenGL axes": [colour_errors(f, pose=f.camera.camera_to_world @ OPENGL_TO_OPENCV) for f in frames],
-        "upside down": [colour_errors(f, pose=f.camera.camera_to_world @ half_turn) for f in frames],
-        "from behind": [colour_errors(f, pose=half_turn @ f.camera.camera_to_world) for f in frames],
-        "too late": [colour_errors(f, t=f.t + 0.1) for f in frames],
+        "OpenGL axes": [color_errors(f, pose=f.camera.camera_to_world @ OPENGL_TO_OPENCV) for f in frames],
+        "upside down": [color_errors(f, pose=f.camera.camera_to_world @ half_turn) for f in frames],
+        "from behind": [color_errors(f, pose=half_turn @ f.camera.camera_to_world) for f in frames],
+        "too late": [color_errors(f, t=f.t + 0.1) for f in frames],
     }
     for name, errors in wrong.items():
         assert share_that_fits(errors) < 0.55, name
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_photographs_are_not_shifted_by_part_of_a_pixel(scene: SceneData, axis: int):
+def test_images_are_not_shifted_by_part_of_a_pixel(scene: SceneData, axis: int):
     shifts = np.linspace(-1, 1, 5)
     errors = [
-        np.concatenate([colour_errors(frame, shift=tuple(shift * np.eye(2)[axis])) for frame in scene.splits["train"]])
+        np.concatenate([color_errors(frame, shift=tuple(shift * np.eye(2)[axis])) for frame in scene.splits["train"]])
         for shift in shifts
     ]
     square, slope, _ = np.polyfit(shifts, np.mean(errors, axis=1), 2)
@@ -199,7 +199,7 @@ def test_things_do_not_pass_through_each_other():
 def test_everything_lies_in_the_cube_that_training_begins_with(scene: SceneData):
     for name in OBJECTS:
         for t in TIMES:
-            assert np.abs(world_positions(name, surface_points(name, 100), t)).max() < scene.half_extent
+            assert np.abs(world_positions(name, surface_points(name, 100), t)).max() < scene.scene_half_size
 
 
 def test_layout(folder: Path, scene: SceneData):
@@ -246,7 +246,7 @@ def test_another_seed_gives_other_cameras_and_the_same_motion(tmp_path: Path):
     assert np.abs(first[0].camera.position - second[0].camera.position).max() > 0.1
 
 
-def test_progress_counts_every_photograph(tmp_path: Path):
+def test_progress_counts_every_image(tmp_path: Path):
     heard: list[tuple[int, int]] = []
     generate(tmp_path / "a", size=8, train_frames=3, test_frames=1, progress=lambda done, of: heard.append((done, of)))
     assert heard == [(1, 4), (2, 4), (3, 4), (4, 4)]

@@ -1,4 +1,4 @@
-"""Which photographs come, and what they teach: of passes, the window, and the three kinds of steps."""
+"""Which images come, and what they teach: of passes, the window, and the three kinds of steps."""
 
 import json
 from collections import Counter
@@ -13,8 +13,8 @@ from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
-from msdgs_train.engine.curriculum import MIDDLE, NEW, Curriculum, Lesson
-from msdgs_train.engine.trainer import AHEAD, Trainer
+from msdgs_train.engine.curriculum import MIDDLE, NEW, Curriculum, TrainingSample
+from msdgs_train.engine.trainer import NEW_FRAME_LR_MULTIPLIER, Trainer
 from msdgs_train.supports.nodes import BasisLayer
 from tests.support.training_scene import SHARED_MOTIONS, small_config, write_scene
 
@@ -24,9 +24,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneData:
     return load_scene(write_scene(tmp_path_factory.mktemp("scene"), train=41))
 
 
-def lessons(scene: SceneData, numbers: range, **changes: Any) -> list[Lesson]:
-    """Some of a run of 1,000 steps: 100 on all photographs, 100 around the middle, then up to step 600."""
-    settings = {"steps": 1000, "warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6}
+def lessons(scene: SceneData, numbers: range, **changes: Any) -> list[TrainingSample]:
+    """Some of a run of 1,000 steps: 100 on all images, 100 around the middle, then up to step 600."""
+    settings = {"steps": 1000, "static_fraction": 0.1, "static_window_fraction": 0.1, "window_full_fraction": 0.6}
     curriculum = Curriculum(small_config(**{**settings, **changes}), scene.splits["train"], scene.time_range)
     generator = torch.Generator().manual_seed(0)
     return [curriculum.next(number, generator) for number in numbers]
@@ -37,13 +37,13 @@ def distance(scene: SceneData, t: float) -> float:
     return abs(t - (first + last) / 2) / (last - first)
 
 
-def test_every_photograph_once_a_pass(scene: SceneData) -> None:
-    names = [lesson.frame.name for lesson in lessons(scene, range(82), window_until_fraction=0.0)]
+def test_every_image_once_a_pass(scene: SceneData) -> None:
+    names = [lesson.frame.name for lesson in lessons(scene, range(82), window_full_fraction=0.0)]
     assert len(set(names[:41])) == len(set(names[41:])) == 41
     assert names[:41] != names[41:]
 
 
-def test_first_and_last_all_photographs_teach_everything(scene: SceneData) -> None:
+def test_first_and_last_all_images_teach_everything(scene: SceneData) -> None:
     drawn = lessons(scene, range(1000))
     for part in (drawn[:100], drawn[600:]):
         assert {lesson.frame.name for lesson in part} == {frame.name for frame in scene.splits["train"]}
@@ -51,7 +51,7 @@ def test_first_and_last_all_photographs_teach_everything(scene: SceneData) -> No
 
 
 def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
-    for step, lesson in enumerate(lessons(scene, range(1000), window_starts=(0.1,))):
+    for step, lesson in enumerate(lessons(scene, range(1000), window_start_widths=(0.1,))):
         if 100 <= step < 600:
             window = 0.1 + 0.4 * max(step - 200, 0) / 400
             inside = distance(scene, lesson.frame.t) <= window + 1e-9
@@ -60,7 +60,7 @@ def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
 
 
 def test_second_window_grows_as_the_first(scene: SceneData) -> None:
-    changes = {"window_starts": (0.1, 0.3)}
+    changes = {"window_start_widths": (0.1, 0.3)}
     for step, lesson in enumerate(lessons(scene, range(1000), **changes)):
         if 200 <= step < 600:
             window = 0.1 + 0.4 * (step - 200) / 200 if step < 400 else 0.3 + 0.2 * (step - 400) / 200
@@ -68,8 +68,8 @@ def test_second_window_grows_as_the_first(scene: SceneData) -> None:
             assert distance(scene, lesson.t) <= window + 1e-9
 
 
-def test_all_photographs_of_the_second_window_teach_everything(scene: SceneData) -> None:
-    changes = {"window_starts": (0.1, 0.3), "window_until_fraction": 0.9, "steps": 2000}
+def test_all_images_of_the_second_window_teach_everything(scene: SceneData) -> None:
+    changes = {"window_start_widths": (0.1, 0.3), "window_full_fraction": 0.9, "steps": 2000}
     subjects = Counter(lesson.subject for lesson in lessons(scene, range(480, 800), **changes))
     assert subjects == {"everything": 80, "motion": 160, "stillness": 80}
     second = lessons(scene, range(1101, 1800), **changes)
@@ -84,9 +84,9 @@ def test_second_window_keeps_the_motions_that_the_first_has_found(
     scene: SceneData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     carried = []
-    monkeypatch.setattr(BasisLayer, "carry_outwards", lambda _, before, after: carried.append((before, after)))
-    changes = {"warmup_fraction": 0.1, "settling_fraction": 0.1, "window_until_fraction": 0.6, "steps": 50}
-    config = small_config(model=SHARED_MOTIONS, window_starts=(0.1, 0.2), **changes)
+    monkeypatch.setattr(BasisLayer, "on_window", lambda _, before, after: carried.append((before, after)))
+    changes = {"static_fraction": 0.1, "static_window_fraction": 0.1, "window_full_fraction": 0.6, "steps": 50}
+    config = small_config(model=SHARED_MOTIONS, window_start_widths=(0.1, 0.2), **changes)
     trainer = Trainer(config, scene)
     while trainer.step_count < 50:
         trainer.step()
@@ -95,14 +95,18 @@ def test_second_window_keeps_the_motions_that_the_first_has_found(
 
 def test_first_window_discovers_and_the_second_does_not(scene: SceneData) -> None:
     config = small_config(
-        steps=1000, warmup_fraction=0.1, settling_fraction=0.1, window_until_fraction=0.6, window_starts=(0.03, 0.3)
+        steps=1000,
+        static_fraction=0.1,
+        static_window_fraction=0.1,
+        window_full_fraction=0.6,
+        window_start_widths=(0.03, 0.3),
     )
     curriculum = Curriculum(config, scene.splits["train"], scene.time_range)
-    assert [step for step in range(1000) if curriculum.discovers(step)] == list(range(401))
+    assert [step for step in range(1000) if curriculum.is_first_pass(step)] == list(range(401))
 
 
 def test_lessons_of_one_step_differ_and_its_window_is_theirs(scene: SceneData) -> None:
-    drawn = lessons(scene, range(400, 1120), photographs=2, window_starts=(0.1,))
+    drawn = lessons(scene, range(400, 1120), batch_size=2, window_start_widths=(0.1,))
     assert [lesson.subject for lesson in drawn[:4]] == ["stillness", "motion", "everything", "motion"]
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 180, "motion": 360, "stillness": 180}
     for number, lesson in enumerate(drawn, 400):
@@ -111,19 +115,19 @@ def test_lessons_of_one_step_differ_and_its_window_is_theirs(scene: SceneData) -
 
 
 def test_of_four_lessons_two_teach_motion_and_one_stillness(scene: SceneData) -> None:
-    drawn = lessons(scene, range(200, 560), window_starts=(0.1,))
+    drawn = lessons(scene, range(200, 560), window_start_widths=(0.1,))
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 90, "motion": 180, "stillness": 90}
 
 
 def test_switches(scene: SceneData) -> None:
-    drawn = lessons(scene, range(200, 560), window_starts=(0.1,), teach_motion=False)
+    drawn = lessons(scene, range(200, 560), window_start_widths=(0.1,), new_frames_motion_only=False)
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 270, "stillness": 90}
-    drawn = lessons(scene, range(200, 560), window_starts=(0.1,), teach_stillness=False)
+    drawn = lessons(scene, range(200, 560), window_start_widths=(0.1,), outside_frames_static_only=False)
     assert Counter(lesson.subject for lesson in drawn) == {"everything": 180, "motion": 180}
 
 
 def test_what_is_new_teaches_motion(scene: SceneData) -> None:
-    for step, lesson in enumerate(lessons(scene, range(600), window_starts=(0.1,))):
+    for step, lesson in enumerate(lessons(scene, range(600), window_start_widths=(0.1,))):
         if lesson.subject == "motion":
             window = 0.1 + 0.4 * (step - 200) / 400
             assert step >= 200
@@ -137,7 +141,7 @@ def test_a_single_time_leaves_no_window_empty(tmp_path: Path) -> None:
 
 
 def test_a_lesson_changes_only_what_it_teaches(scene: SceneData) -> None:
-    trainer = Trainer(small_config(warmup_fraction=0.1, settling_fraction=0.1, densify_every=0, steps=100), scene)
+    trainer = Trainer(small_config(static_fraction=0.1, static_window_fraction=0.1, refine_every=0, steps=100), scene)
     groups = {"motion": list(trainer.model.deformation.parameters())}
     while trainer.step_count < 22:
         trainer.step()
@@ -159,8 +163,10 @@ def test_a_lesson_changes_only_what_it_teaches(scene: SceneData) -> None:
     assert seen == {"everything", "motion", "stillness"}
 
 
-def test_motions_hurry_to_where_new_photographs_show_them_but_stretches_do_not(scene: SceneData) -> None:
-    config = small_config(model=SHARED_MOTIONS, warmup_fraction=0.1, settling_fraction=0.1, steps=100, densify_every=0)
+def test_motions_hurry_to_where_new_images_show_them_but_stretches_do_not(scene: SceneData) -> None:
+    config = small_config(
+        model=SHARED_MOTIONS, static_fraction=0.1, static_window_fraction=0.1, steps=100, refine_every=0
+    )
     trainer = Trainer(config, scene)
     while trainer.step_count < 25:
         trainer.step()
@@ -180,19 +186,19 @@ def test_motions_hurry_to_where_new_photographs_show_them_but_stretches_do_not(s
     trainer._move(shots)
     for name, curve in curves.items():
         times = torch.ones(len(curve))
-        times[read] = 1.0 if name == "stretches" else AHEAD
+        times[read] = 1.0 if name == "stretches" else NEW_FRAME_LR_MULTIPLIER
         assert steps[name][read].abs().max() > 0
         torch.testing.assert_close(
             curve.detach() - before[name], steps[name] * times[:, None, None], rtol=1e-4, atol=1e-6
         )
 
 
-def test_blocks_of_pictures_are_compared_where_motion_alone_is_taught(
+def test_blocks_of_images_are_compared_where_motion_alone_is_taught(
     scene: SceneData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compared = []
-    monkeypatch.setattr(trainer_module, "blocks_loss", lambda *pictures: compared.append(pictures) or 0.0)
-    config = small_config(warmup_fraction=0.1, settling_fraction=0.1, steps=100, blocks_weight=1.0)
+    monkeypatch.setattr(trainer_module, "pooled_l1", lambda *images: compared.append(images) or 0.0)
+    config = small_config(static_fraction=0.1, static_window_fraction=0.1, steps=100, pooled_l1_weight=1.0)
     trainer, taught = Trainer(config, scene), []
     while trainer.step_count < 40:
         (shot,) = trainer._shots()
@@ -201,12 +207,16 @@ def test_blocks_of_pictures_are_compared_where_motion_alone_is_taught(
     assert len(compared) == taught.count("motion") > 0
 
 
-def test_motions_of_new_photographs_may_bend(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_motions_of_new_images_may_bend(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
     bends, strains, taught = [], [], []
     monkeypatch.setattr(BasisLayer, "bends", lambda _, t: bends.append(float(t)) or 0.0)
     monkeypatch.setattr(BasisLayer, "strains", lambda _, t: strains.append(float(t)) or 0.0)
     config = small_config(
-        model=SHARED_MOTIONS, warmup_fraction=0.1, settling_fraction=0.1, steps=100, teach_stillness=False
+        model=SHARED_MOTIONS,
+        static_fraction=0.1,
+        static_window_fraction=0.1,
+        steps=100,
+        outside_frames_static_only=False,
     )
     trainer = Trainer(config, scene)
     while trainer.step_count < 40:
@@ -220,22 +230,22 @@ def test_motions_of_new_photographs_may_bend(scene: SceneData, monkeypatch: pyte
 
 @pytest.mark.parametrize("starts", [(), [0.6], [-0.1], [float("nan")], ["0.1"], [True], 0.1])
 def test_starts_of_windows_that_cannot_be_are_named(starts: object) -> None:
-    with pytest.raises(InvalidInput, match=r"config\.window_starts"):
-        small_config(window_starts=starts)
+    with pytest.raises(InvalidInput, match=r"config\.window_start_widths"):
+        small_config(window_start_widths=starts)
 
 
 def test_starts_of_windows_read_from_json_are_the_same() -> None:
-    config = small_config(window_starts=(0.1, 0.3, 0.3))
+    config = small_config(window_start_widths=(0.1, 0.3, 0.3))
     assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
 def test_a_third_window_grows_as_the_second(scene: SceneData) -> None:
     config = small_config(
         steps=1000,
-        warmup_fraction=0.1,
-        settling_fraction=0.1,
-        window_until_fraction=0.8,
-        window_starts=(0.1, 0.3, 0.2),
+        static_fraction=0.1,
+        static_window_fraction=0.1,
+        window_full_fraction=0.8,
+        window_start_widths=(0.1, 0.3, 0.2),
     )
     curriculum = Curriculum(config, scene.splits["train"], scene.time_range)
     windows = [curriculum.window(step) for step in (200, 300, 400, 500, 600, 700, 800)]

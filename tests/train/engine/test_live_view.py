@@ -17,11 +17,11 @@ from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.metrics_log import to_bytes
-from msdgs_train.engine.run import Observer, Observers, Outcome, fit
+from msdgs_train.engine.run import Observer, Observers, RunResult, fit
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.gaussians.model_file import LoadedModel, SceneInfo, save_model
 from msdgs_train.viewer.snapshot import Snapshot, snapshot_of_training
-from msdgs_train.viewer.stage import stage_of_data, stage_of_file
+from msdgs_train.viewer.stage import view_of_data, view_of_file
 from msdgs_train.viewer.training_view import TrainingView
 from msdgs_train.viewer.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
 from tests.support.models import SCENE, random_model
@@ -79,15 +79,15 @@ def test_small_while_it_moves_and_large_when_it_is_still(page: PageServer, loade
     with Viewer("127.0.0.1", 0) as viewer:
         show_model(viewer, loaded, "model.pt")
         page.clients[3] = client = PageClient(VIEW)
-        wait_for(lambda: len(client.pictures) == 2)
+        wait_for(lambda: len(client.images) == 2)
         small = VIEW.resized(round(MOVING_PART * WIDTH), round(MOVING_PART * HEIGHT))
-        np.testing.assert_array_equal(client.pictures[0], _expected(loaded, small, 0.5, 2))
-        np.testing.assert_array_equal(client.pictures[1], _expected(loaded, VIEW, 0.5, 2))
+        np.testing.assert_array_equal(client.images[0], _expected(loaded, small, 0.5, 2))
+        np.testing.assert_array_equal(client.images[1], _expected(loaded, VIEW, 0.5, 2))
         time.sleep(0.3)
-        assert len(client.pictures) == 2, "what is shown already isn't drawn again"
+        assert len(client.images) == 2, "what is shown already isn't drawn again"
         client.look_from(CLOSER)
-        wait_for(lambda: len(client.pictures) == 4)
-        np.testing.assert_array_equal(client.pictures[3], _expected(loaded, CLOSER, 0.5, 2))
+        wait_for(lambda: len(client.images) == 4)
+        np.testing.assert_array_equal(client.images[3], _expected(loaded, CLOSER, 0.5, 2))
     assert "step 7" in page.texts[0].content
 
 
@@ -95,16 +95,14 @@ def test_controls_change_what_is_drawn(page: PageServer, loaded: LoadedModel) ->
     with Viewer("127.0.0.1", 0) as viewer:
         show_model(viewer, loaded, "model.pt")
         page.clients[0] = client = PageClient(VIEW)
-        wait_for(lambda: len(client.pictures) == 2)
+        wait_for(lambda: len(client.images) == 2)
         assert page.controls["layers"].limits == (0, 2, 1)
         page.controls["time"].value, page.controls["layers"].value = 0.9, 1
-        wait_for(lambda: np.array_equal(client.pictures[-1], _expected(loaded, VIEW, 0.9, 1)))
+        wait_for(lambda: np.array_equal(client.images[-1], _expected(loaded, VIEW, 0.9, 1)))
         page.controls["channel"].value = "alpha"
-        wait_for(
-            lambda: client.pictures[-1].shape == (HEIGHT, WIDTH, 3) and np.ptp(client.pictures[-1], axis=2).max() == 0
-        )
+        wait_for(lambda: client.images[-1].shape == (HEIGHT, WIDTH, 3) and np.ptp(client.images[-1], axis=2).max() == 0)
         page.controls["resolution"].value = 30
-        wait_for(lambda: client.pictures[-1].shape == (20, 30, 3))
+        wait_for(lambda: client.images[-1].shape == (20, 30, 3))
 
 
 def test_playing_goes_round(page: PageServer, loaded: LoadedModel) -> None:
@@ -139,12 +137,12 @@ def test_depth_is_white_where_it_is_nearest() -> None:
 
 
 def test_a_model_without_motion_or_cameras_can_be_seen(page: PageServer) -> None:
-    still = LoadedModel(random_model(layers=(), embedding_size=0), SceneInfo(time_range=(1.0, 1.0)), 3)
+    still = LoadedModel(random_model(layers=(), embedding_dim=0), SceneInfo(time_range=(1.0, 1.0)), 3)
     with Viewer("127.0.0.1", 0) as viewer:
         show_model(viewer, still, "model.pt")
         page.clients[0] = client = PageClient(VIEW)
-        wait_for(lambda: len(client.pictures) == 2)
-        assert client.pictures[1].any()
+        wait_for(lambda: len(client.images) == 2)
+        assert client.images[1].any()
 
 
 def test_what_is_not_finite_is_said_and_drawn_when_it_is_again(page: PageServer, loaded: LoadedModel) -> None:
@@ -155,20 +153,20 @@ def test_what_is_not_finite_is_said_and_drawn_when_it_is_again(page: PageServer,
         show_model(viewer, loaded._replace(model=broken), "model.pt")
         page.clients[0] = client = PageClient(VIEW)
         wait_for(lambda: "can't be drawn" in page.texts[1].content)
-        assert client.pictures == []
+        assert client.images == []
         viewer.show(Snapshot(loaded.model, loaded.scene.background))
-        wait_for(lambda: client.pictures)
+        wait_for(lambda: client.images)
         wait_for(lambda: page.texts[1].content == "")
 
 
-def test_the_first_view_is_that_of_a_photograph(data: Path) -> None:
+def test_the_first_view_is_that_of_an_image(data: Path) -> None:
     scene = load_scene(data)
-    first, stage = scene.splits["train"][0].camera, stage_of_data(scene, 2)
+    first, stage = scene.splits["train"][0].camera, view_of_data(scene, 2)
     pose = look_at(stage.eye, stage.target, stage.up)
     assert_close(pose, first.camera_to_world, "rotation")
     assert_close(np.degrees(stage.fov_y), FOV, "rotation")
     assert_close(stage.target, np.zeros(3), "rotation")
-    assert stage_of_file(LoadedModel(random_model(), SCENE, 7)).layers == 2
+    assert view_of_file(LoadedModel(random_model(), SCENE, 7)).layers == 2
 
 
 def test_a_snapshot_stays_as_it_was(data: Path) -> None:
@@ -187,28 +185,28 @@ def test_a_snapshot_stays_as_it_was(data: Path) -> None:
 
 
 class _LooksOn(Observer):
-    """From the beginning on; after some steps it waits for another picture."""
+    """From the beginning on; after some steps it waits for another image."""
 
     def __init__(self, page: PageServer) -> None:
         self._page, self.client = page, PageClient(VIEW)
 
-    def begins(self, trainer: Trainer) -> None:
+    def on_train_start(self, trainer: Trainer) -> None:
         self._page.clients[0] = self.client
 
     def step(self, result: StepResult, seconds: float) -> None:
         if result.step % 3 == 0:
-            before = len(self.client.pictures)
-            wait_for(lambda: len(self.client.pictures) > before)
+            before = len(self.client.images)
+            wait_for(lambda: len(self.client.images) > before)
 
 
-@pytest.mark.parametrize("photographs", [1, 3])
-def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, photographs: int) -> None:
-    config = small_config(threads=2, photographs=photographs)
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, batch_size: int) -> None:
+    config = small_config(threads=2, batch_size=batch_size)
     fit(config, data, tmp_path / "alone")
     looks_on = _LooksOn(page)
     with Viewer("127.0.0.1", 0) as viewer:
         fit(config, data, tmp_path / "seen", observer=Observers(TrainingView(viewer, config.steps), looks_on))
-    pictures = [picture for picture in looks_on.client.pictures if picture.shape == (HEIGHT, WIDTH, 3)]
+    pictures = [picture for picture in looks_on.client.images if picture.shape == (HEIGHT, WIDTH, 3)]
     assert len(pictures) >= 2
     assert not np.array_equal(pictures[0], pictures[-1]), "training should have been seen"
     alone, seen = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("alone", "seen"))
@@ -246,7 +244,7 @@ class _Stoppable(Observer):
 
 
 def test_a_pause_holds_the_run_takes_no_time_and_can_be_stopped(data: Path, tmp_path: Path, page: PageServer) -> None:
-    config, watched, outcomes = small_config(steps=100_000, eval_every=0), _Stoppable(), list[Outcome]()
+    config, watched, outcomes = small_config(steps=100_000, eval_every=0), _Stoppable(), list[RunResult]()
     with Viewer("127.0.0.1", 0) as viewer:
         observers = Observers(TrainingView(viewer, config.steps), watched)
         thread = threading.Thread(
@@ -259,7 +257,7 @@ def test_a_pause_holds_the_run_takes_no_time_and_can_be_stopped(data: Path, tmp_
         time.sleep(1.0)
         step = watched.last
         page.clients[0] = client = PageClient(VIEW)
-        wait_for(lambda: len(client.pictures) >= 2)
+        wait_for(lambda: len(client.images) >= 2)
         time.sleep(0.2)
         assert watched.last == step
         page.controls["pause"].value = False
@@ -279,11 +277,11 @@ def test_the_page_stays_after_the_run(
     page.clients[0] = client = PageClient(VIEW)
 
     def ctrl_c(viewer: Viewer) -> None:
-        before = len(client.pictures)
-        wait_for(lambda: len(client.pictures) > before)
+        before = len(client.images)
+        wait_for(lambda: len(client.images) > before)
 
-    monkeypatch.setattr(Viewer, "stay", ctrl_c)
-    options = ["--steps", "2", "--threads=1", "--init-count=60", "--max-gaussians=90", "--viewer"]
+    monkeypatch.setattr(Viewer, "wait_for_interrupt", ctrl_c)
+    options = ["--steps", "2", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--viewer"]
     assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
     printed = capsys.readouterr().out
     assert "look at http://localhost:8080" in printed
@@ -298,11 +296,11 @@ def test_a_model_file_is_viewed(
 
     def ctrl_c(viewer: Viewer) -> None:
         page.clients[0] = client
-        wait_for(lambda: len(client.pictures) == 2)
+        wait_for(lambda: len(client.images) == 2)
 
-    monkeypatch.setattr(Viewer, "stay", ctrl_c)
+    monkeypatch.setattr(Viewer, "wait_for_interrupt", ctrl_c)
     assert cli.main(["view", str(tmp_path / "model.pt")]) == 0
-    np.testing.assert_array_equal(client.pictures[1], _expected(loaded, VIEW, 0.5, 2))
+    np.testing.assert_array_equal(client.images[1], _expected(loaded, VIEW, 0.5, 2))
 
 
 def test_without_viser_the_extra_is_named_before_anything_is_done(

@@ -17,7 +17,7 @@ from playwright.sync_api import Browser, Page
 from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
 from msdgs_train.viewer.snapshot import Snapshot
-from msdgs_train.viewer.stage import stage_of_data
+from msdgs_train.viewer.stage import view_of_data
 from msdgs_train.viewer.viewer import Viewer
 from tests.support.browser import WEBGL, chromium
 from tests.support.images import decode
@@ -30,7 +30,7 @@ from tests.support.viewer_page import wait_for
 pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
 pytestmark = pytest.mark.slow
 
-SMALL = ["--threads=1", "--init-count=60", "--max-gaussians=90", "--model.width=16", "--model.depth=2"]
+SMALL = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--model.width=16", "--model.depth=2"]
 MILLISECONDS = 60_000
 
 
@@ -114,9 +114,9 @@ def test_the_page_stays_until_ctrl_c(data: Path, tmp_path: Path, page: Page) -> 
 
 
 @pytest.mark.parametrize("opened_early", [True, False])
-def test_a_browsers_camera_begins_at_the_first_photograph(data: Path, page: Page, opened_early: bool) -> None:
+def test_a_browsers_camera_begins_at_the_first_image(data: Path, page: Page, opened_early: bool) -> None:
     scene = load_scene(data)
-    model, stage = random_model(), stage_of_data(scene, 2)
+    model, stage = random_model(), view_of_data(scene, 2)
     with Viewer("127.0.0.1", 0) as viewer:
         if opened_early:
             page.goto(viewer.url)

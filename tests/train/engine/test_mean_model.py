@@ -27,13 +27,13 @@ from tests.support.training_scene import (
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
     model=SHARED_MOTIONS,
-    window_until_fraction=0.5,
-    densify_until_fraction=BEGINS / STEPS,
-    average_steps=KEPT,
+    window_full_fraction=0.5,
+    refine_stop_fraction=BEGINS / STEPS,
+    ema_steps=KEPT,
     eval_every=0,
 )
 AS_THE_PRESET = replace(
-    CONFIG, photographs=2, window_until_fraction=BEGINS / STEPS, densify_until_fraction=0.5, eps2d_start=0.4
+    CONFIG, batch_size=2, window_full_fraction=BEGINS / STEPS, refine_stop_fraction=0.5, eps2d_init=0.4
 )
 
 
@@ -47,21 +47,21 @@ def _parameters(model: torch.nn.Module) -> list[np.ndarray]:
 
 
 def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
-    """All of them weigh the same until there are `average_steps`, then older ones ever less."""
+    """All of them weigh the same until there are `ema_steps`, then older ones ever less."""
     trainer, seen = Trainer(CONFIG, load_scene(data)), []
     for step in range(1, STEPS + 1):
         trainer.step()
         if step <= BEGINS:
-            assert trainer.kept_model is trainer.model
+            assert trainer.eval_model is trainer.model
             continue
         seen.append(_parameters(trainer.model))
         if len(seen) <= KEPT:
             expected = [np.mean(values, axis=0) for values in zip(*seen, strict=True)]
         else:
             expected = [(1 - 1 / KEPT) * old + last / KEPT for old, last in zip(expected, seen[-1], strict=True)]
-        for mean, value in zip(_parameters(trainer.kept_model), expected, strict=True):
+        for mean, value in zip(_parameters(trainer.eval_model), expected, strict=True):
             np.testing.assert_allclose(mean, value, rtol=1e-5, atol=1e-6)
-    moved = zip(_parameters(trainer.kept_model), seen[-1], strict=True)
+    moved = zip(_parameters(trainer.eval_model), seen[-1], strict=True)
     assert sum(not np.array_equal(mean, last) for mean, last in moved) > 5
 
 
@@ -111,9 +111,9 @@ def test_with_more_steps_it_begins_anew(data: Path, tmp_path: Path) -> None:
     before = _saved(data, tmp_path / "checkpoint.pt", STEPS)
     longer = Trainer(replace(CONFIG, steps=2 * STEPS), before.scene)
     longer.load_checkpoint(tmp_path / "checkpoint.pt")
-    assert longer.kept_model is longer.model
+    assert longer.eval_model is longer.model
     longer.step()
-    assert longer.kept_model is longer.model
+    assert longer.eval_model is longer.model
 
 
 def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_pa
     for _ in range(2):
         shorter.step()
         seen.append(_parameters(shorter.model))
-    for mean, *values in zip(_parameters(shorter.kept_model), *seen, strict=True):
+    for mean, *values in zip(_parameters(shorter.eval_model), *seen, strict=True):
         np.testing.assert_allclose(mean, np.mean(values, axis=0), rtol=1e-5, atol=1e-6)
 
 
@@ -135,9 +135,9 @@ def test_a_run_from_before_there_were_means_goes_on(data: Path, tmp_path: Path) 
     torch.save(state, tmp_path / "checkpoint.pt")
     trainer = Trainer(CONFIG, before.scene)
     trainer.load_checkpoint(tmp_path / "checkpoint.pt")
-    assert trainer.kept_model is trainer.model
+    assert trainer.eval_model is trainer.model
     trainer.step()
-    for mean, last in zip(_parameters(trainer.kept_model), _parameters(trainer.model), strict=True):
+    for mean, last in zip(_parameters(trainer.eval_model), _parameters(trainer.model), strict=True):
         np.testing.assert_array_equal(mean, last)
 
 
@@ -146,9 +146,9 @@ def test_it_begins_when_gaussians_and_motions_stay_what_they_are(last: str) -> N
     ends = {"still": 0.25, "windows": 0.25, "density control": 0.25, last: 0.5}
     config = replace(
         CONFIG,
-        warmup_fraction=ends["still"],
-        window_until_fraction=ends["windows"],
-        densify_until_fraction=ends["density control"],
+        static_fraction=ends["still"],
+        window_full_fraction=ends["windows"],
+        refine_stop_fraction=ends["density control"],
     )
-    assert [step for step in range(1, STEPS + 1) if config.averages_after(step)] == list(range(13, STEPS + 1))
-    assert not any(replace(config, average_steps=0).averages_after(step) for step in range(1, STEPS + 1))
+    assert [step for step in range(1, STEPS + 1) if config.averages_at(step)] == list(range(13, STEPS + 1))
+    assert not any(replace(config, ema_steps=0).averages_at(step) for step in range(1, STEPS + 1))

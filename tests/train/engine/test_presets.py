@@ -25,7 +25,7 @@ from tests.support.training_scene import write_scene
 def sizes(config: ModelConfig, count: int = 3) -> tuple[int, int]:
     """Parameters of the deformation, and of the modulation with its embeddings."""
     model = DynamicGaussians(
-        config, CanonicalGaussians.random_in_cube(count, 1.0, config.sh_degree, config.embedding_size, 0)
+        config, CanonicalGaussians.random_in_cube(count, 1.0, config.sh_degree, config.embedding_dim, 0)
     )
     embeddings = model.gaussians.embeddings
     modulation = [] if model.modulation is None or embeddings is None else [*model.modulation.parameters(), embeddings]
@@ -81,12 +81,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shrunk(config: TrainConfig) -> TrainConfig:
     """The same system on few Gaussians and in few steps, narrow, with half of its steps after the warm-up."""
     model = dataclasses.replace(
-        config.model, layers=config.model.layers[:3], width=16, time_width=8, time_features=4, plane_channels=4,
-        plane_space_nodes=6, plane_time_nodes=5, plane_width=8, embedding_size=min(config.model.embedding_size, 4),
+        config.model, layers=config.model.layers[:3], width=16, time_width=8, time_features=4, plane_features_dim=4,
+        plane_resolution=6, plane_time_resolution=5, plane_width=8, embedding_dim=min(config.model.embedding_dim, 4),
     )  # fmt: skip
     return dataclasses.replace(
-        config, model=model, steps=12, warmup_fraction=0.25, threads=2, init_count=60, max_gaussians=90, densify_from=4,
-        densify_every=4, sh_interval=4,
+        config, model=model, steps=12, static_fraction=0.25, threads=2, init_num_pts=60, max_gaussians=90,
+        refine_start=4, refine_every=4, sh_degree_interval=4,
     )  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def test_each_preset_trains_and_exports(name: str, data: Path, tmp_path: Path) -
     trainer.save_model(tmp_path / "model.pt")
     exported = export_scene(tmp_path / "model.pt", tmp_path / "scene.onnx", times=5)
     assert exported.metadata.delta_space == preset(name).model.delta_space
-    drawn, posed = DeformationSession(exported.path).gaussians(0.37), trainer.kept_model.pose(0.37)
+    drawn, posed = DeformationSession(exported.path).gaussians(0.37), trainer.eval_model.pose(0.37)
     for field in ("means", "quats", "scales"):
         want = getattr(posed, field).detach().numpy()
         np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))

@@ -13,7 +13,7 @@ from PIL import Image
 from msdgs_train.cli import main as cli
 from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.metrics_log import read_metrics
-from msdgs_train.engine.run import RENDERS_WHILE_TRAINING, Observer, fit
+from msdgs_train.engine.run import RENDERS_PER_EVAL, Observer, fit
 from msdgs_train.engine.tensorboard_events import EVAL_SCALARS, FOLDER, TRAIN_SCALARS
 from msdgs_train.engine.trainer import StepResult
 from tests.support.tolerances import tolerance
@@ -27,7 +27,7 @@ accumulator = pytest.importorskip(
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene", test=RENDERS_WHILE_TRAINING + 1)
+    return write_scene(tmp_path_factory.mktemp("data") / "scene", test=RENDERS_PER_EVAL + 1)
 
 
 @pytest.fixture(autouse=True)
@@ -90,7 +90,7 @@ def test_held_out_renderings_at_every_evaluation(data: Path, tmp_path: Path) -> 
     run = tmp_path / "run"
     fit(small_config(), data, run, tensorboard=True)
     events = _events(run)
-    shown = {f"test/r_{i:03d}" for i in range(RENDERS_WHILE_TRAINING)} | {"val/r_000"}
+    shown = {f"test/r_{i:03d}" for i in range(RENDERS_PER_EVAL)} | {"val/r_000"}
     assert set(events.Tags()["images"]) == shown
     images = events.Images("test/r_000")
     assert [image.step for image in images] == [10, 20, 24]
@@ -101,7 +101,15 @@ def test_held_out_renderings_at_every_evaluation(data: Path, tmp_path: Path) -> 
 
 def test_the_command_line_asks_for_it(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    options = ["--steps", "2", "--threads=1", "--init-count=60", "--max-gaussians=90", "--log-every=1", "--tensorboard"]
+    options = [
+        "--steps",
+        "2",
+        "--threads=1",
+        "--init-num-pts=60",
+        "--max-gaussians=90",
+        "--log-every=1",
+        "--tensorboard",
+    ]
     assert cli.main(["fit", str(data), str(run), *options]) == 0
     _assert_as_in_metrics(run)
     assert math.isfinite(_events(run).Scalars("test/psnr")[0].value)

@@ -17,8 +17,8 @@ from tests.support.processes import ROOT
 from tests.support.training_scene import write_scene
 
 SMALL = [
-    *("--threads=1", "--init-count=60", "--max-gaussians=90", "--log-every=1", "--model.sh-degree=1"),
-    *("--model.width=16", "--model.depth=2", "--model.time-width=8", "--model.embedding-size=4"),
+    *("--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--log-every=1", "--model.sh-degree=1"),
+    *("--model.width=16", "--model.depth=2", "--model.time-width=8", "--model.embedding-dim=4"),
 ]
 
 
@@ -73,7 +73,7 @@ def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
     more = ["fit", str(data), str(run), "--resume", "--steps", str(step + 3)]
     assert cli.main(more) == 0
     assert json.loads((run / "metrics.json").read_text())["step"] == step + 3
-    assert json.loads((run / "config.json").read_text())["init_count"] == 60
+    assert json.loads((run / "config.json").read_text())["init_num_pts"] == 60
     assert cli.main([*more, "--l1-weight", "0.1"]) == cli.EXIT_INVALID
 
 
@@ -96,10 +96,10 @@ def _wait_for_lines(path: Path, process: subprocess.Popen, lines: int = 3, secon
 
 
 def test_a_preset_gives_way_to_what_is_given_beside_it(data: Path, tmp_path: Path) -> None:
-    options = ["--preset", "static", "--steps", "2", "--init-count", "60", "--max-gaussians=90", "--threads=1"]
+    options = ["--preset", "static", "--steps", "2", "--init-num-pts", "60", "--max-gaussians=90", "--threads=1"]
     assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert (config["model"]["layers"], config["init_count"], config["window_until_fraction"]) == ([], 60, 0.0)
+    assert (config["model"]["layers"], config["init_num_pts"], config["window_full_fraction"]) == ([], 60, 0.0)
 
 
 def test_help_shows_the_settings_of_a_preset(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from msdgs_train.datasets import load_scene
 from msdgs_train.engine import run as fit_module
 from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
-from msdgs_train.engine.curriculum import Lesson
+from msdgs_train.engine.curriculum import TrainingSample
 from msdgs_train.engine.metrics_log import MetricsLog, read_metrics
 from msdgs_train.engine.optimizer import exponential, learning_rates
 from msdgs_train.engine.run import Observer, fit
@@ -57,8 +57,8 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     points, colors = numbers.uniform(-0.5, 0.5, (found, 3)), numbers.uniform(0.1, 0.9, (found, 3))
     scene = dataclasses.replace(load_scene(data), points=points, point_colors=colors)
     trainer = Trainer(small_config(), scene)
-    first, started = trainer.model.gaussians, min(found, trainer.config.init_count)
-    assert 20 < trainer.config.init_count < 500
+    first, started = trainer.model.gaussians, min(found, trainer.config.init_num_pts)
+    assert 20 < trainer.config.init_num_pts < 500
     assert len(first) == started
     nearest = np.linalg.norm(first.means.detach().numpy()[:, None] - points[None], axis=2).argmin(axis=1)
     assert len(set(nearest)) == started
@@ -71,7 +71,7 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
 @pytest.mark.parametrize("stop", [8, 13])
 def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
     """Stopped in the first and in the second window."""
-    config = small_config(model=SHARED_MOTIONS, window_starts=(0.03, 0.2))
+    config = small_config(model=SHARED_MOTIONS, window_start_widths=(0.03, 0.2))
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
     fit(config, data, tmp_path / "parts", resume=True)
@@ -82,7 +82,7 @@ def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path,
 @pytest.mark.parametrize("stop", [3, 11, 16])
 @pytest.mark.parametrize("background", ["white", "random"])
 def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, background: str) -> None:
-    """Stopped in the warm-up, between and after densifications, in the middle of a pass over the photographs."""
+    """Stopped in the warm-up, between and after densifications, in the middle of a pass over the images."""
     config = small_config(background=background)
     fit(config, data, tmp_path / "whole")
     outcome = fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
@@ -90,7 +90,7 @@ def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, backgrou
     torch.manual_seed(stop)
     assert fit(config, data, tmp_path / "parts", resume=True).status == "finished"
     whole, parts = (state_of(tmp_path / name) for name in ("whole", "parts"))
-    assert len(whole["/density/0"]) != config.init_count, "density control should have taken part"
+    assert len(whole["/density/0"]) != config.init_num_pts, "density control should have taken part"
     assert_same_bits(whole, parts)
     lines = [[{**line, "seconds": 0} for line in read_metrics(tmp_path / name)] for name in ("whole", "parts")]
     assert lines[0] == lines[1]
@@ -98,7 +98,7 @@ def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, backgrou
 
 def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    outcome = fit(small_config(steps=150, eval_every=50, checkpoint_every=50, opacity_reset_every=0), data, run)
+    outcome = fit(small_config(steps=150, eval_every=50, checkpoint_every=50, reset_every=0), data, run)
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
     assert names == {
         "config.json", "run.json", "metrics.jsonl", "metrics.json", "curve.png", "checkpoint.pt", "model.pt", "best.pt",
@@ -129,12 +129,12 @@ def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
         posed = model.pose(evaluated.frame.t)
         with torch.no_grad():
             rgb = trainer_module.rasterize(*posed, evaluated.frame.camera, torch.ones(3))[0]
-        assert quality(rgb, evaluated.truth) == evaluated.quality
+        assert quality(rgb, evaluated.target) == evaluated.quality
 
 
 @pytest.mark.usefixtures("_no_curve")
 def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
-    model = ModelConfig(sh_degree=0, layers=(), embedding_size=0)
+    model = ModelConfig(sh_degree=0, layers=(), embedding_dim=0)
     assert fit(small_config(model=model), data, tmp_path / "run").status == "finished"
 
 
@@ -160,10 +160,10 @@ def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: P
 
 
 def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = Trainer(small_config(steps=100, densify_every=0), load_scene(data))
+    trainer = Trainer(small_config(steps=100, refine_every=0), load_scene(data))
     trainer.step()
     before = [p.detach().clone() for p in trainer.model.parameters()]
-    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, *parts: rgb.sum() * float("nan"))
+    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, target, *parts: rgb.sum() * float("nan"))
     result = trainer.step()
     assert (result.step, result.skipped) == (2, 1)
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.model.parameters(), strict=True))
@@ -171,14 +171,14 @@ def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.Mo
         _steps(trainer, 19)
 
 
-def test_photographs_of_a_step_share_it_evenly(data: Path) -> None:
-    config = small_config(warmup_fraction=0.0, window_until_fraction=0.0, densify_every=0, rigidity_weight=0.1)
+def test_images_of_a_step_share_it_evenly(data: Path) -> None:
+    config = small_config(static_fraction=0.0, window_full_fraction=0.0, refine_every=0, rigidity_weight=0.1)
     scene = load_scene(data)
 
-    def gradients(photographs: int, threads: int) -> list[list[Tensor]]:
-        trainer = Trainer(dataclasses.replace(config, photographs=photographs, threads=threads), scene)
+    def gradients(batch_size: int, threads: int) -> list[list[Tensor]]:
+        trainer = Trainer(dataclasses.replace(config, batch_size=batch_size, threads=threads), scene)
         found = []
-        for _ in range(6 // photographs):
+        for _ in range(6 // batch_size):
             trainer._set_gradients(trainer._shots())
             found.append([p.grad.clone() for p in trainer.model.parameters() if p.grad is not None])
         return found
@@ -191,8 +191,8 @@ def test_photographs_of_a_step_share_it_evenly(data: Path) -> None:
     assert all(map(torch.equal, at_once, gradients(6, 2)[0])), "the same bits for any number of threads"
 
 
-def test_a_parameter_learns_the_mean_of_the_photographs_that_teach_it(data: Path) -> None:
-    trainer = Trainer(small_config(photographs=2, window_until_fraction=0.0), load_scene(data))
+def test_a_parameter_learns_the_mean_of_the_images_that_teach_it(data: Path) -> None:
+    trainer = Trainer(small_config(batch_size=2, window_full_fraction=0.0), load_scene(data))
     first, second = trainer._shots()
     of_first, of_second = first.gradients[0], second.gradients[0]
     assert of_first is not None
@@ -213,9 +213,9 @@ class _Rollbacks(Observer):
     def step(self, result: StepResult, seconds: float) -> None:
         self.steps.append(result.step)
 
-    def rolled_back(self, reason: str, step: int, rate_factor: float) -> None:
+    def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
         assert "not finite" in reason
-        self.seen.append((step, rate_factor))
+        self.seen.append((step, lr_factor))
 
 
 def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
@@ -225,7 +225,7 @@ def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
     def breaking(whole: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
         return lambda *arguments: whole(*arguments) * (float("nan") if next(calls) in broken else 1.0)
 
-    for name in ("photometric_loss", "still_loss"):
+    for name in ("photometric_loss", "masked_l1"):
         monkeypatch.setattr(trainer_module, name, breaking(getattr(trainer_module, name)))
 
 
@@ -266,12 +266,12 @@ def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
 
 
 def test_another_way_is_taken_after_a_rollback(data: Path) -> None:
-    diverged, again = (Trainer(small_config(window_until_fraction=0.0), load_scene(data)) for _ in range(2))
+    diverged, again = (Trainer(small_config(window_full_fraction=0.0), load_scene(data)) for _ in range(2))
     first, second = ([_next_frame(trainer) for _ in range(7)] for trainer in (diverged, again))
     assert first == second
     again.retry_after(diverged)
     assert [_next_frame(again) for _ in range(7)] != first
-    assert (again.rollbacks, again.rate_factor) == (1, 0.5)
+    assert (again.rollbacks, again.lr_factor) == (1, 0.5)
 
 
 def _next_frame(trainer: Trainer) -> str:
@@ -284,11 +284,11 @@ def _plane_differences(planes: np.ndarray, order: int, axis: int) -> float:
 
 @pytest.mark.parametrize("mcmc", [False, True])
 def test_what_is_added_to_the_loss(data: Path, mcmc: bool) -> None:
-    model = dataclasses.replace(small_config().model, layers=("plane", "mlp"), plane_scales=(1, 2), plane_space_nodes=5)
-    weights = {"plane_bends_weight": 1.0, "plane_slopes_weight": 10.0, "plane_space_bends_weight": 100.0}
+    model = dataclasses.replace(small_config().model, layers=("plane", "mlp"), multires=(1, 2), plane_resolution=5)
+    weights = {"time_smoothness_weight": 1.0, "plane_tv_weight": 10.0, "plane_smoothness_weight": 100.0}
     config = small_config(
-        model=model, warmup_fraction=0.0, densify_strategy="mcmc" if mcmc else "gradient", mcmc_opacity_weight=2e4,
-        mcmc_scale_weight=3e5, plane_time_l1_weight=1e3, **weights,
+        model=model, static_fraction=0.0, density_strategy="mcmc" if mcmc else "gradient", opacity_reg=2e4,
+        scale_reg=3e5, l1_time_planes_weight=1e3, **weights,
     )  # fmt: skip
     trainer = Trainer(config, load_scene(data))
     expected = 0.0
@@ -304,32 +304,32 @@ def test_what_is_added_to_the_loss(data: Path, mcmc: bool) -> None:
         if mcmc:
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(trainer.model.plane_grids()) == 2
-        lesson = Lesson(trainer.frames[0], 0.3, "everything")
-        assert float(trainer._priors(posed, lesson, torch.Generator())) == pytest.approx(
+        lesson = TrainingSample(trainer.frames[0], 0.3, "everything")
+        assert float(trainer._regularizers(posed, lesson, torch.Generator())) == pytest.approx(
             float(expected), rel=tolerance("float32.relative")
         )
 
 
 def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
     model = dataclasses.replace(small_config().model, delta_space="activated")
-    trainer = Trainer(small_config(model=model, warmup_fraction=0.0), load_scene(data))
-    assert trainer.step().floored == 0
+    trainer = Trainer(small_config(model=model, static_fraction=0.0), load_scene(data))
+    assert trainer.step().clamped_scales == 0
     with torch.no_grad():
         trainer.model.get_parameter("deformation.layers.0.heads.bias")[4] = -1e3
     result = trainer.step()
-    assert result.floored == result.gaussians
+    assert result.clamped_scales == result.gaussians
 
 
 def test_an_outlier_of_a_gradient_is_cut(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = Trainer(small_config(steps=100, warmup_fraction=0.0), load_scene(data))
-    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, truth, *parts: 1e9 * (rgb - truth).sum() ** 2)
+    trainer = Trainer(small_config(steps=100, static_fraction=0.0), load_scene(data))
+    monkeypatch.setattr(trainer_module, "photometric_loss", lambda rgb, target, *parts: 1e9 * (rgb - target).sum() ** 2)
     _steps(trainer, 3)
     gradients = [p.grad for p in trainer.model.deformation.parameters() if p.grad is not None]
     assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer_module.MAX_FIELD_GRADIENT)
 
 
 def test_warmup_leaves_the_deformation_alone(data: Path) -> None:
-    trainer = Trainer(small_config(warmup_fraction=0.25), load_scene(data))
+    trainer = Trainer(small_config(static_fraction=0.25), load_scene(data))
     before = [p.detach().clone() for p in trainer.model.deformation.parameters()]
     _steps(trainer, 6)
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.model.deformation.parameters(), strict=True))
@@ -344,11 +344,11 @@ def test_learning_rates() -> None:
     config = TrainConfig()
     rates = learning_rates(config, config.steps)
     assert rates["means"] == pytest.approx(8e-6)
-    assert rates["deformation"] == pytest.approx(config.field_rate_end)
+    assert rates["deformation"] == pytest.approx(config.deform_lr_final)
     assert rates["raw_opacities"] == 0.05
-    while_the_window_grows = learning_rates(config, round(config.window_until_fraction * config.steps))
-    assert while_the_window_grows["deformation"] == config.field_rate_start
-    assert while_the_window_grows["means"] < config.means_rate_start
+    while_the_window_grows = learning_rates(config, round(config.window_full_fraction * config.steps))
+    assert while_the_window_grows["deformation"] == config.deform_lr_init
+    assert while_the_window_grows["means"] < config.means_lr_init
     assert rates["means"] < while_the_window_grows["means"]
     first = learning_rates(config, 0)
     for group in ("raw_opacities", "log_scales", "raw_quats", "sh_dc", "sh_rest"):
@@ -358,10 +358,10 @@ def test_learning_rates() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("steps", 0), ("l1_weight", 1.5), ("l1_weight", float("nan")), ("means_rate_start", 0.0),
-        ("squares_part", 1.1), ("blocks_weight", -1.0), ("average_steps", -1),
-        ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("densify_every", -1),
-        ("quats_rate", float("inf")), ("size", 0), ("densify_strategy", "none"), ("mcmc_noise", -1.0),
+        ("steps", 0), ("l1_weight", 1.5), ("l1_weight", float("nan")), ("means_lr_init", 0.0),
+        ("mse_fraction", 1.1), ("pooled_l1_weight", -1.0), ("ema_steps", -1),
+        ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("refine_every", -1),
+        ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),
     ],
 )  # fmt: skip
 def test_settings_out_of_range_are_named(field: str, value: object) -> None:
@@ -372,8 +372,8 @@ def test_settings_out_of_range_are_named(field: str, value: object) -> None:
 def test_settings_survive_json_and_strangers_are_refused() -> None:
     config = small_config(background="random", size=SIZE)
     assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    with pytest.raises(InvalidInput, match="`colour`"):
-        TrainConfig.from_dict({"colour": 1})
+    with pytest.raises(InvalidInput, match="`color`"):
+        TrainConfig.from_dict({"color": 1})
 
 
 def test_metrics_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:

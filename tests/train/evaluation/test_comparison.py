@@ -16,7 +16,7 @@ import pytest
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli import main as cli
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
-from msdgs_train.comparison.pools import Ended, processes
+from msdgs_train.comparison.pools import RunEnd, processes
 from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
 from msdgs_train.comparison.results import CurvePoint, Result, Spread
 from msdgs_train.comparison.runner import train_all
@@ -24,7 +24,7 @@ from msdgs_train.systems.presets import preset
 from tests.support.processes import ROOT
 from tests.support.training_scene import write_scene
 
-BUDGET = Budget(steps=6, init_count=60, max_gaussians=90)
+BUDGET = Budget(steps=6, init_num_pts=60, max_gaussians=90)
 SYSTEMS = """
 [still]
 preset = "static"
@@ -32,13 +32,13 @@ preset = "static"
 [k1]
 model.layers = ["mlp"]
 model.width = 16
-model.embedding_size = 4
+model.embedding_dim = 4
 
 ["k2, w = 1"]
 model.layers = ["mlp", "mlp"]
 model.width = 16
 model.weights = false
-field_rate_start = 1e-3
+deform_lr_init = 1e-3
 """
 
 
@@ -60,15 +60,15 @@ def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) 
     assert systems["deformgs"] == dataclasses.replace(preset("deformgs"), **BUDGET.settings())
     assert systems["still"].model.layers == ()
     assert systems["k2 w=1"].model == dataclasses.replace(preset("msdgs-small").model, width=16, weights=False)
-    assert systems["k2 w=1"].field_rate_start == 1e-3
+    assert systems["k2 w=1"].deform_lr_init == 1e-3
     for config in systems.values():
-        assert (config.steps, config.init_count, config.max_gaussians, config.threads) == (6, 60, 90, 1)
+        assert (config.steps, config.init_num_pts, config.max_gaussians, config.threads) == (6, 60, 90, 1)
 
 
 @pytest.mark.parametrize("name", ["ablation.toml", "shared_motions.toml"])
 def test_tables_of_systems_in_the_repository_can_be_compared(name: str) -> None:
     file = ROOT / "benchmarks" / name
-    systems = read_systems([str(file)], Budget(steps=6, init_count=4000, max_gaussians=5000))
+    systems = read_systems([str(file)], Budget(steps=6, init_num_pts=4000, max_gaussians=5000))
     assert len({json.dumps(system.config.to_dict()) for system in systems}) == len(systems) > 10
 
 
@@ -197,7 +197,7 @@ def _wide() -> Result:
 
 
 def arguments(systems_file: Path, data: Path, out: Path, *more: str) -> list[str]:
-    options = ["--steps", "6", "--init-count", "60", "--max-gaussians", "90", "--jobs", "1", *more]
+    options = ["--steps", "6", "--init-num-pts", "60", "--max-gaussians", "90", "--jobs", "1", *more]
     return ["compare", str(systems_file), "--data", str(data), "--out", str(out), *options]
 
 
@@ -235,7 +235,7 @@ def test_no_jobs_are_refused(
 
 
 def test_a_run_that_fails_is_said_and_the_others_go_on(systems_file: Path, tmp_path: Path) -> None:
-    ended: list[tuple[str, Ended]] = []
+    ended: list[tuple[str, RunEnd]] = []
     runs = make_runs(read_systems([str(systems_file)], BUDGET), [tmp_path / "nowhere"], [0], tmp_path / "out")
     assert train_all(runs, processes(1), lambda run, how: ended.append((run.system, how)))
     assert [system for system, _ in ended] == ["still", "k1", "k2 w=1"]

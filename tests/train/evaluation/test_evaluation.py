@@ -47,7 +47,7 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "draw_curve", lambda run: None)
-        fit(small_config(steps=40, eval_every=5, warmup_fraction=0.1), data, run)
+        fit(small_config(steps=40, eval_every=5, static_fraction=0.1), data, run)
     return run
 
 
@@ -61,15 +61,15 @@ def _read(path: Path) -> np.ndarray:
     return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))[..., :3]
 
 
-def _psnr(rgb: np.ndarray, truth: np.ndarray) -> float:
-    return -10 * math.log10(np.mean((rgb.astype(float) - truth) ** 2))
+def _psnr(rgb: np.ndarray, target: np.ndarray) -> float:
+    return -10 * math.log10(np.mean((rgb.astype(float) - target) ** 2))
 
 
-def _ssim(rgb: np.ndarray, truth: np.ndarray) -> float:
+def _ssim(rgb: np.ndarray, target: np.ndarray) -> float:
     """As the 3D Gaussian projects compute it: blurred with zeros beyond the border."""
     taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     taps /= taps.sum()
-    x, y = rgb.astype(float), truth.astype(float)
+    x, y = rgb.astype(float), target.astype(float)
     mx, my, xx, yy, xy = (
         correlate1d(correlate1d(v, taps, 0, mode="constant"), taps, 1, mode="constant")
         for v in (x, y, x * x, y * y, x * y)
@@ -93,16 +93,16 @@ def test_numbers_are_those_computed_here(data: Path, run: Path) -> None:
     assert set(report["models"]) == {"last", "best"}
     frames = load_scene(data).splits["test"]
     for name, file in (("last", "model.pt"), ("best", "best.pt")):
-        judged = report["models"][name]
-        assert judged["file"] == file
-        assert [image["name"] for image in judged["images"]] == [frame.name for frame in frames]
-        for image, frame in zip(judged["images"], frames, strict=True):
-            rgb, truth = _render(run / file, frame), _read(frame.image_path)
-            assert_close(image["psnr"], _psnr(rgb, truth), "psnr.relative")
-            assert_close(image["ssim"], _ssim(rgb, truth), "ssim.float32")
+        evaluated = report["models"][name]
+        assert evaluated["file"] == file
+        assert [image["name"] for image in evaluated["images"]] == [frame.name for frame in frames]
+        for image, frame in zip(evaluated["images"], frames, strict=True):
+            rgb, target = _render(run / file, frame), _read(frame.image_path)
+            assert_close(image["psnr"], _psnr(rgb, target), "psnr.relative")
+            assert_close(image["ssim"], _ssim(rgb, target), "ssim.float32")
         for score in ("psnr", "ssim"):
-            mean = sum(image[score] for image in judged["images"]) / len(frames)
-            assert_close(judged["mean"][score], mean, "psnr.relative")
+            mean = sum(image[score] for image in evaluated["images"]) / len(frames)
+            assert_close(evaluated["mean"][score], mean, "psnr.relative")
     metrics = json.loads((run / "metrics.json").read_text())
     assert report["models"]["last"]["mean"]["psnr"] == metrics["splits"]["test"]["psnr"]
     assert report["models"]["last"]["mean"]["ssim"] == metrics["splits"]["test"]["ssim"]
@@ -115,7 +115,7 @@ def test_the_best_model_is_that_of_the_highest_psnr_on_val(run: Path) -> None:
     assert best == {"file": "best.pt", "split": "val", "step": highest["step"], "psnr": highest["psnr"]}
     assert load_model(run / "best.pt").step == highest["step"]
     evaluation = evaluate_run(run, split="val")
-    by_name = {judged.name: judged for judged in evaluation.models}
+    by_name = {evaluated.name: evaluated for evaluated in evaluation.models}
     assert by_name["best"].mean.psnr == highest["psnr"]
     assert by_name["last"].loaded.step == 40
     assert by_name["last"].mean.psnr <= highest["psnr"]
@@ -147,13 +147,13 @@ def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path, monkeypatch: p
 
 
 def test_psnr_inside_a_mask_has_a_known_answer() -> None:
-    rgb, truth = torch.full((10, 10, 3), 0.5), torch.full((10, 10, 3), 0.5)
+    rgb, target = torch.full((10, 10, 3), 0.5), torch.full((10, 10, 3), 0.5)
     mask = np.zeros((10, 10), bool)
     mask[2:4, 3:8] = True
     rgb[torch.from_numpy(mask)] += 0.1
     rgb[9, 9] += 0.4
-    assert masked_psnr(rgb, truth, mask) == pytest.approx(20, abs=1e-4)
-    assert masked_psnr(rgb, truth, np.zeros((10, 10), bool)) is None
+    assert masked_psnr(rgb, target, mask) == pytest.approx(20, abs=1e-4)
+    assert masked_psnr(rgb, target, np.zeros((10, 10), bool)) is None
 
 
 def test_a_centre_travels_by_pixels() -> None:
@@ -193,7 +193,7 @@ def test_the_models_region_is_where_gaussians_that_move_are_seen() -> None:
 
 
 def _write_fixed_camera(folder: Path) -> Path:
-    """One camera that stays: grey, with a black square of 4 pixels that goes to the right, 6 pixels a photograph."""
+    """One camera that stays: grey, with a black square of 4 pixels that goes to the right, 6 pixels an image."""
     matrix = OPENGL_TO_OPENCV.tolist()
     for split, times in (("train", (0.0, 0.5, 1.0)), ("test", (0.25, 0.75))):
         (folder / split).mkdir(parents=True)
@@ -210,17 +210,15 @@ def _write_fixed_camera(folder: Path) -> Path:
     return folder
 
 
-def test_with_fixed_cameras_the_region_is_that_of_the_photographs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_with_fixed_cameras_the_region_is_that_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The region is the square. The background is right and the square is left out: a known error there, none else."""
     monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
     data, run = _write_fixed_camera(tmp_path / "fixed"), tmp_path / "run"
     fit(small_config(steps=2), data, run)
     grey = torch.full((SIZE, SIZE, 3), 128 / 255)
-    monkeypatch.setattr(evaluation_module.JudgedModel, "render", lambda self, frame: grey)
+    monkeypatch.setattr(evaluation_module.EvaluatedModel, "render", lambda self, frame: grey)
     evaluation = evaluate_run(run)
-    assert evaluation.region_source == "photographs"
+    assert evaluation.region_source == "images"
     for frame, mask, scores in zip(evaluation.frames, evaluation.masks, evaluation.models[0].images, strict=True):
         square = np.zeros((SIZE, SIZE), bool)
         square[10:14, round(20 * frame.t) : round(20 * frame.t) + 4] = True
@@ -234,11 +232,11 @@ def test_flip_is_nvidias(data: Path, run: Path) -> None:
     evaluator = pytest.importorskip("flip_evaluator")
     evaluation = evaluate_run(run)
     frame, scores = evaluation.frames[0], evaluation.models[0].images[0]
-    rgb, truth = _render(run / "model.pt", frame), _read(frame.image_path)
+    rgb, target = _render(run / "model.pt", frame), _read(frame.image_path)
     assert scores.flip is not None
     assert 0.01 < scores.flip < 1
-    assert_close(scores.flip, evaluator.evaluate(truth, rgb, "LDR")[1], "flip.relative")
-    assert perceptual_metrics().metrics["flip"](torch.from_numpy(truth), torch.from_numpy(truth)) == 0
+    assert_close(scores.flip, evaluator.evaluate(target, rgb, "LDR")[1], "flip.relative")
+    assert perceptual_metrics().metrics["flip"](torch.from_numpy(target), torch.from_numpy(target)) == 0
 
 
 @pytest.mark.usefixtures("_clean")
@@ -248,8 +246,8 @@ def test_what_is_not_there_is_null_and_said(run: Path, monkeypatch: pytest.Monke
     assert cli.main(["eval", str(run)]) == 0
     report = json.loads((run / "eval" / "test.json").read_text())
     assert set(report["unavailable"]) == {"lpips", "flip"}
-    for judged in report["models"].values():
-        for scores in (judged["mean"], *judged["images"]):
+    for evaluated in report["models"].values():
+        for scores in (evaluated["mean"], *evaluated["images"]):
             assert scores["lpips"] is None
             assert scores["flip"] is None
     table = (run / "eval" / "test.md").read_text()
@@ -258,7 +256,7 @@ def test_what_is_not_there_is_null_and_said(run: Path, monkeypatch: pytest.Monke
     assert "flip-evaluator isn't installed" in table
 
 
-def test_lpips_wants_its_weights_on_disk_and_pictures_in_plus_minus_one(
+def test_lpips_wants_its_weights_on_disk_and_images_in_plus_minus_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     weights = types.SimpleNamespace(IMAGENET1K_V1=types.SimpleNamespace(url="https://example.org/vgg16-1.pth"))
@@ -279,13 +277,13 @@ class _StandInForLpips:
     def eval(self) -> "_StandInForLpips":
         return self
 
-    def __call__(self, rgb: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    def __call__(self, rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         assert rgb.shape == (1, 3, 6, 5)
-        return (truth - rgb).mean()[None, None, None, None]
+        return (target - rgb).mean()[None, None, None, None]
 
 
 @pytest.mark.usefixtures("_clean")
-def test_sheet_shows_photograph_rendering_and_error(run: Path) -> None:
+def test_sheet_shows_image_rendering_and_error(run: Path) -> None:
     evaluation = evaluate_run(run)
     evaluation_report.write_evaluation(run, evaluation)
     assert {path.name for path in (run / "eval").iterdir()} == {"test.json", "test.md", "test.png"}
@@ -297,7 +295,7 @@ def test_sheet_shows_photograph_rendering_and_error(run: Path) -> None:
 
 
 def _contains(sheet: np.ndarray, picture: np.ndarray) -> bool:
-    """Whether the picture lies somewhere in the sheet, pixel for pixel, in the first row."""
+    """Whether the image lies somewhere in the sheet, pixel for pixel, in the first row."""
     height, width, _ = picture.shape
     rows = sheet[HEADER + CAPTION : HEADER + CAPTION + height]
     return any(np.array_equal(rows[:, x : x + width], picture) for x in range(sheet.shape[1] - width + 1))
@@ -363,10 +361,10 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         assert word in text
 
 
-def test_split_without_photographs_is_named(run: Path, tmp_path: Path) -> None:
+def test_split_without_images_is_named(run: Path, tmp_path: Path) -> None:
     data = write_scene(tmp_path / "scene")
     (data / "transforms_test.json").unlink()
-    with pytest.raises(Exception, match="`test` has no photographs; there are `train` with 7, `val` with 1"):
+    with pytest.raises(Exception, match="`test` has no images; there are `train` with 7, `val` with 1"):
         evaluate_run(run, data)
 
 

@@ -1,4 +1,4 @@
-"""`msdgs-train steps`: a picture after each layer."""
+"""`msdgs-train steps`: an image after each layer."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -48,13 +48,13 @@ def test_one_panel_a_layer_and_the_canonical_one_first(model: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("layers", [(), ("mlp", "plane", "mlp")])
-def test_as_many_pictures_as_layers_and_one(layers: tuple[str, ...], tmp_path: Path) -> None:
+def test_as_many_images_as_layers_and_one(layers: tuple[str, ...], tmp_path: Path) -> None:
     save_model(tmp_path / "model.pt", random_model(20, layers=layers), SCENE, 7)
     assert len(write_steps(tmp_path / "model.pt", tmp_path / "steps.png", size=30)) == len(layers) + 1
 
 
 def test_time_and_camera_unless_given(tmp_path: Path) -> None:
-    """0.3 of the way through the scene, from the camera whose photograph is nearest in time."""
+    """0.3 of the way through the scene, from the camera whose image is nearest in time."""
     near = {**CAMERA, "name": "near", "t": 0.33, "cx": 10.0}
     scene = replace(SCENE, time_range=(0.2, 0.7), cameras=[{**CAMERA, "name": "far", "t": 0.1}, near])
     save_model(tmp_path / "model.pt", random_model(noise=0.2), scene, 7)
@@ -82,7 +82,7 @@ def test_what_is_wrong_is_named(wrong: dict, word: str, model: Path, tmp_path: P
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_a_sheet_that_no_picture_can_hold_is_refused(tmp_path: Path) -> None:
+def test_a_sheet_that_no_image_can_hold_is_refused(tmp_path: Path) -> None:
     row = [Panel(np.zeros((1, 22_000, 3), np.uint8), "")] * 3
     with pytest.raises(InvalidInput, match="65,535 pixels a side"):
         draw_sheet(tmp_path / "sheet.png", "", [row])

@@ -1,4 +1,4 @@
-"""Shared motions: splines, turns, blends, where they begin, and how they go on where nothing is known yet."""
+"""Motion bases: splines, turns, blends, where they begin, and how they go on where nothing is known yet."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.config import ModelConfig
-from msdgs_train.supports.nodes import BasisLayer, Carried, cubic_weights, product, rotation_matrices
-from msdgs_train.supports.skinning_kernels import FOLLOWED, LEAST_STRETCH
+from msdgs_train.supports.nodes import BasisLayer, SkinningInputs, cubic_weights, product, rotation_matrices
+from msdgs_train.supports.skinning_kernels import K_NEAREST, LEAST_STRETCH
 from tests.support.models import random_model
 from tests.support.tolerances import tolerance
 
@@ -29,13 +29,13 @@ def layer_of(count: int = 3, knots: int = 5, time_range: tuple[float, float] = (
     return layer
 
 
-def carried_of(count: int, motions: int) -> Carried:
+def carried_of(count: int, motions: int) -> SkinningInputs:
     generator = torch.Generator().manual_seed(2)
     means, quats, logits = (
         torch.randn(count, columns, generator=generator, dtype=torch.float64) for columns in (3, 4, motions)
     )
     ids = torch.stack([torch.randperm(motions, generator=generator) for _ in range(count)])
-    return Carried(means, quats / quats.norm(dim=1, keepdim=True), logits.softmax(dim=1), ids)
+    return SkinningInputs(means, quats / quats.norm(dim=1, keepdim=True), logits.softmax(dim=1), ids)
 
 
 def time(t: float) -> torch.Tensor:
@@ -55,7 +55,7 @@ def test_motions_are_on_splines(t: float) -> None:
     for k in range(3):
         quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
         point, one = torch.randn(1, 3, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
-        step = layer(Carried(point, quats, one, torch.tensor([[k]])), time(t))
+        step = layer(SkinningInputs(point, quats, one, torch.tensor([[k]])), time(t))
         rotation, pivot = as_rotation(torch.from_numpy(turn[k])), layer.pivots[k].numpy()
         longer = np.eye(3) + stretch[k][[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
         expected = rotation.apply(longer @ (point[0].numpy() - pivot)) + pivot + shift[k]
@@ -72,15 +72,15 @@ def test_scales_grow_along_a_gaussians_own_axes() -> None:
         layer.stretches[:, 0, 0] = 1.0  # twice as long along x
     quats = torch.tensor([[half, 0.0, 0.0, half]], dtype=torch.float64)  # its second axis is -x
     zeros, ones = (torch.full((1, 3), value, dtype=torch.float64) for value in (0, 1))
-    step = layer(Carried(zeros, quats, ones[:, :1], torch.tensor([[0]])), time(0.5))
+    step = layer(SkinningInputs(zeros, quats, ones[:, :1], torch.tensor([[0]])), time(0.5))
     assert np.abs(step.delta_scales.exp().detach().numpy() - [[1, 2, 1]]).max() <= EXACT
 
 
 def test_a_gaussian_follows_the_mean_of_its_motions() -> None:
     layer, carried = layer_of(), carried_of(7, 3)
     moved = carried.means + layer(carried, time(0.3)).delta_means
-    alone = [layer(carried._replace(basis_weights=torch.eye(3).double()[[k] * 7]), time(0.3)) for k in range(3)]
-    mean = sum(carried.basis_weights[:, k, None] * (carried.means + alone[k].delta_means) for k in range(3))
+    alone = [layer(carried._replace(skinning_weights=torch.eye(3).double()[[k] * 7]), time(0.3)) for k in range(3)]
+    mean = sum(carried.skinning_weights[:, k, None] * (carried.means + alone[k].delta_means) for k in range(3))
     assert float((moved - mean).abs().max().detach()) <= EXACT
 
 
@@ -91,9 +91,9 @@ def test_a_new_layer_moves_nothing() -> None:
     assert float(step.delta_scales.abs().max().detach()) <= EXACT
 
 
-def plainly(carried: Carried, motions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def plainly(carried: SkinningInputs, motions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """What the kernels do, by matrices."""
-    blended = torch.einsum("nk,nkm->nm", carried.basis_weights, motions[carried.basis_ids])
+    blended = torch.einsum("nk,nkm->nm", carried.skinning_weights, motions[carried.node_ids])
     matrices, offsets, turns = blended[:, :9].view(-1, 3, 3), blended[:, 9:12], blended[:, 12:]
     moved = torch.einsum("nij,nj->ni", matrices, carried.means) + offsets
     lengths = (matrices @ rotation_matrices(carried.quats)).norm(dim=1)
@@ -105,7 +105,7 @@ def test_kernels_do_what_matrices_do() -> None:
     layer, carried = layer_of(6), carried_of(9, 6)
     with torch.no_grad():
         layer.stretches[:, 2, :3] = -1.2  # squeezed to nothing and a bit beyond
-        carried.basis_weights[0] = (carried.basis_ids[0] == 2).double()
+        carried.skinning_weights[0] = (carried.node_ids[0] == 2).double()
     want = plainly(carried, layer.motions(time(0.3)))
     step = layer(carried, time(0.3))
     for got, expected in zip((step.delta_means, step.delta_scales, step.delta_quats), want, strict=True):
@@ -119,7 +119,7 @@ def test_gradients() -> None:
 
     def moved(means: torch.Tensor, quats: torch.Tensor, weights: torch.Tensor, *values: torch.Tensor) -> Any:
         replaced = dict(zip(curves, values, strict=True))
-        of_now = Carried(means, quats, weights, carried.basis_ids)
+        of_now = SkinningInputs(means, quats, weights, carried.node_ids)
         return torch.func.functional_call(layer, replaced, (of_now, time(0.41)))[:3]
 
     assert torch.autograd.gradcheck(moved, learning)
@@ -140,7 +140,7 @@ def test_pivots_are_spread_among_what_is_opaque() -> None:
     logits, ids = layer.place(means, opacities)
     assert bool((layer.pivots[:, 0] < 0.5).all())
     assert len(layer.pivots.unique(dim=0)) == 20
-    nearest = torch.cdist(means, layer.pivots).topk(FOLLOWED, largest=False).indices
+    nearest = torch.cdist(means, layer.pivots).topk(K_NEAREST, largest=False).indices
     assert torch.equal(ids.sort(dim=1).values, nearest.sort(dim=1).values)
     assert torch.equal(ids.gather(1, logits.argmax(dim=1, keepdim=True)), nearest[:, :1])
 
@@ -150,7 +150,7 @@ def test_fewer_gaussians_than_motions(count: int) -> None:
     layer = BasisLayer(12, 4)
     logits, ids = layer.place(torch.rand(count, 3), torch.full((count,), 0.1))
     assert bool(torch.isfinite(logits).all())
-    assert ids.shape == (count, FOLLOWED)
+    assert ids.shape == (count, K_NEAREST)
 
 
 def test_beyond_the_window_motions_stay_and_turn_on() -> None:
@@ -160,7 +160,7 @@ def test_beyond_the_window_motions_stay_and_turn_on() -> None:
         layer.shifts[:, 0, 0] = torch.arange(43.0)
         layer.turns[:, 0] = torch.stack([(angles / 2).cos(), 0 * angles, 0 * angles, (angles / 2).sin()], dim=1)
     known = layer.turns.detach().clone()
-    layer.carry_outwards(0.1, 0.2)
+    layer.on_window(0.1, 0.2)
     inside = [k for k in range(43) if abs((k - 1) / 40 - 0.5) <= 0.2 + 0.5 / 40]
     assert torch.equal(layer.shifts[inside, 0, 0].detach(), torch.tensor(inside, dtype=torch.float32))
     assert (layer.shifts[: inside[0], 0, 0] == inside[0]).all()
@@ -203,7 +203,7 @@ def test_only_the_first_layer_may_be_of_bases() -> None:
 
 
 def test_rigid_motions_stay_rigid() -> None:
-    model = random_model(20, layers=("bases",), basis_count=4, basis_knots=3, basis_stretches=False, embedding_size=0)
+    model = random_model(20, layers=("bases",), num_nodes=4, num_knots=3, affine=False, embedding_dim=0)
     bases = model.double().bases
     assert bases is not None
     assert not any("stretches" in name for name, _ in bases.named_parameters())
@@ -217,7 +217,7 @@ def test_stretches_are_factors_of_scales() -> None:
 
 
 def test_of_a_model_the_means_get_gradients_as_they_are_turned() -> None:
-    model = random_model(20, layers=("bases",), basis_count=4, basis_knots=3, embedding_size=0).double()
+    model = random_model(20, layers=("bases",), num_nodes=4, num_knots=3, embedding_dim=0).double()
     weights = torch.randn(20, 3, dtype=torch.float64)
     (got,) = torch.autograd.grad((model.pose(0.3).means * weights).sum(), [model.gaussians.means])
     nudged = torch.zeros(20, 3, dtype=torch.float64)

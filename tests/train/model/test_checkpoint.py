@@ -23,7 +23,7 @@ def rewritten(path: Path, **changes: object) -> Path:
     return path
 
 
-@pytest.mark.parametrize("changes", [{}, {"layers": ()}, {"embedding_size": 0}, {"sh_degree": 0}])
+@pytest.mark.parametrize("changes", [{}, {"layers": ()}, {"embedding_dim": 0}, {"sh_degree": 0}])
 def test_what_is_saved_comes_back(tmp_path: Path, changes: dict[str, int]):
     model = random_model(**changes)
     save_model(tmp_path / "model.pt", model, SCENE, 42)

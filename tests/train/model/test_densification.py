@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from msdgs_train.density.gradient import SPLIT_SHRINK, DensityControl, rotate
+from msdgs_train.density.gradient import SPLIT_SHRINK, GradientStrategy, rotate
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.optimizer import make_optimizer
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -15,12 +15,12 @@ from tests.support.training_scene import small_config
 EXTENT = 4.0
 
 
-def _setup(count: int = 6, **changes: Any) -> tuple[DynamicGaussians, torch.optim.Adam, DensityControl]:
+def _setup(count: int = 6, **changes: Any) -> tuple[DynamicGaussians, torch.optim.Adam, GradientStrategy]:
     """Gaussians of scale 0.001 (to be cloned) and moments that tell the rows apart."""
     from msdgs_train.gaussians.canonical import CanonicalGaussians
 
-    config: TrainConfig = small_config(init_count=count, max_gaussians=100, densify_gradient=0.5, **changes)
-    gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, config.model.embedding_size, 0)
+    config: TrainConfig = small_config(init_num_pts=count, max_gaussians=100, grow_grad2d=0.5, **changes)
+    gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, config.model.embedding_dim, 0)
     with torch.no_grad():
         gaussians.log_scales.fill_(math.log(0.001))
     model = DynamicGaussians(config.model, gaussians)
@@ -32,13 +32,13 @@ def _setup(count: int = 6, **changes: Any) -> tuple[DynamicGaussians, torch.opti
         rows = torch.arange(1, count + 1, dtype=torch.float32).reshape(-1, *[1] * (p.ndim - 1))
         optimizer.state[p]["exp_avg"] += rows
         optimizer.state[p]["exp_avg_sq"] += 10 * rows
-    return model, optimizer, DensityControl.start(config, EXTENT, count)
+    return model, optimizer, GradientStrategy.start(config, EXTENT, count)
 
 
-def _gather(control: DensityControl, pixels: list[float]) -> None:
+def _gather(control: GradientStrategy, pixels: list[float]) -> None:
     """A gradient for each, in NDC units at 2 × 2 pixels."""
     grads = torch.tensor(pixels)
-    control.gather(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), 2, 2)
+    control.accumulate(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), 2, 2)
 
 
 def _moment_rows(model: DynamicGaussians, optimizer: torch.optim.Adam, name: str) -> list[float]:
@@ -51,8 +51,8 @@ def _moment_rows(model: DynamicGaussians, optimizer: torch.optim.Adam, name: str
 def test_gradients_are_scaled_to_ndc_and_averaged_over_where_drawn() -> None:
     _, _, control = _setup(2)
     grads = torch.tensor([[0.3, 0.4], [1.0, 1.0]])
-    control.gather(grads, torch.tensor([1.0, 0.0]), 20, 20)
-    control.gather(grads, torch.tensor([1.0, 0.0]), 20, 20)
+    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20)
+    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20)
     assert torch.allclose(control.gradients, torch.tensor([10.0, 0.0]))
     assert control.counts.tolist() == [2.0, 0.0]
 
@@ -85,7 +85,7 @@ def test_large_ones_are_split_inside_themselves() -> None:
 
 
 def test_faint_ones_go_at_once_and_giants_after_the_first_reset() -> None:
-    model, optimizer, control = _setup(opacity_reset_every=9)
+    model, optimizer, control = _setup(reset_every=9)
     with torch.no_grad():
         model.gaussians.raw_opacities[0] = -10.0
         model.gaussians.log_scales[1] = math.log(0.2 * EXTENT)
@@ -104,7 +104,7 @@ def test_a_scene_that_has_faded_is_left_alone() -> None:
 
 def test_strongest_gradients_come_first_under_the_cap() -> None:
     model, optimizer, control = _setup()
-    control.config = small_config(init_count=6, max_gaussians=8, densify_gradient=0.5, warmup_fraction=0.0)
+    control.config = small_config(init_num_pts=6, max_gaussians=8, grow_grad2d=0.5, static_fraction=0.0)
     _gather(control, [0.6, 0.9, 0.7, 0.8, 0.6, 0.6])
     assert control.densify(model.gaussians, optimizer, 4).cloned == 2
     assert torch.equal(model.gaussians.means[6:], model.gaussians.means[[1, 3]])
@@ -149,14 +149,12 @@ def test_splits_depend_on_the_seed_alone() -> None:
 
 
 def test_schedule() -> None:
-    config = small_config(
-        steps=100, densify_from=10, densify_every=10, densify_until_fraction=0.5, opacity_reset_every=20
-    )
-    control = DensityControl.start(config, EXTENT, 1)
-    assert [s for s in range(1, 101) if config.densifies_after(s)] == [10, 20, 30, 40, 50]
+    config = small_config(steps=100, refine_start=10, refine_every=10, refine_stop_fraction=0.5, reset_every=20)
+    control = GradientStrategy.start(config, EXTENT, 1)
+    assert [s for s in range(1, 101) if config.refines_at(s)] == [10, 20, 30, 40, 50]
     assert [s for s in range(1, 101) if control.is_reset_due(s)] == [20, 40]
-    off = DensityControl.start(small_config(densify_every=0, opacity_reset_every=0), EXTENT, 1)
-    assert not any(off.config.densifies_after(s) or off.is_reset_due(s) for s in range(1, 101))
+    off = GradientStrategy.start(small_config(refine_every=0, reset_every=0), EXTENT, 1)
+    assert not any(off.config.refines_at(s) or off.is_reset_due(s) for s in range(1, 101))
 
 
 def test_rotation() -> None:

@@ -9,7 +9,7 @@ import torch
 from msdgs_train.gaussians.modulation import Modulation
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.layers.heads import Heads
-from msdgs_train.layers.mlp import MLPLayer, PositionalEncoding, octaves
+from msdgs_train.layers.mlp import MLPLayer, PositionalEncoding, frequency_matrix
 from tests.support.tolerances import assert_close, tolerance
 
 PAPER_LAYER_PARAMETERS = 235_561
@@ -42,9 +42,11 @@ def plain_step(layer: MLPLayer, means: np.ndarray, t: float) -> tuple[np.ndarray
         assert isinstance(module, torch.nn.Linear)
         return value @ module.weight.detach().numpy().T + module.bias.detach().numpy()
 
-    time = np.maximum(linear(layer.time_hidden, plain_encoding(np.array([[t]]), layer.time_octaves.shape[1])), 0)
+    time = np.maximum(
+        linear(layer.time_hidden, plain_encoding(np.array([[t]]), layer.time_frequency_matrix.shape[1])), 0
+    )
     features = np.repeat(linear(layer.time_output, time), len(means), axis=0)
-    inputs = np.concatenate([plain_encoding(means, layer.xyz_octaves.shape[1] // 3), features], axis=1)
+    inputs = np.concatenate([plain_encoding(means, layer.xyz_frequency_matrix.shape[1] // 3), features], axis=1)
     hidden = np.maximum(linear(layer.first, inputs), 0)
     for i, module in enumerate(layer.trunk, start=1):
         read = np.concatenate([inputs, hidden], axis=1) if i == layer.skip else hidden
@@ -87,20 +89,20 @@ def test_a_new_layer_moves_nothing_but_has_weights():
 @pytest.mark.parametrize(("dimensions", "frequencies"), [(3, 10), (1, 6), (3, 1)])
 def test_encoding_is_value_sines_cosines(dimensions: int, frequencies: int):
     x = torch.rand(50, dimensions, dtype=torch.float64) * 4 - 2
-    got = PositionalEncoding.apply(x, octaves(dimensions, frequencies).double())
+    got = PositionalEncoding.apply(x, frequency_matrix(dimensions, frequencies).double())
     assert got.shape[1] == dimensions * (1 + 2 * frequencies)
     assert_close(got, plain_encoding(x.numpy(), frequencies), "encoding.float64")
 
 
 def test_encoding_in_float32_is_precise_at_the_highest_frequency():
     x = torch.rand(20_000, 3) * 4 - 2
-    got = PositionalEncoding.apply(x, octaves(3, 10))
+    got = PositionalEncoding.apply(x, frequency_matrix(3, 10))
     assert_close(got, plain_encoding(x.double().numpy(), 10), "encoding.float32")
 
 
 def test_encoding_gradient():
     x = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(PositionalEncoding.apply, (x, octaves(3, 4).double()))
+    assert torch.autograd.gradcheck(PositionalEncoding.apply, (x, frequency_matrix(3, 4).double()))
 
 
 @pytest.mark.parametrize(

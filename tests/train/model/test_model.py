@@ -7,7 +7,7 @@ import torch
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbour_distances
-from msdgs_train.gaussians.model import SMALLEST_SCALE, DynamicGaussians, ModelConfig, unit_quats
+from msdgs_train.gaussians.model import MIN_SCALE, DynamicGaussians, ModelConfig, unit_quats
 from tests.support.models import random_model, small_config
 from tests.support.tolerances import assert_close
 
@@ -54,12 +54,12 @@ def changed(config: dict[str, Any]) -> set[str]:
 )
 @pytest.mark.parametrize("delta_space", ["raw", "activated"])
 def test_modulation_changes_its_targets_only(targets: tuple[str, ...], delta_space: str):
-    assert changed({"modulate": targets, "delta_space": delta_space}) == set(targets)
+    assert changed({"modulation_targets": targets, "delta_space": delta_space}) == set(targets)
 
 
 @pytest.mark.parametrize("targets", [("means",), ("scales",), ("quats",), ("means", "scales", "quats")])
 def test_modulation_multiplies_the_sums_once(targets: tuple[Any, ...]):
-    model = random_model(modulate=targets).double()
+    model = random_model(modulation_targets=targets).double()
     g, posed = model.gaussians, model.pose(0.3)
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     assert model.modulation is not None
@@ -78,16 +78,16 @@ def test_deltas_may_be_added_to_scales_themselves():
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     assert model.modulation is not None
     wanted = g.log_scales.exp() + model.modulation(g.embeddings).scales * deltas.scales
-    floored = wanted < SMALLEST_SCALE
-    assert 0 < floored.sum() < floored.numel() / 2
-    assert_close(posed.scales[~floored].detach(), wanted[~floored].detach(), "network.float64")
-    assert (posed.scales[floored] == SMALLEST_SCALE).all()
+    clamped_scales = wanted < MIN_SCALE
+    assert 0 < clamped_scales.sum() < clamped_scales.numel() / 2
+    assert_close(posed.scales[~clamped_scales].detach(), wanted[~clamped_scales].detach(), "network.float64")
+    assert (posed.scales[clamped_scales] == MIN_SCALE).all()
     assert (random_model(delta_space="raw", noise=0.2).pose(0.3).scales.double() - posed.scales).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("heads", [{"opacity_head": True}, {"sh_head": True}, {"opacity_head": True, "sh_head": True}])
 @pytest.mark.parametrize("layers", [("mlp", "mlp"), ("plane",), ("plane", "mlp")])
-def test_heads_of_opacity_and_colour(heads: dict[str, bool], layers: tuple[str, ...]):
+def test_heads_of_opacity_and_color(heads: dict[str, bool], layers: tuple[str, ...]):
     model = random_model(layers=layers, **heads)
     early, late, canonical = model.pose(0.1), model.pose(0.9), model.pose(0.1, deform=False)
     for name, head in (("opacities", "opacity_head"), ("sh", "sh_head")):
@@ -128,7 +128,7 @@ def test_a_model_without_layers_is_static():
 
 
 def test_a_model_without_modulation():
-    model = random_model(embedding_size=0)
+    model = random_model(embedding_dim=0)
     assert model.modulation is None
     assert not any("embed" in name or "modulation" in name for name in model.state_dict())
     assert model.pose(0.5).scales.isfinite().all()
@@ -171,7 +171,7 @@ def test_every_parameter_is_reached_by_gradients():
 
 def test_detached_means_get_the_gradient_of_a_shift():
     for detach in (True, False):
-        model = random_model(detach_means=detach)
+        model = random_model(detach_deform_input=detach)
         gradient = torch.autograd.grad(model.pose(0.3).means.sum(), model.gaussians.means)[0]
         assert torch.equal(gradient, torch.ones(300, 3)) == detach
 
@@ -195,20 +195,20 @@ def test_quaternions_without_direction_become_identity():
         ("width", 0),
         ("depth", 0),
         ("time_width", 0),
-        ("embedding_size", -1),
+        ("embedding_dim", -1),
         ("layers", True),
         ("layers", ("mlp", "grid")),
         ("layers", "mlp"),
-        ("plane_space_nodes", 1),
-        ("plane_channels", 0),
+        ("plane_resolution", 1),
+        ("plane_features_dim", 0),
         ("delta_space", "linear"),
         ("skip", 4),
         ("weights", 1),
-        ("modulate", ()),
-        ("modulate", ("scales", "scales")),
-        ("modulate", ("opacities",)),
-        ("plane_scales", ()),
-        ("plane_scales", (1, 0)),
+        ("modulation_targets", ()),
+        ("modulation_targets", ("scales", "scales")),
+        ("modulation_targets", ("opacities",)),
+        ("multires", ()),
+        ("multires", (1, 0)),
     ],
 )
 def test_impossible_sizes_are_refused_by_name(field: str, value: Any):
@@ -221,12 +221,12 @@ def test_impossible_sizes_are_refused_by_name(field: str, value: Any):
     [
         ("log_scales", {"count": 4}),
         ("sh_rest", {"sh_degree": 2}),
-        ("embeddings", {"embedding_size": 0}),
-        ("embeddings", {"embedding_size": 9}),
+        ("embeddings", {"embedding_dim": 0}),
+        ("embeddings", {"embedding_dim": 9}),
     ],
 )
 def test_tensors_that_disagree_are_refused_by_name(field: str, change: dict[str, int]):
-    sizes = {"count": 5, "half_extent": 1.0, "sh_degree": 3, "embedding_size": 8, "seed": 0}
+    sizes = {"count": 5, "scene_half_size": 1.0, "sh_degree": 3, "embedding_dim": 8, "seed": 0}
     gaussians = CanonicalGaussians.random_in_cube(**sizes)
     other = CanonicalGaussians.random_in_cube(**(sizes | change))
     setattr(gaussians, field, getattr(other, field))

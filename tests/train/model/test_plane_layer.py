@@ -13,7 +13,7 @@ from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
 def layer(dtype: torch.dtype = torch.float64, scales: tuple[int, ...] = (1,)) -> PlaneLayer:
     torch.manual_seed(0)
-    made = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8, half_extent=1.3, scales=scales)
+    made = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8, scene_half_size=1.3, scales=scales)
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
@@ -125,7 +125,7 @@ def test_what_enters_the_time_window_goes_on_from_its_border() -> None:
     planes = PlaneGrid(16, 32, 11, 1.0, (0.0, 1.0))
     with torch.no_grad():
         planes.time[:] = torch.arange(11.0)[None, :, None, None]
-    planes.carry_outwards(0.12, 0.31)
+    planes.on_window(0.12, 0.31)
     # before: times 0.38 to 0.62 read nodes 3 to 7; after: 0.19 to 0.81, nodes 1 to 9
     assert planes.time[0, :, 0, 0].tolist() == [0, 3, 3, 3, 4, 5, 6, 7, 7, 7, 10]
 
@@ -135,14 +135,14 @@ def test_flat_grids_and_straight_lines_in_time_are_smooth() -> None:
     with torch.no_grad():
         planes.space[:] = 0.3
         planes.time[:] = torch.linspace(1, 5, 9)[None, :, None, None]
-        assert float(planes.time_bends() + planes.space_slopes() + planes.space_bends()) < 1e-12
-        assert float(planes.time_offsets()) == pytest.approx(2)
+        assert float(planes.time_smoothness() + planes.plane_tv() + planes.plane_smoothness()) < 1e-12
+        assert float(planes.l1_time_planes()) == pytest.approx(2)
         planes.time[:, 4] += 1
         planes.space[:, 3] += 1
-        assert float(planes.time_bends()) == pytest.approx((1 + 4 + 1) / 7)
-        assert float(planes.time_offsets()) == pytest.approx(2 + 1 / 9)
-        assert float(planes.space_slopes()) == pytest.approx(2 / 31)
-        assert float(planes.space_bends()) == pytest.approx((1 + 4 + 1) / 30)
+        assert float(planes.time_smoothness()) == pytest.approx((1 + 4 + 1) / 7)
+        assert float(planes.l1_time_planes()) == pytest.approx(2 + 1 / 9)
+        assert float(planes.plane_tv()) == pytest.approx(2 / 31)
+        assert float(planes.plane_smoothness()) == pytest.approx((1 + 4 + 1) / 30)
 
 
 def test_grids_of_before_there_were_several_or_boxes_are_read() -> None:

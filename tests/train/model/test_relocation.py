@@ -1,4 +1,4 @@
-"""Density control under a budget: its formulas against slow ones, and that the budget and the picture are kept."""
+"""Density control under a budget: its formulas against slow ones, and that the budget and the image are kept."""
 
 import math
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from msdgs_train.datasets import load_scene
-from msdgs_train.density.mcmc import MOST_SHARES, Relocation, share
+from msdgs_train.density.mcmc import MAX_COPIES, MCMCStrategy, share
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.optimizer import make_optimizer
 from msdgs_train.engine.run import fit
@@ -57,7 +57,7 @@ def test_shares_together_look_as_one(opacity: float, shares: int) -> None:
 
 
 def test_more_shares_than_the_table_has_are_divided_as_its_last() -> None:
-    assert shared(0.7, 1000) == shared(0.7, MOST_SHARES)
+    assert shared(0.7, 1000) == shared(0.7, MAX_COPIES)
 
 
 @pytest.mark.parametrize("shares", SHARES)
@@ -67,11 +67,11 @@ def test_a_wholly_opaque_one_can_be_shared(shares: int) -> None:
     assert 0 < shrink <= 1
 
 
-def setup(count: int = 100, **changes: Any) -> tuple[CanonicalGaussians, torch.optim.Adam, Relocation]:
+def setup(count: int = 100, **changes: Any) -> tuple[CanonicalGaussians, torch.optim.Adam, MCMCStrategy]:
     """Gaussians of random opacity, the first ten of them faint, with moments that are all 1."""
-    values: dict[str, Any] = {"densify_strategy": "mcmc", "init_count": count, "max_gaussians": 1000}
+    values: dict[str, Any] = {"density_strategy": "mcmc", "init_num_pts": count, "max_gaussians": 1000}
     config: TrainConfig = small_config(**(values | changes))
-    gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, config.model.embedding_size, 0)
+    gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, config.model.embedding_dim, 0)
     with torch.no_grad():
         gaussians.raw_opacities[:] = torch.randn(count, generator=torch.Generator().manual_seed(1))
         gaussians.raw_opacities[:10] = -9.0
@@ -83,7 +83,7 @@ def setup(count: int = 100, **changes: Any) -> tuple[CanonicalGaussians, torch.o
     for p in gaussians.parameters():
         for moment in ("exp_avg", "exp_avg_sq"):
             optimizer.state[p][moment].fill_(1.0)
-    return gaussians, optimizer, Relocation.start(config)
+    return gaussians, optimizer, MCMCStrategy.start(config)
 
 
 def test_the_faint_move_beside_others_and_share_with_them() -> None:
@@ -144,7 +144,7 @@ def test_a_scene_that_has_faded_is_left_alone() -> None:
 
 
 def test_only_the_faint_wander_and_along_their_shape() -> None:
-    gaussians, _, control = setup(densify_every=0)
+    gaussians, _, control = setup(refine_every=0)
     half = math.sqrt(0.5)
     with torch.no_grad():
         gaussians.log_scales[:] = torch.tensor([0.3, 1e-4, 1e-4]).log()
@@ -175,21 +175,21 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_training_keeps_to_the_budget_at_every_step(data: Path) -> None:
-    config = small_config(steps=40, densify_strategy="mcmc", max_gaussians=67, densify_from=2, densify_every=2)
+    config = small_config(steps=40, density_strategy="mcmc", max_gaussians=67, refine_start=2, refine_every=2)
     trainer = Trainer(config, load_scene(data))
     counts = [trainer.step().gaussians for _ in range(40)]
-    assert counts[0] == config.init_count
+    assert counts[0] == config.init_num_pts
     assert max(counts) == counts[-1] == 67
     assert trainer.skipped == 0
 
 
 def test_resuming_changes_no_bit(data: Path, tmp_path: Path) -> None:
-    config = small_config(densify_strategy="mcmc", eval_every=0)
+    config = small_config(density_strategy="mcmc", eval_every=0)
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=StopAfter(11))
     fit(config, data, tmp_path / "parts", resume=True)
     one, other = (torch.load(tmp_path / run / "checkpoint.pt", weights_only=True) for run in ("whole", "parts"))
-    assert len(one["model"]["gaussians.means"]) > config.init_count
+    assert len(one["model"]["gaussians.means"]) > config.init_num_pts
     for name, tensor in one["model"].items():
         assert torch.equal(tensor, other["model"][name]), name
     for a, b in zip(one["generators"], other["generators"], strict=True):

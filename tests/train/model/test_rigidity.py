@@ -12,8 +12,8 @@ def cloud(n: int = 200, scale: float = 1.0) -> Tensor:
     return scale * torch.randn(n, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
 
-def loss(before: Tensor, after: Tensor, half_extent: float = 1.0) -> Tensor:
-    return stretch(before, after, half_extent, torch.Generator().manual_seed(0))
+def loss(before: Tensor, after: Tensor, scene_half_size: float = 1.0) -> Tensor:
+    return stretch(before, after, scene_half_size, torch.Generator().manual_seed(0))
 
 
 def turned(points: Tensor) -> Tensor:
@@ -37,8 +37,8 @@ def test_a_stretch_costs_its_share_of_the_distances(factor: float) -> None:
 
 
 def test_the_cost_does_not_depend_on_the_unit_of_length() -> None:
-    metres = loss(cloud(), 1.3 * cloud(), half_extent=1.0)
-    millimetres = loss(cloud(scale=1e3), 1.3 * cloud(scale=1e3), half_extent=1e3)
+    metres = loss(cloud(), 1.3 * cloud(), scene_half_size=1.0)
+    millimetres = loss(cloud(scale=1e3), 1.3 * cloud(scale=1e3), scene_half_size=1e3)
     torch.testing.assert_close(metres, millimetres)
 
 

@@ -1,4 +1,4 @@
-"""A channel of an image as a picture that people look at."""
+"""A channel of an image as an image that people look at."""
 
 from typing import NamedTuple
 
@@ -19,15 +19,15 @@ class DepthRange(NamedTuple):
     far: float
 
 
-def picture(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
-    """0 to 1, where it isn't beyond what can be shown: [H, W, 3], [H, W, 4] with straight alpha for transparent colour,
+def display_image(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
+    """0 to 1, where it isn't beyond what can be shown: [H, W, 3], [H, W, 4] with straight alpha for transparent color,
     or [H, W, 1] for all of one number.
 
     Motion is black where nothing moves; the hue is its direction, and the brightest is the fastest of this very image.
 
     Depth is lighter the nearer it is, over `depth_range` or, where None, over the depths of this very image.
 
-    These two are darker where the image is thin (alpha below 1), so that what is hardly seen in colour is hardly seen
+    These two are darker where the image is thin (alpha below 1), so that what is hardly seen in color is hardly seen
     here.
 
     Numbers of Gaussians are white where they are highest in this very image.
