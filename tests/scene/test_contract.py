@@ -249,14 +249,6 @@ def test_a_graph_whose_shapes_disagree_is_refused_by_its_node(tmp_path: Path):
     assert refusal(tmp_path / "scene.onnx", change).field == "layer1.trunk0.out"
 
 
-def test_constants_in_another_file_are_refused(tmp_path: Path):
-    path = tmp_path / "scene.onnx"
-    model = onnx.load_from_string(SCENE_BYTES)
-    onnx.save(model, path, save_as_external_data=True, location="weights.bin", size_threshold=100)
-    with pytest.raises(SceneFileInvalid, match="external_data"):
-        DeformationSession(path)
-
-
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.1, 0.5, 0.99, 0.9999])
 def test_cut_off_files_are_refused(tmp_path: Path, part: float):
     path = tmp_path / "scene.onnx"
