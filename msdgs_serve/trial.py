@@ -64,6 +64,8 @@ def main(given: str) -> None:
 
 def _limit(memory: int, seconds: float) -> None:
     os.nice(NICENESS)
+    if sys.platform == "linux":  # where memory runs out, this is the process to end
+        Path("/proc/self/oom_score_adj").write_text("1000")
     limits = {
         resource.RLIMIT_CPU: int(seconds) + 1,
         resource.RLIMIT_FSIZE: 0,

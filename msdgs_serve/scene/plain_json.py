@@ -15,10 +15,10 @@ MAX_TEXT = 2000
 _TOKENS = re.compile(r'"(?:[^"\\]|\\.?)*(?:"|$)|[\[{]|[\]}]', re.DOTALL)
 
 
-def parse(text: str) -> Any:
+def parse(text: str, max_characters: int = MAX_CHARACTERS) -> Any:
     """Plain values; every text in them is printable and every number finite. Raises ValueError saying what isn't."""
-    if len(text) > MAX_CHARACTERS:
-        raise ValueError(f"it has {len(text):,} characters, more than {MAX_CHARACTERS:,}")
+    if len(text) > max_characters:
+        raise ValueError(f"it has {len(text):,} characters, more than {max_characters:,}")
     _check_depth(text)
     value = json.loads(text, parse_int=_whole, parse_float=_decimal, parse_constant=_decimal, object_pairs_hook=_object)
     _check_texts(value)
