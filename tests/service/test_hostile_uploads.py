@@ -18,11 +18,13 @@ from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.trial import try_scene
 from tests.service.test_api import eventually
 from tests.service.test_api_poison import check_problem
+from tests.support.fuzz_scenes import hostile_file
 from tests.support.hostile_scenes import ATTACKS, POISON, poisoned
 from tests.support.processes import ROOT
 from tests.support.scene_files import write_scene
 from tests.support.service import in_this_process, serving
 
+MUTATED = 20
 FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 32, "height": 32}
 
 
@@ -100,6 +102,22 @@ def test_a_poisoned_file_is_listed_as_broken_and_nothing_else_changes(tmp_path: 
         (tmp_path / "late.onnx").write_bytes(contents)  # what comes later is looked at by the reload
         write_scene(good, static_color=(0, 0, 1))
         eventually(lambda: frame(client) != before)
+
+
+def test_mutated_files_are_refused_or_served_without_a_server_error(tmp_path: Path):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    write_scene(folder / "good.onnx")
+    with serving(folder, uploads=True) as client:
+        before = frame(client)
+        for seed in range(MUTATED):
+            query = {"name": "mutated", "replace": "true"}
+            answer = client.post("/scenes", params=query, content=hostile_file(seed))
+            assert answer.status_code in (201, 422), (seed, answer.text)
+            for t in (0, 0.37, 1) if answer.status_code == 201 else ():
+                drawn = client.post("/render", json={**FRAME, "scene": "mutated", "t": t})
+                assert drawn.status_code in (200, 422, 503), (seed, drawn.text)
+        assert frame(client) == before
 
 
 def test_a_file_that_takes_too_long_is_refused(tmp_path: Path):

@@ -14,7 +14,6 @@ from msdgs_serve.scene.onnx.shapes import (
     axes_of,
     axis_of,
     broadcast,
-    fixed,
     reshaped,
     text,
 )
@@ -160,24 +159,3 @@ def gemm(call: Call) -> Result:
     if broadcast(product, summand) != product:
         raise ShapeInvalid(f"can't add {text(summand)} to {text(product)}")
     return Result([product], inner=left[1:])
-
-
-__all__ = [
-    "Call",
-    "Result",
-    "alike",
-    "clip",
-    "concat",
-    "elementwise",
-    "fixed",
-    "gather",
-    "gemm",
-    "matmul",
-    "quantize",
-    "reduce",
-    "reshape",
-    "scatter",
-    "split",
-    "squeeze",
-    "unsqueeze",
-]

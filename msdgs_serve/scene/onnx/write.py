@@ -58,16 +58,16 @@ class _Message:
     def number(self, field: int, value: int) -> None:
         self._add(_varint(field << 3 | _VARINT), _varint(value % (1 << 64)))
 
-    def bytes(self, field: int, value: "bytes | memoryview") -> None:
+    def data(self, field: int, value: bytes | memoryview) -> None:
         self._add(_varint(field << 3 | _LENGTH), _varint(len(value)), value)
 
     def text(self, field: int, value: str) -> None:
-        self.bytes(field, value.encode())
+        self.data(field, value.encode())
 
     def message(self, field: int, value: "_Message") -> None:
         self._add(_varint(field << 3 | _LENGTH), _varint(value.length), *value.parts)
 
-    def _add(self, *parts: "bytes | memoryview") -> None:
+    def _add(self, *parts: bytes | memoryview) -> None:
         self.parts += parts
         self.length += sum(len(part) for part in parts)
 
@@ -98,7 +98,7 @@ def _tensor(tensor: Tensor) -> _Message:
         message.number(1, length)
     message.number(2, tensor.element)
     message.text(8, tensor.name)
-    message.bytes(9, tensor.data)
+    message.data(9, tensor.data)
     return message
 
 
@@ -122,7 +122,7 @@ def _port(name: str, value: Value) -> _Message:
     return port
 
 
-def _varint(value: int) -> "bytes":
+def _varint(value: int) -> bytes:
     digits = bytearray()
     while value >= 0x80:
         digits.append(value & 0x7F | 0x80)
