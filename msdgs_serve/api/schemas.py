@@ -326,6 +326,7 @@ class SceneView(BaseModel):
 class GraphLimit(BaseModel):
     """What a scene may take at most."""
 
+    gaussians: int
     memory_bytes: int
     operations: float
 
@@ -333,7 +334,7 @@ class GraphLimit(BaseModel):
 class GraphCost(BaseModel):
     """What posing takes at most, known from the file before anything runs and the same at all times."""
 
-    memory_bytes: int = Field(description="of the values of one call of the graph; calls may run side by side")
+    memory_bytes: int = Field(description="of the values of one call of the graph and of all poses")
     operations: int = Field(description="of posing all moving Gaussians once")
     calls: int = Field(description="of the graph, that this takes")
     limits: GraphLimit

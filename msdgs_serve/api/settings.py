@@ -64,8 +64,9 @@ class Settings(BaseSettings):
     max_video_pixels: int = Field(default=1 << 28, ge=1, description="largest width × height × frames of a film")
     max_scene_megabytes: int = Field(default=1024, ge=1, description="largest scene file that is taken in")
     max_scene_memory_megabytes: int = Field(
-        default=2048, ge=1, description="most memory for the values of one call of a scene's graph"
+        default=2048, ge=1, description="most memory for the values of one call of a scene's graph and for all poses"
     )
+    max_scene_gaussians: int = Field(default=40_000_000, ge=1, description="most Gaussians of a scene")
     max_scene_operations: float = Field(
         default=1e13, gt=0, description="most operations of a scene's graph for one frame"
     )
@@ -97,7 +98,7 @@ class Settings(BaseSettings):
     @property
     def graph_limits(self) -> GraphLimits:
         """What the graph of a scene may take."""
-        return GraphLimits(self.max_scene_memory_megabytes << 20, self.max_scene_operations)
+        return GraphLimits(self.max_scene_gaussians, self.max_scene_memory_megabytes << 20, self.max_scene_operations)
 
     def open_scene(self, path: Path) -> DeformationSession:
         """A scene file within these limits. Raises `SceneFileInvalid`."""

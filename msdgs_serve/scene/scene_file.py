@@ -21,6 +21,7 @@ _INPUTS: Mapping[str, tuple[int, Shape]] = {
     OPTIONAL_INPUT: (FLOAT, fixed([1])),
 }
 _COLUMNS = {"means": 3, "quats": 4, "scales": 3}
+_POSED_BYTES = 4 * sum(_COLUMNS.values())
 _AT_A_TIME = 1 << 22
 """Values that are looked at at once, so that looking takes no memory to speak of."""
 
@@ -29,7 +30,7 @@ _AT_A_TIME = 1 << 22
 class SceneCost:
     """Upper bounds, known before anything runs and the same at all times, beside what is allowed."""
 
-    memory_bytes: int  # of the values of one call
+    memory_bytes: int  # of the values of one call and of all poses
     operations: int  # of posing all moving Gaussians once
     calls: int  # that this takes
     limits: GraphLimits
@@ -72,8 +73,9 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
     moving_count, steps = _default_ids(model), _default_steps(model)
     ids = moving_count if steps is None else min(CHUNK, moving_count)
     calls = -(-moving_count // max(ids, 1))
-    values, cost = infer(model, inputs, limits, ids, calls)
+    values, cost = infer(model, inputs, limits, ids, calls, moving_count * _POSED_BYTES)
     _check_outputs(model, values, moving_count)
+    _check_count(moving_count + values["static_means"].shape[0].fixed, limits)
     constants = {}
     for name in CONSTANT_OUTPUTS:
         stored = values[name].constant
@@ -150,6 +152,11 @@ def _default_steps(model: Model) -> float | None:
     return float(steps.array()[0])
 
 
+def _check_count(gaussians: int, limits: GraphLimits) -> None:
+    if gaussians > limits.gaussians:
+        raise ModelInvalid("ids", f"and `static_means` are {gaussians:,} Gaussians; allowed are {limits.gaussians:,}")
+
+
 def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int) -> None:
     for name in (*MOVING_OUTPUTS, *CONSTANT_OUTPUTS):
         if name not in model.outputs or name not in values:
@@ -161,6 +168,8 @@ def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int)
     for name in CONSTANT_OUTPUTS:
         if values[name].varies:
             raise ModelInvalid(name, "depends on an input, where it has to be constant")
+        if not values[name].shape:
+            raise ModelInvalid(name, "is a single number")
     for name, columns in _COLUMNS.items():
         shapes = [(IDS, *fixed([columns]))] + ([] if moving_count else [fixed([0, columns])])
         if values[name].shape not in shapes:

@@ -68,7 +68,7 @@ def test_refusals_say_which_node_what_it_takes_and_what_is_allowed(client: httpx
     contents = ATTACKS["six_gigabytes_by_broadcasting"](model, tmp_path)
     answer = client.post("/scenes", params={"name": "hostile"}, content=contents)
     detail = answer.json()["detail"]
-    assert "`vast` (Add) takes a call to 6,104 MiB of values; allowed are 2,048 MiB" in detail
+    assert "`vast` (Add) takes a frame to 6,104 MiB of values; allowed are 2,048 MiB" in detail
 
 
 def test_what_a_scene_takes_is_shown(client: httpx.Client):

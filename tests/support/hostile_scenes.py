@@ -234,9 +234,9 @@ POISON: dict[str, tuple[str, str]] = {
     "an infinite error": ("measured_error", '{"rendered": {"psnr_worst": 1e999}}'),
     "a header in the plan": ("plan", '"network\\r\\nSet-Cookie: a=b"'),
     "a lone surrogate": ("plan", '"\\ud800"'),
-    "a plan of a megabyte": ("plan", f'"{"x" * 2**20}"'),
+    "a plan of 300,000 letters": ("plan", f'"{"x" * 300_000}"'),
     "a key twice": ("measured_error", '{"psnr": 1, "psnr": 2}'),
-    "a million quotation marks": ("left_out", '"\\"' * 10**6),
+    "300,000 quotation marks": ("left_out", '"\\"' * 100_000),
     "texts for numbers": ("time_range", '["0", "1"]'),
     "not a number": ("bounds", "[[0, 0, NaN], [1, 1, 1]]"),
 }

@@ -202,7 +202,8 @@ def _problem(status: SceneStatus) -> dict[str, Any]:
 
 
 def _cost(cost: SceneCost) -> GraphCost:
-    limits = GraphLimit(memory_bytes=cost.limits.memory_bytes, operations=cost.limits.operations)
+    allowed = cost.limits
+    limits = GraphLimit(gaussians=allowed.gaussians, memory_bytes=allowed.memory_bytes, operations=allowed.operations)
     return GraphCost(memory_bytes=cost.memory_bytes, operations=cost.operations, calls=cost.calls, limits=limits)
 
 

@@ -10,8 +10,11 @@ PRODUCT = 1000
 class GraphLimits:
     """What a scene may take at most. A frame poses all moving Gaussians, in one call or several."""
 
+    gaussians: int = 40_000_000
+    """Moving and static ones: as many as 2 GiB hold, the most that an ONNX file has."""
+
     memory_bytes: int = 2 << 30
-    """Of one call. Calls of one frame may run side by side, one on each thread."""
+    """Of one call, and of what a frame's calls return. Calls may run side by side, one on each thread."""
 
     operations: float = 1e13
     """Of one frame: about four minutes of two cores, and ten times a network of the paper's size with 100,000 moving
@@ -23,7 +26,8 @@ class GraphLimits:
 
 @dataclass(frozen=True)
 class CallCost:
-    """Upper bounds of one call: the values of all nodes, as if none were let go before the end, and the operations."""
+    """Upper bounds of one call: the values of all nodes, as if none were let go before the end, and the operations.
+    Memory begins with what all calls of a frame return."""
 
     memory_bytes: int = 0
     operations: int = 0
@@ -37,7 +41,7 @@ class CallCost:
         frame = self.operations * calls
         if self.memory_bytes > limits.memory_bytes:
             taken, allowed = self.memory_bytes / 2**20, limits.memory_bytes / 2**20
-            return f"takes a call to {taken:,.0f} MiB of values; allowed are {allowed:,.0f} MiB"
+            return f"takes a frame to {taken:,.0f} MiB of values; allowed are {allowed:,.0f} MiB"
         if self.operations > limits.call_operations:
             return f"takes a call to {self.operations:.2g} operations; allowed are {limits.call_operations:.2g}"
         if frame > limits.operations:

@@ -26,16 +26,17 @@ class Value:
 
 
 def infer(
-    model: Model, inputs: Mapping[str, Value], limits: GraphLimits, ids: int, calls: int
+    model: Model, inputs: Mapping[str, Value], limits: GraphLimits, ids: int, calls: int, returned: int
 ) -> tuple[dict[str, Value], CallCost]:
-    """All values by name, and the cost of one of `calls` calls of a frame, each of at most `ids` ids.
+    """All values by name, and the cost of one of `calls` calls of a frame, each of at most `ids` ids; all return so
+    many bytes.
 
     Raises `ModelInvalid` naming a node whose operator, attributes, types, shapes or cost a scene file may not have.
     """
     values = dict(inputs)
     for name, tensor in model.constants.items():
         values.setdefault(name, Value(tensor.element, fixed(tensor.shape), False, tensor))
-    cost = CallCost()
+    cost = CallCost(returned)
     for node in model.nodes:
         operator = OPERATORS.get(node.operator)
         if operator is None:

@@ -15,8 +15,8 @@ MAX_RANK = 8
 MAX_ELEMENTS = 1 << 40
 """Of an array, lengths of 0 counted as 1: an empty one of huge lengths overflows in libraries."""
 MAX_PROPERTIES = 64
-
-_MANY = 1 << 16
+"""Entries of metadata, of the model or any part of it."""
+MAX_VALUE_INFOS = 8192
 
 MODEL: Schema = {
     1: Field("ir_version", Kind.INTEGER),
@@ -41,10 +41,10 @@ GRAPH: Schema = {
     10: Field("doc_string", Kind.SKIPPED),
     11: Field("input", Kind.BYTES, most=MAX_PORTS),
     12: Field("output", Kind.BYTES, most=MAX_PORTS),
-    13: Field("value_info", Kind.SKIPPED, most=_MANY),
+    13: Field("value_info", Kind.SKIPPED, most=MAX_VALUE_INFOS),
     14: Field("quantization_annotation", Kind.REFUSED),
     15: Field("sparse_initializer", Kind.REFUSED),
-    16: Field("metadata_props", Kind.SKIPPED, most=_MANY),
+    16: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
 }
 NODE: Schema = {
     1: Field("input", Kind.NAME, most=MAX_OPERANDS),
@@ -55,7 +55,7 @@ NODE: Schema = {
     6: Field("doc_string", Kind.SKIPPED),
     7: Field("domain", Kind.NAME),
     8: Field("overload", Kind.NAME),
-    9: Field("metadata_props", Kind.SKIPPED, most=_MANY),
+    9: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
     10: Field("device_configurations", Kind.REFUSED),
 }
 ATTRIBUTE: Schema = {
@@ -93,13 +93,13 @@ TENSOR: Schema = {
     12: Field("doc_string", Kind.SKIPPED),
     13: Field("external_data", Kind.REFUSED),
     14: Field("data_location", Kind.ENUM),
-    16: Field("metadata_props", Kind.SKIPPED, most=_MANY),
+    16: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
 }
 PORT: Schema = {
     1: Field("name", Kind.NAME),
     2: Field("type", Kind.BYTES),
     3: Field("doc_string", Kind.SKIPPED),
-    4: Field("metadata_props", Kind.SKIPPED, most=_MANY),
+    4: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
 }
 TYPE: Schema = {
     1: Field("tensor_type", Kind.BYTES),

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-MAX_TEXT = 200
-"""Bytes of a name."""
+MAX_NAME, MAX_TEXT = 200, 1 << 20
+"""Bytes of a name and of any other text."""
 
 _VARINT, _LENGTH = 0, 2
 _FIXED_BYTES = {1: 8, 5: 4}
@@ -32,7 +32,7 @@ class Kind(Enum):
     INTEGER = "int64"
     ENUM = "number from 0 to 2³¹ − 1"
     NAME = "printable text of at most 200 bytes"
-    TEXT = "UTF-8 text"
+    TEXT = "UTF-8 text of at most 1 MiB"
     BYTES = "bytes"
     SKIPPED = "skipped"  # of any wire type: has no meaning for a scene and is never passed on
     REFUSED = "refused"
@@ -106,7 +106,7 @@ def _number(value: int, field: Field, what: str) -> int:
 
 
 def _text(part: memoryview, field: Field, what: str) -> str:
-    if field.kind is Kind.NAME and len(part) > MAX_TEXT:
+    if len(part) > (MAX_NAME if field.kind is Kind.NAME else MAX_TEXT):
         raise _invalid(f"{what} has `{field.name}` of {len(part):,} bytes, not {field.kind.value}")
     try:
         text = str(part, "utf-8")
