@@ -5,4 +5,4 @@ import os
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 """onnxruntime reads it when it is imported; without it, importing writes a database into the home folder."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -12,7 +12,7 @@ from msdgs_serve.scene import InvalidInput, MsdgsError
 if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
-VideoFormat = Literal["mp4", "webm"]
+VideoFormat = Literal["mp4", "webm", "webp"]
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,14 @@ class VideoTraits:
 VIDEO_FORMATS: dict[VideoFormat, VideoTraits] = {
     "mp4": VideoTraits("video/mp4", "libx264", {"crf": "18", "preset": "fast"}),
     "webm": VideoTraits("video/webm", "libvpx-vp9", {"crf": "24", "b": "0", "deadline": "realtime", "cpu-used": "6"}),
+    "webp": VideoTraits("image/webp", "libwebp_anim", {"quality": "70"}),
 }
 
-# in pieces, so that it plays while it comes
-FRAGMENTS: dict[VideoFormat, dict[str, str]] = {
+# mp4 in fragments, so that it can be played while it is received; an animated WebP repeats without end
+MUXER_OPTIONS: dict[VideoFormat, dict[str, str]] = {
     "mp4": {"movflags": "frag_keyframe+empty_moov+default_base_moof"},
     "webm": {},
+    "webp": {"loop": "0"},
 }
 
 
@@ -59,7 +61,7 @@ def write_video(frames: Iterable[np.ndarray], fps: float, video_format: VideoFor
 
     traits = VIDEO_FORMATS[video_format]
     count = 0
-    with av.open(file, "w", format=video_format, options=FRAGMENTS[video_format]) as container:
+    with av.open(file, "w", format=video_format, options=MUXER_OPTIONS[video_format]) as container:
         stream = None
         for pixels in frames:
             height, width = (side - side % 2 for side in pixels.shape[:2])

@@ -1,52 +1,78 @@
-"""A layer of motion bases as a graph: splines once a call, then one product and a few sums for each Gaussian."""
+"""A layer of kind `bases` as a graph: motion splines once per call, then linear blend skinning of each Gaussian."""
+
+from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
+import torch
 from onnx import TensorProto
+from torch import Tensor, nn
 
-from export.jobs.bake import Moving
+from export.layers.base import LayerInputs
 from export.layers.graph import GraphBuilder, to_numpy
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.supports.nodes import BasisLayer
-from msdgs_train.supports.skinning_kernels import LEAST_STRETCH
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import carried
+from msdgs_train.supports.nodes import BasisLayer, SkinningInputs
+from msdgs_train.supports.skinning_kernels import K_NEAREST, LEAST_STRETCH
 
 KNOTS = 4
-"""That a time reads."""
+"""Knots that the value at a time depends on."""
 
 
-def basis_deltas(
-    graph: GraphBuilder,
-    name: str,
-    layer: BasisLayer,
-    moving: Moving,
-    means: str,
-    quats: str,
-    time: str,
-    used: list[str],
-    share: str,
-) -> str:
-    """Deltas of the heads `used` of canonical means, [M, 3], and unit quaternions, [M, 4], times the layer's share."""
-    blended = _blended(graph, name, moving, _motions(graph, f"{name}.motions", layer, time))
-    matrices, offsets, turns = graph.split(
-        blended, [f"{name}.{p}" for p in ("matrices", "offsets", "turns")], [9, 3, 4]
-    )
-    parts = {
-        "means": lambda: _moved(graph, name, matrices, offsets, means),
-        "scales": lambda: _stretched(graph, name, matrices, quats),
-        "quats": lambda: _turned(graph, name, turns, quats),
-    }
-    columns = [parts[part]() for part in used]
-    return graph.node("Mul", [graph.node("Concat", columns, f"{name}.raw", axis=1), share], f"{name}.shared")
+class SplineExport:
+    """Of `BasisLayer`."""
+
+    removable_heads: frozenset[str] = frozenset()
+    parameters = frozenset({"skinning_logits", "node_ids"})
+    bytes_per_gaussian = K_NEAREST * (4 + 1)  # a weight in float32 and an id in 8 bits for each motion
+
+    def attributes(self, gaussians: CanonicalGaussians) -> dict[str, np.ndarray]:
+        """`skinning_weights`, [N, F], whose rows sum to 1, and `node_ids`, int64 [N, F]: the motions of a Gaussian."""
+        inputs = carried(gaussians)
+        assert inputs is not None  # the model's configuration has seen to it
+        return {"skinning_weights": to_numpy(inputs.skinning_weights), "node_ids": inputs.node_ids.numpy()}
+
+    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+        """Motions once a call, then for each Gaussian the mean of its motions, applied to its canonical pose."""
+        name, means, quats = inputs.name, inputs.canonical_means, inputs.canonical_quats
+        motions = _motions(graph, f"{name}.motions", cast(BasisLayer, inputs.layer), inputs.time)
+        blended = _blended(graph, name, inputs.attributes, motions)
+        names = [f"{name}.{part}" for part in ("matrices", "offsets", "turns")]
+        matrices, offsets, turns = graph.split(blended, names, [9, 3, 4])
+        parts = {
+            "means": lambda: _moved(graph, name, matrices, offsets, means),
+            "scales": lambda: _stretched(graph, name, matrices, quats),
+            "quats": lambda: _turned(graph, name, turns, quats),
+        }
+        columns = [parts[part]() for part in used]
+        return graph.node("Mul", [graph.node("Concat", columns, f"{name}.raw", axis=1), inputs.gate], f"{name}.shared")
+
+    def inert_heads(self, layer: nn.Module) -> frozenset[str]:
+        """None: a motion moves, scales and rotates."""
+        return frozenset()
+
+    def without_heads(self, layer: nn.Module, names: frozenset[str]) -> nn.Module:
+        """The layer as it is: it has no heads to remove."""
+        return layer
 
 
-def _blended(graph: GraphBuilder, name: str, moving: Moving, motions: str) -> str:
+def skinning_inputs(means: Tensor, quats: Tensor, attributes: Mapping[str, np.ndarray]) -> SkinningInputs | None:
+    """What `BasisLayer` reads of canonical Gaussians, in the dtype of `means`; None without its attributes."""
+    if "node_ids" not in attributes:
+        return None
+    weights = torch.from_numpy(attributes["skinning_weights"]).to(means.dtype)
+    return SkinningInputs(means, quats, weights, torch.from_numpy(attributes["node_ids"]))
+
+
+def _blended(graph: GraphBuilder, name: str, attributes: Mapping[str, np.ndarray], motions: str) -> str:
     """[M, 16] the mean of the motions [B, 16] that each Gaussian follows."""
-    assert moving.skinning_weights is not None  # `bake` has seen to it
-    assert moving.node_ids is not None
-    small = np.uint8 if moving.node_ids.max(initial=0) < 256 else np.int64
-    ids = graph.node("Gather", [graph.constant("node_ids", moving.node_ids.astype(small)), "ids"], "ids.node_ids")
+    node_ids, skinning_weights = attributes["node_ids"], attributes["skinning_weights"]
+    small = np.uint8 if node_ids.max(initial=0) < 256 else np.int64
+    ids = graph.node("Gather", [graph.constant("node_ids", node_ids.astype(small)), "ids"], "ids.node_ids")
     ids = graph.node("Cast", [ids], f"{name}.followed", to=TensorProto.INT64)
     weights = graph.node(
-        "Gather", [graph.constant("skinning_weights", moving.skinning_weights), "ids"], "ids.skinning_weights"
+        "Gather", [graph.constant("skinning_weights", skinning_weights), "ids"], "ids.skinning_weights"
     )
     axis = graph.constant(f"{name}.axis", np.array([1], np.int64))
     row = graph.node("Unsqueeze", [weights, axis], f"{name}.row")

@@ -1,9 +1,8 @@
-"""How much a chain of layers multiplies an error made on the way, and what float32 must therefore be expected to do.
+"""How much a chain of layers amplifies an error, and the error of float32 that follows from it.
 
 Layer k moves a Gaussian by x_k = x_{k-1} + w_k f_k(x_{k-1}, t) (equation 8). A small error before layer k is multiplied
-by the product of the later Jacobians, J_K … J_{k+1} with J = I + ∂(w f)/∂x. Each is 3 × 3 a Gaussian, and the rows of
-a batch don't depend on each other, so three backward passes through a layer give it exactly for all Gaussians at once:
-no power iteration is needed.
+by the product of the later Jacobians, J_K … J_{k+1} with J = I + ∂(w f)/∂x. Each is 3 × 3 per Gaussian, and the rows
+of a batch are independent, so three backward passes through a layer give it exactly for all Gaussians at once.
 """
 
 import math
@@ -17,13 +16,13 @@ from msdgs_train.layers.chain import MultiStepDeformation, step_of
 from msdgs_train.supports.nodes import SkinningInputs
 
 UNIT_ROUNDOFF = 2.0**-24
-"""Of float32: the largest relative error of one rounding."""
+"""Largest relative error of one rounding to float32."""
 
 
 class Growth(NamedTuple):
-    """M Gaussians at one time on their way through K layers, in float64."""
+    """Error growth of M Gaussians at one time through K layers, in float64."""
 
-    after: np.ndarray  # [K, M] ‖J_k … J_1‖: what a displacement of the canonical mean has become after layer k
+    after: np.ndarray  # [K, M] ‖J_k … J_1‖: growth of a displacement of the canonical mean after layer k
     amplification: np.ndarray  # [M] the largest ‖J_j … J_i‖ of products that end at the last layer, at least 1
     predicted: (
         np.ndarray

@@ -1,4 +1,4 @@
-"""The moving Gaussians of a baked scene at any time, in float64: what plans are fitted to."""
+"""Poses of the moving Gaussians of a baked scene, in float64 by torch and in float32 by onnxruntime."""
 
 import copy
 
@@ -7,16 +7,17 @@ import numpy.typing as npt
 import torch
 
 from export.jobs.bake import Baked
+from export.layers import HEAD_COLUMNS, HEADS
+from export.layers.spline import skinning_inputs
 from export.plans.network import network
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.gaussians import FloatArray
 from msdgs_train.gaussians.model import MIN_SCALE, activated_scales, unit_quats
 from msdgs_train.layers.chain import MultiStepDeformation, operations
-from msdgs_train.supports.nodes import SkinningInputs
 
 POSE = 10
 """Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""
-MEANS, SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
+MEANS, SCALES, QUATS = HEAD_COLUMNS.values()
 
 Poses = npt.NDArray[np.float64]
 
@@ -29,18 +30,13 @@ class ExactPoses:
         self.count = len(m)
         self._raw = baked.scene.metadata.delta_space == "raw"
         self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
-        factors = (m.mean_modulation, m.scale_modulation, m.quat_modulation)
-        self._factors = [None if f is None else _double(f) for f in factors]
-        self._carried = None
-        if m.skinning_weights is not None and m.node_ids is not None:
-            self._carried = SkinningInputs(
-                self._means, self._quats, _double(m.skinning_weights), torch.from_numpy(m.node_ids)
-            )
+        self._factors = {head: _double(factors) for head, factors in m.modulation.items()}
+        self._skinning = skinning_inputs(self._means, self._quats, m.attributes)
         self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
 
     @property
     def operations(self) -> int:
-        """About how many a pose takes."""
+        """Approximate operations per Gaussian and pose."""
         return max(operations(self._deformation.layers), 1)
 
     def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
@@ -50,11 +46,11 @@ class ExactPoses:
     @torch.no_grad()
     def _posed(self, t: float, ids: torch.Tensor) -> Poses:
         means, log_scales = self._means[ids], self._log_scales[ids]
-        carried = self._carried.rows(ids) if self._carried else None
-        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64), carried=carried)
+        skinning = self._skinning.rows(ids) if self._skinning else None
+        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64), carried=skinning)
         of_means, of_scales, of_quats = (
-            delta if factors is None else factors[ids] * delta  # equation 12
-            for factors, delta in zip(self._factors, (deltas.means, deltas.scales, deltas.quats), strict=True)
+            self._factors[head][ids] * getattr(deltas, head) if head in self._factors else getattr(deltas, head)
+            for head in HEADS  # equation 12
         )
         if self._raw:
             scales = activated_scales(log_scales + of_scales)
@@ -68,9 +64,9 @@ def _double(array: np.ndarray) -> torch.Tensor:
 
 
 def pixel(baked: Baked) -> float:
-    """What one pixel of the scene's nearest camera spans in scene units at the middle of what moves.
+    """Size in scene units of one pixel of the nearest camera, at the middle of the moving Gaussians.
 
-    Errors of plans are chosen in this unit. Without cameras: of an image of 400 pixels across the scene's bounds.
+    The unit of error bounds. Without cameras: of an image of 400 pixels across the scene's bounds.
     """
     low, high = np.array(baked.scene.metadata.bounds)
     middle = np.median(baked.moving.means, axis=0) if len(baked.moving) else (low + high) / 2
@@ -83,7 +79,10 @@ def pixel(baked: Baked) -> float:
 
 
 class SinglePoses:
-    """As `ExactPoses`, to round-off. Raises `SceneFileInvalid` where float32 can't hold the scene or its motion."""
+    """As `ExactPoses`, in float32: 0.4 of the processor time of torch, at ten layers of 256 units on two cores.
+
+    Raises `SceneFileInvalid` if float32 can't hold the scene or its motion.
+    """
 
     def __init__(self, baked: Baked) -> None:
         self._session = DeformationSession("network in float32", contents=network(baked).SerializeToString())

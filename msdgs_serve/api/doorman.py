@@ -1,7 +1,7 @@
 """Calls that are refused before anybody has parsed them.
 
 Under four times too much load most calls are refused, and frames wait for the interpreter meanwhile: of the frames that
-the service draws at its peak, 83 % are still answered with the doorman and 69 to 76 % without (`benchmarks/service.py
+the service draws at its peak, 83 % are still answered with the doorman and 69 to 76 % without (`benchmarks.service
 --only overload`).
 """
 

@@ -278,7 +278,7 @@ class VideoRequest(Strict):
     fps: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=240)] | None = Field(
         default=None, description="frames a second; default: the path's, else 24"
     )
-    format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9")
+    format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9. `webp`: animated")
     background: tuple[Unit, Unit, Unit] | Literal["scene"] = Field(default="scene", description="sRGB-encoded, 0 to 1")
 
 

@@ -74,9 +74,9 @@ class FitProgress(Observer):
             left = (self._steps - result.step) / speed if speed else 0.0
             self._console.print(f"step {result.step:,}/{self._steps:,}  {state}  {left:.0f} s left", soft_wrap=True)
 
-    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
+    def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
         self._console.print(
-            f"step {step:,}: {split} PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}", soft_wrap=True
+            f"step {step:,}: {split} PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}", soft_wrap=True
         )
 
     def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
@@ -100,8 +100,8 @@ def print_outcome(console: Console, outcome: RunResult, data: Path, run: Path) -
     console.print(
         f"{outcome.status} at step {outcome.step:,}, {outcome.gaussians:,} Gaussians, {outcome.seconds:.0f} s"
     )
-    for split, quality in outcome.qualities.items():
-        console.print(f"{split:>5}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
+    for split, metrics in outcome.metrics.items():
+        console.print(f"{split:>5}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
     console.print(f"model: {run / 'model.pt'}", soft_wrap=True)
     if outcome.best is not None:
         best = outcome.best

@@ -1,6 +1,5 @@
 """What is to be trained: systems × scenes × seeds, each a run with its settings and its folder."""
 
-import dataclasses
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import Any
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
-from msdgs_train.systems.presets import DEFAULT, PRESETS, preset
+from msdgs_train.systems.registry import DEFAULT, preset, systems
 
 EVALUATIONS = 10  # of the held-out images while training: points of a curve
 LOG_LINES = 100
@@ -43,7 +42,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class System:
+class ComparedSystem:
     """Settings by name."""
 
     name: str
@@ -66,18 +65,18 @@ class Run:
         return f"{self.system}, {self.scene}, seed {self.seed}"
 
 
-def read_systems(sources: Sequence[str], budget: Budget) -> list[System]:
+def read_systems(sources: Sequence[str], budget: Budget) -> list[ComparedSystem]:
     """Of names of presets and of TOML files, in which each table is a system: a `preset` and what differs from it.
 
     Raises `InvalidInput` naming the file, the system and the setting that can't be used.
     """
     tables = [pair for source in sources for pair in _tables(source)]
-    systems = [System(name, _config(name, table, budget)) for name, table in tables]
+    systems = [ComparedSystem(name, _config(name, table, budget)) for name, table in tables]
     _require_unique("system", (system.name for system in systems))
     return systems
 
 
-def make_runs(systems: Sequence[System], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
+def make_runs(systems: Sequence[ComparedSystem], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
     """Seed by seed, so that a comparison that is stopped early has something of every system."""
     _require_unique("scene", (scene.resolve().name for scene in scenes))
     _require_unique("seed", map(str, seeds))
@@ -88,7 +87,7 @@ def make_runs(systems: Sequence[System], scenes: Sequence[Path], seeds: Sequence
             seed,
             scene.resolve(),
             out / system.name / f"{scene.resolve().name}_{seed}",
-            dataclasses.replace(system.config, seed=seed),
+            system.config.updated(seed=seed),
         )
         for seed in seeds
         for scene in scenes
@@ -97,11 +96,11 @@ def make_runs(systems: Sequence[System], scenes: Sequence[Path], seeds: Sequence
 
 
 def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
-    if source in PRESETS:
+    if source in systems():
         return [(source, {"preset": source})]
     path = Path(source)
     if path.suffix != ".toml":
-        raise InvalidInput("config", f"a preset ({', '.join(PRESETS)}) or a .toml file", source)
+        raise InvalidInput("config", f"a preset ({', '.join(systems())}) or a .toml file", source)
     try:
         contents = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -115,11 +114,9 @@ def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
 
 
 def _config(name: str, table: Mapping[str, Any], budget: Budget) -> TrainConfig:
-    values = preset(table.get("preset", DEFAULT)).to_dict()
-    changes = {key: value for key, value in table.items() if key not in ("preset", "model")}
-    model = values["model"] | dict(table.get("model", {}))
+    changes = {key: value for key, value in table.items() if key != "preset"}
     try:
-        return TrainConfig.from_dict(values | changes | budget.settings() | {"model": model})
+        return preset(table.get("preset", DEFAULT)).updated(**changes | budget.settings())
     except (InvalidInput, TypeError, ValueError) as error:
         raise InvalidInput("config", "made of settings that can be used", f"system `{name}`: {error}") from error
 

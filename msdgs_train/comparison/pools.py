@@ -167,7 +167,7 @@ def _is_orphan() -> bool:
 
 def _train(run: Run, observer: Observer) -> RunEnd:
     """One run, begun or gone on with."""
-    os.environ[THREADS_VARIABLE] = str(run.config.threads)
+    os.environ[THREADS_VARIABLE] = str(run.config.run.threads)
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
         outcome = fit(run.config, run.data, run.folder, resume=(run.folder / CHECKPOINT).exists(), observer=observer)

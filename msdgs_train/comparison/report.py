@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from msdgs_train.comparison.results import Result, Spread
-from msdgs_train.engine.files import replacing, write_text
+from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_train.layers.parts import to_text
 
 TABLE, NUMBERS, TIME_PLOT, LAYERS_PLOT = "comparison.md", "comparison.json", "time.png", "layers.png"
 HEADINGS = (
@@ -70,8 +71,8 @@ def as_markdown(results: Sequence[Result], missing: int) -> str:
     lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
     lines += ["| " + " | ".join(row) + " |" for row in table(results)]
     budget = results[0].run.config
-    limit = f", at most {budget.max_minutes:g} minutes a run" if budget.max_minutes is not None else ""
-    under = f"{budget.steps:,} steps{limit}; {budget.threads} thread(s) a run; held-out images of "
+    limit = f", at most {budget.run.max_minutes:g} minutes a run" if budget.run.max_minutes is not None else ""
+    under = f"{budget.run.steps:,} steps{limit}; {budget.run.threads} thread(s) a run; held-out images of "
     under += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
     machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     notes = [under, f"Measured on {date.today().isoformat()}: {machine}."]
@@ -141,8 +142,8 @@ def rms_error(psnr: np.ndarray) -> np.ndarray:
 
 def _family(result: Result) -> str:
     config = result.run.config
-    kinds = "+".join(sorted(set(config.model.layers)))
-    rest = dataclasses.replace(config, seed=0, model=dataclasses.replace(config.model, layers=())).to_dict()
+    kinds = "+".join(sorted({to_text(layer) for layer in config.model.layers}))
+    rest = config.updated(seed=0, model=dataclasses.replace(config.model, layers=())).to_dict()
     return kinds + json.dumps(rest)
 
 

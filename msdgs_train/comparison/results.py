@@ -1,4 +1,4 @@
-"""What the runs of a comparison have come to: quality, sizes, and the time that training and one frame take."""
+"""What the runs of a comparison have come to: metrics, sizes, and the time that training and one frame take."""
 
 import statistics
 import time
@@ -16,13 +16,14 @@ from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.engine.run import MODEL, SELECTION_SPLITS
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
+from msdgs_train.gaussians.modulation import EMBEDDINGS
 
 TIMED_FRAMES = 8
 FIRST_SPLIT = "test"
 
 
 class CurvePoint(NamedTuple):
-    """The quality on held-out images at one moment of training."""
+    """The metrics on held-out images at one moment of training."""
 
     step: int
     seconds: float
@@ -83,16 +84,16 @@ def _result(run: Run) -> Result:
         gaussians=metrics["gaussians"],
         seconds=metrics["seconds"],
         skipped=max((line["skipped"] for line in lines if line["kind"] == "train"), default=0),
-        frame_ms=frame_milliseconds(loaded, run.config.threads),
+        frame_ms=frame_milliseconds(loaded, run.config.run.threads),
         curve=_curve(lines, split),
     )
 
 
 def _modulation_parameters(loaded: LoadedModel) -> int:
-    model, embeddings = loaded.model, loaded.model.gaussians.embeddings
-    if model.modulation is None or embeddings is None:
+    model = loaded.model
+    if model.modulation is None:
         return 0
-    return embeddings.numel() + sum(p.numel() for p in model.modulation.parameters())
+    return model.gaussians.attributes[EMBEDDINGS].numel() + sum(p.numel() for p in model.modulation.parameters())
 
 
 def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:

@@ -5,7 +5,6 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from typing import Any
 
 from msdgs_serve.scene.errors import InvalidInput
@@ -50,9 +49,9 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
 def is_finished(run: Run) -> bool:
     """Whether the budget has been spent and the result written."""
     metrics = final_metrics(run)
-    minutes = run.config.max_minutes
+    minutes = run.config.run.max_minutes
     return metrics is not None and (
-        metrics["step"] >= run.config.steps or (minutes is not None and metrics["seconds"] >= 60 * minutes)
+        metrics["step"] >= run.config.run.steps or (minutes is not None and metrics["seconds"] >= 60 * minutes)
     )
 
 
@@ -69,9 +68,9 @@ def final_metrics(run: Run) -> dict[str, Any] | None:
 def _check_settings(run: Run) -> None:
     if not (run.folder / CONFIG).exists() or not (run.folder / CHECKPOINT).exists():
         return
-    stored, wanted = (replace(config, threads=1).to_dict() for config in (stored_config(run.folder), run.config))
-    for name, value in stored.items():
-        if value != wanted[name]:
+    stored, wanted = (config.updated(threads=1).to_dict() for config in (stored_config(run.folder), run.config))
+    for name, value in ((name, value) for group in stored.values() for name, value in group.items()):
+        if value != {name: v for group in wanted.values() for name, v in group.items()}[name]:
             raise InvalidInput(
                 "out", "a new folder, or one of the same comparison", f"{run.folder} with other settings: {name}"
             )

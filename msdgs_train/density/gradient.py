@@ -1,7 +1,7 @@
 """Adaptive density control of 3D Gaussian Splatting (Kerbl et al. 2023, section 5.2), on the canonical Gaussians.
 
-Gradients are gathered where the Gaussians are drawn, posed at the time of each image; what is cloned, split,
-faded and removed are their canonical attributes.
+Gradients are accumulated where the Gaussians are drawn, posed at the time of each image; their canonical attributes
+are cloned, split, reset and removed.
 """
 
 import math
@@ -12,9 +12,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from msdgs_train.engine.config import TrainConfig
-from msdgs_train.engine.optimizer import replace_rows, replace_values
+from msdgs_train.density.config import DensityConfig
+from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import PosedGaussians
+from msdgs_train.gaussians.surgery import RowSurgery
+from msdgs_train.layers.quaternions import rotate
 
 SPLIT_SHRINK = 1.6
 """The two halves of a split Gaussian are smaller by this factor."""
@@ -31,19 +34,19 @@ class DensityChange(NamedTuple):
 
 @dataclass
 class GradientStrategy:
-    """Gathers gradients over many images and, every now and then, adds and removes Gaussians."""
+    """Accumulates gradients over many images and periodically adds and removes Gaussians."""
 
-    config: TrainConfig
-    extent: float  # radius of the cameras' positions, scene units
+    schedule: Schedule
+    scene_scale: float  # radius of the cameras' positions, scene units
     gradients: Tensor  # [N] sums of norms
     counts: Tensor  # [N] images in which each was drawn
     generator: torch.Generator
 
     @classmethod
-    def start(cls, config: TrainConfig, extent: float, count: int) -> "GradientStrategy":
-        """With nothing gathered yet, for `count` Gaussians."""
-        generator = torch.Generator().manual_seed(config.seed + 1)
-        return cls(config, extent, torch.zeros(count), torch.zeros(count), generator)
+    def start(cls, schedule: Schedule, scene_scale: float, count: int) -> "GradientStrategy":
+        """With nothing accumulated yet, for `count` Gaussians."""
+        generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
+        return cls(schedule, scene_scale, torch.zeros(count), torch.zeros(count), generator)
 
     def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one image: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
@@ -52,62 +55,67 @@ class GradientStrategy:
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
 
-    def after_step(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> None:
-        """`densify` and `reset_opacities` where they are due."""
-        if self.config.refines_at(step):
-            self.densify(gaussians, optimizer, step)
-        if self.is_reset_due(step):
-            self.reset_opacities(gaussians, optimizer)
+    @property
+    def config(self) -> DensityConfig:
+        """The settings."""
+        return self.schedule.config.density
+
+    def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:
+        """None."""
+        return {}
+
+    def after_step(self, surgery: RowSurgery, step: int) -> None:
+        """`densify` and `reset_opacities` when they are due."""
+        if self.schedule.refines_at(step):
+            self.densify(surgery, step)
+        if self.schedule.resets_at(step):
+            self.reset_opacities(surgery)
 
     def state(self) -> tuple[Tensor, ...]:
-        """What has been gathered."""
+        """What has been accumulated."""
         return self.gradients, self.counts
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:
-        """Go on from it."""
+        """Continue from it."""
         self.gradients, self.counts = state
 
-    def is_reset_due(self, step: int) -> bool:
-        """Whether `reset_opacities` is to run after this step (counted from 1)."""
-        every = self.config.reset_every
-        return every > 0 and step < self.config.refine_stop and step % every == 0
-
-    def densify(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer, step: int) -> DensityChange:
-        """Clone small and split large Gaussians under strong gradients, remove faint and huge ones, start anew."""
+    def densify(self, surgery: RowSurgery, step: int) -> DensityChange:
+        """Clone small and split large Gaussians of large gradients, remove low-opacity and huge ones, and reset."""
+        gaussians = surgery.gaussians
         with torch.no_grad():
             pruned = self._to_prune(gaussians, step)
             chosen = self._to_densify(pruned, step)
-            large = gaussians.log_scales.exp().amax(dim=1) > self.config.grow_scale3d * self.extent
+            large = gaussians.log_scales.exp().amax(dim=1) > self.config.grow_scale3d * self.scene_scale
             cloned, split = (torch.nonzero(m)[:, 0] for m in (chosen & ~large, chosen & large))
             halves = self._halves(gaussians, split.repeat(2))
             added = {name: torch.cat([p[cloned], halves[name]]) for name, p in gaussians.named_parameters()}
             kept = torch.nonzero(~pruned & ~(chosen & large))[:, 0]
-            replace_rows(optimizer, gaussians, kept, added)
+            surgery.replace_rows(kept, added)
         self.reset(len(kept) + len(cloned) + 2 * len(split))
         return DensityChange(len(cloned), len(split), int(pruned.sum()))
 
-    def reset_opacities(self, gaussians: CanonicalGaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Cut every opacity to 0.01 at most: what the images need comes back, the rest is pruned."""
+    def reset_opacities(self, surgery: RowSurgery) -> None:
+        """Reset every opacity to 0.01 at most: what the images need comes back, the rest is pruned."""
         ceiling = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
-        replace_values(optimizer, gaussians, "raw_opacities", gaussians.raw_opacities.detach().clamp(max=ceiling))
+        surgery.replace_values("raw_opacities", surgery.gaussians.raw_opacities.detach().clamp(max=ceiling))
 
     def reset(self, count: int) -> None:
-        """Drop what was gathered; there are `count` Gaussians now."""
+        """Drop what was accumulated; there are `count` Gaussians now."""
         self.gradients, self.counts = torch.zeros(count), torch.zeros(count)
 
     def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
         pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
         if 0 < self.config.reset_every < step:
-            pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.extent
-        if bool(pruned.all()):  # a scene that has faded altogether keeps its Gaussians and may recover
+            pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.scene_scale
+        if bool(pruned.all()):  # a scene of which all is transparent keeps its Gaussians and may recover
             return torch.zeros_like(pruned)
         return pruned
 
     def _to_densify(self, pruned: Tensor, step: int) -> Tensor:
-        """[N] bool: strong gradients, the strongest first while there is room."""
+        """[N] bool: large gradients, the largest first while there is room."""
         mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
         chosen = mean >= self.config.grow_grad2d
-        room = self.config.most_gaussians(step) - int((~pruned).sum())
+        room = self.schedule.max_gaussians(step) - int((~pruned).sum())
         if int(chosen.sum()) > room:
             strongest = torch.sort(mean, descending=True, stable=True).indices[: max(room, 0)]
             chosen = torch.zeros_like(chosen).index_fill_(0, strongest, True)
@@ -120,10 +128,3 @@ class GradientStrategy:
         values["means"] = values["means"] + rotate(functional.normalize(values["raw_quats"], dim=1), noise)
         values["log_scales"] = values["log_scales"] - math.log(SPLIT_SHRINK)
         return values
-
-
-def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors [N, 3] turned by unit quaternions [N, 4], wxyz."""
-    w, axis = quats[:, :1], quats[:, 1:]
-    twice = 2 * torch.linalg.cross(axis, vectors)
-    return vectors + w * twice + torch.linalg.cross(axis, twice)

@@ -1,32 +1,31 @@
-"""Which image comes next, and what it may teach.
+"""Which image comes next, and which parameters it updates.
 
-First all images teach a scene that stands still: what does stand still is in place before anything moves. Then
-what moves is followed from the middle of the scene's time outwards, in a window that grows image by image,
-once or more. While it grows for the first time, of four lessons
+First all images train a static scene. Then what moves is tracked from the middle of the scene's time outwards, in a
+window that grows image by image, once or more. While it grows for the first time, of four samples
 
-- one draws from all images of the window alike, and teaches everything;
-- two draw from its outermost ones, which are new, and teach motion alone. Were the Gaussians to learn from these few as
-  often, they would take on what explains only them, and lose their textures;
-- one draws from those outside, and teaches what stands still alone, where that is what they see. Else a few images
-  in the middle of time would be explained by whatever geometry their few cameras can't tell from the true one.
+- one is drawn from all images of the window alike, and updates everything;
+- two are drawn from the newest ones, at its border, and update motion alone: canonical Gaussians that learned from so
+  few images as often would overfit them and lose their textures;
+- one is drawn from those outside, and updates what is static alone, where static parts are visible: otherwise the few
+  images in the middle of time would be explained by any geometry that their few cameras can't tell from the true one.
 
-Where it grows again motions are nearly right: all its images teach everything.
+When it grows again, motion is nearly right: all images of the window update everything.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from msdgs_train.datasets import Frame
-from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.schedule import Schedule
 
-Subject = Literal["everything", "motion", "stillness"]
+Update = Literal["all", "motion", "static"]
 
-NEW = 0.01
-"""Parts of the scene's time from the window's border inwards: images that teach motion."""
-MIDDLE = 0.7
-"""Of the window; they are at least this far out, and there is always one."""
+NEW_FRAME_BORDER = 0.01
+"""Fraction of the scene's time from the window's border inwards whose images are new."""
+MIN_NEW_FRAME_DISTANCE = 0.7
+"""New images are at least this fraction of the window out, and there is always one."""
 
 
 class TrainingSample(NamedTuple):
@@ -34,75 +33,80 @@ class TrainingSample(NamedTuple):
 
     frame: Frame
     t: float  # of the Gaussians: the image's, or the nearest within the window
-    subject: Subject
+    update: Update  # which parameters learn from it
 
 
-class Curriculum:
-    """The order of the images. `order`, indices, is what is left of a pass over those of the window."""
-
-    def __init__(self, config: TrainConfig, frames: list[Frame], time_range: tuple[float, float]) -> None:
-        self._config, self._frames, self._time_range = config, frames, time_range
-        self.distances = distances_from_middle(time_range, frames)
-        self.order = torch.empty(0, dtype=torch.int64)
-
-    def window(self, step: int) -> float:
-        """How far from the middle of the scene's time images are taken in: 0.5 is all of it."""
-        c = self._config
-        if c.window_full_fraction == 0 or not c.model.layers or step < c.static_steps:
-            return 0.5
-        grown = self._growth(step)
-        if grown >= len(c.window_start_widths):
-            return 0.5
-        start = c.window_start_widths[int(grown)]
-        return start + (0.5 - start) * (grown % 1)
-
-    def is_first_pass(self, step: int) -> bool:
-        """Whether times that the window takes in now have never been in it."""
-        return self._growth(step) <= 1
-
-    def _growth(self, step: int) -> float:
-        """How many times the window has grown to all times."""
-        c = self._config
-        done = max(step - c.deform_start_step, 0) / max(c.full_window_step - c.deform_start_step, 1e-9)
-        return done * len(c.window_start_widths)
+class Curriculum(Protocol):
+    """The order of the images of a run."""
 
     def next(self, number: int, generator: torch.Generator) -> TrainingSample:
-        """The lesson of this number, counted from 0: a step takes as many as images."""
-        step = number // self._config.batch_size
-        window = self.window(step)
-        follows = window < 0.5 and self.is_first_pass(step)
+        """The sample of this number, counted from 0; a step takes `batch_size` of them."""
+        ...
+
+    def state(self) -> Tensor:
+        """What `load_state` continues from, besides the generator."""
+        ...
+
+    def load_state(self, state: Tensor) -> None:
+        """Continue from a state; an empty one starts a new pass."""
+        ...
+
+
+class WindowCurriculum:
+    """A time window that grows from the middle. `_order`, indices, is what is left of a pass over its images."""
+
+    def __init__(self, schedule: Schedule, frames: list[Frame], time_range: tuple[float, float]) -> None:
+        self._schedule, self._frames, self._time_range = schedule, frames, time_range
+        self._config, self._batch_size = schedule.config.curriculum, schedule.config.run.batch_size
+        self.distances = distances_from_middle(time_range, frames)
+        self._order = torch.empty(0, dtype=torch.int64)
+
+    def state(self) -> Tensor:
+        return self._order
+
+    def load_state(self, state: Tensor) -> None:
+        self._order = state
+
+    def next(self, number: int, generator: torch.Generator) -> TrainingSample:
+        step, schedule = number // self._batch_size, self._schedule
+        window = schedule.window(step)
+        grows = window < 0.5 and schedule.is_first_pass(step)
         if (
             self._config.outside_frames_static_only
-            and follows
+            and grows
             and number % 4 == 0
             and len(outside := torch.nonzero(self.distances > window)[:, 0])
         ):
-            return self._lesson(self._drawn(outside, generator), window, "stillness")
-        if follows and number % 2 == 1 and step >= self._config.deform_start_step:
-            border = min(float(self.distances[self.distances <= window].max()), max(window - NEW, MIDDLE * window))
-            new = torch.nonzero((self.distances <= window) & (self.distances >= border))[:, 0]
-            subject = "motion" if self._config.new_frames_motion_only else "everything"
-            return self._lesson(self._drawn(new, generator), window, subject)
-        self.order = self.order[self.distances[self.order] <= window]
-        if not len(self.order):
+            return self._sample(self._drawn(outside, generator), window, "static")
+        if grows and number % 2 == 1 and step >= schedule.deform_start_step:
+            new = self._new_frames(window)
+            update = "motion" if self._config.new_frames_motion_only else "all"
+            return self._sample(self._drawn(new, generator), window, update)
+        self._order = self._order[self.distances[self._order] <= window]
+        if not len(self._order):
             inside = torch.nonzero(self.distances <= window)[:, 0]
-            self.order = inside[torch.randperm(len(inside), generator=generator)]
-        chosen, self.order = self.order[0], self.order[1:]
-        return self._lesson(int(chosen), window, "everything")
+            self._order = inside[torch.randperm(len(inside), generator=generator)]
+        chosen, self._order = self._order[0], self._order[1:]
+        return self._sample(int(chosen), window, "all")
+
+    def _new_frames(self, window: float) -> Tensor:
+        outermost = float(self.distances[self.distances <= window].max())
+        border = min(outermost, max(window - NEW_FRAME_BORDER, MIN_NEW_FRAME_DISTANCE * window))
+        return torch.nonzero((self.distances <= window) & (self.distances >= border))[:, 0]
 
     def _drawn(self, ids: Tensor, generator: torch.Generator) -> int:
         return int(ids[torch.randint(len(ids), (), generator=generator)])
 
-    def _lesson(self, chosen: int, window: float, subject: Subject) -> TrainingSample:
+    def _sample(self, chosen: int, window: float, update: Update) -> TrainingSample:
         frame = self._frames[chosen]
         first, last = self._time_range
         middle, reach = (first + last) / 2, window * (last - first)
-        t = min(max(frame.t, middle - reach), middle + reach) if subject == "stillness" else frame.t
-        return TrainingSample(frame, t, subject)
+        t = min(max(frame.t, middle - reach), middle + reach) if update == "static" else frame.t
+        return TrainingSample(frame, t, update)
 
 
 def distances_from_middle(time_range: tuple[float, float], frames: list[Frame]) -> Tensor:
-    """[F] in [0, 0.5], as parts of the time range; the nearest is set to 0 so that no window is empty."""
+    """[F] in [0, 0.5], as fractions of the time range; the nearest is set to 0 so that no window is empty."""
     first, last = time_range
     middle, length = (first + last) / 2, (last - first) or 1.0
     distances = torch.tensor([min(abs(frame.t - middle) / length, 0.5) for frame in frames], dtype=torch.float64)

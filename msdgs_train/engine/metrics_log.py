@@ -34,9 +34,9 @@ class MetricsLog:
         """One line about the steps so far."""
         self._append({"kind": "train", **result._asdict(), "seconds": round(seconds, 3)})
 
-    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
+    def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
         """One line about a split of held-out images."""
-        self._append({"kind": "eval", "step": step, "split": split, **quality._asdict()})
+        self._append({"kind": "eval", "step": step, "split": split, **metrics._asdict()})
 
     def image(self, step: int, split: str, evaluated: EvaluatedFrame) -> None:
         """A held-out image at the left and its rendering at the right, for TensorBoard only."""

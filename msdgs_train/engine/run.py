@@ -11,7 +11,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.engine.config import TrainConfig, check_resumable
 from msdgs_train.engine.metrics_log import MetricsLog, draw_curve, write_side_by_side
-from msdgs_train.engine.run_record import Best, RunRecord, read_record, write_record
+from msdgs_train.engine.run_record import Best, RunInvalid, RunRecord, read_record, write_record
 from msdgs_train.engine.tensorboard_events import require_tensorboard
 from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
 from msdgs_train.evaluation.metrics import ImageMetrics, mean_metrics
@@ -35,7 +35,7 @@ class RunResult(NamedTuple):
 
     status: Status
     step: int
-    qualities: dict[str, ImageMetrics]  # of each held-out split; none when interrupted
+    metrics: dict[str, ImageMetrics]  # of each held-out split; none when interrupted
     gaussians: int
     seconds: float  # of training in all, evaluations included
     best: Best | None  # what `best.pt` is; None while nothing has been evaluated
@@ -50,7 +50,7 @@ class Observer:
     def step(self, result: StepResult, seconds: float) -> None:
         """After every step."""
 
-    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
+    def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
         """After a split has been evaluated."""
 
     def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
@@ -79,9 +79,9 @@ class Observers(Observer):
         for observer in self.observers:
             observer.step(result, seconds)
 
-    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
+    def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
         for observer in self.observers:
-            observer.evaluation(step, split, quality)
+            observer.evaluation(step, split, metrics)
 
     def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
         for observer in self.observers:
@@ -99,7 +99,10 @@ def stored_config(run: Path) -> TrainConfig:
     path = run / CONFIG
     if not path.exists() or not (run / CHECKPOINT).exists():
         raise InvalidInput("run", "the folder of a run with a checkpoint, to resume it", run)
-    return TrainConfig.from_dict(json.loads(path.read_text()))
+    try:
+        return TrainConfig.from_dict(json.loads(path.read_text()))
+    except (InvalidInput, ValueError, AttributeError, TypeError) as error:
+        raise RunInvalid(path, f"can't be resumed, train again in a new folder: {error}") from error
 
 
 def fit(
@@ -124,7 +127,7 @@ def fit(
         check_resumable(stored_config(run), config)
     elif (run / CHECKPOINT).exists():
         raise InvalidInput("run", "a new folder, or a run to go on with (--resume)", f"{run}, which holds a run")
-    scene = load_scene(data, config.size)
+    scene = load_scene(data, config.data.size)
     run.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(config, scene)
     seconds = trainer.load_checkpoint(run / CHECKPOINT) if resume else 0.0
@@ -178,24 +181,24 @@ class _Run:
     def execute(self) -> RunResult:
         status: Status = "finished"
         self.observer.on_train_start(self.trainer)
-        while self.trainer.step_count < self.config.steps and status == "finished":
+        while self.trainer.step_count < self.config.run.steps and status == "finished":
             try:
                 result = self.trainer.step()
             except TrainingDiverged as error:
                 self._roll_back(error)
                 continue
             self._after_step(result)
-            if result.step < self.config.steps:
+            if result.step < self.config.run.steps:
                 status = self._reason_to_stop()
-        qualities = {}
+        metrics = {}
         if status != "interrupted":
-            qualities = {split: self._evaluate(split, renders=None) for split in self.splits}
+            metrics = {split: self._evaluate(split, renders=None) for split in self.splits}
         self._save()
         draw_curve(self.folder)
-        if qualities:
-            self._write_final_metrics(qualities)
-        count = len(self.trainer.model.gaussians)
-        return RunResult(status, self.trainer.step_count, qualities, count, self._seconds(), self.record.best)
+        if metrics:
+            self._write_final_metrics(metrics)
+        count = self.trainer.system.size
+        return RunResult(status, self.trainer.step_count, metrics, count, self._seconds(), self.record.best)
 
     def _open_log(self) -> MetricsLog:
         return MetricsLog(self.folder, keep_until=self.trainer.step_count, tensorboard=self.tensorboard)
@@ -222,7 +225,7 @@ class _Run:
         self._wait_while_paused()
         if self.observer.should_stop():
             return "interrupted"
-        budget = self.config.max_minutes
+        budget = self.config.run.max_minutes
         return "out of time" if budget is not None and self._seconds() >= 60 * budget else "finished"
 
     def _wait_while_paused(self) -> None:
@@ -233,51 +236,51 @@ class _Run:
         self.started += time.perf_counter() - since
 
     def _after_step(self, result: StepResult) -> None:
-        if result.step % self.config.log_every == 0 or result.step == self.config.steps:
+        if result.step % self.config.logging.log_every == 0 or result.step == self.config.run.steps:
             self.log.train(result, self._seconds())
         self.observer.step(result, self._seconds())
-        if result.step < self.config.steps:
-            if _is_due(result.step, self.config.eval_every) and self.splits:
+        if result.step < self.config.run.steps:
+            if _is_due(result.step, self.config.logging.eval_every) and self.splits:
                 for split in self.splits:
                     self._evaluate(split, renders=RENDERS_PER_EVAL)
                 draw_curve(self.folder)
-            if _is_due(result.step, self.config.checkpoint_every) and not self.trainer.is_skipping:
+            if _is_due(result.step, self.config.logging.checkpoint_every) and not self.trainer.is_skipping:
                 self._save()
 
     def _evaluate(self, split: str, *, renders: int | None) -> ImageMetrics:
         """The mean quality of a split; the first `renders` frames, or all, are written beside their images."""
-        qualities = []
+        frames = []
         for index, evaluated in enumerate(self.trainer.evaluate(split)):
-            qualities.append(evaluated.quality)
+            frames.append(evaluated.metrics)
             if renders is None or index < renders:
                 write_side_by_side(self.folder, split, evaluated)
             if index < RENDERS_PER_EVAL:
                 self.log.image(self.trainer.step_count, split, evaluated)
-        quality = mean_metrics(qualities)
-        self.log.evaluation(self.trainer.step_count, split, quality)
-        self.observer.evaluation(self.trainer.step_count, split, quality)
-        if split == self.selection_split and math.isfinite(quality.psnr):
-            self._keep_if_best(Best(split, self.trainer.step_count, quality.psnr))
-        return quality
+        mean = mean_metrics(frames)
+        self.log.evaluation(self.trainer.step_count, split, mean)
+        self.observer.evaluation(self.trainer.step_count, split, mean)
+        if split == self.selection_split and math.isfinite(mean.psnr):
+            self._keep_if_best(Best(split, self.trainer.step_count, mean.psnr))
+        return mean
 
     def _keep_if_best(self, candidate: Best) -> None:
         best = self.record.best
         if best is None or candidate.psnr > best.psnr:
-            self.trainer.save_model(self.folder / BEST)
+            self.trainer.system.save(self.folder / BEST, self.trainer.step_count)
             self.record = RunRecord(self.record.data, candidate)
             write_record(self.folder, self.record)
 
     def _save(self) -> None:
         self.log.flush()  # a run that goes on from this checkpoint doesn't log again what came before it
         self.trainer.save_checkpoint(self.folder / CHECKPOINT, self._seconds())
-        self.trainer.save_model(self.folder / MODEL)
+        self.trainer.system.save(self.folder / MODEL, self.trainer.step_count)
 
-    def _write_final_metrics(self, qualities: dict[str, ImageMetrics]) -> None:
+    def _write_final_metrics(self, splits: dict[str, ImageMetrics]) -> None:
         metrics = {
             "step": self.trainer.step_count,
             "seconds": round(self._seconds(), 1),
-            "gaussians": len(self.trainer.model.gaussians),
-            "splits": {split: quality._asdict() for split, quality in qualities.items()},
+            "gaussians": self.trainer.system.size,
+            "splits": {split: metrics._asdict() for split, metrics in splits.items()},
             "best": self.record.best and {"file": BEST, **asdict(self.record.best)},
         }
         (self.folder / FINAL_METRICS).write_text(json.dumps(metrics, indent=2) + "\n")

@@ -13,7 +13,7 @@ from torch import Tensor
 from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, composite, load_scene
 from msdgs_train.engine.run import BEST, CONFIG, MODEL
 from msdgs_train.engine.run_record import RECORD, Best, RunInvalid, read_record
-from msdgs_train.evaluation.metrics import masked_psnr, quality
+from msdgs_train.evaluation.metrics import image_metrics, masked_psnr
 from msdgs_train.evaluation.moving_region import moving_region
 from msdgs_train.evaluation.perceptual import PerceptualMetrics, perceptual_metrics
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
@@ -101,7 +101,7 @@ def evaluate_run(
 
 def scores(rgb: Tensor, target: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
     """Of one rendering and its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
-    psnr, ssim = quality(rgb, target)
+    psnr, ssim = image_metrics(rgb, target)
     others = {name: metric(rgb, target) for name, metric in perceptual.metrics.items()}
     return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, mask))
 
@@ -110,7 +110,7 @@ def _image_width(run: Path) -> int | None:
     """The setting that decides what images are judged; others may have come and gone between versions."""
     path = run / CONFIG
     try:
-        return json.loads(path.read_text(encoding="utf-8"))["size"]
+        return json.loads(path.read_text(encoding="utf-8"))["data"]["size"]
     except OSError as error:
         problem = f"{error.strerror}; RUN is a folder that `msdgs-train fit DATA RUN` has filled"
         raise RunInvalid(path, problem) from None
@@ -123,9 +123,11 @@ def _data_folder(run: Path, data: Path | None) -> Path:
         return data.absolute()
     record = read_record(run)
     if record is None:
-        raise RunInvalid(run / RECORD, f"no such file, so the dataset has to be given: msdgs-train eval {run} DATA")
+        raise RunInvalid(
+            run / RECORD, f"no such file, so the dataset has to be given: msdgs-train eval {run} --data DATA"
+        )
     if not record.data.is_dir():
-        where = f"if it is elsewhere now: msdgs-train eval {run} DATA"
+        where = f"if it is elsewhere now: msdgs-train eval {run} --data DATA"
         raise DatasetInvalid(record.data, "folder", f"does not exist; {where}")
     return record.data
 

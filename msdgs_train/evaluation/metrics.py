@@ -36,13 +36,13 @@ def psnr_from_mse(mse: float) -> float:
     return MAX_PSNR if mse <= 10 ** (-MAX_PSNR / 10) else -10 * math.log10(mse)
 
 
-def quality(rgb: Tensor, target: Tensor) -> ImageMetrics:
+def image_metrics(rgb: Tensor, target: Tensor) -> ImageMetrics:
     """PSNR and SSIM of one rendering, clamped to [0, 1] first; both [H, W, 3]."""
     shown = rgb.detach().clamp(0, 1)
     return ImageMetrics(psnr(shown, target), float(ssim(shown, target)))
 
 
-def mean_metrics(qualities: list[ImageMetrics]) -> ImageMetrics:
+def mean_metrics(metrics: list[ImageMetrics]) -> ImageMetrics:
     """The mean over images: of their PSNRs (not the PSNR of their mean error) and of their SSIMs."""
-    count = len(qualities)
-    return ImageMetrics(sum(q.psnr for q in qualities) / count, sum(q.ssim for q in qualities) / count)
+    count = len(metrics)
+    return ImageMetrics(sum(q.psnr for q in metrics) / count, sum(q.ssim for q in metrics) / count)

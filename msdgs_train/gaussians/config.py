@@ -1,124 +1,132 @@
-"""What a model is made of: layers, their sizes, and every switch of the method, checked when it is built."""
+"""What a model is made of: a support, its layers, and every switch of the method, checked when it is built."""
 
+import dataclasses
 import math
 from dataclasses import dataclass, fields
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
-from msdgs_train.layers.heads import Heads
-from msdgs_train.supports.skinning_kernels import K_NEAREST
-
-LayerKind = Literal["mlp", "plane", "bases"]
-ModulationTarget = Literal["means", "scales", "quats"]
-DeltaSpace = Literal["raw", "activated"]
-LEAST = {
-    "width": 1,
-    "depth": 1,
-    "time_width": 1,
-    "time_features": 1,
-    "plane_features_dim": 1,
-    "plane_resolution": 2,
-    "plane_time_resolution": 2,
-    "plane_width": 1,
-    "num_nodes": 1,
-    "num_knots": 1,
-}
-"""The smallest sizes that make sense; the others may be 0."""
+from msdgs_train.gaussians.modulation import EMBEDDINGS, ModulationTarget, embeddings_attribute
+from msdgs_train.gaussians.scale_space import ScaleSpace
+from msdgs_train.layers.base import Heads, LayerConfig
+from msdgs_train.layers.mlp import MLPConfig
+from msdgs_train.layers.parameters import LearningRate
+from msdgs_train.layers.parts import from_plain, to_plain
+from msdgs_train.layers.registry import LAYERS
+from msdgs_train.supports.base import Attribute, SupportConfig
+from msdgs_train.supports.gaussians import GaussiansConfig
+from msdgs_train.supports.registry import SUPPORTS
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Sizes and switches of a model. The defaults are the paper's, with K = 2 layers; K = 0 is a static scene."""
+    """Parts and switches of a model. The defaults are the paper's, with K = 2 layers; K = 0 is a static scene."""
 
     sh_degree: int = 3
-    layers: tuple[LayerKind, ...] = ("mlp", "mlp")
-    """The kind of each of the K layers, in order; kinds may be mixed."""
-    width: int = 256
-    depth: int = 4
-    xyz_frequencies: int = 10
-    time_frequencies: int = 6
-    time_width: int = 256
-    time_features: int = 30
-    skip: int = 0
-    """An MLP layer reads its input once more after so many hidden layers, fewer than `depth`; 0: it doesn't."""
-    plane_features_dim: int = 16
-    """This and the following are sizes of layers of kind `plane`, those above of kind `mlp`."""
-    plane_resolution: int = 32
-    plane_time_resolution: int = 50
-    plane_width: int = 32
-    multires: tuple[int, ...] = (1,)
-    """Grids a layer, with so many times `plane_resolution`; their features are put side by side. 4DGS has 1 2."""
-    num_nodes: int = 256
-    """Motions of a layer of kind `bases`, each of which many Gaussians follow. Such a layer is the first."""
-    num_knots: int = 36
-    """Of their splines, over the time range of the scene."""
-    affine: bool = True
-    """They stretch what follows them; else they are rigid."""
+    """Degree of the spherical harmonics, 0 to 3."""
+    support: SupportConfig = GaussiansConfig()
+    """What the layers move, with its settings: gaussians, or nodes that carry the Gaussians (nodes:num_nodes=512)."""
+    layers: tuple[LayerConfig, ...] = (MLPConfig(), MLPConfig())
+    """The K layers in order, each a kind with settings of its own (mlp:width=96,depth=2); kinds may be mixed."""
     weights: bool = True
     """Each layer predicts how much its step counts (equation 8); without, all steps count in full."""
     embedding_dim: int = 32
-    """Numbers a Gaussian that the modulation reads; 0: no modulation."""
+    """Numbers per Gaussian that the modulation reads; 0: no modulation."""
     modulation_targets: tuple[ModulationTarget, ...] = ("scales",)
     """Which summed deltas the modulation multiplies, one or more of means, scales and quats."""
-    delta_space: DeltaSpace = "raw"
-    """Where deltas of scales are added: `raw`, to their logarithms; `activated`, to the scales, as in DeformGS."""
+    modulation_lr_init: float = 8e-4
+    """Learning rate of the modulation network and its embeddings."""
+    modulation_lr_final: float = 1.6e-6
+    """At the last step, to which it decays exponentially."""
+    scale_space: ScaleSpace = "log"
+    """Where deltas of scales are added: `log`, to their logarithms; `linear`, to the scales, as in DeformGS."""
     opacity_head: bool = False
     """Layers also change opacities, before the sigmoid. Such a model can't be exported yet."""
     sh_head: bool = False
     """Layers also change colors, as SH coefficients. Such a model can't be exported yet."""
-    detach_deform_input: bool = True
-    """Photometric gradients through the layers' input don't reach the canonical means, as in DeformGS."""
     eps2d: float = 0.3
-    """Added to the diagonal of projected covariances, px², so that nothing is missed between pixels: 0.3 in the field.
-    With less what is small is sharper; other programs, which add 0.3, then draw the model softer."""
+    """Added to the diagonal of projected covariances, px²: 0.3 in the field. With less, small things are sharper; other
+    programs, which add 0.3, then draw the model softer."""
 
     def __post_init__(self) -> None:
-        self._check_list("layers", get_args(LayerKind))
-        self._check_list("modulation_targets", get_args(ModulationTarget))
-        self._check_list("multires", None)
+        for name in ("layers", "modulation_targets"):
+            if not isinstance(getattr(self, name), tuple | list):
+                raise InvalidInput(f"model.{name}", "a list", getattr(self, name))
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.type is int and not (type(value) is int and value >= LEAST.get(field.name, 0)):
-                raise InvalidInput(f"model.{field.name}", f"an integer of {LEAST.get(field.name, 0)} or more", value)
+            if field.type is int and not (type(value) is int and value >= 0):
+                raise InvalidInput(f"model.{field.name}", "an integer of 0 or more", value)
             if field.type is bool and type(value) is not bool:
                 raise InvalidInput(f"model.{field.name}", "true or false", value)
+            if "_lr_" in field.name and not (type(value) in (int, float) and 0 < value < math.inf):
+                raise InvalidInput(f"model.{field.name}", "a finite learning rate above 0", value)
         if type(self.eps2d) not in (int, float) or not 0 <= self.eps2d < math.inf:
             raise InvalidInput("model.eps2d", "finite and 0 or above", self.eps2d)
         if self.sh_degree > 3:
             raise InvalidInput("model.sh_degree", "0, 1, 2 or 3", self.sh_degree)
-        if not self.modulation_targets or len(set(self.modulation_targets)) < len(self.modulation_targets):
-            raise InvalidInput(
-                "model.modulate", "one target or more, each once; embedding_dim 0: none", self.modulation_targets
-            )
-        if not self.multires:
-            raise InvalidInput("model.multires", "one grid or more", self.multires)
-        if self.skip >= self.depth:
-            raise InvalidInput("model.skip", f"fewer than the {self.depth} hidden layers of `depth`", self.skip)
-        if "bases" in self.layers[1:]:
-            raise InvalidInput("model.layers", "with `bases`, which moves canonical Gaussians, first", self.layers)
-        if self.delta_space not in get_args(DeltaSpace):
-            raise InvalidInput("model.delta_space", f"one of {list(get_args(DeltaSpace))}", self.delta_space)
-        if "bases" in self.layers and self.delta_space != "raw":
-            raise InvalidInput("model.delta_space", "raw with `bases`, whose stretches are factors", self.delta_space)
+        self._check_modulation()
+        self._check_parts()
 
-    def _check_list(self, name: str, known: tuple[Any, ...] | None) -> None:
-        """Make a list, as JSON has it, a tuple; refuse values that aren't known, or aren't whole numbers above 0."""
-        expected = "whole numbers above 0" if known is None else f"values out of {list(known)}"
-        values = getattr(self, name)
-        if not isinstance(values, tuple | list):
-            raise InvalidInput(f"model.{name}", f"a list of {expected}", values)
-        object.__setattr__(self, name, tuple(values))
-        for value in values:
-            if not (type(value) is int and value > 0 if known is None else value in known):
-                raise InvalidInput(f"model.{name}", expected, value)
+    def _check_modulation(self) -> None:
+        targets, known = self.modulation_targets, get_args(ModulationTarget)
+        if not targets or len(set(targets)) < len(targets) or not set(targets) <= set(known):
+            expected = f"one or more of {list(known)}, each once; embedding_dim 0: no modulation"
+            raise InvalidInput("model.modulation_targets", expected, targets)
 
-    @property
-    def motions(self) -> int:
-        """Motion bases that each Gaussian may follow."""
-        return min(K_NEAREST, self.num_nodes) if "bases" in self.layers else 0
+    def _check_parts(self) -> None:
+        if not isinstance(self.support, SupportConfig):
+            raise InvalidInput("model.support", f"one of {', '.join(SUPPORTS)}", self.support)
+        self.support.check("model.support")
+        for index, layer in enumerate(self.layers):
+            if not isinstance(layer, LayerConfig):
+                raise InvalidInput(f"model.layers.{index}", f"one of {', '.join(LAYERS)}", layer)
+            layer.check(f"model.layers.{index}", self.support.moves_nodes)
+        if self.scale_space not in get_args(ScaleSpace):
+            raise InvalidInput("model.scale_space", f"one of {list(get_args(ScaleSpace))}", self.scale_space)
+        if self.layers and self.support.moves_nodes:
+            if self.scale_space != "log":
+                raise InvalidInput("model.scale_space", "log with nodes, whose stretches are factors", self.scale_space)
+            for name in ("opacity_head", "sh_head"):
+                if getattr(self, name):
+                    raise InvalidInput(f"model.{name}", "off with nodes, which move Gaussians only", True)
 
     @property
     def heads(self) -> Heads:
         """What each layer predicts besides the deltas that all have."""
         return Heads(self.weights, self.opacity_head, sh_coefficients(self.sh_degree) if self.sh_head else 0)
+
+    @property
+    def modulation_lr(self) -> LearningRate:
+        """Of the modulation network and its embeddings."""
+        return LearningRate(self.modulation_lr_init, self.modulation_lr_final)
+
+    def attributes(self) -> dict[str, Attribute]:
+        """What modulation and support store per Gaussian."""
+        own = {EMBEDDINGS: embeddings_attribute(self.embedding_dim, self.modulation_lr)} if self.embedding_dim else {}
+        return own | (self.support.attributes() if self.layers else {})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values["support"] = to_plain(self.support)
+        values["layers"] = [to_plain(layer) for layer in self.layers]
+        return values | {"modulation_targets": list(self.modulation_targets)}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "ModelConfig":
+        """The inverse of `to_dict`; parts may also be text (`mlp:width=96`). Raises `InvalidInput` naming a setting
+        that is unknown or out of range."""
+        unknown = sorted(set(values) - {field.name for field in dataclasses.fields(cls)})
+        if unknown:
+            raise InvalidInput("model", f"made of {', '.join(f.name for f in fields(cls))}", f"`{unknown[0]}`")
+        values = dict(values)
+        if "support" in values:
+            values["support"] = from_plain("model.support", values["support"], SUPPORTS)
+        if "layers" in values:
+            if not isinstance(values["layers"], list | tuple):
+                raise InvalidInput("model.layers", "a list", values["layers"])
+            layers = (from_plain(f"model.layers.{i}", layer, LAYERS) for i, layer in enumerate(values["layers"]))
+            values["layers"] = tuple(layers)
+        return cls(**values)

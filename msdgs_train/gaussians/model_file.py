@@ -3,35 +3,24 @@
 Every file is written beside its place and moved over it, so that a reader finds the old one or the new one whole.
 """
 
-import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from msdgs_serve import __version__
 from msdgs_serve.scene.camera import Camera
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError
-from msdgs_train.engine.files import replacing
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.safe_load import CheckpointInvalid, load, refuse_unlike_stored, save_atomic
 from msdgs_train.rendering.rasterize import rasterize
 
-FORMAT = "msdgs-model/1"
-
-PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
-PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
-"""Types of numbers."""
-
-
-class CheckpointInvalid(MsdgsError):
-    """A checkpoint can't be read, or holds what no model can use."""
-
-    def __init__(self, file: str | Path, problem: str) -> None:
-        super().__init__(f"{file}: {problem}")
+FORMAT = "msdgs-model/2"
 
 
 @dataclass(frozen=True)
@@ -53,18 +42,20 @@ class LoadedModel(NamedTuple):
     step: int
 
     @torch.no_grad()
-    def render(self, camera: Camera, t: float, layers: int | None = None) -> Tensor:
-        """[H, W, 3] over the scene's background, after so many `layers` of the deformation; all if not given."""
+    def render(self, camera: Camera, t: float, num_layers: int | None = None) -> Tensor:
+        """[H, W, 3] over the scene's background, after `num_layers` of the deformation; all if not given."""
         background = torch.tensor(self.scene.background)
-        return rasterize(*self.model.pose(t, steps=layers), camera, background, self.model.rasterizer)[0]
+        return rasterize(*self.model.pose(t, num_layers=num_layers), camera, background, self.model.rasterizer)[0]
 
 
-def save_model(path: str | Path, model: DynamicGaussians, scene: SceneInfo, step: int) -> None:
-    """Write `model.pt`, atomically."""
+def save_model(
+    path: str | Path, model: DynamicGaussians, scene: SceneInfo, step: int, config: ModelConfig | None = None
+) -> None:
+    """Write `model.pt`, atomically; `config` as the model is drawn, its own if not given."""
     contents = {
         "format": FORMAT,
         "package_version": __version__,
-        "config": asdict(model.config),
+        "config": (config or model.config).to_dict(),
         "scene": asdict(scene),
         "step": step,
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
@@ -77,12 +68,14 @@ def load_model(path: str | Path) -> LoadedModel:
     contents = load(path)
     if not isinstance(contents, dict) or contents.get("format") != FORMAT:
         found = contents.get("format") if isinstance(contents, dict) else type(contents).__name__
-        raise CheckpointInvalid(path, f"isn't a model of format {FORMAT} (found {found!r})")
+        raise CheckpointInvalid(
+            path, f"isn't a model of format {FORMAT} (found {found!r}): train or import it again with this version"
+        )
     try:
         state = contents["state"]
         refuse_unlike_stored(path, state)
         _refuse_not_finite(path, state)
-        model = _build(ModelConfig(**contents["config"]), state)
+        model = _build(ModelConfig.from_dict(contents["config"]), state)
         scene = SceneInfo(**contents["scene"])
         _refuse_unusable_scene(path, scene)
         return LoadedModel(model, scene, int(contents["step"]))
@@ -90,64 +83,12 @@ def load_model(path: str | Path) -> LoadedModel:
         raise CheckpointInvalid(path, f"isn't a complete model: {error}") from error
 
 
-def save_atomic(path: str | Path, obj: Any) -> None:
-    """`torch.save`, atomically."""
-    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
-        torch.save(obj, file)
-
-
-def load(path: str | Path) -> Any:
-    """`torch.load` of tensors and plain values onto the CPU; no code in the file is run."""
-    path = Path(path)
-    try:
-        size = path.stat().st_size
-        if size == 0:
-            raise CheckpointInvalid(path, "is empty")
-        if not zipfile.is_zipfile(path):
-            raise CheckpointInvalid(path, f"isn't a torch checkpoint, or is cut off after {size:,} bytes")
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > size:  # it could unpack to anything
-            raise CheckpointInvalid(path, f"is packed: it holds {unpacked:,} bytes; torch.save packs nothing")
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise CheckpointInvalid(path, "no such file") from error
-    except OSError as error:
-        raise CheckpointInvalid(path, f"can't be read: {error.strerror or error}") from error
-    except CheckpointInvalid:
-        raise
-    except Exception as error:  # where bits are turned its stack machine stumbles in any way
-        raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
-
-
-def refuse_unlike_stored(path: str | Path, tensors: Mapping[str, Tensor]) -> None:
-    """Raise `CheckpointInvalid` for what isn't rows of plain numbers, or claims more of a storage than there is of it.
-
-    Strides of 0 make a few stored bytes a tensor of any size.
-    """
-    claimed: dict[int, int] = {}
-    for name, tensor in tensors.items():
-        if not _is_plain(tensor):
-            raise CheckpointInvalid(path, f"`{name}` isn't a dense tensor of plain numbers")
-        storage = tensor.untyped_storage()
-        claimed.setdefault(storage.data_ptr(), 0)
-        claimed[storage.data_ptr()] += tensor.numel() * tensor.element_size()
-        if claimed[storage.data_ptr()] > storage.nbytes():
-            problem = f"of shape {tuple(tensor.shape)} isn't stored in full: it shares {storage.nbytes():,} bytes"
-            raise CheckpointInvalid(path, f"`{name}` {problem}")
-
-
-def _is_plain(tensor: Any) -> bool:
-    plain = type(tensor) in (Tensor, nn.Parameter) and tensor.layout is torch.strided and not tensor.is_nested
-    return plain and tensor.device.type == "cpu" and tensor.dtype in PLAIN
-
-
 def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
     """A model of this configuration and these tensors; RuntimeError names what is missing or too much."""
     prefix = "gaussians."
     gaussians = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
-    if "mlp" in config.layers and config.depth > len(state):
-        raise InvalidInput("model.depth", f"at most {len(state)}, the number of tensors that are stored", config.depth)
+    for layer in config.layers:
+        layer.check_stored(len(state))
     with torch.device("meta"):  # sizes that aren't what is stored may be any, and take no memory here
         DynamicGaussians(config, CanonicalGaussians(**gaussians)).load_state_dict(state, assign=True)
     model = DynamicGaussians(config, CanonicalGaussians(**gaussians))

@@ -1,17 +1,24 @@
 """Time-invariant modulation of what the layers change (paper, section 3.4)."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
+import torch
 from torch import Tensor, nn
 
-from msdgs_train.gaussians.config import ModulationTarget
+from msdgs_train.layers.parameters import LearningRate
+from msdgs_train.supports.base import Attribute
+
+ModulationTarget = Literal["means", "scales", "quats"]
 
 MAX_LOG_FACTOR = 2.0
-"""Factors stay in [e^-2, e^2]. Left alone they grew to 5,000 in 2,000 steps on one scene, and the loss blew up: a small
+"""Factors stay in [e^-2, e^2]. Unbounded they grew to 5,000 in 2,000 steps on one scene, and the loss blew up: a small
 change of a layer then changes some scale by orders of magnitude."""
 
 COLUMNS: dict[ModulationTarget, int] = {"means": 3, "scales": 3, "quats": 4}
+
+EMBEDDINGS = "embeddings"
+"""The attribute of the Gaussians that the modulation reads."""
 
 
 class Factors(NamedTuple):
@@ -26,8 +33,15 @@ class Factors(NamedTuple):
         return {name: factors for name, factors in self._asdict().items() if factors is not None}
 
 
+def embeddings_attribute(dim: int, lr: LearningRate) -> Attribute:
+    """Small random embeddings, [N, dim]."""
+    return Attribute(
+        dim, lambda n, columns, generator: 0.1 * torch.randn(n, columns, generator=generator), lr, "static"
+    )
+
+
 class Modulation(nn.Module):
-    """F of equation 12: an embedding a Gaussian → factors for its summed deltas. They start at exactly 1.
+    """F of equation 12: an embedding per Gaussian → factors for its summed deltas. They start at exactly 1.
 
     For scales alone, the paper's, it has 1,155 parameters besides the embeddings. Table 5 has the other targets.
     """

@@ -1,35 +1,19 @@
 """One step of deformation: a small MLP over encoded position and time, with its heads (paper, equations 7 and 10)."""
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from msdgs_train.layers.heads import PAPER_HEADS, Heads
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers.base import PAPER_HEADS, Heads, LayerConfig, SceneBounds, check_size
+from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.layers.parameters import LearningRate, ParamGroup
 
 HIDDEN_BIAS, XYZ_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
 """Of a new layer: bias of the hidden units, and what the first Linear's columns are multiplied by."""
-
-
-class LayerStep(NamedTuple):
-    """What one layer proposes for N Gaussians at one time; the deltas aren't yet multiplied by the weight."""
-
-    delta_means: Tensor  # [N, 3] scene units
-    delta_scales: Tensor  # [N, 3] of logarithms or of scales, as the model's `delta_space` says
-    delta_quats: Tensor  # [N, 4] wxyz
-    weight: Tensor  # [N, 1] in (0, 1); 1 without the head
-    delta_opacities: Tensor | None = None  # [N] of logits
-    delta_sh: Tensor | None = None  # [N, (degree + 1)², 3]
-
-    @classmethod
-    def of_columns(cls, columns: Tensor, heads: Heads) -> "LayerStep":
-        """From the heads' columns side by side, [N, sum of `heads.sizes`]."""
-        means, scales, quats, opacity, sh, logit = columns.split(heads.sizes, dim=1)
-        weight = logit.sigmoid() if heads.weight else columns.new_ones(len(columns), 1)
-        opacities = opacity[:, 0] if heads.opacity else None
-        return cls(means, scales, quats, weight, opacities, sh.unflatten(1, (heads.sh, 3)) if heads.sh else None)
 
 
 def frequency_matrix(dimensions: int, frequencies: int) -> Tensor:
@@ -62,11 +46,51 @@ class PositionalEncoding(torch.autograd.Function):
         return torch.addmm(grad[..., :d], grad_phases, frequency_matrix_.t()), None
 
 
-class MLPLayer(nn.Module):
+@dataclass(frozen=True)
+class MLPConfig(LayerConfig):
+    """Sizes and learning rates of an MLP layer; the sizes are the paper's."""
+
+    kind: ClassVar[str] = "mlp"
+    width: int = 256
+    """Hidden units of the trunk."""
+    depth: int = 4
+    """Hidden layers of the trunk."""
+    xyz_frequencies: int = 10
+    """Octaves of the positional encoding of a mean."""
+    time_frequencies: int = 6
+    """Octaves of the encoding of a time."""
+    time_width: int = 256
+    """Hidden units of the network of time."""
+    time_features: int = 30
+    """Outputs of the network of time."""
+    skip: int = 0
+    """The input is read again after so many hidden layers, fewer than `depth`; 0: never."""
+    lr_init: float = 2e-3
+    """Learning rate until all times take part."""
+    lr_final: float = 2e-5
+    """Learning rate at the last step, to which it decays exponentially."""
+
+    def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "MLPLayer":
+        return MLPLayer(self, heads)
+
+    def check(self, field: str, moves_nodes: bool) -> None:
+        for name in ("width", "depth", "time_width", "time_features"):
+            check_size(f"{field}.{name}", getattr(self, name))
+        for name in ("xyz_frequencies", "time_frequencies", "skip"):
+            check_size(f"{field}.{name}", getattr(self, name), least=0)
+        if self.skip >= self.depth:
+            raise InvalidInput(f"{field}.skip", f"fewer than the {self.depth} hidden layers of `depth`", self.skip)
+
+    def check_stored(self, num_tensors: int) -> None:
+        if self.depth > num_tensors:
+            raise InvalidInput("depth", f"at most {num_tensors}, the number of tensors that are stored", self.depth)
+
+
+class MLPLayer(DeformationLayer):
     """D_k of equation 7: encoded means and time through `depth` Linear–ReLU, then one Linear for all heads.
 
-    Time has its own small network whose output is the same for all Gaussians. It runs once a call, and its part of
-    a Linear that reads it is a vector added to the bias. At the default sizes the layer has 235,561 parameters. With
+    Time has its own small network whose output is the same for all points. It runs once a call, and its part of a
+    Linear that reads it is a vector added to the bias. At the default sizes the layer has 235,561 parameters. With
     depth 8, `skip` 5 and no weight it is the network of DeformGS, 522,280 parameters.
     """
 
@@ -74,29 +98,19 @@ class MLPLayer(nn.Module):
     xyz_frequency_matrix: Tensor
     time_frequency_matrix: Tensor
 
-    def __init__(
-        self,
-        width: int = 256,
-        depth: int = 4,
-        xyz_frequencies: int = 10,
-        time_frequencies: int = 6,
-        time_width: int = 256,
-        time_features: int = 30,
-        skip: int = 0,
-        outputs: Heads = PAPER_HEADS,
-    ) -> None:
-        """`skip`: after so many hidden layers the input is read once more, beside their output; 0: never."""
+    def __init__(self, config: MLPConfig = MLPConfig(), outputs: Heads = PAPER_HEADS) -> None:
         super().__init__()
-        self.outputs = outputs
-        self.skip = skip
-        self.register_buffer("xyz_frequency_matrix", frequency_matrix(3, xyz_frequencies), persistent=False)
-        self.register_buffer("time_frequency_matrix", frequency_matrix(1, time_frequencies), persistent=False)
-        self.xyz_features = 3 * (1 + 2 * xyz_frequencies)
+        c = config
+        width, time_features = c.width, c.time_features
+        self.config, self.outputs, self.skip = config, outputs, c.skip
+        self.register_buffer("xyz_frequency_matrix", frequency_matrix(3, c.xyz_frequencies), persistent=False)
+        self.register_buffer("time_frequency_matrix", frequency_matrix(1, c.time_frequencies), persistent=False)
+        self.xyz_features = 3 * (1 + 2 * c.xyz_frequencies)
         self.input_features = self.xyz_features + time_features
-        self.time_hidden = nn.Linear(1 + 2 * time_frequencies, time_width)
-        self.time_output = nn.Linear(time_width, time_features)
+        self.time_hidden = nn.Linear(1 + 2 * c.time_frequencies, c.time_width)
+        self.time_output = nn.Linear(c.time_width, time_features)
         self.first = nn.Linear(self.input_features, width)  # columns: encoded xyz, then time features
-        trunk = [nn.Linear(width + (self.input_features if i == skip else 0), width) for i in range(1, depth)]
+        trunk = [nn.Linear(width + (self.input_features if i == c.skip else 0), width) for i in range(1, c.depth)]
         self.trunk = nn.ModuleList(trunk)  # columns of the one after the skip: as `first`, then hidden units
         self.heads = nn.Linear(width, sum(outputs.sizes))
         self._initialize(trunk)
@@ -123,7 +137,6 @@ class MLPLayer(nn.Module):
         self.heads.bias[:] = 0
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
-        """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""
         encoded, code = PositionalEncoding.apply(means, self.xyz_frequency_matrix), self.time_code(t)
         hidden = self._read_input(self.first, encoded, code).relu_()
         for i, linear in enumerate(self.trunk, start=1):
@@ -136,7 +149,7 @@ class MLPLayer(nn.Module):
         return LayerStep.of_columns(self.heads(hidden), self.outputs)
 
     def time_code(self, t: Tensor) -> Tensor:
-        """[time_features] of time `t`, the same for all Gaussians."""
+        """[time_features] of time `t`, the same for all points."""
         encoded = PositionalEncoding.apply(t.reshape(1, 1), self.time_frequency_matrix)
         return self.time_output(self.time_hidden(encoded).relu_())[0]
 
@@ -146,10 +159,6 @@ class MLPLayer(nn.Module):
         at_time = torch.addmv(bias, weight[:, self.xyz_features : self.input_features], code)
         return torch.addmm(at_time, encoded, weight[:, : self.xyz_features].t())
 
-    def extra_repr(self) -> str:
-        return f"{sum(p.numel() for p in self.parameters()):,} parameters"
-
-
-def to_array(tensor: Tensor) -> np.ndarray:
-    """As kernels take it."""
-    return tensor.detach().cpu().contiguous().numpy()
+    def parameter_groups(self) -> list[ParamGroup]:
+        lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
+        return [ParamGroup("network", list(self.parameters()), lr, "motion", is_clipped=True)]

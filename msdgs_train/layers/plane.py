@@ -1,20 +1,71 @@
 """One step of deformation read from six planes of features over space and time (paper, section 3.3, equation 11)."""
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.threads import run_parallel, split_evenly
-from msdgs_train.layers.heads import PAPER_HEADS, Heads
-from msdgs_train.layers.mlp import LayerStep, to_array
+from msdgs_train.layers.arrays import to_array
+from msdgs_train.layers.base import PAPER_HEADS, Heads, LayerConfig, SceneBounds, check_size
+from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.plane_kernels import plane_features, plane_gradients
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
 SPACE_INIT = (0.1, 0.5)
+
+
+@dataclass(frozen=True)
+class PlaneConfig(LayerConfig):
+    """Sizes, learning rates and regularizers of a plane layer; the sizes are the paper's."""
+
+    kind: ClassVar[str] = "plane"
+    features: int = 16
+    """Channels of a plane."""
+    resolution: int = 32
+    """Nodes of a plane along each axis of space."""
+    time_resolution: int = 50
+    """Nodes along time."""
+    width: int = 32
+    """Hidden units."""
+    multires: tuple[int, ...] = (1,)
+    """Grids, with so many times `resolution`; their features are put side by side. 4DGS has (1, 2)."""
+    lr_init: float = 2e-3
+    """Learning rate of the networks until all times take part."""
+    lr_final: float = 2e-5
+    """Of the networks at the last step, to which it decays exponentially."""
+    grid_lr_init: float = 1e-2
+    """Learning rate of the grids until all times take part."""
+    grid_lr_final: float = 1e-3
+    """Of the grids at the last step."""
+    time_smoothness_weight: float = 1e-2
+    """Weight of the mean squared second difference along time."""
+    l1_time_planes_weight: float = 0.0
+    """Weight of the mean distance of the planes over time from 1, where they change nothing."""
+    plane_tv_weight: float = 1e-4
+    """Weight of the mean squared first difference along space."""
+    plane_smoothness_weight: float = 0.0
+    """Weight of the mean squared second difference along space, what 4DGS calls plane_tv."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "multires", tuple(self.multires))
+
+    def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "PlaneLayer":
+        return PlaneLayer(self, bounds, heads)
+
+    def check(self, field: str, moves_nodes: bool) -> None:
+        for name, least in (("features", 1), ("resolution", 2), ("time_resolution", 2), ("width", 1)):
+            check_size(f"{field}.{name}", getattr(self, name), least)
+        if not self.multires:
+            raise InvalidInput(f"{field}.multires", "one grid or more", self.multires)
+        for factor in self.multires:
+            check_size(f"{field}.multires", factor)
 
 
 class PlaneGrid(nn.Module):
@@ -88,72 +139,72 @@ class PlaneGrid(nn.Module):
         return self.space.diff(n=2, dim=1).square().mean() + self.space.diff(n=2, dim=2).square().mean()
 
 
-class PlaneLayer(nn.Module):
+class PlaneLayer(DeformationLayer):
     """D_k of equation 11: features of planes over space and time, then one small MLP a head.
 
     The paper's has one grid, a simplification of 4DGS's HexPlane: 131,083 parameters at the default sizes. With
-    `scales` (1, 2), 32 channels, 64 and 75 nodes, width 64 and no weight it is the network of 4DGS, 3,365,770
+    `multires` (1, 2), 32 features, 64 and 75 nodes, width 64 and no weight it is the network of 4DGS, 3,365,770
     parameters, but for its heads of opacity and SH, which 4DGS itself leaves out unless asked for.
     """
 
     kind = "plane"
 
     def __init__(
-        self,
-        channels: int = 16,
-        space_nodes: int = 32,
-        time_nodes: int = 50,
-        width: int = 32,
-        scene_half_size: float = 1.0,
-        time_range: tuple[float, float] = (0.0, 1.0),
-        scales: tuple[int, ...] = (1,),
-        outputs: Heads = PAPER_HEADS,
+        self, config: PlaneConfig = PlaneConfig(), bounds: SceneBounds = SceneBounds(), outputs: Heads = PAPER_HEADS
     ) -> None:
-        """`scales`: a grid each, with so many times `space_nodes`; their features are put side by side."""
         super().__init__()
-        self.outputs = outputs
+        c, self.config, self.outputs = config, config, outputs
         self.grids = nn.ModuleList(
-            PlaneGrid(channels, space_nodes * scale, time_nodes, scene_half_size, time_range) for scale in scales
+            PlaneGrid(c.features, c.resolution * factor, c.time_resolution, *bounds) for factor in c.multires
         )
-        self.features = nn.Linear(channels * len(scales), width)
-        sizes = [size for size in outputs.sizes if size]
+        width, sizes = c.width, [size for size in outputs.sizes if size]
+        self.features = nn.Linear(c.features * len(c.multires), width)
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in sizes)
         self.heads = nn.ModuleList(nn.Linear(width, size) for size in sizes)
-        self.register_load_state_dict_pre_hook(_name_the_grid)
         with torch.no_grad():
             for i, head in enumerate(self.heads):
-                head.get_parameter(
-                    "bias"
-                ).zero_()  # a new layer moves nothing; its weight learns from a random direction
+                head.get_parameter("bias").zero_()
+                # a new layer moves nothing; its step weight learns from a random direction
                 if not (outputs.weight and i == len(sizes) - 1):
                     head.get_parameter("weight").zero_()
 
     def plane_grids(self) -> list[PlaneGrid]:
-        """From the coarsest to the finest, as `scales` has them."""
+        """From the coarsest to the finest, as `multires` has them."""
         return [grid for grid in self.grids if isinstance(grid, PlaneGrid)]
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
-        """The step of means, [N, 3], at time `t`, a scalar tensor of the same dtype and device."""
         read = torch.cat([grid(means, t) for grid in self.grids], dim=1)
         features = self.features(read).relu()
         heads = zip(self.hidden, self.heads, strict=True)
         columns = torch.cat([head(hidden(features).relu()) for hidden, head in heads], dim=1)
         return LayerStep.of_columns(columns, self.outputs)
 
-    def extra_repr(self) -> str:
-        return f"{sum(p.numel() for p in self.parameters()):,} parameters"
+    def parameter_groups(self) -> list[ParamGroup]:
+        grids = [planes for grid in self.plane_grids() for planes in (grid.space, grid.time)]
+        own = {id(p) for p in grids}
+        networks = [p for p in self.parameters() if id(p) not in own]
+        c = self.config
+        return [
+            ParamGroup("grids", grids, LearningRate(c.grid_lr_init, c.grid_lr_final, holds=True), "motion", True),
+            ParamGroup("networks", networks, LearningRate(c.lr_init, c.lr_final, holds=True), "motion", True),
+        ]
 
+    def regularizers(self, t: Tensor, is_new_frame: bool) -> dict[str, Tensor]:
+        c, terms = self.config, {}
+        for i, grid in enumerate(self.plane_grids()):
+            for weight, name, term in (
+                (c.time_smoothness_weight, "time_smoothness", grid.time_smoothness),
+                (c.l1_time_planes_weight, "l1_time_planes", grid.l1_time_planes),
+                (c.plane_tv_weight, "plane_tv", grid.plane_tv),
+                (c.plane_smoothness_weight, "plane_smoothness", grid.plane_smoothness),
+            ):
+                if weight:
+                    terms[f"{name}_{i}"] = weight * term()
+        return terms
 
-def _name_the_grid(layer: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Older models hold the only grid's tensors under the layer's own name, and one size of cells for all axes."""
-    for name in ("space", "time", "cells", "first_time", "time_cells"):
-        if prefix + name in state:
-            state[f"{prefix}grids.0.{name}"] = state.pop(prefix + name)
-    for name in [name for name in state if name.startswith(f"{prefix}grids.") and name.endswith(".cells")]:
-        grid = name.removesuffix("cells")
-        if state[name].ndim == 0 and f"{grid}space" in state:
-            state[name] = state[name].expand(3).clone()
-            state[f"{grid}origin"] = torch.full_like(state[name], (state[f"{grid}space"].shape[1] - 1) / 2)
+    def on_window(self, before: float, after: float) -> None:
+        for grid in self.plane_grids():
+            grid.on_window(before, after)
 
 
 class _PlaneFeatures(torch.autograd.Function):

@@ -19,7 +19,7 @@ from msdgs_serve.rasterizer.projection import rotation_columns
 from msdgs_serve.rasterizer.projection_backward import quaternion_gradient
 from msdgs_serve.scene.quaternion import MIN_NORM
 
-K_NEAREST = 8
+MAX_NEAREST = 8
 """Motions nearest to a Gaussian, that it may ever follow."""
 MOTION = 16
 OFFSET, TURN = 9, 12
@@ -31,7 +31,7 @@ DELTAS = 10
 
 
 @kernel
-def carry(
+def skin_forward(
     means: np.ndarray,
     quats: np.ndarray,
     weights: np.ndarray,
@@ -58,7 +58,7 @@ def carry(
 
 
 @kernel
-def carry_backward(
+def skin_backward(
     means: np.ndarray,
     quats: np.ndarray,
     weights: np.ndarray,
@@ -74,7 +74,11 @@ def carry_backward(
 ) -> None:
     """Add the gradients of rows `start` to `stop` to those of the motions, and set those of their own."""
     blended, pulls, found = np.empty(MOTION, means.dtype), np.empty(MOTION, means.dtype), np.empty(16, means.dtype)
-    products, flat, grad_flat = np.zeros(K_NEAREST * MOTION, means.dtype), motions.reshape(-1), grad_motions.reshape(-1)
+    products, flat, grad_flat = (
+        np.zeros(MAX_NEAREST * MOTION, means.dtype),
+        motions.reshape(-1),
+        grad_motions.reshape(-1),
+    )
     g = grad_deltas
     for n in range(np.uint64(start), np.uint64(stop)):
         _blend(weights, ids, flat, n, blended)

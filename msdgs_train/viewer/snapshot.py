@@ -1,18 +1,19 @@
 """A model at one moment, and how any camera sees it."""
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import torch
 
 from msdgs_serve.rasterizer import Rendering, rasterize
-from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import LoadedModel
+from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 
 Channel = Literal["rgb", "alpha", "depth"]
 OUTLYING_DEPTHS = (0.02, 0.98)
@@ -43,15 +44,22 @@ class Snapshot:
     def _pose(self, t: float, layers: int) -> Gaussians:
         """Kept until another is wanted: a camera that moves asks for the same again and again."""
         if self._posed is None or self._posed[0] != (t, layers):
-            posed = self.model.pose(t, steps=layers, deform=self.deform, sh_degree=self.sh_degree)
+            posed = self.model.pose(t, num_layers=layers, deform=self.deform, sh_degree=self.sh_degree)
             self._posed = (t, layers), Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
         return self._posed[1]
 
 
 def snapshot_of_training(trainer: Trainer) -> Snapshot:
     """A copy of the model as it would be judged and saved now. Not to be called while a step is done."""
-    model = copy.deepcopy(trainer.eval_model)
-    return Snapshot(model, trainer.config.evaluation_background, *trainer.parts_in_use)
+    system, step = trainer.system, trainer.step_count
+    if not isinstance(system, GaussianSplatting):
+        raise InvalidInput(
+            "viewer", "not used with this system, which isn't made of Gaussians", trainer.config.run.system
+        )
+    schedule, model = trainer.schedule, copy.deepcopy(system.eval_model)
+    model.config = replace(model.config, eps2d=schedule.eps2d(step))
+    background = trainer.config.data.evaluation_background
+    return Snapshot(model, background, schedule.deforms(step), schedule.sh_degree(step))
 
 
 def snapshot_of_file(loaded: LoadedModel) -> Snapshot:

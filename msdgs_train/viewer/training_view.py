@@ -32,7 +32,7 @@ class TrainingView(Observer):
             self._paused = gui.add_checkbox("pause", False)
             hint = "of the time that drawing may take away from training"
             self._share = gui.add_slider("share", 0.05, 0.9, 0.05, SHARE, hint=hint)
-        self._viewer.open(view_of_data(trainer.scene, len(trainer.model.deformation)))
+        self._viewer.open(view_of_data(trainer.scene, len(trainer.config.model.layers)))
         self._hand_over()
 
     def step(self, result: StepResult, seconds: float) -> None:
@@ -51,8 +51,8 @@ class TrainingView(Observer):
             f"{result.gaussians:,} Gaussians  \ntrain PSNR {result.psnr:.2f} dB{self._judged}"
         )
 
-    def evaluation(self, step: int, split: str, quality: ImageMetrics) -> None:
-        self._judged = f"  \n{split} PSNR {quality.psnr:.2f} dB at step {step:,}"
+    def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
+        self._judged = f"  \n{split} PSNR {metrics.psnr:.2f} dB at step {step:,}"
 
     def is_paused(self) -> bool:
         paused = bool(self._paused.value)

@@ -9,8 +9,10 @@ import pytest
 import torch
 from onnx import helper
 
-from export.jobs.job import Job
-from export.measure.rendered_error import ExactFrames, posed, shown
+from export.jobs.job import ExportJob
+from export.measure.frames import render
+from export.measure.poses import posed
+from export.measure.rendered_error import ExactFrames
 from export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, rasterize
@@ -60,8 +62,8 @@ def camera() -> Camera:
 @pytest.fixture
 def expected(loaded: LoadedModel, camera: Camera) -> np.ndarray:
     gaussians = posed(loaded.model, T)
-    narrow = shown(gaussians, camera, SCENE.background, NARROW)
-    assert np.abs(narrow - shown(gaussians, camera, SCENE.background, GSPLAT)).max() > 0.05
+    narrow = render(gaussians, camera, SCENE.background, NARROW)
+    assert np.abs(narrow - render(gaussians, camera, SCENE.background, GSPLAT)).max() > 0.05
     return narrow
 
 
@@ -88,7 +90,7 @@ def test_exact_frames_of_an_export(
     rows = np.arange(len(loaded.model.gaussians))
     assert exact.measure(exact.pose, rows).psnr_worst == 100.0
     assert exact.measure(exact.pose, rows, options=GSPLAT).psnr_worst < 40.0
-    job = Job(folder / "model.pt", tmp_path)
+    job = ExportJob(folder / "model.pt", tmp_path)
     candidate = job.candidate("network", 50.0)
     assert candidate.options == NARROW
     assert job.error(candidate).psnr_worst > 50.0

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
 from export.exporters.gltf import EXTENSION, read_gltf
-from export.exporters.proof import ConversionFailed, visionary_of
+from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_rules import VisionaryInvalid, check_visionary

@@ -21,7 +21,7 @@ from export.importers import ImportFailed, read_splats
 from export.importers.runs.model import write_model
 from export.importers.scene import write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
-from export.measure.rendered_error import as_gaussians
+from export.measure.poses import posed as posed_model
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.camera import Camera, orbit
@@ -128,8 +128,7 @@ def run_of(write_run: Callable[..., Path], state: dict[str, torch.Tensor]) -> Ca
 def read_run(kind: str) -> Callable[[Path, list[Path]], Gaussians]:
     def read(folder: Path, files: list[Path]) -> Gaussians:
         write_model(folder / "run", kind, folder / "model.pt", QUIET)
-        with torch.no_grad():
-            return as_gaussians(load_model(folder / "model.pt").model.pose(0.5))
+        return posed_model(load_model(folder / "model.pt").model, 0.5)
 
     return read
 
@@ -141,13 +140,12 @@ def our_model(folder: Path, g: Gaussians) -> list[Path]:
 
 def read_our_model(folder: Path, files: list[Path]) -> Gaussians:
     try:
-        with torch.no_grad():
-            return as_gaussians(load_model(files[0]).model.pose(0.5)).validate()
+        return posed_model(load_model(files[0]).model, 0.5).validate()
     except (CheckpointInvalid, InvalidInput) as error:
         raise ImportFailed(files[0], str(error)) from error
 
 
-KINDS = {
+FORMATS = {
     "model": Kind(our_model, read_our_model),
     "ply": one("a.ply", lambda g: ply_bytes(inria_columns(g))),
     "text ply": one("a.ply", lambda g: ply_bytes(inria_columns(g), "ascii")),
@@ -168,9 +166,9 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files_are_refused_or_drawn(tmp_path: Path, name: str):
-    kind, rng = KINDS[name], np.random.default_rng(sum(name.encode()))
+    kind, rng = FORMATS[name], np.random.default_rng(sum(name.encode()))
     files = kind.make(tmp_path, some_gaussians(COUNT, sh_degree=1))
     whole = {file: file.read_bytes() for file in files}
     drawn(kind.read(tmp_path, files))  # compiles

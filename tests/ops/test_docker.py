@@ -18,13 +18,12 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from benchmarks.service_process import free_port
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.work import WorkQueue
 from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.store import SceneStore
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, free_port
 from tests.support.scene_files import write_scene
 from tests.support.service import in_this_process, serving
 

@@ -32,7 +32,7 @@ REPORT = {
     "min_psnr": 50.0,
     "points": [
         {
-            "plan": plan, "front": True, "chosen": plan == "prefix", "trim_db": None, "bytes": 1e6,
+            "plan": plan, "front": True, "chosen": plan == "prefix", "pruning_db": None, "bytes": 1e6,
             "milliseconds": {"total": {"min": milliseconds}}, "error": {"psnr_worst": decibels},
         }
         for plan, milliseconds, decibels in (("network", 40.0, 95.0), ("prefix", 20.0, 60.0))

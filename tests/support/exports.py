@@ -1,13 +1,14 @@
-"""The shortest way from a model file to a scene file: all layers as trained, nothing trimmed, no sweep."""
+"""The shortest way from a model file to a scene file: all layers as trained, nothing pruned, no sweep."""
 
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
 from export.jobs.bake import bake
-from export.jobs.write import PLAN, Exported, write_scene
+from export.jobs.write import Exported, write_scene
 from export.measure.stability import assess
 from export.measure.verify import TIMES, TOLERANCE
+from export.plans.base import BASELINE
 from export.plans.registry import build
 from msdgs_train.gaussians.model_file import load_model
 
@@ -31,5 +32,5 @@ def export_scene(
     with checkpoint.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     baked = bake(loaded.model, loaded.scene, sha256)
-    assess(loaded.model, loaded.scene, times=STABILITY_TIMES).require(PLAN)
-    return write_scene(output, build(PLAN, baked), loaded.model, tolerance=tolerance, times=times, on_time=on_time)
+    assess(loaded.model, loaded.scene, times=STABILITY_TIMES).require(BASELINE)
+    return write_scene(output, build(BASELINE, baked), loaded.model, tolerance=tolerance, times=times, on_time=on_time)

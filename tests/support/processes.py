@@ -1,6 +1,7 @@
-"""Python code in a process of its own."""
+"""Python code in a process of its own, and ports for such."""
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -16,3 +17,10 @@ def run_python(code: str, *arguments: object, **environment: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def free_port() -> int:
+    """A port of this machine that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

@@ -10,10 +10,9 @@ from collections.abc import Iterator
 
 import httpx
 
-from benchmarks.service_process import free_port
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.cluster import deployment
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, free_port
 
 OBJECT_STORE_BYTES = 100 << 20
 CORES = 64  # as Ray counts them: several services are up at once

@@ -1,4 +1,4 @@
-"""Draw the images of docs/viewer.md: `python -m tests.support.viewer_screenshots docs/images`."""
+"""Take the screenshots of docs/viewer.md: `python -m tests.support.viewer_screenshots docs/images`."""
 
 import sys
 from pathlib import Path

@@ -67,7 +67,7 @@ def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) 
 
 @pytest.mark.parametrize("name", ["ablation.toml", "shared_motions.toml"])
 def test_tables_of_systems_in_the_repository_can_be_compared(name: str) -> None:
-    file = ROOT / "benchmarks" / name
+    file = ROOT / "benchmarks" / "training" / name
     systems = read_systems([str(file)], Budget(steps=6, init_num_pts=4000, max_gaussians=5000))
     assert len({json.dumps(system.config.to_dict()) for system in systems}) == len(systems) > 10
 

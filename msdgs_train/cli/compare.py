@@ -1,0 +1,86 @@
+"""`msdgs-train compare`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, rich_table
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train every system on every scene with every seed under one budget, and put them side by side: a table
+    (comparison.md), all numbers (comparison.json), error against training time (time.png) and against the number of
+    layers (layers.png).
+
+    A system is a preset, or a table of a TOML file: the settings of `fit`, changed from a `preset`. What Ctrl-C has
+    stopped goes on with the same command; finished runs aren't trained again.
+
+    Example:  msdgs-train compare deformgs 4dgs mine.toml --data data/a data/b --out runs/all --steps 3000 --size 200
+    --init-num-pts 5000 --max-gaussians 10000
+
+    where mine.toml holds:  [k2]  preset = "msdgs-small"  [k4]  layers = ["mlp", "mlp:width=64", "mlp", "mlp"]
+    """
+
+    systems: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG...")]
+    """Presets and TOML files."""
+    data: tuple[Path, ...]
+    """Dataset folders, one or more."""
+    out: Path
+    """The folder for all runs and the results; new, or one of the same comparison."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Each is a run of its own; the table shows mean and spread."""
+    steps: int = 3000
+    """The budget of each run in optimiser steps, whatever a preset says. Schedules that are parts of a run shrink with
+    it; those in steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
+    minutes: float | None = None
+    """A run also ends after so many minutes. Learning rates fall over --steps, so choose these to be just reached."""
+    size: int | None = None
+    """Width in pixels of all images."""
+    init_num_pts: int | None = None
+    """Gaussians at the start, for all systems; left out: each its own."""
+    max_gaussians: int | None = None
+    """Gaussians at most, for all systems; left out: each its own."""
+    threads: int = 1
+    """Of each run."""
+    jobs: int | None = None
+    """Runs side by side; left out: as many as have their threads' cores. Times of runs side by side disturb each other
+    somewhat; those of frames are taken at the end, one after the other."""
+    ray: str | None = None
+    """Train on a Ray cluster: `auto`, that of this machine (one is started where there is none), or its address. DATA
+    and OUT must be seen by all its machines under the same names."""
+
+    def execute(self) -> int:
+        from msdgs_serve.threads import thread_count
+        from msdgs_train.cli.progress import ComparisonProgress
+        from msdgs_train.comparison.matrix import Budget, make_runs, read_systems
+        from msdgs_train.comparison.pools import processes, ray_tasks
+        from msdgs_train.comparison.report import HEADINGS, table, write_comparison
+        from msdgs_train.comparison.results import collect
+        from msdgs_train.comparison.runner import train_all
+
+        budget = Budget(self.steps, self.minutes, self.size, self.threads, self.init_num_pts, self.max_gaussians)
+        runs = make_runs(read_systems(self.systems, budget), self.data, self.seeds, self.out)
+        if self.jobs is not None and self.jobs < 1:
+            raise InvalidInput("jobs", "1 or more", self.jobs)
+        if self.ray is None:
+            pool = processes(self.jobs or max(1, thread_count() // self.threads))
+        else:
+            pool = ray_tasks(self.ray, self.threads, self.jobs)
+        with ComparisonProgress(console, len(runs)) as progress:
+            complete = train_all(runs, pool, progress.ended)
+        results = collect(runs)
+        if results:
+            paths = write_comparison(self.out, results, len(runs) - len(results))
+            if console.is_terminal:
+                console.print(rich_table(HEADINGS, table(results), names=2))
+            else:  # 80 columns would cut it
+                console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, markup=False, highlight=False)
+            console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+        if not complete:
+            console.print("interrupted; the same command goes on", soft_wrap=True)
+            return EXIT_INTERRUPTED
+        return 0 if len(results) == len(runs) else EXIT_INVALID

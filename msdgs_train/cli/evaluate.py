@@ -1,0 +1,68 @@
+"""`msdgs-train eval`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.cli.console import console, rich_table
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from msdgs_train.evaluation.evaluate import Evaluation
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Evaluate the last and the best model of runs on held-out images: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR where
+    something moves, since a static background hides what is wrong with the motion.
+
+    RUN/eval gets numbers for every image (<split>.json), a table (<split>.md) and a contact sheet of images, renderings
+    and errors (<split>.png). LPIPS and ꟻLIP are omitted if their packages or weights are not on this machine; nothing
+    is downloaded. Several runs are also drawn side by side.
+
+    Example:  msdgs-train eval runs/first
+
+    Two runs beside the same images:  msdgs-train eval runs/first runs/second --sheet first_and_second.png
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
+    """Folders of runs that `msdgs-train fit` has filled."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
+    """The dataset, if it is not any more where the runs found it."""
+    split: Literal["test", "val", "train"] = "test"
+    """Which images."""
+    sheet: Path = Path("side_by_side.png")
+    """With several runs, the PNG to write: a row for each of some images, then the rendering of each run."""
+
+    def execute(self) -> int:
+        from msdgs_train.cli.progress import frame_progress
+        from msdgs_train.evaluation.evaluate import evaluate_run
+        from msdgs_train.evaluation.report import draw_runs, notes, write_evaluation
+
+        if not self.runs:
+            raise InvalidInput("RUN", "the folder of one run or more", "none")
+        evaluations = {}
+        for run in self.runs:
+            with frame_progress(console, 0) as progress:
+                evaluation = evaluations[str(run)] = evaluate_run(run, self.data, self.split, progress)
+            paths = write_evaluation(run, evaluation)
+            console.print(_table(str(run), evaluation))
+            for note in notes(evaluation):
+                console.print(note, soft_wrap=True, highlight=False)
+            console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+        if len(evaluations) > 1:
+            draw_runs(self.sheet, evaluations)
+            console.print(f"wrote {self.sheet}", soft_wrap=True)
+        return 0
+
+
+def _table(run: str, evaluation: "Evaluation") -> "Table":
+    from msdgs_train.evaluation.report import HEADINGS, cells
+
+    rows = [[j.name, f"{j.loaded.step:,}", *cells(evaluation, j.mean)] for j in evaluation.models]
+    title = f"{run}: {evaluation.split}, mean of {len(evaluation.frames)} images"
+    return rich_table(["model", "step", *HEADINGS.values()], rows, names=1, title=title)

@@ -1,0 +1,27 @@
+"""Images in memory, so that each is decoded once."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msdgs_train.datasets import Frame, composite
+
+MAX_BYTES = 2 << 30
+
+
+class ImageCache:
+    """Keeps pixels as uint8 RGBA, read when first needed, up to `MAX_BYTES`."""
+
+    def __init__(self) -> None:
+        self._pixels: dict[Path, np.ndarray] = {}
+
+    def image(self, frame: Frame, background: Tensor) -> Tensor:
+        """[H, W, 3] over a background color [3]."""
+        rgba = self._pixels.get(frame.image_path)
+        if rgba is None:
+            rgba = frame.load_rgba()
+            if (len(self._pixels) + 1) * rgba.nbytes <= MAX_BYTES:
+                self._pixels[frame.image_path] = rgba
+        return torch.from_numpy(composite(rgba, background.numpy()))

@@ -1,0 +1,54 @@
+"""Settings of density control."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from msdgs_train.settings import Checked
+
+
+@dataclass(frozen=True)
+class DensityConfig(Checked):
+    """How many Gaussians there are, and when and where they are added and removed."""
+
+    init_num_pts: int = 8_000
+    """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
+    max_gaussians: int = 10_000
+    """There are never more; the largest gradients come first."""
+    density_strategy: Literal["gradient", "mcmc"] = "gradient"
+    """gradient clones and splits by gradients of the projected means, and prunes; mcmc relocates low-opacity Gaussians
+    and grows by 5 % a round up to max_gaussians."""
+    refine_start: int = 500
+    """The first step of density control."""
+    refine_every: int = 100
+    """Steps between rounds of density control; 0 switches it off."""
+    refine_stop_fraction: float = 0.7
+    """Density control ends after this fraction of the run."""
+    grow_grad2d: float = 4e-4
+    """gradient: a projected mean of a larger mean gradient norm, in normalized device coordinates, is densified."""
+    grow_scale3d: float = 0.01
+    """gradient: one with a larger scale than this fraction of the scene's scale is split, a smaller one is cloned."""
+    prune_opa: float = 0.005
+    """Gaussians of a lower opacity are removed, or relocated."""
+    prune_scale3d: float = 0.1
+    """gradient: Gaussians larger than this fraction of the scene's scale are removed after a reset of opacities."""
+    reset_every: int = 0
+    """gradient: opacities are reset to at most 0.01 each so many steps, while density control lasts; 0: never."""
+    noise_lr: float = 5e5
+    """mcmc: factor of the noise that is injected into means, in their learning rates times their covariance."""
+    opacity_reg: float = 1e-2
+    """mcmc: weight of the mean opacity."""
+    scale_reg: float = 1e-2
+    """mcmc: weight of the mean scale in scene units."""
+    reseed_fraction: float = 0.25
+    """Random Gaussians that are added after the static phase, as a fraction of max_gaussians: briefly crossed regions
+    have lost theirs by then. Until then there are at most max_gaussians less twice as many."""
+
+    def __post_init__(self) -> None:
+        self.require_counts("init_num_pts", "max_gaussians")
+        self.require_counts("refine_start", "refine_every", "reset_every", least=0)
+        self.require_fractions("refine_stop_fraction", "prune_opa")
+        self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
+        self.require_weights("noise_lr", "opacity_reg", "scale_reg")
+        self.require(("reseed_fraction",), "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
+        self.require(("max_gaussians",), "init_num_pts or more", lambda v: v >= self.init_num_pts)
+        self.require(("density_strategy",), "gradient or mcmc", lambda v: v in ("gradient", "mcmc"))

@@ -1,0 +1,113 @@
+"""The phases of a run in steps, and all that depends on them."""
+
+from typing import NamedTuple
+
+from msdgs_train.engine.config import TrainConfig
+
+
+class Phase(NamedTuple):
+    """Consecutive steps that train alike."""
+
+    name: str
+    first: int
+    stop: int  # the first step that isn't part of it
+
+
+class Schedule(NamedTuple):
+    """What happens when. Steps are counted from 0 unless a method says so."""
+
+    config: TrainConfig
+    num_steps: int
+    static_steps: int  # all images, no deformation
+    deform_start_step: int
+    full_window_step: int  # all times take part
+    refine_stop: int  # the last step of density control, counted from 1
+    num_reseeded: int  # random Gaussians that are added after the static phase
+
+    @classmethod
+    def from_config(cls, config: TrainConfig) -> "Schedule":
+        """Of these settings."""
+        c, steps = config.curriculum, config.run.steps
+        static_window = c.static_window_fraction if c.window_full_fraction else 0.0
+        static_steps = round(c.static_fraction * steps)
+        reseeds = static_steps and c.window_full_fraction and config.model.layers
+        return cls(
+            config,
+            steps,
+            static_steps,
+            deform_start_step=round((c.static_fraction + static_window) * steps),
+            full_window_step=round(c.window_full_fraction * steps),
+            refine_stop=round(config.density.refine_stop_fraction * steps),
+            num_reseeded=int(config.density.reseed_fraction * config.density.max_gaussians) if reseeds else 0,
+        )
+
+    def phases(self) -> list[Phase]:
+        """Those that there are, in order."""
+        starts = self.config.curriculum.window_start_widths
+        if not self.config.model.layers or self.config.curriculum.window_full_fraction == 0:
+            start = min(self.deform_start_step, self.num_steps) if self.config.model.layers else self.num_steps
+            found = [Phase("static, all images", 0, start), Phase("all times", start, self.num_steps)]
+        else:
+            grown = max(self.full_window_step, self.deform_start_step)
+            edges = [self.deform_start_step + (grown - self.deform_start_step) * i // len(starts)
+                     for i in range(len(starts) + 1)]  # fmt: skip
+            found = [
+                Phase("static, all images", 0, self.static_steps),
+                Phase("static, first time window", self.static_steps, self.deform_start_step),
+                *(Phase(f"time window grows from {start:g}", edges[i], edges[i + 1]) for i, start in enumerate(starts)),
+                Phase("all times", grown, self.num_steps),
+            ]
+        return [phase for phase in found if phase.stop > phase.first]
+
+    def window(self, step: int) -> float:
+        """Half width of the time window, as a fraction of the scene's time: 0.5 is all of it."""
+        c = self.config
+        if c.curriculum.window_full_fraction == 0 or not c.model.layers or step < self.static_steps:
+            return 0.5
+        grown, starts = self._growth(step), c.curriculum.window_start_widths
+        if grown >= len(starts):
+            return 0.5
+        start = starts[int(grown)]
+        return start + (0.5 - start) * (grown % 1)
+
+    def is_first_pass(self, step: int) -> bool:
+        """Whether times that the window takes in now have never been in it."""
+        return self._growth(step) <= 1
+
+    def _growth(self, step: int) -> float:
+        """How many times the window has grown to all times."""
+        done = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
+        return done * len(self.config.curriculum.window_start_widths)
+
+    def deforms(self, step: int) -> bool:
+        """Whether the deformation takes part."""
+        return step >= self.deform_start_step and len(self.config.model.layers) > 0
+
+    def sh_degree(self, step: int) -> int:
+        """Of the spherical harmonics in use."""
+        return min(step // self.config.optimizer.sh_degree_interval, self.config.model.sh_degree)
+
+    def eps2d(self, step: int) -> float:
+        """Dilation of projected covariances in this step, counted from 1, px²."""
+        init = self.config.optimizer.eps2d_init
+        return self.config.model.eps2d if init is None or step > self.full_window_step else init
+
+    def max_gaussians(self, step: int) -> int:
+        """How many there may be after this step, counted from 1."""
+        most = self.config.density.max_gaussians
+        return most - 2 * self.num_reseeded if step <= self.static_steps else most
+
+    def refines_at(self, step: int) -> bool:
+        """Whether a round of density control is due after this step, counted from 1."""
+        d = self.config.density
+        return d.refine_every > 0 and d.refine_start <= step <= self.refine_stop and step % d.refine_every == 0
+
+    def resets_at(self, step: int) -> bool:
+        """Whether opacities are reset after this step, counted from 1."""
+        every = self.config.density.reset_every
+        return every > 0 and step < self.refine_stop and step % every == 0
+
+    def averages_at(self, step: int) -> bool:
+        """Whether the model after this step, counted from 1, is part of the average."""
+        last = max(self.deform_start_step, self.full_window_step, self.refine_stop)
+        return self.config.optimizer.ema_steps > 0 and step > last

@@ -1,0 +1,46 @@
+"""How large a scene is: by its cameras, and by the Gaussians that can be seen."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from msdgs_serve.scene import Camera
+from msdgs_train.datasets import Frame
+from msdgs_train.gaussians.model import PosedGaussians
+
+BOUNDS_TIMES = 9
+VISIBLE_OPACITY = 0.05
+OUTSIDE_BOUNDS = 0.01
+"""Fraction of the means that is outside of the bounds on each side: some are flung far away, where no image shows
+them."""
+
+
+def scene_scale(cameras: Sequence[Camera]) -> float:
+    """1.1 times the radius of the cameras' positions, as 3D Gaussian Splatting measures a scene; 0 for one camera."""
+    positions = np.array([camera.position for camera in cameras])
+    return 1.1 * float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
+
+
+def scene_bounds(
+    pose: Callable[[float], PosedGaussians], time_range: tuple[float, float], scene_half_size: float
+) -> list[list[float]]:
+    """Corners of the box that holds the means of visible Gaussians, over the times of the scene."""
+    boxes = []
+    for t in np.linspace(*time_range, BOUNDS_TIMES):
+        posed = pose(float(t))
+        means = posed.means[posed.opacities >= VISIBLE_OPACITY]
+        if len(means):
+            boxes.append(torch.quantile(means, torch.tensor([OUTSIDE_BOUNDS, 1 - OUTSIDE_BOUNDS]), dim=0))
+    if not boxes:
+        return [[-scene_half_size] * 3, [scene_half_size] * 3]
+    stacked = torch.stack(boxes)
+    return [stacked[:, 0].amin(dim=0).tolist(), stacked[:, 1].amax(dim=0).tolist()]
+
+
+def camera_entry(frame: Frame) -> dict[str, Any]:
+    """A frame's camera in plain values, as `SceneInfo.cameras` holds it."""
+    camera = frame.camera
+    entry = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    return {"name": frame.name, **entry, "camera_to_world": camera.camera_to_world.tolist(), "t": frame.t}

@@ -1,0 +1,75 @@
+"""Torch files from anywhere: written atomically, and read as tensors and plain values only."""
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from msdgs_serve.scene.errors import MsdgsError
+from msdgs_train.datasets.common.files import replacing
+
+PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
+PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
+"""Types of numbers."""
+
+
+class CheckpointInvalid(MsdgsError):
+    """A checkpoint can't be read, or holds what no model can use."""
+
+    def __init__(self, file: str | Path, problem: str) -> None:
+        super().__init__(f"{file}: {problem}")
+
+
+def save_atomic(path: str | Path, obj: Any) -> None:
+    """`torch.save`, atomically."""
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        torch.save(obj, file)
+
+
+def load(path: str | Path) -> Any:
+    """`torch.load` of tensors and plain values onto the CPU; no code in the file is run."""
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if size == 0:
+            raise CheckpointInvalid(path, "is empty")
+        if not zipfile.is_zipfile(path):
+            raise CheckpointInvalid(path, f"isn't a torch checkpoint, or is cut off after {size:,} bytes")
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+        if unpacked > size:  # it could unpack to anything
+            raise CheckpointInvalid(path, f"is packed: it holds {unpacked:,} bytes; torch.save packs nothing")
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise CheckpointInvalid(path, "no such file") from error
+    except OSError as error:
+        raise CheckpointInvalid(path, f"can't be read: {error.strerror or error}") from error
+    except CheckpointInvalid:
+        raise
+    except Exception as error:  # where bits are turned its stack machine stumbles in any way
+        raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
+
+
+def refuse_unlike_stored(path: str | Path, tensors: Mapping[str, Tensor]) -> None:
+    """Raise `CheckpointInvalid` for what isn't rows of plain numbers, or claims more of a storage than there is of it.
+
+    Strides of 0 make a few stored bytes a tensor of any size.
+    """
+    claimed: dict[int, int] = {}
+    for name, tensor in tensors.items():
+        if not _is_plain(tensor):
+            raise CheckpointInvalid(path, f"`{name}` isn't a dense tensor of plain numbers")
+        storage = tensor.untyped_storage()
+        claimed.setdefault(storage.data_ptr(), 0)
+        claimed[storage.data_ptr()] += tensor.numel() * tensor.element_size()
+        if claimed[storage.data_ptr()] > storage.nbytes():
+            problem = f"of shape {tuple(tensor.shape)} isn't stored in full: it shares {storage.nbytes():,} bytes"
+            raise CheckpointInvalid(path, f"`{name}` {problem}")
+
+
+def _is_plain(tensor: Any) -> bool:
+    plain = type(tensor) in (Tensor, nn.Parameter) and tensor.layout is torch.strided and not tensor.is_nested
+    return plain and tensor.device.type == "cpu" and tensor.dtype in PLAIN

@@ -1,0 +1,52 @@
+"""Quaternions [N, 4], wxyz, and symmetric matrices, differentiable."""
+
+import torch
+from torch import Tensor
+
+from msdgs_serve.scene.quaternion import MIN_NORM
+
+
+def unit(quats: Tensor) -> Tensor:
+    """Scaled to unit length; those of norm under 1e-8 vanish."""
+    return quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(MIN_NORM)
+
+
+def unit_or_identity(raw_quats: Tensor) -> Tensor:
+    """Scaled to unit length; those of norm under 1e-8 have no direction and become the identity."""
+    norms = torch.linalg.vector_norm(raw_quats, dim=1, keepdim=True)
+    identity = raw_quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return torch.where(norms < MIN_NORM, identity, raw_quats / norms.clamp_min(MIN_NORM))
+
+
+def multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton products: first b rotates, then a."""
+    (aw, av), (bw, bv) = (q.split((1, 3), dim=1) for q in (a, b))
+    vector = aw * bv + bw * av + torch.linalg.cross(av, bv)
+    return torch.cat([aw * bw - (av * bv).sum(dim=1, keepdim=True), vector], dim=1)
+
+
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors [N, 3] rotated by unit quaternions."""
+    w, axis = quats[:, :1], quats[:, 1:]
+    twice = 2 * torch.linalg.cross(axis, vectors)
+    return vectors + w * twice + torch.linalg.cross(axis, twice)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """[N, 3, 3] of unit quaternions."""
+    w, x, y, z = quats.unbind(dim=1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def stretch_matrices(stretches: Tensor) -> Tensor:
+    """[N, 3, 3] the identity plus symmetric matrices of xx, yy, zz, xy, xz, yz, [N, 6], or diagonal ones, [N, 3]."""
+    if stretches.shape[1] == 3:
+        return torch.diag_embed(1 + stretches)
+    xx, yy, zz, xy, xz, yz = stretches.unbind(dim=1)
+    rows = ((1 + xx, xy, xz), (xy, 1 + yy, yz), (xz, yz, 1 + zz))
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)

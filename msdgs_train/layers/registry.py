@@ -1,0 +1,17 @@
+"""The kinds of layers by name. A kind from outside this package joins with `register_layer`."""
+
+from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.mlp import MLPConfig
+from msdgs_train.layers.plane import PlaneConfig
+from msdgs_train.layers.spline import SplineConfig
+
+LAYERS: dict[str, type[LayerConfig]] = {}
+
+
+def register_layer(config: type[LayerConfig]) -> None:
+    """Make a kind known under its `kind`."""
+    LAYERS[config.kind] = config
+
+
+for _config in (MLPConfig, PlaneConfig, SplineConfig):
+    register_layer(_config)

@@ -1,0 +1,139 @@
+"""One step of deformation by free curves: each node has a translation, a rotation and a stretch of its own over time.
+
+What is learned of one time leaves other times as they are, where an MLP's weights serve all positions and times. On
+control nodes these are the motion bases of Shape of Motion (Wang et al. 2024), on splines, and with a stretch: a soft
+body takes few of them, where rigid ones must be many.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers.base import Heads, LayerConfig, SceneBounds, check_size
+from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.layers.parameters import LearningRate, ParamGroup
+from msdgs_train.layers.quaternions import multiply, unit
+
+ROTATION_WEIGHT = 0.3
+"""Scene units that a quaternion's unit counts as in temporal smoothness, and a stretch by as much again."""
+
+
+@dataclass(frozen=True)
+class SplineConfig(LayerConfig):
+    """Sizes and learning rates of a spline layer."""
+
+    kind: ClassVar[str] = "spline"
+    num_knots: int = 36
+    """Intervals of a spline over the time range of the scene."""
+    affine: bool = True
+    """Nodes stretch what follows them; else their motion is rigid."""
+    lr_init: float = 6e-4
+    """Learning rate until all times take part."""
+    lr_final: float = 6e-5
+    """Learning rate at the last step, to which it decays exponentially."""
+    motion_smoothness_weight: float = 0.2
+    """Weight of the mean size of second differences along time."""
+
+    def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "SplineLayer":
+        assert num_points is not None  # `check` has seen to it
+        return SplineLayer(self, num_points, bounds.time_range)
+
+    def check(self, field: str, moves_nodes: bool) -> None:
+        check_size(f"{field}.num_knots", self.num_knots)
+        if not moves_nodes:
+            raise InvalidInput(field, "of another kind, or with --model.support nodes: curves are of nodes", self.kind)
+
+
+class SplineLayer(DeformationLayer):
+    """Uniform cubic B-splines of evenly spaced knots; step weights are 1."""
+
+    kind = "spline"
+    stretches: Tensor
+    first_time: Tensor
+    knots_per_time: Tensor
+
+    def __init__(self, config: SplineConfig, num_points: int, time_range: tuple[float, float]) -> None:
+        super().__init__()
+        first, last = time_range
+        rows, knots = config.num_knots + 3, config.num_knots
+        self.config = config
+        self.transls = nn.Parameter(torch.zeros(rows, num_points, 3))  # scene units
+        self.rots = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, num_points, 1))  # wxyz, any length
+        stretches = torch.zeros(rows, num_points, 6)  # a right-stretch tensor less the identity: xx, yy, zz, xy, xz, yz
+        if config.affine:
+            self.stretches = nn.Parameter(stretches)
+        else:
+            self.register_buffer("stretches", stretches)
+        self.register_buffer("first_time", torch.tensor(first))
+        self.register_buffer("knots_per_time", torch.tensor(knots / ((last - first) or 1.0)))
+
+    def forward(self, means: Tensor, t: Tensor) -> LayerStep:
+        read, part = self.knots_at(t)
+        weights = cubic_weights(part)
+        transls, rots, stretches = (torch.einsum("k,kbc->bc", weights, curve[read]) for curve in self._curves)
+        return LayerStep(transls, stretches, rots - rots.new_tensor([1.0, 0, 0, 0]), transls.new_ones(len(transls), 1))
+
+    @property
+    def _curves(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.transls, self.rots, self.stretches
+
+    def knots_at(self, t: Tensor) -> tuple[slice, Tensor]:
+        """The four knots that a time reads, and how far it is, in [0, 1], from the second to the third of them."""
+        knots = self.config.num_knots
+        position = ((t - self.first_time) * self.knots_per_time).clamp(0, knots)
+        first = min(int(position), knots - 1)
+        return slice(first, first + 4), position - first
+
+    def parameter_groups(self) -> list[ParamGroup]:
+        lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
+        return [ParamGroup("curves", list(self.parameters()), lr, "motion")]
+
+    def regularizers(self, t: Tensor, is_new_frame: bool) -> dict[str, Tensor]:
+        """Temporal smoothness, but not at new frames: a bounce needs a kink."""
+        if is_new_frame:
+            return {}
+        return {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}
+
+    def temporal_smoothness(self, t: Tensor) -> Tensor:
+        """Mean size of second differences along time of the knots that a time reads; translations count most."""
+        read, _ = self.knots_at(t)
+        transls, rots, stretches = (curve[read].diff(n=2, dim=0).abs().mean() for curve in self._curves)
+        return transls + ROTATION_WEIGHT * (rots + stretches)
+
+    @torch.no_grad()
+    def on_window(self, before: float, after: float) -> None:
+        """Beyond the window, translations and stretches are held constant and rotations continue at constant speed.
+
+        Rotation has inertia, and what falls will bounce: translations that went on would lose it under the ground.
+        """
+        knots = self.config.num_knots
+        known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
+        for last, outwards in ((known[0], -1), (known[-1], 1)):
+            rot, inner = (unit(self.rots[k]) for k in (last, last - outwards))
+            step = multiply(rot, inner * rot.new_tensor([1.0, -1.0, -1.0, -1.0]))
+            for k in range(last + outwards, knots + 3 if outwards > 0 else -1, outwards):
+                if abs(k - last) <= 3:  # as many as a time within the window reads
+                    rot = unit(multiply(step, rot))
+                self.transls[k], self.rots[k], self.stretches[k] = self.transls[last], rot, self.stretches[last]
+
+    def new_frame_rows(self, times: Iterable[float]) -> list[tuple[nn.Parameter, Tensor]]:
+        """Of translations and rotations. Not of stretches: what is out of place would shrink until it has no gradient,
+        before it gets there."""
+        rows = torch.zeros(len(self.transls), dtype=torch.bool)
+        for t in times:
+            rows[self.knots_at(torch.tensor(t))[0]] = True
+        return [(self.transls, rows), (self.rots, rows)]
+
+    def operations(self) -> int:
+        """None: a node's curves are read once a frame."""
+        return 0
+
+
+def cubic_weights(part: Tensor) -> Tensor:
+    """[4] of the knots around a time, `part` of the way from the second to the third: a uniform cubic B-spline."""
+    u, v = part, 1 - part
+    return torch.stack([v**3, 3 * u**3 - 6 * u**2 + 4, 3 * v**3 - 6 * v**2 + 4, u**3]) / 6

@@ -1,0 +1,47 @@
+"""Checks that all groups of settings share."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+from msdgs_serve.scene.errors import InvalidInput
+
+
+class Checked:
+    """A frozen dataclass whose fields are checked when it is built."""
+
+    def require(self, names: tuple[str, ...], expected: str, holds: Callable[[Any], bool]) -> None:
+        """Raise `InvalidInput` naming the first of the fields `names` whose value doesn't hold."""
+        for name in names:
+            value = getattr(self, name)
+            if not holds(value):
+                raise InvalidInput(f"config.{name}", expected, value)
+
+    def require_counts(self, *names: str, least: int = 1) -> None:
+        """Whole numbers of `least` or more."""
+        self.require(names, f"a whole number of {least} or more", lambda v: type(v) is int and v >= least)
+
+    def require_fractions(self, *names: str) -> None:
+        """Numbers in [0, 1]."""
+        self.require(names, "in [0, 1]", lambda v: _is_number(v) and 0 <= v <= 1)
+
+    def require_weights(self, *names: str) -> None:
+        """Finite numbers of 0 or above."""
+        self.require(names, "finite and 0 or above", lambda v: _is_number(v) and 0 <= v < math.inf)
+
+    def require_positive(self, *names: str) -> None:
+        """Finite numbers above 0."""
+        self.require(names, "finite and above 0", lambda v: _is_number(v) and 0 < v < math.inf)
+
+    def require_positive_or_none(self, *names: str) -> None:
+        """Finite numbers above 0, or None."""
+        self.require(names, "above 0, or not given", lambda v: v is None or (_is_number(v) and 0 < v < math.inf))
+
+    def names(self) -> tuple[str, ...]:
+        """Of all fields."""
+        return tuple(item.name for item in dataclasses.fields(self))  # type: ignore[arg-type]
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float)

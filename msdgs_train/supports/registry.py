@@ -1,0 +1,16 @@
+"""The kinds of supports by name. A kind from outside this package joins with `register_support`."""
+
+from msdgs_train.supports.base import SupportConfig
+from msdgs_train.supports.gaussians import GaussiansConfig
+from msdgs_train.supports.nodes import NodesConfig
+
+SUPPORTS: dict[str, type[SupportConfig]] = {}
+
+
+def register_support(config: type[SupportConfig]) -> None:
+    """Make a kind known under its `kind`."""
+    SUPPORTS[config.kind] = config
+
+
+for _config in (GaussiansConfig, NodesConfig):
+    register_support(_config)

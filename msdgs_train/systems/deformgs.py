@@ -1,0 +1,32 @@
+"""Deformable-3D-Gaussians (Yang et al. 2024): one deep MLP, whose deltas are added to activated scales."""
+
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.layers.mlp import MLPConfig
+from msdgs_train.systems.registry import register_system
+
+PUBLISHED = TrainConfig().updated(
+    steps=40_000,
+    background="black",
+    init_num_pts=100_000,
+    max_gaussians=150_000,
+    static_fraction=3_000 / 40_000,
+    sh_degree_interval=1_000,
+    grow_grad2d=2e-4,
+    refine_stop_fraction=15_000 / 40_000,
+    reset_every=3_000,
+)
+"""As it trains on D-NeRF, and most that came after it."""
+
+register_system(
+    "deformgs",
+    "Deformable-3D-Gaussians",
+    PUBLISHED.updated(
+        model=ModelConfig(
+            layers=(MLPConfig(depth=8, skip=5, lr_init=8e-4, lr_final=1.6e-6),),
+            weights=False,
+            embedding_dim=0,
+            scale_space="linear",
+        )
+    ),
+)

@@ -1,0 +1,186 @@
+"""Systems of Gaussians: any support and any chain of layers, which is what sets the published ones apart."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
+from msdgs_serve.scene import Camera
+from msdgs_train.datasets import SceneData
+from msdgs_train.density.reseed import make_strategy, reseed
+from msdgs_train.engine.averaging import WeightAverage
+from msdgs_train.engine.curriculum import TrainingSample
+from msdgs_train.engine.schedule import Schedule
+from msdgs_train.gaussians import model_file
+from msdgs_train.gaussians.bounds import camera_entry, scene_bounds, scene_scale
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
+from msdgs_train.gaussians.scale_space import count_clamped
+from msdgs_train.gaussians.surgery import RowSurgery
+from msdgs_train.layers.base import SceneBounds
+from msdgs_train.layers.parameters import LearningRate, ParamGroup, constant
+from msdgs_train.losses.photometric import masked_l1, photometric_loss, pooled_l1
+from msdgs_train.rendering.rasterize import rasterize
+from msdgs_train.systems.base import ViewLoss
+
+CAMERAS_OF_TRAINING = 20
+"""Training cameras that a model file keeps if there is no test split."""
+
+
+class GaussianSplatting:
+    """A model of Gaussians, its density control and its average; implements `System`."""
+
+    def __init__(self, schedule: Schedule, scene: SceneData) -> None:
+        config = schedule.config
+        self.schedule, self.config, self.scene = schedule, config, scene
+        self.scene_half_size = config.data.scene_half_size or scene.scene_half_size
+        self._model = _new_model(schedule, scene, SceneBounds(self.scene_half_size, scene.time_range))
+        scale = scene_scale([frame.camera for frame in scene.splits["train"]]) or self.scene_half_size
+        self.density = make_strategy(schedule, scale, self.size)
+        self.average: WeightAverage[DynamicGaussians] = WeightAverage(config.optimizer.ema_steps)
+
+    @property
+    def model(self) -> DynamicGaussians:
+        return self._model
+
+    @property
+    def size(self) -> int:
+        return len(self.model.gaussians)
+
+    @property
+    def eval_model(self) -> DynamicGaussians:
+        """The one that is evaluated, shown and saved: the average, or the last step's before it begins."""
+        return self.model if self.average.model is None else self.average.model
+
+    def parameter_groups(self) -> list[ParamGroup]:
+        o, g = self.config.optimizer, self.model.gaussians
+        rates: dict[str, LearningRate] = {
+            "means": LearningRate(o.means_lr_init, o.means_lr_final),
+            "log_scales": constant(o.scales_lr),
+            "raw_quats": constant(o.quats_lr),
+            "raw_opacities": constant(o.opacities_lr),
+            "sh_dc": constant(o.sh_dc_lr),
+            "sh_rest": constant(o.sh_rest_lr),
+        }
+        own = [ParamGroup(name, [g.get_parameter(name)], lr, "static") for name, lr in rates.items()]
+        return own + self.model.motion_groups()
+
+    @torch.no_grad()
+    def before_step(self, optimizer: torch.optim.Optimizer, step: int) -> None:
+        schedule, surgery = self.schedule, RowSurgery(self.model.gaussians, optimizer)
+        if step == schedule.static_steps and schedule.num_reseeded:
+            reseed(surgery, schedule, self.scene_half_size)
+            self.density.reset(self.size)
+        if step == schedule.deform_start_step:
+            self.model.support.on_deform_start(self.model.gaussians, surgery)
+        before, after = schedule.window(step - 1), schedule.window(step)
+        if before < after and schedule.is_first_pass(step):
+            for layer in self.model.deformation:
+                layer.on_window(before, after)
+
+    def loss(self, sample: TrainingSample, target: Tensor, background: Tensor, step: int) -> ViewLoss:
+        posed, c = self._pose(self.model, sample.t, step), self.config.loss
+        rgb, _, info = rasterize(*posed, sample.frame.camera, background, self._options(step + 1))
+        if sample.update == "static":
+            loss = masked_l1(rgb, target, 1 - c.ssim_lambda)
+        else:
+            loss = photometric_loss(rgb, target, 1 - c.ssim_lambda, c.mse_fraction)
+            loss = loss + self._regularizers(posed, sample, step)
+        if sample.update == "motion" and c.pooled_l1_weight:
+            loss = loss + c.pooled_l1_weight * pooled_l1(rgb, target)
+        return ViewLoss(loss, rgb, count_clamped(self.config.model.scale_space, posed.scales), info)
+
+    def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
+        return [rows for layer in self.model.deformation for rows in layer.new_frame_rows(times)]
+
+    def after_step(
+        self, optimizer: torch.optim.Optimizer, step: int, views: list[tuple[TrainingSample, ViewLoss]]
+    ) -> None:
+        for sample, view in views:
+            if sample.update == "all" and view.screen.means2d_grads is not None:
+                camera = sample.frame.camera
+                self.density.accumulate(view.screen.means2d_grads, view.screen.radii, camera.width, camera.height)
+        self.density.after_step(RowSurgery(self.model.gaussians, optimizer), step)
+        if self.schedule.averages_at(step):
+            self.average.add(self.model)
+        else:
+            self.average.reset()
+
+    @torch.no_grad()
+    def render(self, camera: Camera, t: float, background: Tensor, step: int) -> Tensor:
+        posed = self._pose(self.eval_model, t, step)
+        return rasterize(*posed, camera, background, self._options(step))[0].clamp(0, 1)
+
+    def generators(self) -> list[torch.Generator]:
+        return [self.density.generator]
+
+    def state(self) -> dict[str, Any]:
+        return {"model": self.model.state_dict(), "average": self.average.state(), "density": self.density.state()}
+
+    def load_state(self, state: dict[str, Any], step: int) -> None:
+        _resize(self.model.gaussians, state["model"])
+        self.model.load_state_dict(state["model"])
+        average = state["average"] if self.schedule.averages_at(step) else None
+        self.average.load_state(average, self.model)
+        self.density.load_state(state["density"])
+
+    @torch.no_grad()
+    def save(self, path: Path, step: int) -> None:
+        """`model.pt`: the model with what a service needs to show it, times, background, bounds and cameras."""
+        model, info = self.eval_model, self._scene_info(step)
+        as_drawn = replace(model.config, eps2d=self.schedule.eps2d(step))
+        model_file.save_model(path, model, info, step, as_drawn)
+
+    def _scene_info(self, step: int) -> model_file.SceneInfo:
+        frames = self.scene.splits.get("test") or self.scene.splits["train"][:CAMERAS_OF_TRAINING]
+        return model_file.SceneInfo(
+            time_range=self.scene.time_range,
+            background=self.config.data.evaluation_background,
+            bounds=scene_bounds(
+                lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
+            ),
+            cameras=[camera_entry(frame) for frame in frames],
+        )
+
+    def _options(self, step: int) -> RasterizerOptions:
+        """Of a step counted from 1."""
+        return GSPLAT._replace(eps2d=self.schedule.eps2d(step))
+
+    def _pose(self, model: DynamicGaussians, t: float, step: int) -> PosedGaussians:
+        return model.pose(t, deform=self.schedule.deforms(step), sh_degree=self.schedule.sh_degree(step))
+
+    def _regularizers(self, posed: PosedGaussians, sample: TrainingSample, step: int) -> Tensor | float:
+        """The weighted sum of all priors: of density control, of the support and of the layers."""
+        terms = list(self.density.regularizers(posed).values())
+        if self.schedule.deforms(step):
+            time = torch.tensor(sample.t, dtype=posed.means.dtype)
+            terms += self.model.support.regularizers(self.model.deformation, time).values()
+            for layer in self.model.deformation:
+                terms += layer.regularizers(time, is_new_frame=sample.update == "motion").values()
+        total: Tensor | float = 0.0
+        for term in terms:
+            total = total + term
+        return total
+
+
+def _new_model(schedule: Schedule, scene: SceneData, bounds: SceneBounds) -> DynamicGaussians:
+    config, attributes = schedule.config.model, schedule.config.model.attributes()
+    count, seed = schedule.config.density.init_num_pts, schedule.config.run.seed
+    rest = (config.sh_degree, seed, attributes)
+    if scene.points is not None and len(scene.points):
+        gaussians = CanonicalGaussians.from_sparse_points(scene.points, scene.point_colors, count, *rest)
+    else:
+        gaussians = CanonicalGaussians.random_in_cube(count, bounds.scene_half_size, *rest)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return DynamicGaussians(config, gaussians, bounds)
+
+
+def _resize(gaussians: nn.Module, state: dict[str, Tensor]) -> None:
+    for name, parameter in list(gaussians.named_parameters()):
+        rows = len(state[f"gaussians.{name}"])
+        new = parameter.new_empty(rows, *parameter.shape[1:])
+        setattr(gaussians, name, nn.Parameter(new, parameter.requires_grad))

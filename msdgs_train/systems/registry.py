@@ -1,0 +1,77 @@
+"""Systems by name: what a run's settings begin from, and who builds and trains the model.
+
+A system is one file in this folder, or a plugin, that calls `register_system`.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import msdgs_train.systems
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.datasets import SceneData
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.schedule import Schedule
+from msdgs_train.layers.plugins import load_plugins
+from msdgs_train.systems.base import System
+
+DEFAULT = "msdgs-small"
+
+
+class SystemEntry(NamedTuple):
+    """A system that `msdgs-train fit --preset NAME` trains."""
+
+    name: str
+    description: str  # a line of help
+    config: TrainConfig
+    build: Callable[[Schedule, SceneData], System] | None = None  # None: Gaussians
+
+
+_ENTRIES: dict[str, SystemEntry] = {}
+
+
+def register_system(
+    name: str,
+    description: str,
+    config: TrainConfig,
+    build: Callable[[Schedule, SceneData], System] | None = None,
+) -> None:
+    """Make a system known by its name."""
+    _ENTRIES[name] = SystemEntry(name, description, config.updated(system=name), build)
+
+
+@cache
+def _load_own() -> None:
+    for module in pkgutil.iter_modules(msdgs_train.systems.__path__):
+        importlib.import_module(f"msdgs_train.systems.{module.name}")
+
+
+def systems() -> dict[str, SystemEntry]:
+    """All systems by name, those of plugins included; the default first."""
+    _load_own()
+    load_plugins()
+    return {DEFAULT: _ENTRIES[DEFAULT]} | _ENTRIES
+
+
+def preset(name: str) -> TrainConfig:
+    """The settings of a system. Raises `InvalidInput` for a name that isn't known."""
+    return _entry(name).config
+
+
+def system_of(schedule: Schedule, scene: SceneData) -> System:
+    """A new system of a run's settings."""
+    build = _entry(schedule.config.run.system).build
+    if build is None:
+        from msdgs_train.systems.gaussian_splatting import GaussianSplatting
+
+        build = GaussianSplatting
+    return build(schedule, scene)
+
+
+def _entry(name: str) -> SystemEntry:
+    known = systems()
+    if name not in known:
+        raise InvalidInput("preset", f"one of {', '.join(known)}; others come with --plugin MODULE", name)
+    return known[name]
