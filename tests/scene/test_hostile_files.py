@@ -28,6 +28,7 @@ NAMED = {
     "six_gigabytes_by_broadcasting": "`vast` (Add) takes a frame to 6,104 MiB of values; allowed are 2,048 MiB",
     "a_quadrillion_operations": "(MatMul) takes a call to 2.1e+11 operations; allowed are 2e+11",
     "whole_numbers_divided_by_zero": "`quotient` (Div) reads int64, not float32",
+    "a_shape_that_depends_on_time": "`largest` (Reshape) reads `whole`, which must be a constant of the file",
     "another_domain": "com.microsoft",
 }
 

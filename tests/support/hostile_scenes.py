@@ -186,6 +186,15 @@ def whole_numbers_divided_by_zero(model: onnx.ModelProto, secret: Path) -> bytes
     return with_sum_of(model, nodes, "largest")
 
 
+def a_shape_that_depends_on_time(model: onnx.ModelProto, secret: Path) -> bytes:
+    """An operator of the table, whose output is as large as t says."""
+    nodes = [
+        helper.make_node("Cast", ["t"], ["whole"], to=TensorProto.INT64),
+        helper.make_node("Reshape", ["one", "whole"], ["largest"]),
+    ]
+    return with_sum_of(model, nodes, "largest")
+
+
 def another_domain(model: onnx.ModelProto, secret: Path) -> bytes:
     """onnxruntime's own operators."""
     model.opset_import.append(helper.make_opsetid("com.microsoft", 1))
@@ -223,6 +232,7 @@ ATTACKS: dict[str, Attack] = {
         six_gigabytes_by_broadcasting,
         a_quadrillion_operations,
         whole_numbers_divided_by_zero,
+        a_shape_that_depends_on_time,
         another_domain,
     )
 }
