@@ -4,6 +4,7 @@
 process, and not the service.
 """
 
+import contextlib
 import json
 import os
 import resource
@@ -64,7 +65,7 @@ def main(given: str) -> None:
 
 def _limit(memory: int, seconds: float) -> None:
     os.nice(NICENESS)
-    if sys.platform == "linux":  # where memory runs out, this is the process to end
+    with contextlib.suppress(OSError):  # where Linux runs out of memory, this is the process to end
         Path("/proc/self/oom_score_adj").write_text("1000")
     limits = {
         resource.RLIMIT_CPU: int(seconds) + 1,
