@@ -12,7 +12,7 @@ from msdgs_serve.scene import InvalidInput, MsdgsError
 if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
-VideoFormat = Literal["mp4", "webm"]
+VideoFormat = Literal["mp4", "webm", "webp"]
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,14 @@ VIDEO_FORMATS: dict[VideoFormat, VideoTraits] = {
         "video/webm", "libvpx-vp9",
         {"crf": "24", "b": "0", "deadline": "realtime", "cpu-used": "6", "lag-in-frames": "0", **BOUNDED},
     ),
+    "webp": VideoTraits("image/webp", "libwebp_anim", {"quality": "70"}),
 }  # fmt: skip
 
-# in pieces, so that it plays while it comes
-FRAGMENTS: dict[VideoFormat, dict[str, str]] = {
+# mp4 in fragments, so that it can be played while it is received; an animated WebP repeats without end
+MUXER_OPTIONS: dict[VideoFormat, dict[str, str]] = {
     "mp4": {"movflags": "frag_keyframe+empty_moov+default_base_moof"},
     "webm": {},
+    "webp": {"loop": "0"},
 }
 
 
@@ -68,7 +70,7 @@ class FilmWriter:
 
         self._traits = VIDEO_FORMATS[video_format]
         self._rate = Fraction(fps).limit_denominator(1001)
-        self._container = av.open(file, "w", format=video_format, options=FRAGMENTS[video_format])
+        self._container = av.open(file, "w", format=video_format, options=MUXER_OPTIONS[video_format])
         self._stream: VideoStream | None = None
 
     def add(self, pixels: np.ndarray) -> None:

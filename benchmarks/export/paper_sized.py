@@ -24,18 +24,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.measuring import machine
-from export.plans.splines import fitting
-from export.rendered_error import posed, shown
-from export.views import cameras_of, deciding_views
+from export.measure.frames import compare, render
+from export.measure.poses import posed
+from export.measure.views import cameras_of, selection_views
+from export.trajectories.splines import fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
-from msdgs_train.density.gradient import rotate
 from msdgs_train.evaluation.layer_strip import camera_of
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.mlp import MLPLayer
-from msdgs_train.systems.presets import PRESETS
+from msdgs_train.layers.quaternions import rotate, unit_or_identity
+from msdgs_train.systems.registry import preset
 from tests.support.models import SCENE, random_model
 
 SHRINK = 0.6
@@ -47,7 +47,7 @@ MOST_OPACITY = 0.999
 SAMPLES = 257
 """Times at which the small model is asked for its poses."""
 
-TIMES_A_STEP, GAUSSIANS_A_TIME = 4, 384
+TIMES_A_STEP, GAUSSIANS_PER_TIME = 4, 384
 MOVING_SHARE = 0.75
 """Of a batch, drawn from Gaussians whose motion is more than a pixel."""
 
@@ -80,7 +80,7 @@ class SmoothMotion:
         t0, t1 = self._time_range
         weights = BSpline.design_matrix(np.array([(t - t0) / (t1 - t0)]), self._knots, 3).toarray()[0]
         pose = torch.einsum("c,mck->mk", torch.from_numpy(weights).float(), self._control[ids])
-        return torch.cat([pose[:, :6], unit_quats(pose[:, QUATS])], dim=1)
+        return torch.cat([pose[:, :6], unit_or_identity(pose[:, QUATS])], dim=1)
 
     @torch.no_grad()
     def _sampled(self, model: DynamicGaussians, ids: Tensor) -> Tensor:
@@ -135,8 +135,8 @@ class Fit:
         return torch.cat([pose.means - wanted[:, MEANS], pose.scales - scales, turned], dim=1) / self.pixel
 
     def _batch(self) -> Tensor:
-        moving = round(MOVING_SHARE * GAUSSIANS_A_TIME) if len(self._moving) else 0
-        any_ = torch.randint(len(self.model.gaussians), (GAUSSIANS_A_TIME - moving,), generator=self._generator)
+        moving = round(MOVING_SHARE * GAUSSIANS_PER_TIME) if len(self._moving) else 0
+        any_ = torch.randint(len(self.model.gaussians), (GAUSSIANS_PER_TIME - moving,), generator=self._generator)
         if not moving:
             return any_
         return torch.cat([any_, self._moving[torch.randint(len(self._moving), (moving,), generator=self._generator)]])
@@ -200,7 +200,7 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
     """
     g, parents = small.gaussians, torch.arange(count) * len(small.gaussians) // count
     places = (1 - SHRINK**2) ** 0.5 * torch.randn(count, 3, generator=generator).clamp(-2.5, 2.5)
-    offsets = rotate(unit_quats(g.raw_quats[parents]), places * g.log_scales[parents].exp())
+    offsets = rotate(unit_or_identity(g.raw_quats[parents]), places * g.log_scales[parents].exp())
     parts = torch.bincount(parents, minlength=len(g))[parents]
     clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MOST_OPACITY)).log() / (parts * SHRINK**2)
     tensors = {
@@ -211,8 +211,7 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
         "sh_dc": g.sh_dc[parents],
         "sh_rest": g.sh_rest[parents],
     }
-    if g.embeddings is not None:
-        tensors["embeddings"] = g.embeddings[parents]
+    tensors |= {name: values[parents] for name, values in g.attributes.items()}
     model = DynamicGaussians(small.config, CanonicalGaussians(**tensors)).requires_grad_(requires_grad=False)
     model.deformation, model.modulation = small.deformation, small.modulation
     return model
@@ -222,19 +221,19 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
 def grown(small: DynamicGaussians) -> DynamicGaussians:
     """A model of the preset msdgs-mlp that does what the small one does; of its ten layers the last ones move nothing
     yet."""
-    paper = PRESETS["msdgs-mlp"].model
+    paper = preset("msdgs-mlp").model
     config = replace(
         paper,
         sh_degree=small.config.sh_degree,
         embedding_dim=small.config.embedding_dim,
         modulation_targets=small.config.modulation_targets,
-        delta_space=small.config.delta_space,
+        scale_space=small.config.scale_space,
     )
     torch.manual_seed(0)
     large = DynamicGaussians(config, small.gaussians).requires_grad_(requires_grad=False)
     large.modulation = small.modulation
     for layer in _mlp_layers(large):
-        damping = OCTAVE_DAMPING ** torch.arange(config.xyz_frequencies).repeat_interleave(3)
+        damping = OCTAVE_DAMPING ** torch.arange(layer.config.xyz_frequencies).repeat_interleave(3)
         layer.first.weight[:, 3 : 3 + 2 * len(damping)] *= damping.repeat(2)
     for layer, trained in zip(_mlp_layers(large), _mlp_layers(small), strict=False):
         _grown(layer, trained)
@@ -244,7 +243,9 @@ def grown(small: DynamicGaussians) -> DynamicGaussians:
 def _mlp_layers(model: DynamicGaussians) -> list[MLPLayer]:
     layers = [layer for layer in model.deformation.layers if isinstance(layer, MLPLayer)]
     if len(layers) < len(model.deformation) or any(layer.skip for layer in layers):
-        raise InvalidInput("model", "of MLP layers that read their input once", ", ".join(model.config.layers))
+        raise InvalidInput(
+            "model", "of MLP layers that read their input once", ", ".join(layer.kind for layer in model.config.layers)
+        )
     return layers
 
 
@@ -319,9 +320,9 @@ def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
     layers = torch.stack(adds).view(5, -1).mean(0)
     console.print(f"pixels that a layer moves, mean: {', '.join(f'{v:.2f}' for v in layers)}", markup=False)
     psnrs = []
-    for view in deciding_views(cameras_of(fit.info), fit.info.time_range, 9):
-        frames = [shown(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
-        psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
+    for view in selection_views(cameras_of(fit.info), fit.info.time_range, 9):
+        frames = [render(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
+        psnrs.append(compare(*frames).psnr)
     console.print(f"images against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
 
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from benchmarks.measuring import machine
 from export.exporters.command import LOSSY, Settings, convert
-from export.exporters.proof import Proof, require
+from export.exporters.round_trip import RoundTrip, require
 from export.importers import read_splats
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
@@ -36,7 +36,7 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
     console.print(machine(), markup=False)
     try:
         session = DeformationSession(scene)
-        proof = Proof(session)
+        proof = RoundTrip(session)
         t0, _ = session.scene.metadata.time_range
         with tempfile.TemporaryDirectory() as folder:
             for suffix in WRITTEN:

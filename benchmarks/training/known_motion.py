@@ -1,5 +1,5 @@
-"""How well the systems of a comparison can follow motion at all: their layers are taught where points of the synthetic
-scene are, which is known, instead of images."""
+"""How well the systems of a comparison can follow motion at all: their layers are trained on the
+known trajectories of points of the synthetic scene instead of images."""
 
 import statistics
 import sys
@@ -15,16 +15,18 @@ from torch import Tensor
 
 from benchmarks.measuring import machine
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.comparison.matrix import Budget, System, read_systems
+from msdgs_train.comparison.matrix import Budget, ComparedSystem, read_systems
 from msdgs_train.datasets.synthetic.motion import OBJECTS, world_positions
 from msdgs_train.datasets.synthetic.trajectories import surface_points
-from msdgs_train.engine.optimizer import learning_rates, make_optimizer, set_learning_rates
+from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
+from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians, SceneBounds
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.base import SceneBounds
 
 MOVING = OBJECTS[2:]
 HALF_EXTENT = 1.3  # scene units
-JUDGED_TIMES = 61
+EVALUATED_TIMES = 61
 
 
 def main(
@@ -34,7 +36,7 @@ def main(
     points: int = 400,
     check: bool = False,
 ) -> int:
-    """Teach each system the motion of points, and tell how far from them it ends.
+    """Train each system on the trajectories of points, and print how far from them it ends.
 
     python -m benchmarks.training.known_motion benchmarks/training/ablation.toml --steps 1200 --seeds 0 1 2
 
@@ -68,14 +70,15 @@ def main(
     return 0
 
 
-def errors_of(system: System, seed: int, points: int) -> np.ndarray:
-    """[objects] rms distance of a taught model's points to where they are, thousandths of a scene unit."""
+def errors_of(system: ComparedSystem, seed: int, points: int) -> np.ndarray:
+    """[objects] rms distance of a trained model's points to where they are, thousandths of a scene unit."""
     local = [surface_points(name, points, seed) for name in MOVING]
     model, config = _new_model(system, seed, _places(local, 0.5)), system.config
-    optimizer = make_optimizer(model, config)
+    schedule, groups = Schedule.from_config(config), model.motion_groups()
+    optimizer = make_optimizer(groups, schedule)
     random = np.random.default_rng(seed)
-    for step in range(config.steps):
-        set_learning_rates(optimizer, learning_rates(config, step))
+    for step in range(schedule.num_steps):
+        set_learning_rates(optimizer, groups, schedule, step, factor=1.0)
         t = float(random.uniform())
         loss = (model.pose(t).means - _places(local, t)).abs().mean()
         optimizer.zero_grad()
@@ -83,19 +86,18 @@ def errors_of(system: System, seed: int, points: int) -> np.ndarray:
         optimizer.step()
     squares = np.zeros(len(MOVING))
     with torch.no_grad():
-        for t in np.linspace(0, 1, JUDGED_TIMES):
+        for t in np.linspace(0, 1, EVALUATED_TIMES):
             off = (model.pose(float(t)).means - _places(local, float(t))).square().sum(dim=1)
-            squares += off.reshape(len(MOVING), points).mean(dim=1).double().numpy() / JUDGED_TIMES
+            squares += off.reshape(len(MOVING), points).mean(dim=1).double().numpy() / EVALUATED_TIMES
     return 1e3 * np.sqrt(squares)
 
 
-def _new_model(system: System, seed: int, canonical: Tensor) -> DynamicGaussians:
+def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicGaussians:
     sizes, generator = system.config.model, torch.Generator().manual_seed(seed)
-    rest = (sizes.sh_degree, sizes.embedding_dim, generator, sizes.motions)
-    gaussians = CanonicalGaussians.from_points(canonical, torch.full_like(canonical, 0.5), *rest)
-    gaussians.requires_grad_(requires_grad=False)
-    if gaussians.embeddings is not None:
-        gaussians.embeddings.requires_grad_()
+    gray = torch.full_like(canonical, 0.5)
+    gaussians = CanonicalGaussians.from_points(canonical, gray, sizes.sh_degree, generator, sizes.attributes())
+    for name in ("means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"):
+        gaussians.get_parameter(name).requires_grad = False
     torch.manual_seed(seed)
     return DynamicGaussians(sizes, gaussians, SceneBounds(HALF_EXTENT))
 
@@ -114,7 +116,7 @@ def self_test() -> int:
     for name in MOVING:
         local = surface_points(name, 20, 0)
         middle = world_positions(name, local, 0.5)
-        off = [world_positions(name, local, t) - middle for t in np.linspace(0, 1, JUDGED_TIMES)]
+        off = [world_positions(name, local, t) - middle for t in np.linspace(0, 1, EVALUATED_TIMES)]
         at_rest.append(1e3 * np.sqrt(np.mean(np.sum(np.square(off), axis=2))))
     np.testing.assert_allclose(errors_of(before, 0, 20), at_rest, rtol=0.05)
     assert (errors_of(after, 0, 20) < 0.8 * np.array(at_rest)).all()

@@ -11,7 +11,6 @@ In turns with them, steps of several images side by side.
 
 import argparse
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +27,12 @@ from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT
 from msdgs_serve.scene import Gaussians
 from msdgs_train.datasets import load_scene
+from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.datasets.synthetic.generate import generate
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.losses.photometric import photometric_loss
-from msdgs_train.systems.presets import preset
+from msdgs_train.systems.gaussian_splatting import GaussianSplatting
+from msdgs_train.systems.registry import preset
 
 FORWARD = ("deformation", "projection", "tiles", "blending", "loss")
 BACKWARD = ("loss gradient", "blending gradient", "projection gradient", "deformation gradient", "optimizer")
@@ -75,8 +76,7 @@ def make_trainer(arguments: argparse.Namespace, made: Path, images: int) -> Trai
         if not data.exists():
             generate(data, size=arguments.size, train_frames=8, test_frames=2)
     count = arguments.gaussians
-    config = replace(
-        preset(arguments.preset),
+    config = preset(arguments.preset).updated(
         init_num_pts=count,
         max_gaussians=count,
         batch_size=images,
@@ -89,18 +89,20 @@ def make_trainer(arguments: argparse.Namespace, made: Path, images: int) -> Trai
 
 def measure(trainer: Trainer, several: Trainer, times: Times) -> None:
     """The parts of a step of one image, then a whole one, and one of several images."""
-    torch.set_num_threads(trainer.config.threads)
-    frame = trainer.frames[0]
+    torch.set_num_threads(trainer.config.run.threads)
+    system = trainer.system
+    assert isinstance(system, GaussianSplatting)
+    frame = trainer.scene.splits["train"][0]
     camera, zeros = frame.camera, np.zeros((frame.camera.height, frame.camera.width), np.float32)
     size, black = (camera.width, camera.height), np.zeros(3, np.float32)
-    target = trainer._image(frame, torch.zeros(3))
-    posed = times.time("deformation", trainer.model.pose, frame.t)
+    target = ImageCache().image(frame, torch.zeros(3))
+    posed = times.time("deformation", system.model.pose, frame.t)
     gaussians = Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
     splats = times.time("projection", project, gaussians, camera, GSPLAT)
     tiles = times.time("tiles", bin_into_tiles, splats, *size)
     drawn = times.time("blending", composite, splats, tiles, *size, black, GSPLAT)
     rgb = torch.from_numpy(drawn.rgb).requires_grad_()
-    loss = times.time("loss", photometric_loss, rgb, target, trainer.config.l1_weight)
+    loss = times.time("loss", photometric_loss, rgb, target, 1 - trainer.config.loss.ssim_lambda)
     times.time("loss gradient", loss.backward)
     assert rgb.grad is not None
     sums = times.time("blending gradient", composite_backward, splats, tiles, GSPLAT, drawn, rgb.grad.numpy(), zeros)

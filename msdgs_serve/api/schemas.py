@@ -295,7 +295,7 @@ class VideoRequest(Strict):
     width: Pixels | None = Field(default=None, description="pixels; default: the path's, else the first camera's")
     height: Pixels | None = Field(default=None, description="pixels; goes with `width`")
     fps: FramesPerSecond | None = Field(default=None, description="frames a second; default: the path's, else 24")
-    format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9")
+    format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9. `webp`: animated")
     background: tuple[Unit, Unit, Unit] | Literal["scene"] = Field(default="scene", description="sRGB-encoded, 0 to 1")
 
 

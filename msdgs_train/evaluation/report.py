@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.datasets.common.files import write_text
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.evaluate import FILES, EvaluatedModel, Evaluation, Scores
 from msdgs_train.evaluation.sheets import ColourScale, Panel, color, draw_sheet
-from msdgs_train.files import write_text
 
 FOLDER = "eval"
 SHEET_ROWS = 8

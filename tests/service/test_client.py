@@ -21,11 +21,6 @@ LEVEL = Orbit(0, 0, distance=5, fov_y=40)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
-
-
-@pytest.fixture(scope="module")
 def url(scene: Path) -> Iterator[str]:
     with serving(scene) as client:
         yield str(client.base_url)

@@ -34,11 +34,6 @@ KEYS = ["0123456789abcdef", "fedcba9876543210"]
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
-
-
-@pytest.fixture(scope="module")
 def client(scene: Path) -> Iterator[httpx.Client]:
     with serving(scene, max_samples=16, max_batch=8) as client:
         yield client

@@ -92,7 +92,7 @@ TABLE = (
         "stability.accepted_db", 50.0, "what the export promises by default; a model let through must keep it anywhere"
     ),
     Row(
-        "stability.foretold",
+        "stability.predicted",
         2.0,
         "a first-order bound, each layer's error measured once; roundings of the sum of deltas come on top",
     ),
@@ -101,7 +101,7 @@ TABLE = (
     Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
     Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
     Row("export.float32_db", 90.0, "worst frame, float32 against float64: at a few pixels a splat is at its cut-off"),
-    Row("trim.other_times_db", 2.0, "a quarter more error at times that trimming has not looked at"),
+    Row("pruning.other_times_db", 2.0, "a quarter more error at times other than the selection times of pruning"),
     # files of other programs
     Row("splat_values", 3e-6, "float32 logarithms and logits of size 10, back through exp"),
     Row("splat_file_db", 60.0, "stored as float32: what is called lossless"),
@@ -109,7 +109,11 @@ TABLE = (
     Row("stored_frame", 1e-4, "16 bits over a motion of half the scene, relative to the scene"),
     Row("spz_position", 3e-4, "scene units; 12 fractional bits"),
     Row("spz_rotation", 2e-2, "entries of a matrix; 10 bits a component of one file, 10 of the other"),
-    Row("damaged_file.seconds", 20.0, "small files take milliseconds; a busy machine may halt a test for seconds"),
+    Row(
+        "damaged_file.seconds",
+        20.0,
+        "of the processor; small files take milliseconds, and machine code is compiled on the way",
+    ),
     Row("damaged_file.megabytes", 8.0, "beside twice the sound file's: what the allocator keeps from call to call"),
     Row("import.network", 1e-5, "a network of 8 layers in float32, its sums in another order"),
     Row("import.mean_over_time", 2e-3, "a mean over 41 times against one over 401 of what bends at 12 nodes of time"),

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from msdgs_train.datasets import load_scene
-from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.run import fit
@@ -21,8 +20,9 @@ from tests.support.training_scene import (
     assert_same_bits,
     small_config,
     state_of,
-    write_scene,
 )
+
+pytestmark = pytest.mark.slow
 
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
@@ -35,11 +35,6 @@ CONFIG = small_config(
 AS_THE_PRESET = replace(
     CONFIG, batch_size=2, window_full_fraction=BEGINS / STEPS, refine_stop_fraction=0.5, eps2d_init=0.4
 )
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def _parameters(model: torch.nn.Module) -> list[np.ndarray]:
@@ -80,12 +75,10 @@ def test_it_is_judged_shown_and_saved(data: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(shown, to_bytes(evaluated.rgb.numpy()))
 
 
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize("config", [CONFIG, AS_THE_PRESET], ids=["density control last", "windows last"])
 @pytest.mark.parametrize("stop", [BEGINS, BEGINS + 1, BEGINS + 5])
-def test_resuming_changes_no_bit_of_it(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, config: TrainConfig
-) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+def test_resuming_changes_no_bit_of_it(data: Path, tmp_path: Path, stop: int, config: TrainConfig) -> None:
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
     assert (state_of(tmp_path / "parts")["/mean/count"] if stop > BEGINS else 0) == min(stop - BEGINS, KEPT)

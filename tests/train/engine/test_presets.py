@@ -17,9 +17,10 @@ from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
 from msdgs_train.systems.presets import DEFAULT, PRESETS, preset
-from tests.support.exports import export_scene
+from tests.support.models import export_scene
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import write_scene
+
+pytestmark = pytest.mark.slow
 
 
 def sizes(config: ModelConfig, count: int = 3) -> tuple[int, int]:
@@ -71,11 +72,6 @@ def test_the_command_line_offers_all_of_them() -> None:
 def test_unknown_names_are_refused_with_those_there_are() -> None:
     with pytest.raises(InvalidInput, match=r"msdgs-mlp.*4dgs.*hexplane"):
         preset("hexplane")
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def shrunk(config: TrainConfig) -> TrainConfig:

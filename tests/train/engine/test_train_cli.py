@@ -14,17 +14,13 @@ import torch
 
 from msdgs_train.cli import main as cli
 from tests.support.processes import ROOT
-from tests.support.training_scene import write_scene
+
+pytestmark = pytest.mark.slow
 
 SMALL = [
     *("--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--log-every=1", "--model.sh-degree=1"),
     *("--model.width=16", "--model.depth=2", "--model.time-width=8", "--model.embedding-dim=4"),
 ]
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.mark.parametrize("command", [[], ["fit"], ["synthetic"]])
@@ -62,7 +58,7 @@ def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
     try:
         _wait_for_lines(run / "metrics.jsonl", process)
         process.send_signal(signal.SIGINT)
-        output = process.communicate(timeout=60)[0]
+        output = process.communicate(timeout=600)[0]
     finally:
         process.kill()
     assert process.returncode == cli.EXIT_INTERRUPTED, output

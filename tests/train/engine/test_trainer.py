@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from torch import Tensor
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.datasets import load_scene
-from msdgs_train.engine import run as fit_module
 from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum import TrainingSample
@@ -31,19 +31,9 @@ from tests.support.training_scene import (
     assert_same_bits,
     small_config,
     state_of,
-    write_scene,
 )
 
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture
-def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+pytestmark = pytest.mark.slow
 
 
 def _steps(trainer: Trainer, count: int) -> None:
@@ -67,30 +57,26 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     _steps(trainer, 3)
 
 
-@pytest.mark.usefixtures("_no_curve")
-@pytest.mark.parametrize("stop", [8, 13])
-def test_resuming_with_shared_motions_changes_no_bit(data: Path, tmp_path: Path, stop: int) -> None:
-    """Stopped in the first and in the second window."""
-    config = small_config(model=SHARED_MOTIONS, window_start_widths=(0.03, 0.2))
-    fit(config, data, tmp_path / "whole")
-    fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
-    fit(config, data, tmp_path / "parts", resume=True)
-    assert_same_bits(*(state_of(tmp_path / name) for name in ("whole", "parts")))
+RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
+    "white": ({"background": "white"}, (3, 11, 16)),  # in the warm-up, between and after densifications
+    "random": ({"background": "random"}, (3, 11, 16)),
+    "motion bases": ({"model": SHARED_MOTIONS, "window_start_widths": (0.03, 0.2)}, (8, 13)),  # in each of two windows
+    "mcmc": ({"density_strategy": "mcmc"}, (11,)),
+}
 
 
-@pytest.mark.usefixtures("_no_curve")
-@pytest.mark.parametrize("stop", [3, 11, 16])
-@pytest.mark.parametrize("background", ["white", "random"])
-def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int, background: str) -> None:
-    """Stopped in the warm-up, between and after densifications, in the middle of a pass over the images."""
-    config = small_config(background=background)
+@pytest.mark.usefixtures("no_curve")
+@pytest.mark.parametrize(("case", "stop"), [(case, stop) for case, (_, stops) in RESUMED.items() for stop in stops])
+def test_resuming_changes_no_bit(data: Path, tmp_path: Path, case: str, stop: int) -> None:
+    """Stopped in the middle of a pass over the images."""
+    config = small_config(**RESUMED[case][0])
     fit(config, data, tmp_path / "whole")
     outcome = fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
     assert (outcome.status, outcome.step, outcome.qualities) == ("interrupted", stop, {})
     torch.manual_seed(stop)
     assert fit(config, data, tmp_path / "parts", resume=True).status == "finished"
     whole, parts = (state_of(tmp_path / name) for name in ("whole", "parts"))
-    assert len(whole["/density/0"]) != config.init_num_pts, "density control should have taken part"
+    assert len(whole["/model/gaussians.means"]) != config.init_num_pts, "density control should have taken part"
     assert_same_bits(whole, parts)
     lines = [[{**line, "seconds": 0} for line in read_metrics(tmp_path / name)] for name in ("whole", "parts")]
     assert lines[0] == lines[1]
@@ -132,13 +118,13 @@ def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
         assert quality(rgb, evaluated.target) == evaluated.quality
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
     model = ModelConfig(sh_degree=0, layers=(), embedding_dim=0)
     assert fit(small_config(model=model), data, tmp_path / "run").status == "finished"
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_time_budget_stops_evaluates_and_saves(data: Path, tmp_path: Path) -> None:
     outcome = fit(small_config(max_minutes=1e-9), data, tmp_path / "run")
     assert (outcome.status, outcome.step) == ("out of time", 1)
@@ -146,7 +132,7 @@ def test_time_budget_stops_evaluates_and_saves(data: Path, tmp_path: Path) -> No
     assert (tmp_path / "run" / "checkpoint.pt").exists()
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: Path) -> None:
     config, run = small_config(steps=2), tmp_path / "run"
     with pytest.raises(InvalidInput, match="with a checkpoint"):
@@ -229,7 +215,7 @@ def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
         monkeypatch.setattr(trainer_module, name, breaking(getattr(trainer_module, name)))
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize(("start", "back_to"), [(13, 10), (25, 20), (4, 0)])
 def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: int, back_to: int
@@ -251,7 +237,7 @@ def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     load_model(run / "model.pt")
 
 
-@pytest.mark.usefixtures("_no_curve")
+@pytest.mark.usefixtures("no_curve")
 def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
