@@ -226,7 +226,7 @@ def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images
 
 def test_a_film_fails_in_time_to_say_so_or_is_cut_off(scene: Path):
     renderer = Renderer()
-    original, broken = renderer.render, [0.0]
+    original, broken = renderer.render, list[float]()
 
     def render(*arguments: Any) -> Image:
         if arguments[2] in broken:
