@@ -14,6 +14,7 @@ from msdgs_serve.scene.onnx.shapes import (
     axes_of,
     axis_of,
     broadcast,
+    numbers,
     reshaped,
     text,
 )
@@ -99,26 +100,22 @@ def concat(call: Call) -> Result:
 
 def split(call: Call) -> Result:
     """The reverse of `concat`, in parts of constant lengths."""
-    shape, lengths = call.shapes[0], call.constant(1)
+    shape, parts = call.shapes[0], numbers(call.constant(1), "lengths")
     axis = axis_of(call.attributes.get("axis", 0), len(shape))
-    parts = lengths.tolist()
-    if lengths.ndim != 1 or len(parts) != call.outputs or min(parts, default=-1) < 0 or shape[axis] != Dim(sum(parts)):
+    if len(parts) != call.outputs or min(parts, default=-1) < 0 or shape[axis] != Dim(sum(parts)):
         raise ShapeInvalid(f"splits {text(shape)} into {call.outputs} parts of {parts}")
     return Result([(*shape[:axis], Dim(part), *shape[axis + 1 :]) for part in parts])
 
 
 def reshape(call: Call) -> Result:
     """To a constant shape."""
-    target = call.constant(1)
-    if target.ndim != 1:
-        raise ShapeInvalid("reshapes to what isn't a list of lengths")
-    return Result([reshaped(call.shapes[0], target.tolist())])
+    return Result([reshaped(call.shapes[0], numbers(call.constant(1), "lengths"))])
 
 
 def unsqueeze(call: Call) -> Result:
     """New axes of length 1."""
-    rest, axes = list(call.shapes[0]), call.constant(1)
-    rank = len(rest) + axes.size
+    rest, axes = list(call.shapes[0]), numbers(call.constant(1), "axes")
+    rank = len(rest) + len(axes)
     new = axes_of(axes, rank)
     return Result([tuple(ONE if i in new else rest.pop(0) for i in range(rank))])
 
@@ -126,7 +123,7 @@ def unsqueeze(call: Call) -> Result:
 def squeeze(call: Call) -> Result:
     """Axes of length 1 less."""
     shape = call.shapes[0]
-    gone = axes_of(call.constant(1), len(shape))
+    gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
     if any(shape[axis] != ONE for axis in gone):
         raise ShapeInvalid(f"squeezes axes {sorted(gone)} of {text(shape)}")
     return Result([tuple(dim for i, dim in enumerate(shape) if i not in gone)])
@@ -135,7 +132,7 @@ def squeeze(call: Call) -> Result:
 def reduce(call: Call) -> Result:
     """One value along some axes."""
     shape, keep = call.shapes[0], call.attributes.get("keepdims", 1)
-    gone = axes_of(call.constant(1), len(shape))
+    gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
     left = tuple(ONE if i in gone else dim for i, dim in enumerate(shape) if keep or i not in gone)
     return Result([left], inner=tuple(shape[axis] for axis in gone))
 

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msdgs_serve.scene.onnx.schema import MAX_OPERANDS
+
 
 class ShapeInvalid(ValueError):
     """Shapes that don't fit; whoever knows the node adds its name."""
@@ -68,11 +70,18 @@ def axis_of(axis: int, rank: int) -> int:
     return axis % rank
 
 
-def axes_of(axes: np.ndarray, rank: int) -> set[int]:
+def numbers(values: np.ndarray, what: str) -> list[int]:
+    """A list of lengths or axes, as short as shapes are."""
+    if values.ndim != 1 or len(values) > MAX_OPERANDS:
+        raise ShapeInvalid(f"has {what} of shape {values.shape}, not a short list")
+    return values.tolist()
+
+
+def axes_of(axes: Sequence[int], rank: int) -> set[int]:
     """Several that differ."""
-    found = {axis_of(int(axis), rank) for axis in axes}
-    if axes.ndim != 1 or len(found) != len(axes):
-        raise ShapeInvalid(f"has axes {axes.tolist()} that aren't a list of different ones")
+    found = {axis_of(axis, rank) for axis in axes}
+    if len(found) != len(axes):
+        raise ShapeInvalid(f"has axes {axes} that aren't different ones")
     return found
 
 
