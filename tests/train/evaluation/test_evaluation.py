@@ -347,7 +347,7 @@ def test_a_run_from_before_there_was_a_best_model(data: Path, run: Path, tmp_pat
     assert set(json.loads((tmp_path / "eval" / "val.json").read_text())["models"]) == {"last"}
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         cli.main(["eval", "--help"])
     assert exit_info.value.code == 0
