@@ -1,1 +1,2 @@
-"""Offline jobs between training and serving. Used from a checkout; no part of the installed package."""
+"""Export of trained models to scene files, and conversion from and to other formats. Used from a checkout; not part of
+the installed package."""

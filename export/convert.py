@@ -1,4 +1,4 @@
-"""`python export/convert.py scene.onnx OUT`: a scene file in the formats of other viewers."""
+"""`python export/convert.py scene.onnx OUT`: conversion of a scene file to formats of other viewers."""
 
 import sys
 from pathlib import Path
@@ -24,31 +24,31 @@ def main(
     frames: int = 30,
     min_psnr: float | None = None,
 ) -> int:
-    """Write a scene file as other viewers read it. What was written is read back, drawn and compared.
+    """Convert a scene file for other viewers. The written file is read back, rendered and compared with the scene.
 
-    The ending of OUT says the format:
+    The suffix of OUT selects the format:
 
-    python export/convert.py ball.onnx ball.ply          one moment, as INRIA's trainer writes it
+    python export/convert.py ball.onnx ball.ply          one time, as INRIA's trainer writes it
 
-    python export/convert.py ball.onnx ball.spz          one moment, ten times smaller
+    python export/convert.py ball.onnx ball.spz          one time, ten times smaller
 
-    python export/convert.py ball.onnx ball.glb          one moment, as glTF with KHR_gaussian_splatting
+    python export/convert.py ball.onnx ball.glb          one time, as glTF with KHR_gaussian_splatting
 
-    python export/convert.py ball.onnx ball.usdc         all of its time, as OpenUSD with a sample of poses a frame
+    python export/convert.py ball.onnx ball.usdc         the whole time range, as OpenUSD with a time sample per frame
 
     python export/convert.py ball.onnx frames/           a folder of numbered PLY files over the scene's time
 
-    python export/convert.py ball.onnx ball.visionary.onnx     all of it, for Visionary in a browser
+    python export/convert.py ball.onnx ball.visionary.onnx     the whole scene, for Visionary in a browser
 
-    Films are msdgs-render's: msdgs-render ball.onnx turn.mp4. docs/formats.md says what each format keeps.
+    For videos use msdgs-render: msdgs-render ball.onnx turn.mp4. docs/formats.md lists what each format keeps.
 
     Args:
         scene: A scene file (.onnx).
         out: What to write: name.ply, name.spz, name.glb, name.usdc (or .usda, .usd), name.visionary.onnx, or a folder.
-        t: The moment of a single file; by default the beginning of the scene's time.
-        frames: How many files in a folder or frames of OpenUSD, evenly over the scene's time, both ends among them.
-        min_psnr: What was written must be so close to the scene, dB, or nothing is; by default 45 for SPZ and Visionary
-            and 60 for others, which lose nothing.
+        t: The time of a single file; by default the start of the scene's time range.
+        frames: The number of files in a folder or frames of OpenUSD, evenly over the time range, both ends among them.
+        min_psnr: PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and
+            Visionary and 60 for others, which are lossless.
     """
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
@@ -56,7 +56,7 @@ def main(
             from export.exporters.command import Settings, convert  # heavy: not before --help
         convert(Settings(scene, out, t, frames, min_psnr), console)
     except KeyboardInterrupt:
-        console.print("stopped; files that are there are whole", markup=False)
+        console.print("stopped; existing files are complete", markup=False)
         return 130
     except (MsdgsError, OSError) as error:
         console.print(f"error: {error}", style="red", markup=False)

@@ -1,4 +1,4 @@
-"""`python export/stability.py model.pt`: does float32, or less, show what the model itself would show in float64?"""
+"""`python export/stability.py model.pt`: whether float32, or less, shows what the model would show in float64."""
 
 import sys
 from importlib.util import find_spec
@@ -21,8 +21,8 @@ except ModuleNotFoundError as error:
 
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 
-UNSTEADY = 3
-"""Exit status where the model is flagged; 1 is an error."""
+UNSTABLE = 3
+"""Exit status if the model is unstable; 1 is an error."""
 
 
 def main(
@@ -37,19 +37,19 @@ def main(
     A chain of layers multiplies round-off: each layer sees the means that the layers before it have moved. For
     Gaussians spread over the scene, at times between the frames as well, this measures how much a small displacement
     grows on its way, and how far the pose is off from float64 in float32, bfloat16 and float16; then it draws the worst
-    moments both ways. docs/stability.md tells how to read the table.
+    times in each. docs/stability.md explains the table.
 
     Type this:
 
     python export/stability.py runs/ball/model.pt --plot stability.png
 
-    The status is 0 where float32 is as good as float64, 3 where it is not, and 1 where the file can't be read.
+    The exit status is 0 if float32 is as good as float64, 3 if it isn't, and 1 if the file can't be read.
 
     Args:
         model: The `model.pt` of a training run.
-        json: Write the figures to this file.
+        json: Write the numbers to this file.
         plot: Draw growth, amplification and errors into this PNG.
-        times: At how many times to compare, both ends of the scene's time among them.
+        times: The number of times to compare at, both ends of the scene's time range among them.
         min_psnr: PSNR in dB of the worst frame against float64, below which an error counts as visible.
     """
     console = Console(soft_wrap=True, highlight=False)
@@ -92,7 +92,7 @@ def _report(
         write_json(report, json)
     if plot is not None:
         draw(report, plot)
-    return 0 if report.steady else UNSTEADY
+    return 0 if report.stable else UNSTABLE
 
 
 if __name__ == "__main__":

@@ -1,3 +1,3 @@
 """Serve dynamic Gaussian scenes from one ONNX file, on a CPU. Importing this package imports nothing heavy."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     scene = 'a scene file (.onnx), or a camera path (.json) whose cameras name one each, as "scene"'
     parser.add_argument("scene", type=Path, help=scene)
-    parser.add_argument("out", type=Path, help="a folder for images, or a film: name.mp4 or name.webm")
+    parser.add_argument("out", type=Path, help="a folder for images, or a video: name.mp4, name.webm or name.webp")
     parser.add_argument("--path", type=Path, help="a camera path, as nerfstudio writes it; default: one turn around")
     parser.add_argument("--frames", type=int, default=60, help="of the turn (default 60)")
     parser.add_argument("--elevation", type=float, default=20.0, help="of the turn, degrees (default 20)")

@@ -1,1 +1,1 @@
-"""Scene files out: to formats that other viewers read. One file a format; `proof` reads back what was written."""
+"""Exporters to formats of other viewers, one module a format; `round_trip` reads files back and compares them."""

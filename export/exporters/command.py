@@ -1,4 +1,4 @@
-"""What `convert.py` does."""
+"""The conversion of a scene file, as `convert.py` runs it."""
 
 import json
 from collections.abc import Callable
@@ -11,33 +11,34 @@ from rich.progress import Progress, track
 
 from export.exporters.gltf import read_gltf, write_gltf
 from export.exporters.ply import write_ply
-from export.exporters.proof import Proof, require, visionary_of
+from export.exporters.round_trip import RoundTrip, require, visionary_of
 from export.exporters.spz import write_spz
 from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
-from export.importers.detect import read_splats
 from export.importers.sequence import is_switched, of_the_moment
+from export.importers.splats.formats import read_splats
+from export.plans.registry import PLANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.files import replacing
+from msdgs_train.datasets.common.files import replacing
 
 LOSSLESS, LOSSY = 60.0, 45.0
-"""dB that what was written must have by default."""
+"""Default floors of PSNR of a written file against the scene, dB."""
 
 VISIONARY = ".visionary.onnx"
 SINGLE = (".ply", ".spz", ".glb")
 USD = (".usdc", ".usda", ".usd")
 FILMS = (".mp4", ".webm")
 COMPARED = 5
-"""Times at which a model that moves is compared."""
+"""Number of times at which a moving scene is compared."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the command line says."""
+    """Options of the command line."""
 
     scene: Path
     out: Path
@@ -47,8 +48,8 @@ class Settings:
 
 
 def convert(settings: Settings, console: Console) -> None:
-    """Write, read back, compare. Raises `InvalidInput`, `SceneFileInvalid` and `ConversionFailed`; a file that isn't
-    close enough doesn't take the place of an old one."""
+    """Write, read back, compare. Raises `InvalidInput`, `SceneFileInvalid` and `ConversionFailed`; a file below the
+    floor of PSNR doesn't replace an old one."""
     out = settings.out
     if out.suffix in FILMS:
         raise InvalidInput("out", f"other than a film: msdgs-render {settings.scene} {out} writes one", out.name)
@@ -81,7 +82,7 @@ def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | No
             (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
         default = LOSSY if file.suffix == ".spz" else LOSSLESS
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
-        psnr = Proof(session).psnr(written, t)
+        psnr = RoundTrip(session).psnr(written, t)
         require(psnr, default if min_psnr is None else min_psnr, file.name)
     return psnr
 
@@ -104,7 +105,7 @@ def _sequence(session: DeformationSession, settings: Settings, console: Console)
 
 
 def _usd(session: DeformationSession, settings: Settings, console: Console) -> None:
-    """All of the scene's time, or the moment asked for."""
+    """The scene's whole time range, or one time."""
     out, (t0, t1) = settings.out, session.scene.metadata.time_range
     moves = session.scene.moving_count and settings.t is None
     plan = session.scene.metadata.plan
@@ -113,13 +114,13 @@ def _usd(session: DeformationSession, settings: Settings, console: Console) -> N
     if moves and settings.frames < 2:
         raise InvalidInput("frames", "2 or more", settings.frames)
     times = np.linspace(t0, t1, settings.frames).tolist() if moves else [t0 if settings.t is None else settings.t]
-    proof = Proof(session)
+    check = RoundTrip(session)
     with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
         task = progress.add_task("writing frames", total=len(times))
         write_usd(temporary, lambda t: of_the_moment(session.gaussians(t), plan), times, lambda: progress.advance(task))
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
-        worst = min(proof.psnr(shown(number), times[number]) for number in compared)
+        worst = min(check.psnr(shown(number), times[number]) for number in compared)
         require(worst, LOSSLESS if settings.min_psnr is None else settings.min_psnr, out.name)
     size = out.stat().st_size / 1e6
     console.print(f"{out}: {len(times)} frames, {size:.2f} MB, {worst:.1f} dB from the scene", markup=False)
@@ -139,11 +140,12 @@ def _visionary(session: DeformationSession, settings: Settings, console: Console
     console.print(f"{scene_json}: the scene.json of a folder for Visionary's editor", markup=False)
     if metadata.antialiasing == "mip":
         console.print("its anti-aliasing isn't in this format: thin parts come out brighter")
-    if session.scene.moving_count and metadata.plan.partition(":")[0] in ("network", "prefix"):
+    plan = PLANS.get(metadata.plan.partition(":")[0])
+    if session.scene.moving_count and plan is not None and not plan.fitted:
         console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a scene that is cheaper")
 
 
 def _worst(session: DeformationSession, shown: Callable[[float], Gaussians]) -> float:
-    proof = Proof(session, mip=False)
+    check = RoundTrip(session, mip=False)
     times = np.linspace(*session.scene.metadata.time_range, COMPARED if session.scene.moving_count else 1)
-    return min(proof.psnr(shown(float(np.float32(t))), float(np.float32(t))) for t in times)
+    return min(check.psnr(shown(float(np.float32(t))), float(np.float32(t))) for t in times)

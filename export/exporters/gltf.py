@@ -1,4 +1,4 @@
-"""One moment as binary glTF with KHR_gaussian_splatting: a cloud of points whose attributes are Gaussians."""
+"""The Gaussians at one time as binary glTF with KHR_gaussian_splatting: points with Gaussians as attributes."""
 
 import json
 import struct
@@ -25,7 +25,7 @@ PRIMITIVE = {
 
 
 def write_gltf(file: Path, gaussians: Gaussians) -> None:
-    """All Gaussians, activated, float32; axes right, up, back. Viewers without the extension see colored points."""
+    """All Gaussians, activated, float32; axes right, up, back. Viewers without the extension show colored points."""
     means, quats, sh = from_right_up_back(gaussians.means, gaussians.quats, gaussians.sh)
     colors = np.concatenate([SH_C0 * sh[:, 0] + 0.5, gaussians.opacities[:, None]], axis=1)
     attributes = {
@@ -64,7 +64,7 @@ def write_gltf(file: Path, gaussians: Gaussians) -> None:
 
 
 def read_gltf(file: Path) -> Gaussians:
-    """What `write_gltf` has written."""
+    """Read a file of `write_gltf`."""
     contents = file.read_bytes()
     size, _ = CHUNK.unpack_from(contents, HEADER.size)
     start = HEADER.size + CHUNK.size

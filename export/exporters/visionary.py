@@ -1,4 +1,4 @@
-"""ONNX as Visionary plays it in a browser: a time in, packed Gaussians and colors out.
+"""ONNX for Visionary in a browser: time as input, packed Gaussians and colors as outputs.
 
 The graph is the scene's own with its ids fixed to all of them. What doesn't depend on time is computed here, and
 covariances take the place of rotations and scales.

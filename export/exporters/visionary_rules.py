@@ -18,7 +18,7 @@ GAUSSIAN_TYPES = {GAUSSIANS: TensorProto.FLOAT, "gaussian_f16": TensorProto.FLOA
 
 CONTROL_FLOW = {"If", "Loop", "Scan", "SequenceMap"}
 QUANTISED = {"QuantizeLinear", "DequantizeLinear"}
-INSIDE = {TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL}
+GRAPH_TYPES = {TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL}
 """Types of values that aren't outputs."""
 
 RESERVED = ("sh", "color", "rgb")
@@ -87,7 +87,7 @@ def _graph_problems(model: onnx.ModelProto) -> list[str]:
 
 
 def _type_problems(what: str, kind: int) -> list[str]:
-    return [] if kind in INSIDE else [f"{what} is {TensorProto.DataType.Name(kind)}, not float32"]
+    return [] if kind in GRAPH_TYPES else [f"{what} is {TensorProto.DataType.Name(kind)}, not float32"]
 
 
 def _padding_problems(model: onnx.ModelProto) -> list[str]:

@@ -1,11 +1,12 @@
-"""Other people's scenes in: files and folders of other formats to what a scene file stores.
+"""Importers of scenes from other programs: one module a format.
 
-One file a format. Each reader takes what it is given as hostile: sizes are checked before memory is taken, no code in
-a file is run, and what is wrong is said with the file's name.
+Each reader treats its input as hostile: sizes are checked before memory is allocated, no code in a file is run, and
+errors name the file.
 """
 
-from export.importers.detect import KINDS, READERS, read_splats, recognise
+from export.importers.detect import FORMATS, detect_format
 from export.importers.errors import ImportFailed
 from export.importers.splats.base import Splats
+from export.importers.splats.formats import READERS, read_splats
 
-__all__ = ["KINDS", "READERS", "ImportFailed", "Splats", "read_splats", "recognise"]
+__all__ = ["FORMATS", "READERS", "ImportFailed", "Splats", "detect_format", "read_splats"]

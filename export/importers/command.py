@@ -1,4 +1,4 @@
-"""What `to_onnx.py` does with anything but a model.pt, and what it prints while it does."""
+"""The inputs of `to_onnx.py` other than a model.pt."""
 
 import tempfile
 from collections.abc import Iterator
@@ -8,49 +8,50 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from export.importers.detect import KINDS_OF_RUNS, READERS, checked_kind, frame_files, read_splats, recognise
-from export.importers.runs.model import write_model
+from export.importers.detect import checked_format, detect_format, frame_files
+from export.importers.runs.model import RUNS, write_model
 from export.importers.scene import digest, note_left_out, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
+from export.importers.splats.formats import READERS, read_splats
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
 
 
 @contextmanager
-def model_or_import(path: Path, kind: str | None, output: Path, console: Console) -> Iterator[Path | None]:
+def model_or_import(path: Path, file_format: str, output: Path, console: Console) -> Iterator[Path | None]:
     """The model.pt to export: `path` itself, or one made of another trainer's run, there until the end of the block.
 
-    Splats and sequences are written as scene files at once; then there is None. `kind` is one of `KINDS`, or None to
-    look into the files. Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
+    Splats and sequences are written as scene files at once; then there is None. `file_format` is one of `FORMATS`, or
+    "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
     """
-    if kind is None:
-        kind = "model" if not path.exists() or path.suffix == ".pt" else recognise(path)
-    kind = checked_kind(kind)
-    if kind == "model":
+    if file_format == "detect":
+        file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
+    file_format = checked_format(file_format)
+    if file_format == "model":
         yield path / "model.pt" if path.is_dir() else path
-    elif kind in KINDS_OF_RUNS:
+    elif file_format in RUNS:
         with tempfile.TemporaryDirectory(prefix="msdgs-import-") as folder:
             model = Path(folder) / "model.pt"
-            lost = write_model(path, kind, model, console)
+            lost = write_model(path, file_format, model, console)
             yield model
             if lost:
                 note_left_out(output, lost)
     else:
         if not output.parent.is_dir():
             raise InvalidInput("output", "in a folder that exists", str(output))
-        scene = _sequence(path, kind, output, console) if kind not in READERS else _splats(path, kind, output, console)
-        _print(scene, output, console)
+        write = _splats if file_format in READERS else _sequence
+        _print(write(path, file_format, output, console), output, console)
         yield None
 
 
-def _splats(path: Path, kind: str, output: Path, console: Console) -> BakedScene:
+def _splats(path: Path, file_format: str, output: Path, console: Console) -> BakedScene:
     with console.status(f"reading {path}"):
-        source = read_splats(path, kind)
+        source = read_splats(path, file_format)
         return write_imported(output, static_scene(source, digest(path)), lambda t: source.gaussians, [0.0])
 
 
-def _sequence(path: Path, kind: str, output: Path, console: Console) -> BakedScene:
-    how = kind.partition(":")[2] or None
+def _sequence(path: Path, file_format: str, output: Path, console: Console) -> BakedScene:
+    how = file_format.partition(":")[2] or None
     with Progress(console=console, transient=True) as progress:
         reading = progress.add_task("reading frames", total=len(frame_files(path)))
         sequence = read_sequence(path, how, lambda: progress.advance(reading))

@@ -1,68 +1,40 @@
-"""Which format a file or folder is, by what is in it; names decide only where contents can't."""
+"""Which format a file or folder is, by its contents; names decide only where contents can't."""
 
 import re
 import zipfile
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 from export.importers.errors import ImportFailed
-from export.importers.splats.base import Splats
-from export.importers.splats.ksplat import read_ksplat
-from export.importers.splats.ply import read_ply
-from export.importers.splats.sog import META, ZIP_PROBLEMS, read_sog
-from export.importers.splats.splat import read_splat
-from export.importers.splats.spz import read_spz
+from export.importers.runs.model import RUNS
+from export.importers.splats.formats import READERS, splat_format
 from msdgs_serve.scene.errors import InvalidInput
 
-READERS: dict[str, Callable[[Path], Splats]] = {
-    "ply": read_ply,
-    "spz": read_spz,
-    "spz:unturned": partial(read_spz, turned=False),
-    "sog": read_sog,
-    "splat": read_splat,
-    "ksplat": read_ksplat,
-}
-"""Of one set of Gaussians, by the name of the format."""
-
-KINDS_OF_RUNS = ("deformgs", "4dgs")
-KINDS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *KINDS_OF_RUNS)
-"""All that can be imported: our own model.pt, one set of Gaussians, a folder of them, and runs of other trainers."""
+FORMATS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *RUNS)
+"""All inputs: our own model.pt, one set of Gaussians, a folder of them, and runs of other trainers."""
 
 FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat")
 
 
-def recognise(path: Path) -> str:
-    """The kind of `path`, one of `KINDS`. Raises `ImportFailed` saying what can be read where it is none."""
+def detect_format(path: Path) -> str:
+    """The format of `path`, one of `FORMATS`. Raises `ImportFailed` if it is none, saying which can be read."""
     if not path.exists():
         raise ImportFailed(path, "no such file or folder")
     try:
-        kind = _folder(path) if path.is_dir() else _file(path)
+        found = splat_format(path) or (_folder(path) if path.is_dir() else _model(path))
     except OSError as error:
         raise ImportFailed(path, f"can't be read: {error.strerror or error}") from error
-    if kind is None and path.suffix.lower() == ".onnx":
+    if found is None and path.suffix.lower() == ".onnx":
         raise ImportFailed(path, "is a scene file already; export/convert.py writes it as other formats")
-    if kind is None:
-        raise ImportFailed(path, f"isn't recognised; --from says what it is, one of {', '.join(KINDS)}")
-    return kind
+    if found is None:
+        raise ImportFailed(path, f"has no known format; --format names it, one of {', '.join(FORMATS)}")
+    return found
 
 
-def checked_kind(text: str) -> str:
-    """One of `KINDS`. Raises `InvalidInput` for anything else."""
-    if text not in KINDS:
-        raise InvalidInput("--from", f"one of {', '.join(KINDS)}", repr(text))
+def checked_format(text: str) -> str:
+    """One of `FORMATS`. Raises `InvalidInput` for anything else."""
+    if text not in FORMATS:
+        raise InvalidInput("--format", f"detect or one of {', '.join(FORMATS)}", repr(text))
     return text
-
-
-def read_splats(path: Path, kind: str | None = None) -> Splats:
-    """One set of Gaussians, of a file in any of the formats or of the one named. Raises `ImportFailed`."""
-    kind = kind or recognise(path)
-    if kind not in READERS:
-        raise ImportFailed(path, f"is a {kind}, not one set of Gaussians")
-    try:
-        return READERS[kind](path)
-    except OSError as error:
-        raise ImportFailed(path, f"can't be read: {error.strerror or error}") from error
 
 
 def frame_files(folder: Path) -> list[Path]:
@@ -90,35 +62,14 @@ def _name_and_numbers(file: Path) -> list[str]:
     return [*parts[:-1], f"{parts[-1]}{file.suffix.lower()}"]
 
 
-def _file(path: Path) -> str | None:
-    with path.open("rb") as file:
-        start = file.read(16)
-    if start.startswith(b"ply"):
-        return "ply"
-    if start.startswith((b"NGSP", b"\x1f\x8b")):
-        return "spz"
-    if path.name == META:
-        return "sog"
-    try:
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                return "sog" if any(name.rsplit("/", 1)[-1] == META for name in archive.namelist()) else "model"
-    except ZIP_PROBLEMS as error:
-        raise ImportFailed(path, f"isn't a whole zip: {error}") from error
-    if path.suffix.lower() in (".splat", ".ksplat", ".sog", ".spz"):
-        return path.suffix.lower()[1:]
-    return "model" if path.suffix.lower() in (".pt", ".pth") else None
+def _model(path: Path) -> str | None:
+    return "model" if zipfile.is_zipfile(path) or path.suffix.lower() in (".pt", ".pth") else None
 
 
 def _folder(path: Path) -> str | None:
-    if (path / META).is_file():
-        return "sog"
     if (path / "model.pt").is_file():
         return "model"
-    if next(path.glob("point_cloud/iteration_*/deformation.pth"), None):
-        return "4dgs"
-    if next(path.glob("deform/iteration_*/deform.pth"), None):
-        return "deformgs"
-    if len(frame_files(path)) > 1:
-        return "sequence"
-    return None
+    runs = [name for name, importer in RUNS.items() if importer.detects(path)]
+    if runs:
+        return runs[0]
+    return "sequence" if len(frame_files(path)) > 1 else None

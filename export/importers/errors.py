@@ -1,4 +1,4 @@
-"""What can be wrong with a file that comes from elsewhere."""
+"""Errors of imports."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from msdgs_serve.scene.errors import MsdgsError
 
 
 class ImportFailed(MsdgsError):
-    """A file or folder can't be read as the format that it is, or is taken for."""
+    """A file or folder can't be read as its format."""
 
     def __init__(self, file: str | Path, problem: str) -> None:
         super().__init__(f"{file}: {problem}")
@@ -14,5 +14,5 @@ class ImportFailed(MsdgsError):
 
 
 def cut_off(file: str | Path, what: str, needed: int, found: int) -> ImportFailed:
-    """A file that ends before what its header promises."""
+    """A file that is shorter than its header states."""
     return ImportFailed(file, f"is cut off: {what} needs {needed:,} bytes, there are {found:,}")

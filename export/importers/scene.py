@@ -1,4 +1,4 @@
-"""A scene file of Gaussians that no model of ours made: its metadata, and its proof before it replaces anything."""
+"""Scene files of imported Gaussians: metadata, and the check of a file before it replaces an old one."""
 
 import hashlib
 import json
@@ -13,6 +13,7 @@ from onnx import helper
 from export.importers.splats.base import Splats
 from export.jobs.bake import Baked, Moving
 from export.jobs.write import properties
+from export.plans.base import BASELINE
 from export.plans.registry import build
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
@@ -20,7 +21,7 @@ from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMeta
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
-from msdgs_train.files import replacing
+from msdgs_train.datasets.common.files import replacing
 
 WITHIN = (0.01, 0.99)
 """Parts of the Gaussians below and above which, along each axis, their centres may lie outside of the bounds: strays of
@@ -30,7 +31,7 @@ UP = np.array([0.0, -1.0, 0.0])
 """Of files that don't say: COLMAP's axes, in which INRIA's trainer and most others work."""
 
 CAMERAS, SIZE, FOV_Y, ELEVATION = 6, 800, 50.0, 15.0
-"""A circle of cameras to start from, in degrees and pixels; the files hold none."""
+"""Starting cameras on a circle, pixels and degrees, since the files hold none."""
 
 NEAR = 2.2
 """Distance of these cameras from the middle, in half diagonals of the bounds."""
@@ -41,14 +42,13 @@ def static_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     g = source.gaussians
     metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped)
     scene = BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
-    three = np.empty((0, 3), np.float32)
-    return build("network", Baked(scene, Moving(three, three, np.empty((0, 4), np.float32), None), ()))
+    return build(BASELINE, Baked(scene, Moving.none(), ()))
 
 
 def metadata_of(
     means: np.ndarray, sh_degree: int, sha256: str, antialiasing: str = "dilate", dropped: int = 0
 ) -> SceneMetadata:
-    """What a scene says of itself where its file says nothing: bounds and cameras from the centres, black behind."""
+    """Metadata for formats without any: bounds and cameras from the centers, black background."""
     low, high = (tuple(float(v) for v in np.quantile(means, part, axis=0)) for part in WITHIN)
     left_out = ()
     if dropped:
@@ -57,7 +57,7 @@ def metadata_of(
     return SceneMetadata(
         contract=CONTRACT,
         layers=(),
-        plan="network",
+        plan=BASELINE,
         time_range=(0.0, 1.0),
         bounds=(low, high),
         sh_degree=sh_degree,

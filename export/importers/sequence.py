@@ -15,10 +15,11 @@ import onnx
 from onnx import TensorProto
 from scipy.spatial import KDTree
 
-from export.importers.detect import frame_files, read_splats
+from export.importers.detect import frame_files
 from export.importers.errors import ImportFailed
 from export.importers.scene import UP, metadata_of
 from export.importers.splats.base import Splats
+from export.importers.splats.formats import read_splats
 from export.jobs.bake import Baked, Moving
 from export.plans.scene_graph import activated, finished, new_graph
 from export.trajectories.sampling import give_one_sign
@@ -26,7 +27,7 @@ from export.trajectories.splines import design
 from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.gaussians.model import MIN_SCALE
+from msdgs_train.gaussians.scale_space import MIN_SCALE
 
 CONSTANT = 0.02
 """Opacities and SH coefficients may differ by this between frames that are blended: two steps of 8 bits."""
@@ -39,7 +40,7 @@ SAMPLED = 5_000
 PARKED_AT = 1e6
 """Half diagonals of the scene's bounds below its middle."""
 
-MOST = 1 << 26
+MAX_GAUSSIANS = 1 << 26
 """Gaussians of all frames together."""
 
 
@@ -69,8 +70,10 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     read: list[Splats] = []
     for file in files:
         read.append(read_splats(file))
-        if sum(map(len, read)) > MOST:
-            raise ImportFailed(folder, f"has more than {MOST:,} Gaussians in {len(read)} of {len(files)} frames")
+        if sum(map(len, read)) > MAX_GAUSSIANS:
+            raise ImportFailed(
+                folder, f"has more than {MAX_GAUSSIANS:,} Gaussians in {len(read)} of {len(files)} frames"
+            )
         on_frame()
     modes, degrees = {each.antialiasing for each in read}, {each.gaussians.sh_degree for each in read}
     if len(modes) > 1 or len(degrees) > 1:
@@ -174,7 +177,7 @@ def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     poses = np.stack([np.concatenate([f.means, f.scales, f.quats], axis=1)[moving] for f in frames], axis=1)
     give_one_sign(poses)
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
-    baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving], None), ())
+    baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving]), ())
     graph = new_graph(baked)
     activated(graph, of_ids(graph, GriddedPoses.on_one(StoredPoses.of(control)), metadata.time_range))
     return finished(graph, baked, f"keyframes:{count + 2}")
@@ -202,7 +205,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
     scene = BakedScene(
         replace(metadata, plan=plan), len(means), empty, np.empty((0, 4), np.float32), empty, opacities, sh
     ).validate("the imported sequence")
-    baked = Baked(scene, Moving(means, scales, quats, None), ())
+    baked = Baked(scene, Moving(means, scales, quats), ())
     graph = new_graph(baked)
     low, high = np.array(metadata.bounds)
     parked = (low + high) / 2 - PARKED_AT * max(float(np.linalg.norm(high - low)) / 2, 1e-3) * UP

@@ -1,30 +1,31 @@
-"""From a trained model to what a scene file stores: constants computed once, what only training needs left behind."""
+"""Baking: the constants of a scene file, computed from a trained model in float32."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from export.layers.base import ModelNotExportable
 from msdgs_serve import __version__
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.gaussians.model import DynamicGaussians, carried, unit_quats
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
-from msdgs_train.layers.mlp import MLPLayer
-from msdgs_train.layers.plane import PlaneLayer
-from msdgs_train.supports.nodes import BasisLayer
+from msdgs_train.gaussians.modulation import EMBEDDINGS
+from msdgs_train.gaussians.scale_space import ScaleSpace
+from msdgs_train.layers.arrays import to_array
+from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.quaternions import unit_or_identity
+from msdgs_train.supports.base import Support
+from msdgs_train.supports.gaussians import GaussiansConfig
 
 STARTING_CAMERAS = 8
-"""Cameras kept in a scene file, evenly spread over those of the training."""
+"""Cameras stored in a scene file, evenly spread over the training cameras."""
 
 
-class ModelNotExportable(MsdgsError):
-    """A model has values or parts that a scene file can't hold."""
-
-
-Layer = MLPLayer | PlaneLayer | BasisLayer
+DELTA_SPACES: dict[ScaleSpace, str] = {"log": "raw", "linear": "activated"}
+"""As scene files name them."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,16 @@ class Moving:
     means: FloatArray  # [M, 3]
     log_scales: FloatArray  # [M, 3]
     quats: FloatArray  # [M, 4] wxyz, unit
-    scale_modulation: FloatArray | None  # [M, 3] factors of equation 12; None where the model has none
-    mean_modulation: FloatArray | None = None  # [M, 3]
-    quat_modulation: FloatArray | None = None  # [M, 4]
-    skinning_weights: FloatArray | None = None  # [M, F] of motion bases that each follows, rows sum to 1; None: none
-    node_ids: npt.NDArray[np.int64] | None = None  # [M, F] which ones these are
+    modulation: dict[str, FloatArray] = field(default_factory=dict)
+    """By head: factors of its deltas (equation 12), [M, 3] or [M, 4]."""
+    attributes: dict[str, np.ndarray] = field(default_factory=dict)  # what the support stores per Gaussian
+    baked_attributes: dict[str, np.ndarray] = field(default_factory=dict)  # and as a graph reads it: `Support.baked`
+
+    @classmethod
+    def none(cls) -> "Moving":
+        """No Gaussians."""
+        three = np.empty((0, 3), np.float32)
+        return cls(three, three, np.empty((0, 4), np.float32))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -50,7 +56,8 @@ class Baked:
 
     scene: BakedScene
     moving: Moving
-    layers: tuple[Layer, ...]  # float32; empty where nothing moves
+    layers: tuple[DeformationLayer, ...]  # float32; empty where nothing moves
+    support: Support = field(default_factory=lambda: GaussiansConfig().build())
 
 
 def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Baked:
@@ -63,10 +70,11 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
     with torch.no_grad():
         canonical = model.pose(info.time_range[0], deform=False)
         moves = bool(len(model.deformation)) and len(model.gaussians) > 0
-        moving = _moving(model) if moves else _nothing_moving()
-    layers = tuple(_checked_layer(layer) for layer in model.deformation.layers) if moves else ()
+        moving = _moving(model) if moves else Moving.none()
+    layers = tuple(model.deformation) if moves else ()
+    kinds = tuple(layer.kind for layer in layers)
     scene = BakedScene(
-        _metadata(model, info, tuple(layer.kind for layer in layers), checkpoint_sha256),
+        _metadata(model, info, kinds, checkpoint_sha256),
         moving_count=len(moving),
         static_means=_array(canonical.means[len(moving) :]),
         static_quats=_array(canonical.quats[len(moving) :]),
@@ -74,29 +82,21 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
         opacities=_array(canonical.opacities),
         sh=_array(canonical.sh),
     )
-    return Baked(scene.validate("the baked scene"), moving, layers)
+    return Baked(scene.validate("the baked scene"), moving, layers, model.support)
 
 
 def _moving(model: DynamicGaussians) -> Moving:
-    g, followed = model.gaussians, carried(model.gaussians)
-    factors = {"means": None, "scales": None, "quats": None}
-    if model.modulation is not None:
-        factors |= {name: _array(values) for name, values in model.modulation(g.embeddings).present().items()}
+    g = model.gaussians
+    stored = {name: values for name, values in g.attributes.items() if name != EMBEDDINGS}
+    factors = {} if model.modulation is None else model.modulation(g.attributes[EMBEDDINGS]).present()
     return Moving(
         _array(g.means),
         _array(g.log_scales),
-        _array(unit_quats(g.raw_quats)),
-        scale_modulation=factors["scales"],
-        mean_modulation=factors["means"],
-        quat_modulation=factors["quats"],
-        skinning_weights=None if followed is None else _array(followed.skinning_weights),
-        node_ids=None if followed is None else followed.node_ids.numpy(),
+        _array(unit_or_identity(g.raw_quats)),
+        {head: _array(values) for head, values in factors.items()},
+        {name: to_array(values) for name, values in stored.items()},
+        model.support.baked(stored),
     )
-
-
-def _nothing_moving() -> Moving:
-    three = np.empty((0, 3), np.float32)
-    return Moving(three, three, np.empty((0, 4), np.float32), None)
 
 
 def _metadata(
@@ -109,7 +109,7 @@ def _metadata(
         time_range=(float(info.time_range[0]), float(info.time_range[1])),
         bounds=(tuple(info.bounds[0]), tuple(info.bounds[1])),
         sh_degree=model.config.sh_degree,
-        delta_space=model.config.delta_space,
+        delta_space=DELTA_SPACES[model.config.scale_space],
         background=info.background,
         antialiasing="dilate",
         cameras=starting_cameras(info),
@@ -119,12 +119,12 @@ def _metadata(
         checkpoint_sha256=checkpoint_sha256,
         eps2d=float(model.config.eps2d),
     )
-    # through its own reader: what a later reader would refuse is refused here
+    # through the reader of scene files, which refuses invalid values
     return SceneMetadata.from_properties(draft.to_properties(), "the model's scene")
 
 
 def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
-    """At most eight of the training's cameras, evenly spread, the first and the last among them."""
+    """At most eight of the training cameras, evenly spread, the first and the last among them."""
     chosen = np.linspace(0, len(info.cameras) - 1, min(STARTING_CAMERAS, len(info.cameras))).round().astype(int)
     try:
         return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)
@@ -136,15 +136,9 @@ def _refuse_heads(model: DynamicGaussians) -> None:
     for option, stored in (("opacity_head", "opacities"), ("sh_head", "sh")):
         if getattr(model.config, option) and len(model.deformation):
             raise ModelNotExportable(
-                f"model.{option} is on, so `{stored}` change with time, and {CONTRACT} holds them as constants; "
+                f"model.{option} is on, so `{stored}` change with time, but {CONTRACT} stores constants; "
                 "train without that head to export"
             )
-
-
-def _checked_layer(layer: torch.nn.Module) -> Layer:
-    if not isinstance(layer, Layer):
-        raise ModelNotExportable(f"a layer of type {type(layer).__name__} has no graph in the plan `network`")
-    return layer
 
 
 def _array(tensor: torch.Tensor) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What `to_onnx.py` does, and what it prints while it does."""
+"""The export of one model as `to_onnx.py` runs it, and its output in the terminal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,11 +14,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, Job, Unreachable
+from export.jobs.job import Candidate, ExportJob, TargetNotReached, Track
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
 from export.jobs.sweep import Sweep
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
+from export.options import ExportOptions
 from export.plans.registry import parse
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
@@ -27,125 +27,110 @@ from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:
-    from export.measure.images import Images
+    from export.measure.images import HeldOutImages
 
-LEAST_ERROR = 10.0
-"""dB. Under it a frame isn't one of the scene any more."""
+LOWEST_MIN_PSNR = 10.0
+"""dB. Frames below it have nothing in common with the scene."""
 
 WIDE = 180
-"""Characters that all columns of the table take."""
+"""Width of the terminal, in characters, from which the table has all columns."""
 
-TELLING = ("", "plan", "trimmed to", "SH", "moving", "ms", "MB", "worst frame")
-"""Columns for narrower terminals."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What the command line says."""
-
-    model: Path
-    output: Path
-    min_psnr: float  # dB on the worst frame
-    plan: str | None  # None: the sweep chooses
-    data: Path | None
-    off: frozenset[str]  # rules of trimming
-    tolerance: float
-    times: int
+NARROW_COLUMNS = ("", "plan", "pruned to", "SH", "moving", "ms", "MB", "worst frame")
+"""Columns in narrower terminals."""
 
 
-def export(settings: Settings, console: Console) -> None:
-    """Choose a candidate, prove it and write it. Raises errors that say what to do; old files stay until the end."""
-    _check(settings)
+def export(model: Path, options: ExportOptions, console: Console) -> None:
+    """Choose a candidate, verify it and write it. An error leaves files that were there as they are."""
+    _check(options)
     with (
         tempfile.TemporaryDirectory(prefix="msdgs-export-") as folder,
         Progress(console=console, transient=True) as progress,
     ):
-        started = time.monotonic()
-
-        def track(what: str, steps: int) -> Callable[[], object]:
-            if steps and not console.is_terminal:  # a log shows no bars
-                console.print(f"{time.monotonic() - started:5.0f} s  {what} …", markup=False)
-            task = progress.add_task(what, total=steps)
-            return lambda: progress.advance(task)
-
-        photographs = _images(settings, track)
-        rules = [rule for rule in RULES if rule not in settings.off]
-        training = photographs.training if photographs else []
-        job = Job(
-            settings.model, Path(folder), min_psnr=settings.min_psnr, rules=rules, training=training, progress=track
-        )
+        track = _tracker(console, progress)
+        images = _held_out_images(model, options.data, track)
+        rules = [rule for rule in RULES if rule not in options.keep]
+        training = images.training if images else []
+        job = ExportJob(model, Path(folder), min_psnr=options.min_psnr, rules=rules, training=training, progress=track)
         contents = None
-        if settings.plan is None:
-            result = Sweep(job, settings.min_psnr, photographs).run()
+        if options.chosen_plan is None:
+            result = Sweep(job, options.min_psnr, images).run()
             contents = report(job, result)
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
         else:
-            chosen, error = _planned(job, settings)
+            chosen, error = _planned(job, options.chosen_plan, options.min_psnr)
         exported = write_scene(
-            settings.output,
+            options.scene_file,
             onnx.load(chosen.path),
-            chosen.trimmed.moving,
+            chosen.pruned.moving,
             rendered=error.to_plain(),
-            tolerance=settings.tolerance,
-            times=settings.times,
-            on_time=track("comparing poses with the model", settings.times),
+            tolerance=options.tolerance,
+            times=options.times,
+            on_time=track("comparing poses with the model", options.times),
         )
     if contents:
         _print_table(contents, console)
         console.print(gain(contents), markup=False)
-        for path in write_report(contents, settings.output):
+        for path in write_report(contents, options.scene_file):
             console.print(f"wrote {path}", markup=False)
     _print_chosen(chosen, error, exported, console)
 
 
-def _check(settings: Settings) -> None:
-    error = settings.min_psnr
-    if not (math.isfinite(error) and LEAST_ERROR <= error <= MAX_PSNR):
-        raise InvalidInput("min_psnr", f"a PSNR in dB from {LEAST_ERROR:g} to {MAX_PSNR:g}; 50 is invisible", error)
-    if not settings.tolerance >= 0:
-        raise InvalidInput("tolerance", "0 or more", settings.tolerance)
-    if settings.times < 2:
-        raise InvalidInput("times", "2 or more", settings.times)
-    if settings.plan is not None:
-        parse(settings.plan)
-    if not settings.output.parent.is_dir():
-        raise InvalidInput("output", "in a folder that exists", str(settings.output))
+def _tracker(console: Console, progress: Progress) -> Track:
+    started = time.monotonic()
+
+    def track(what: str, steps: int) -> Callable[[], object]:
+        if steps and not console.is_terminal:  # a log shows no bars
+            console.print(f"{time.monotonic() - started:5.0f} s  {what} …", markup=False)
+        task = progress.add_task(what, total=steps)
+        return lambda: progress.advance(task)
+
+    return track
 
 
-def _images(settings: Settings, track: Callable[[str, int], Callable[[], object]]) -> Images | None:
-    if settings.data is None:
+def _check(options: ExportOptions) -> None:
+    if not (math.isfinite(options.min_psnr) and LOWEST_MIN_PSNR <= options.min_psnr <= MAX_PSNR):
+        allowed = f"a PSNR in dB from {LOWEST_MIN_PSNR:g} to {MAX_PSNR:g}; at 50 no difference is visible"
+        raise InvalidInput("min_psnr", allowed, options.min_psnr)
+    if not options.tolerance >= 0:
+        raise InvalidInput("tolerance", "0 or more", options.tolerance)
+    if options.times < 2:
+        raise InvalidInput("times", "2 or more", options.times)
+    if options.chosen_plan is not None:
+        parse(options.chosen_plan)
+    if not options.scene_file.parent.is_dir():
+        raise InvalidInput("output", "in a folder that exists", str(options.scene_file))
+
+
+def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutImages | None:
+    if data is None:
         return None
     try:
-        from export.measure.images import (
-            Images,  # of the trainer's own readers, which the export alone doesn't need
-        )
+        from export.measure.images import HeldOutImages  # needs the trainer's readers of datasets
     except ModuleNotFoundError as error:
         raise InvalidInput("data", "left out, or pip install '.[train,export]'", f"no module {error.name}") from None
-    info = load_model(settings.model).scene
-    return Images(settings.data, info, lambda count: track("images", count))
+    return HeldOutImages(data, load_model(model).scene, lambda count: track("images", count))
 
 
-def _planned(job: Job, settings: Settings) -> tuple[Candidate, RenderedError]:
-    """The plan asked for, trimmed as far as the error allows beside the plan's own."""
-    assert settings.plan is not None
-    whole = job.candidate(settings.plan, None)
+def _planned(job: ExportJob, plan: str, min_psnr: float) -> tuple[Candidate, RenderedError]:
+    """The plan asked for, pruned as far as its own error leaves room."""
+    whole = job.candidate(plan, None)
     best = job.error(whole)
-    if best.psnr_worst < settings.min_psnr:
-        reachable = f"at most {math.floor(10 * best.psnr_worst) / 10:.1f}, which the plan {settings.plan} reaches"
-        raise Unreachable("min_psnr", f"{reachable} on its worst frame", settings.min_psnr)
+    if best.psnr_worst < min_psnr:
+        reachable = f"at most {math.floor(10 * best.psnr_worst) / 10:.1f}, which the plan {plan} reaches"
+        raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", min_psnr)
     if job.rules:
-        left = 10 ** (-settings.min_psnr / 10) - 10 ** (-best.psnr_worst / 10)
-        for share in (1.0, 0.5, 0.25) if left > 0 else ():
-            trimmed = job.candidate(settings.plan, -10 * math.log10(share * left))
-            error = job.error(trimmed)
-            if error.psnr_worst >= settings.min_psnr:
-                return trimmed, error
+        budget = 10 ** (-min_psnr / 10) - 10 ** (-best.psnr_worst / 10)
+        for fraction in (1.0, 0.5, 0.25) if budget > 0 else ():
+            pruned = job.candidate(plan, -10 * math.log10(fraction * budget))
+            error = job.error(pruned)
+            if error.psnr_worst >= min_psnr:
+                return pruned, error
     return whole, best
 
 
 def _print_table(contents: dict, console: Console) -> None:
-    """All columns where they fit, else those that say most; the report has them all."""
-    names = list(COLUMNS) if console.width >= WIDE else [name for name in COLUMNS if name in TELLING]
+    """All columns if they fit, else the most important ones; the report has them all."""
+    names = list(COLUMNS) if console.width >= WIDE else [name for name in COLUMNS if name in NARROW_COLUMNS]
     table = Table(*(Column(name, no_wrap=True) for name in names), box=None)
     usual = [row for row in rows(contents) if names == list(COLUMNS) or not row[COLUMNS.index("rasterizer")]]
     for row in usual:

@@ -1,4 +1,4 @@
-"""The work-precision diagram: milliseconds a frame across, how far frames are from exact ones upwards."""
+"""The work-precision diagram: milliseconds per frame on the x axis, error of the worst frame on the y axis."""
 
 from pathlib import Path
 from typing import Any
@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullLocator
 
 from export.jobs.points import DEFAULT_RASTERIZER
+from export.plans.registry import PLANS
 
 DB_STEP = 10
 CLOSEST = 100.0
 LABEL_SIZE = np.array([250, 15])
-"""Pixels of room for a name."""
+"""Pixels reserved for a label."""
 
-COLORS = {"network": "#4269d0", "prefix": "#6cc5b0", "int8": "#ff725c", "lowrank": "#3ca951", "keyframes": "#a463f2"}
 OTHER = "#9498a0"
 
 
@@ -29,7 +29,7 @@ def draw(contents: dict[str, Any], path: Path) -> None:
     for kind in dict.fromkeys(_kind(point) for point in points):
         group = [point for point in points if _kind(point) == kind]
         usual = [point for point in group if point["rasterizer"] == DEFAULT_RASTERIZER]
-        axes.scatter(*_places(usual), s=55, color=COLORS.get(kind, OTHER), label=f"plan {kind}", zorder=3)
+        axes.scatter(*_places(usual), s=55, color=PLANS[kind].color, label=f"plan {kind}", zorder=3)
     others = [point for point in points if point["rasterizer"] != DEFAULT_RASTERIZER]
     if others:
         axes.scatter(*_places(others), s=55, marker="x", color=OTHER, label="other rasterizer options", zorder=3)
@@ -41,22 +41,20 @@ def draw(contents: dict[str, Any], path: Path) -> None:
     )
     _axes(axes, points, contents)
     axes.legend(loc="upper right", framealpha=0.95)
-    figure.draw_without_rendering()  # where labels come to lie is known from here on
+    figure.draw_without_rendering()  # fixes the positions of labels
     _label(axes, points)
     figure.savefig(path, dpi=110, format="png")
 
 
 def _front_line(axes: Any, points: list[dict[str, Any]]) -> None:
     ahead = sorted((p for p in points if p["front"]), key=lambda p: p["milliseconds"]["total"]["min"])
-    axes.plot(
-        *_places(ahead), drawstyle="steps-post", color="black", linewidth=1.5, zorder=2, label="nothing is better"
-    )
+    axes.plot(*_places(ahead), drawstyle="steps-post", color="black", linewidth=1.5, zorder=2, label="Pareto front")
 
 
 def _label(axes: Any, points: list[dict[str, Any]]) -> None:
-    """Names of the points on the front, and of the whole network, as far as there is room; the chosen one's first."""
+    """Label the points on the front and those that aren't pruned, the chosen one first, without overlaps."""
     taken: list[np.ndarray] = []
-    named = [point for point in points if point["front"] or point["trim_db"] is None]
+    named = [point for point in points if point["front"] or point["pruning_db"] is None]
     for point in sorted(named, key=lambda point: not point["chosen"]):
         x, y = _places([point])
         place = axes.transData.transform((x[0], y[0]))
@@ -66,8 +64,8 @@ def _label(axes: Any, points: list[dict[str, Any]]) -> None:
 
 
 def _text(point: dict[str, Any]) -> str:
-    trimmed = "all of it" if point["trim_db"] is None else f"trimmed to {point['trim_db']:g}"
-    return f"{point['plan']}, {trimmed}, SH {point['sh_degree']}"
+    pruned = "unpruned" if point["pruning_db"] is None else f"pruned to {point['pruning_db']:g}"
+    return f"{point['plan']}, {pruned}, SH {point['sh_degree']}"
 
 
 def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> None:
@@ -76,7 +74,7 @@ def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> 
     axes.yaxis.set_major_locator(FixedLocator([_rms(db) for db in ticks]))
     axes.yaxis.set_major_formatter(FixedFormatter([f"{db:.0f} dB\n{100 * _rms(db):.2g} %" for db in ticks]))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylabel("error of the worst frame against the exact one:\nPSNR, and root mean square of full brightness")
+    axes.set_ylabel("error of the worst frame against the exact one:\nPSNR and RMSE")
     times = [point["milliseconds"]["total"]["min"] for point in points]
     low, high = min(times) / 1.15, max(times) * 1.5
     places = [base * 10.0**power for power in range(-3, 6) for base in (1, 1.5, 2, 3, 4, 5, 7)]
@@ -87,9 +85,9 @@ def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> 
     axes.xaxis.set_minor_formatter(NullFormatter())
     machine = contents["machine"]
     axes.set_xlabel(
-        f"milliseconds a frame, deformation and drawing ({machine['processor']}, {machine['threads']} threads)"
+        f"milliseconds per frame, deformation and drawing ({machine['processor']}, {machine['threads']} threads)"
     )
-    axes.set_title("Every dot is a way to store this scene. Further left is faster, further down is closer to exact.")
+    axes.set_title("Each point is one way to store this scene: left is faster, down is more exact.")
     axes.grid(alpha=0.3, which="major")
 
 
@@ -103,5 +101,5 @@ def _places(points: list[dict[str, Any]]) -> tuple[list[float], list[float]]:
 
 
 def _rms(db: float) -> float:
-    """Root mean square error of a PSNR, in parts of full brightness."""
+    """RMSE of a PSNR, values in [0, 1]."""
     return 10 ** (-db / 20)

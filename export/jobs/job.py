@@ -1,4 +1,4 @@
-"""One model file, and what all its exports share: exact frames, evidence for trimming, and candidates by plan."""
+"""The exports of one model file: candidates by plan, exact frames and pruning statistics that all of them use."""
 
 import hashlib
 from collections.abc import Callable, Collection, Sequence
@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from export.jobs.bake import Baked
-from export.measure.rendered_error import ExactFrames, RenderedError, posed
+from export.measure.poses import posed
+from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.stability import MIN_PSNR, StabilityReport, assess
-from export.measure.views import cameras_of, deciding_views, measuring_views
-from export.plans.registry import build, parse
-from export.pruning import RULES, Cut, Evidence, TrimmedModel, trim, trimmed_model, whole
-from export.pruning.bake import bake_trimmed
-from export.pruning.mask import rows, untrimmed, with_sh_degree
+from export.measure.views import cameras_of, evaluation_views, selection_views
+from export.plans.registry import build, plan_of
+from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
+from export.pruning.bake import bake_pruned
+from export.pruning.mask import rows, unpruned, with_sh_degree
 from export.trajectories.sampling import SomeTrajectories, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
@@ -24,65 +25,65 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model_file import load_model
 
-MEASURING_TIMES, CAMERAS_A_TIME = 16, 3
-DECIDING_TIMES = 33
+EVALUATION_TIMES, CAMERAS_PER_TIME = 16, 3
+SELECTION_TIMES = 33
 BACK_OFFS = 4
-"""How often trimming is repeated more carefully where its parts together are worse than each promised."""
+"""How often pruning is repeated with a smaller error if its rules together cost more than each of them did."""
 
 BACK_OFF_DB = 0.5
 STABILITY_TIMES = 8
 SAMPLED_KEPT = 2
-"""Sets of trajectories that are kept; one takes up to 2 GiB."""
+"""Sets of trajectories in the cache; one takes up to 2 GiB."""
 
-Progress = Callable[[str, int], Callable[[], object]]
-"""Called with what begins and how many steps it has; returns what is to be called after each."""
+Track = Callable[[str, int], Callable[[], object]]
+"""Called with the name of a task and its number of steps; returns a function to call after each step."""
 
 
-class Unreachable(InvalidInput):
-    """No export of this model is as close to it as was asked for."""
+class TargetNotReached(InvalidInput):
+    """No export of this model reaches the PSNR that was asked for."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A scene file that could be the export, and how it was made."""
+    """A scene file that may be chosen as the export, and how it was made."""
 
     plan: str
-    trim_db: float | None  # what trimming alone may cost, dB on the worst frame; None: nothing was left out
-    trimmed: TrimmedModel
+    pruning_db: float | None  # PSNR of the worst frame that pruning alone may lead to, dB; None: not pruned
+    pruned: PrunedModel
     path: Path
-    options: RasterizerOptions  # what it is drawn with
+    options: RasterizerOptions  # of its frames
 
     @cached_property
     def session(self) -> DeformationSession:
-        """The file, opened when it is first asked for."""
+        """The file, opened on first use."""
         return DeformationSession(self.path)
 
     @cached_property
     def digest(self) -> bytes:
-        """Of the file."""
+        """SHA-256 of the file."""
         return hashlib.sha256(self.path.read_bytes()).digest()
 
     def close(self) -> None:
-        """Give back the memory of the open file."""
+        """Release the memory of the open file."""
         self.__dict__.pop("session", None)
 
     @property
     def sh_degree(self) -> int:
         """Of its colors."""
-        return self.trimmed.moving.config.sh_degree
+        return self.pruned.moving.config.sh_degree
 
     @property
     def size(self) -> int:
-        """Bytes on disk."""
+        """Bytes of the file."""
         return self.path.stat().st_size
 
 
 def no_progress(what: str, steps: int) -> Callable[[], object]:
-    """Tell nobody."""
+    """Ignore progress."""
     return lambda: None
 
 
-class Job:
+class ExportJob:
     """Exports of one model file; candidates are written into `folder`."""
 
     def __init__(
@@ -93,118 +94,106 @@ class Job:
         min_psnr: float = MIN_PSNR,
         rules: Collection[str] = tuple(RULES),
         training: Sequence[Camera] = (),
-        progress: Progress = no_progress,
+        progress: Track = no_progress,
     ) -> None:
-        """`training` are the cameras of the training images, where at hand. Raises `CheckpointInvalid`."""
+        """`training` are the cameras of the training images, if known. Raises `CheckpointInvalid`."""
         self.folder, self.min_psnr, self.rules, self.progress = folder, min_psnr, rules, progress
         self.model, self.info, _ = load_model(checkpoint)
         with checkpoint.open("rb") as file:
             self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         self.cameras = cameras_of(self.info, training)
         self._files = 0
-        self._trimmed: dict[float | None, TrimmedModel] = {None: untrimmed(self.model)}
-        self._stability: StabilityReport | None = None
-        self._evidence: Evidence | None = None
+        self._pruned: dict[float | None, PrunedModel] = {None: unpruned(self.model)}
         self._sampled: list[tuple[bytes, np.ndarray, Trajectories]] = []
-        self._exact: ExactFrames | None = None
 
-    @property
+    @cached_property
     def exact(self) -> ExactFrames:
-        """Frames in float64, computed when they are first asked for."""
-        if self._exact is None:
-            views = measuring_views(self.cameras, self.info.time_range, MEASURING_TIMES, CAMERAS_A_TIME)
-            on_frame = self.progress("exact frames in float64", len(views))
-            self._exact = ExactFrames(self.model, views, self.info.background, on_frame)
-        return self._exact
+        """Frames in float64, computed on first use."""
+        views = evaluation_views(self.cameras, self.info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
+        return ExactFrames(
+            self.model, views, self.info.background, self.progress("exact frames in float64", len(views))
+        )
 
-    @property
-    def evidence(self) -> Evidence:
-        """What trimming decides by, computed when it is first asked for."""
-        if self._evidence is None:
-            views = deciding_views(self.cameras, self.info.time_range, DECIDING_TIMES)
-            on_time = self.progress("what moves, and what is seen", DECIDING_TIMES)
-            self._evidence = Evidence(self.model, views, self.info.background, on_time)
-        return self._evidence
+    @cached_property
+    def statistics(self) -> PruningStatistics:
+        """What pruning decides by, computed on first use."""
+        views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES)
+        on_time = self.progress("motion and visibility of the Gaussians", SELECTION_TIMES)
+        return PruningStatistics(self.model, views, self.info.background, on_time)
 
-    def trimmed(self, trim_db: float | None) -> TrimmedModel:
-        """The model without what `trim_db` dB on the worst frame allow to leave out.
+    def pruned(self, pruning_db: float | None) -> PrunedModel:
+        """The model without what can be removed while the worst frame stays at `pruning_db` dB.
 
-        Frames of all rules together, at other times than those that decided, are held to it as well; where they
-        are worse, trimming is repeated more carefully.
+        It is checked again in the evaluation views, at other times than the selection views; if it is worse there,
+        pruning is repeated with a smaller error.
         """
-        if trim_db not in self._trimmed:
-            assert trim_db is not None
-            self._trimmed[trim_db] = self._checked_trim(trim_db) if self.rules else self._trimmed[None]
-        return self._trimmed[trim_db]
+        if pruning_db not in self._pruned:
+            assert pruning_db is not None
+            self._pruned[pruning_db] = self._checked_pruning(pruning_db) if self.rules else self._pruned[None]
+        return self._pruned[pruning_db]
 
-    def candidate(self, plan: str, trim_db: float | None, sh_degree: int | None = None) -> Candidate:
+    def candidate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> Candidate:
         """Write a scene file. Raises `InvalidInput` for a plan that this scene can't have, `PlanUnsafe` for one whose
-        round-off would be seen."""
+        round-off would be visible."""
         self.stability.require(plan)
-        trimmed = self.trimmed(trim_db)
+        model = self.pruned(pruning_db)
         if sh_degree is not None:
-            trimmed = with_sh_degree(trimmed, sh_degree)
-        return self._written(plan, trim_db, trimmed)
+            model = with_sh_degree(model, sh_degree)
+        return self._written(plan, pruning_db, model)
 
-    @property
+    @cached_property
     def stability(self) -> StabilityReport:
-        """How far float32 is from float64 where layers run when a frame is served."""
-        if self._stability is None:
-            on_time = self.progress("stability of the layers", STABILITY_TIMES)
-            found = assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
-            self._stability = found
-        return self._stability
-
-    def exact_pose(self, t: float) -> Gaussians:
-        """All Gaussians of the model in float64."""
-        return self.exact.pose(t)
+        """How far layers in float32 are from float64, computed on first use."""
+        on_time = self.progress("stability of the layers", STABILITY_TIMES)
+        return assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
 
     def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
-        """How far its frames are from exact ones; all of those kept, or every n-th."""
-        pose, ids = candidate.session.gaussians, candidate.trimmed.ids
+        """The error of its frames against exact ones; of all of them or of every n-th."""
+        pose, ids = candidate.session.gaussians, candidate.pruned.ids
         return self.exact.measure(pose, ids, options=candidate.options, every=every)
 
-    def _checked_trim(self, trim_db: float) -> TrimmedModel:
-        least_db = trim_db
+    def _checked_pruning(self, pruning_db: float) -> PrunedModel:
+        min_db = pruning_db
         for _ in range(BACK_OFFS):
-            on_rule = self.progress(f"trimming to {trim_db:g} dB", len(self.rules))
-            cut, left_out = trim(self.evidence, least_db, self.rules, on_rule)
+            on_rule = self.progress(f"pruning to {pruning_db:g} dB", len(self.rules))
+            mask, left_out = prune(self.statistics, min_db, self.rules, on_rule)
             if not left_out:
                 break
-            trimmed = trimmed_model(self.evidence, cut, left_out)
-            worst_db = self._worst_db(cut, trimmed)
-            if worst_db >= trim_db:
-                return trimmed
-            least_db += trim_db - worst_db + BACK_OFF_DB
-        return self._trimmed[None]
+            mean_poses = self.statistics.poses(mask.network).static
+            smaller = pruned(self.model, mask, mean_poses, left_out)
+            worst_db = self._worst_db(mask, smaller)
+            if worst_db >= pruning_db:
+                return smaller
+            min_db += pruning_db - worst_db + BACK_OFF_DB
+        return self._pruned[None]
 
-    def _worst_db(self, cut: Cut, trimmed: TrimmedModel) -> float:
-        """PSNR of the worst of the measured frames of a trimmed model. Where its layers are all that there were, what
-        moves is where it was in the exact frames, and no layer is run again."""
-        layers_changed = cut.moves.any() and cut.network != whole(self.model).network
-        moving = cut.ids[: len(trimmed.moving.gaussians)]
+    def _worst_db(self, mask: PruningMask, pruned: PrunedModel) -> float:
+        """PSNR of the worst evaluation frame of a pruned model. If its network is complete, moving Gaussians take the
+        poses of the exact frames, and no layer is run again."""
+        layers_changed = mask.moves.any() and mask.network != full_mask(self.model).network
+        moving = mask.ids[: len(pruned.moving.gaussians)]
 
         def pose(t: float) -> Gaussians:
-            moved = posed(trimmed.moving, t) if layers_changed else rows(self.exact.kept(t), moving, 0)
-            still = trimmed.still
-            colors = rows(self.exact.kept(t), cut.ids, cut.sh_degree)
+            moved = posed(pruned.moving, t) if layers_changed else rows(self.exact.kept(t), moving, 0)
+            static = pruned.static
+            colors = rows(self.exact.kept(t), mask.ids, mask.sh_degree)
             parts = ("means", "quats", "scales")
-            arrays = [np.concatenate([getattr(moved, part), getattr(still, part)]) for part in parts]
+            arrays = [np.concatenate([getattr(moved, part), getattr(static, part)]) for part in parts]
             return Gaussians(*(a.astype(np.float32) for a in (*arrays, colors.opacities, colors.sh)))
 
-        return self.exact.measure(pose, trimmed.ids).psnr_worst
+        return self.exact.measure(pose, pruned.ids).psnr_worst
 
-    def _written(self, plan: str, trim_db: float | None, trimmed: TrimmedModel) -> Candidate:
+    def _written(self, plan: str, pruning_db: float | None, pruned: PrunedModel) -> Candidate:
         self._files += 1
         path = self.folder / f"{self._files}.onnx"
-        baked, sampled = bake_trimmed(trimmed, self.info, self.sha256), None
-        if parse(plan).fitted and len(baked.moving):
-            sampled = self._trajectories(baked, trimmed.ids[: len(baked.moving)])
+        baked, sampled = bake_pruned(pruned, self.info, self.sha256), None
+        if plan_of(plan).fitted and len(baked.moving):
+            sampled = self._trajectories(baked, pruned.ids[: len(baked.moving)])
         path.write_bytes(build(plan, baked, sampled).SerializeToString())
-        return Candidate(plan, trim_db, trimmed, path, self.model.rasterizer)
+        return Candidate(plan, pruning_db, pruned, path, self.model.rasterizer)
 
     def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
-        """Those of the model's Gaussians `ids`, ascending, sampled once: what is trimmed further moves as before."""
+        """Of the model's Gaussians `ids`, ascending; sampled once, since pruning doesn't change their motion."""
         layers = layers_digest(baked)
         for known_layers, known, sampled in self._sampled:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
@@ -214,13 +203,13 @@ class Job:
         return sampled
 
     def _on_time(self, count: int) -> Callable[[int, int], object]:
-        """Tells of sampling; where motion is fast there is more to do than was known, which is another step."""
+        """Progress of sampling; fast motion is sampled more densely, which is shown as another task."""
         known, on_step = 0, self.progress("", 0)
 
         def on_time(done: int, total: int) -> None:
             nonlocal known, on_step
             if total != known:
-                what = f"{count:,} trajectories" if not known else "faster ones, sampled more densely"
+                what = f"{count:,} trajectories" if not known else "fast ones, sampled more densely"
                 known, on_step = total, self.progress(what, total - known)
             on_step()
 

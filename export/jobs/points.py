@@ -12,8 +12,8 @@ DEFAULT_RASTERIZER = "default"
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """A quick look at a candidate: some of its frames, and the processor time of one.
+class QuickEstimate:
+    """A quick estimate of a candidate: the error of some of its frames, and the processor time of one.
 
     Processor time is added up over threads; unlike time on the clock it hardly depends on what else a machine does.
     """
@@ -24,15 +24,15 @@ class Look:
     cpu_deformation: float  # of these
     worst_db: float  # PSNR of the worst frame looked at
 
-    def dominates(self, other: "Look", *, time_margin: float, db_margin: float) -> bool:
-        """Whether it is faster and closer than another, by more than looks may be wrong by."""
+    def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
+        """Whether it is faster and has a smaller error than another, by more than the margins."""
         faster = self.cpu * time_margin < other.cpu
         return faster and self.worst_db > other.worst_db + db_margin
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
         quick = {"cpu_milliseconds": self.cpu, "psnr_worst": self.worst_db}
-        return named(self.candidate, self.rasterizer) | {"quick_look": quick}
+        return named(self.candidate, self.rasterizer) | {"quick_estimate": quick}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +44,11 @@ class Point:
     time: FrameTime
     error: RenderedError
     memory: int | None  # bytes at the peak of a frame
-    images_db: float | None
+    images_psnr: float | None
 
     @property
     def milliseconds(self) -> float:
-        """Of a whole frame, the least of the repeats."""
+        """Minimum over the repeats of a whole frame."""
         return self.time.total.min
 
     def to_plain(self) -> dict[str, Any]:
@@ -62,21 +62,21 @@ class Point:
             "memory_bytes": self.memory,
             "milliseconds": self.time.to_plain(),
             "error": self.error.to_plain(),
-            "photographs_psnr": self.images_db,
+            "images_psnr": self.images_psnr,
             "left_out": list(scene.metadata.left_out),
         }
 
 
 def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
-    """What a point is."""
+    """The keys that identify a point."""
     c = candidate
-    return {"plan": c.plan, "trim_db": c.trim_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
+    return {"plan": c.plan, "pruning_db": c.pruning_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
 
 
 def front(points: Sequence[Point]) -> list[int]:
-    """Indices of the points that no other is both faster than and at least as close as, the fastest first.
+    """Indices of the points on the Pareto front of time and error, the fastest first.
 
-    Only those drawn as the service draws them: no file can ask for other rasterizer options.
+    Only those with default rasterizer options, since a file can't ask for others.
     """
     usual = [i for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
     best, kept = -1.0, []

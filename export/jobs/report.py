@@ -1,4 +1,4 @@
-"""What a sweep has found, for people and programs: `model.report.json`, `.md` and `.png` beside the scene file."""
+"""The report of a sweep: `model.report.json`, `.md` and `.png` beside the scene file."""
 
 import json
 import platform
@@ -7,31 +7,32 @@ from pathlib import Path
 from typing import Any
 
 from export.jobs.figure import draw
-from export.jobs.job import CAMERAS_A_TIME, DECIDING_TIMES, MEASURING_TIMES, Job
+from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, SELECTION_TIMES, ExportJob
 from export.jobs.points import DEFAULT_RASTERIZER, front
 from export.jobs.sweep import SweepResult
+from export.plans.base import BASELINE
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
-from msdgs_train.files import replacing, write_text
+from msdgs_train.datasets.common.files import replacing, write_text
 
 FORMAT = "msdgs-report/1"
-COLUMNS = ("", "plan", "trimmed to", "SH", "rasterizer", "moving", "still", "ms", "median", "deform", "draw", "MB",
-           "memory", "worst frame", "mean", "worst pixel", "position", "px", "images")  # fmt: skip
+COLUMNS = ("", "plan", "pruned to", "SH", "rasterizer", "moving", "static", "ms", "median", "deform", "draw", "MB",
+           "memory", "worst frame", "mean", "worst pixel", "position", "px", "held-out")  # fmt: skip
 LEGEND = """\
-- **◆ on the front**: no other point is both faster and closer. **★ chosen**: the fastest within the error allowed.
-- **trimmed to**: dB on the worst frame that leaving things out may cost; "–": nothing was left out.
-- **ms**: a frame, deformation and rasterization together; least and median of interleaved repeats, mean of three views.
-- **memory**: at the peak of loading the file and drawing a frame, above what the process holds anyway.
+- **◆ on the front**: no other point is faster and closer. **★ chosen**: the fastest within the error allowed.
+- **pruned to**: PSNR of the worst frame that pruning alone may lead to; "–": not pruned.
+- **ms**: per frame, deformation and rasterization; minimum and median of interleaved repeats, mean of three views.
+- **memory**: peak while loading the file and drawing a frame, above that of the idle process.
 - **worst frame**, **mean**: PSNR in dB against frames of the exact network, deformation and rasterizer in float64.
-- **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: how far a Gaussian is at most from
-  where it belongs, in scene units and in pixels, faint and hidden ones included.
-- **images**: mean PSNR in dB against images that training has not seen.
-- Points with other rasterizer options show what these would buy; no file asks for them, so none is chosen.
+- **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
+  a Gaussian, in scene units and in pixels, faint and hidden ones included.
+- **held-out**: mean PSNR in dB against held-out images.
+- Points with other rasterizer options show what these would gain; no file can ask for them, so none is chosen.
 """
 
 
-def report(job: Job, result: SweepResult) -> dict[str, Any]:
-    """The whole report as plain values. Errors are the same for the same model; times are this machine's."""
+def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
+    """The report as plain values. Errors are reproducible; times are those of this machine."""
     ahead = set(front(result.points))
     points = [
         {"front": i in ahead, "chosen": i == result.chosen, **point.to_plain()} for i, point in enumerate(result.points)
@@ -44,22 +45,22 @@ def report(job: Job, result: SweepResult) -> dict[str, Any]:
         "min_psnr": job.min_psnr,
         "views": {
             "cameras": len(job.cameras),
-            "measured_frames": len(job.exact.views),
-            "measured_times": MEASURING_TIMES,
-            "cameras_a_time": CAMERAS_A_TIME,
-            "deciding_times": DECIDING_TIMES,
+            "evaluation_frames": len(job.exact.views),
+            "evaluation_times": EVALUATION_TIMES,
+            "cameras_per_time": CAMERAS_PER_TIME,
+            "selection_times": SELECTION_TIMES,
             "width": job.exact.views[0].camera.width,
             "height": job.exact.views[0].camera.height,
         },
-        "exact_photographs_psnr": result.exact_images_db,
+        "exact_images_psnr": result.exact_images_psnr,
         "points": points,
-        "dropped": [look.to_plain() for look in result.looks],
+        "dropped": [estimate.to_plain() for estimate in result.estimates],
         "refused": [{"plan": plan, "why": why} for plan, why in result.refused],
     }
 
 
 def write_report(contents: dict[str, Any], scene: Path) -> list[Path]:
-    """Write the three files beside a scene file, each whole or not at all; returns their paths."""
+    """Write the three files beside a scene file, each atomically; returns their paths."""
     paths = [scene.with_suffix(f".report{ending}") for ending in (".json", ".md", ".png")]
     write_text(paths[0], json.dumps(contents, indent=1, allow_nan=False) + "\n")
     write_text(paths[1], markdown(contents, scene.name, paths[2].name))
@@ -71,21 +72,21 @@ def write_report(contents: dict[str, Any], scene: Path) -> list[Path]:
 def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
     """The report as a page."""
     machine, views = contents["machine"], contents["views"]
-    exact = contents["exact_photographs_psnr"]
+    exact = contents["exact_images_psnr"]
     chosen = next(point for point in contents["points"] if point["chosen"])
     left_out = [f"- {entry['what']}: {entry['count']:,} of {entry['of']:,}" for entry in chosen["left_out"]]
     where = [
         f"{machine['processor']}, {machine['threads']} threads.",
-        f"{views['measured_frames']} frames of {views['width']} × {views['height']} were compared.",
+        f"{views['evaluation_frames']} frames of {views['width']} × {views['height']} were compared.",
         f"Allowed: {contents['min_psnr']:g} dB on the worst frame.",
-        f"The exact network has {exact:.2f} dB against the images." if exact is not None else "",
+        f"The exact network has {exact:.2f} dB against held-out images." if exact is not None else "",
     ]
     lines = [
         f"# {scene}: error against run time",
         "",
         " ".join(where).strip(),
         "",
-        f"![error against milliseconds a frame]({figure})",
+        f"![error against milliseconds per frame]({figure})",
         "",
         "| " + " | ".join(COLUMNS) + " |",
         "|" + "---|" * len(COLUMNS),
@@ -94,9 +95,9 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
         LEGEND,
         gain(contents),
         "",
-        f"After a quick look {len(contents['dropped'])} more candidates were left: others were faster and closer.",
+        f"After a quick estimate {len(contents['dropped'])} more candidates were dropped: others are better.",
         "",
-        "Left out of the chosen file:" if left_out else "Nothing was left out of the chosen file.",
+        "Pruned from the chosen file:" if left_out else "Nothing was pruned from the chosen file.",
         "",
         *left_out,
     ]
@@ -104,12 +105,14 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
 
 
 def gain(contents: dict[str, Any]) -> str:
-    """One sentence: what the chosen point takes against all layers as trained, where these were measured."""
+    """One sentence: times of the chosen point, and against all layers as trained if these were measured."""
     points, views = contents["points"], contents["views"]
     chosen = next(point for point in points if point["chosen"])
-    whole = [p for p in points if p["plan"] == "network" and p["trim_db"] is None and not p["chosen"]]
+    whole = [p for p in points if p["plan"] == BASELINE and p["pruning_db"] is None and not p["chosen"]]
     took, drawing = (chosen["milliseconds"][part]["min"] for part in ("deformation", "rasterization"))
-    text = f"Deformation takes {took:.1f} ms a frame, drawing {drawing:.1f} ms at {views['width']} × {views['height']}"
+    text = (
+        f"Deformation takes {took:.1f} ms per frame, drawing {drawing:.1f} ms at {views['width']} × {views['height']}"
+    )
     if not whole:
         return f"{text}."
     before = whole[0]["milliseconds"]["deformation"]["min"]
@@ -125,11 +128,11 @@ def rows(contents: dict[str, Any]) -> list[Sequence[str]]:
 def _row(point: dict[str, Any]) -> list[str]:
     times, error = point["milliseconds"], point["error"]
     mark = "★" if point["chosen"] else "◆" if point["front"] else ""
-    memory, images = point["memory_bytes"], point["photographs_psnr"]
+    memory, images = point["memory_bytes"], point["images_psnr"]
     return [
         mark,
         point["plan"],
-        "–" if point["trim_db"] is None else f"{point['trim_db']:g} dB",
+        "–" if point["pruning_db"] is None else f"{point['pruning_db']:g} dB",
         str(point["sh_degree"]),
         "" if point["rasterizer"] == DEFAULT_RASTERIZER else point["rasterizer"],
         f"{point['moving']:,}",
@@ -150,7 +153,7 @@ def _row(point: dict[str, Any]) -> list[str]:
 
 
 def processor() -> str:
-    """The processor's name as the system gives it."""
+    """The name of the processor."""
     cpuinfo = Path("/proc/cpuinfo")
     names = (
         [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")] if cpuinfo.exists() else []

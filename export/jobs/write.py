@@ -1,4 +1,4 @@
-"""A graph in, a proven scene file out."""
+"""Writing and verifying a scene file."""
 
 import json
 import math
@@ -11,17 +11,16 @@ import onnx
 from onnx import helper
 
 from export.measure.verify import TIMES, TOLERANCE, verify
+from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import SceneMetadata
-from msdgs_train.files import replacing
+from msdgs_train.datasets.common.files import replacing
 from msdgs_train.gaussians.model import DynamicGaussians
-
-PLAN = "network"
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """A scene file that was written."""
 
     path: Path
     size: int  # bytes
@@ -49,17 +48,17 @@ def write_scene(
     `rendered` is what is known of its frames, and goes into its metadata. With it, a plan that computes something
     else than the model's own layers isn't held to `tolerance`: its frames have been judged.
     """
-    exact = rendered is None or properties(contents)["plan"] == PLAN
+    exact = rendered is None or properties(contents)["plan"] == BASELINE
     with replacing(output) as temporary:
         temporary.write_bytes(contents.SerializeToString())
         session, allowed = DeformationSession(temporary), tolerance if exact else math.inf
         measured = verify(session, model, times=times, tolerance=allowed, on_time=on_time)
-        measured = properties(contents)["measured_error"] | measured  # what a fitted plan knows of itself stays
+        measured = properties(contents)["measured_error"] | measured  # keeps the error bound of a fitted plan
         if rendered is not None:
             measured |= {"rendered": rendered}
         helper.set_model_props(contents, _as_texts(properties(contents) | {"measured_error": measured}))
         temporary.write_bytes(contents.SerializeToString())
-        scene = DeformationSession(temporary).scene  # only its metadata is new, and it must be whole like the first
+        scene = DeformationSession(temporary).scene  # opened again: its metadata has changed
     return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
 
 

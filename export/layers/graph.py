@@ -1,4 +1,4 @@
-"""A small builder of ONNX graphs: constants and nodes, each with a name that a reader of the graph understands."""
+"""A small builder of ONNX graphs of named constants and nodes."""
 
 from typing import Any
 

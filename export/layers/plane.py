@@ -1,18 +1,46 @@
-"""A plane layer as a graph of gathers and interpolations, which run faster than GridSample on a CPU."""
+"""A layer of kind `plane` as a graph of gathers and interpolations, which are faster than GridSample on a CPU."""
+
+import copy
+from typing import cast
 
 import numpy as np
 import torch
 from onnx import TensorProto
 
+from export.layers.base import HEADS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
 from export.layers.graph import GraphBuilder, to_numpy
+from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
 FIRST_AXES = np.array([0, 0, 1], np.int64)  # of the planes xy, xz, yz
 SECOND_AXES = np.array([1, 2, 2], np.int64)
 
 
-def plane_heads(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str, rows: np.ndarray) -> str:
-    """[M, len(rows)] what the heads of one layer say of means [M, 3]: deltas, then the weight before its sigmoid."""
+class PlaneExport(FieldLayerExport):
+    """Of `PlaneLayer`."""
+
+    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+        """Features of the planes, then a hidden layer and a product for each head."""
+        layer = cast(PlaneLayer, inputs.layer)
+        rows = output_rows(used, layer.outputs.weight)
+        outputs = _outputs(graph, inputs.name, layer, inputs.means, inputs.time, rows)
+        return weighted(graph, inputs, outputs, len(rows), layer.outputs.weight)
+
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
+        """Heads whose Linear is all 0."""
+        heads = zip(HEADS, cast(PlaneLayer, layer).heads, strict=False)  # the weight's comes after those of the deltas
+        return frozenset(name for name, head in heads if not any(p.any() for p in head.parameters()))
+
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
+        """Linears of heads set to 0."""
+        layer = copy.deepcopy(cast(PlaneLayer, layer))
+        for name in names:
+            zero(*layer.heads[HEADS.index(name)].parameters())
+        return layer
+
+
+def _outputs(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str, rows: np.ndarray) -> str:
+    """[M, len(rows)] deltas, then the logit of the weight, of means [M, 3]."""
     read = [_features(graph, f"{name}.grid{i}", grid, means, time) for i, grid in enumerate(layer.plane_grids())]
     features = graph.node("Concat", read, f"{name}.features", axis=1) if len(read) > 1 else read[0]
     hidden = _affine(graph, f"{name}.features.linear", features, layer.features.weight, layer.features.bias)

@@ -1,4 +1,4 @@
-"""Memory that one frame of a scene file takes, measured in a process that loads what serving needs and no more.
+"""Memory of one frame of a scene file, measured in a process that loads only what serving needs.
 
 `frame_memory` runs this file as that process: it reads a request on standard input and prints a list of bytes.
 """
@@ -23,11 +23,11 @@ from msdgs_serve.scene.metadata import SceneCamera
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 RESET_PEAK = "5"
 EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALLOC_ARENA_MAX": "1"}
-"""Makes glibc give back at once what is freed; else a file would be drawn in memory that another one has left."""
+"""Makes glibc return freed memory at once; otherwise a file would reuse memory of the one before."""
 
 
 def frame_memory(paths: Sequence[Path], view: SceneCamera) -> list[int | None]:
-    """Bytes at the peak of loading each file and drawing a frame of it, above what the process holds before."""
+    """Peak bytes of loading each file and drawing a frame of it, above those of the process before."""
     request = {"paths": [str(path) for path in paths], "view": view.to_plain()}
     command = [sys.executable, str(Path(__file__).resolve())]
     done = subprocess.run(
@@ -41,7 +41,7 @@ def main() -> None:
     request: dict[str, Any] = json.load(sys.stdin)
     view = SceneCamera.from_plain(request["view"])
     for path in request["paths"][:1]:
-        _draw(path, view)  # what is loaded and compiled once belongs to no file
+        _draw(path, view)  # libraries and kernels that are loaded once don't count
     print(json.dumps([_peak(path, view) for path in request["paths"]]))
 
 

@@ -1,31 +1,31 @@
-"""Images of a scene that training has not seen, to compare an export's frames with."""
+"""Held-out images of a dataset, which frames of an export are compared with."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from export.measure.rendered_error import Pose, shown
+from export.measure.frames import compare, render
+from export.measure.rendered_error import Pose
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.model_file import SceneInfo
 
-MOST = 24
+MAX_IMAGES = 24
 """Images compared with; of more, evenly spread ones."""
 
 
-class Images:
+class HeldOutImages:
     """Held-out images over the scene's background, and the cameras of those that were trained on."""
 
     def __init__(self, folder: Path, info: SceneInfo, begin: Callable[[int], Callable[[], object]]) -> None:
-        """Raises `DatasetInvalid` or `InvalidInput` where the folder holds no dataset."""
+        """Raises `DatasetInvalid` or `InvalidInput` if the folder holds no dataset."""
         data = load_scene(folder, int(info.cameras[0]["width"]) if info.cameras else None)
         t0, t1 = info.time_range
         self.training: list[Camera] = [frame.camera for frame in data.splits["train"]]
         held_out = [frame for frame in data.splits["test"] or data.splits["val"] if t0 <= frame.t <= t1]
-        chosen = np.linspace(0, len(held_out) - 1, min(MOST, len(held_out))).round().astype(int)
+        chosen = np.linspace(0, len(held_out) - 1, min(MAX_IMAGES, len(held_out))).round().astype(int)
         self._frames: list[tuple[Frame, np.ndarray]] = []
         self._background = info.background
         on_image = begin(len(chosen))
@@ -34,9 +34,9 @@ class Images:
             on_image()
 
     def psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
-        """Mean PSNR in dB over the images, as papers report it; None where there are none."""
+        """Mean PSNR in dB over the images, as papers report it; None if there are none."""
         values = []
-        for frame, truth in self._frames:
-            rgb = shown(pose(frame.t), frame.camera, self._background, options)
-            values.append(psnr_from_mse(float(np.mean(np.square(rgb - truth, dtype=np.float64)))))
+        for frame, target in self._frames:
+            rgb = render(pose(frame.t), frame.camera, self._background, options)
+            values.append(compare(rgb, target).psnr)
         return float(np.mean(values)) if values else None

@@ -1,4 +1,4 @@
-"""What an export changed, in rendered pixels: its frames against those of the exact network in float64."""
+"""The rendered error of an export: its frames against those of the exact network in float64."""
 
 import copy
 import itertools
@@ -7,26 +7,26 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
+from export.measure.frames import compare, in_frame, project, render
+from export.measure.poses import posed
 from export.measure.views import View
-from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
+from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
-from msdgs_train.evaluation.metrics import psnr_from_mse
-from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 
 MEMORY = 768e6
-"""Bytes of exact frames and poses that are kept; with larger images fewer views are."""
+"""Bytes of exact frames and poses that are stored; with larger images there are fewer views."""
 
 POSE_BYTES = 52
-"""Of a Gaussian at one time: its mean in float64, the rest in float32."""
+"""Per Gaussian and time: its mean in float64, the rest in float32."""
 
 Pose = Callable[[float], Gaussians]
 
 
 class WorstFrame(NamedTuple):
-    """Which frame is furthest off."""
+    """The frame with the largest error."""
 
     camera: str
     t: float
@@ -34,14 +34,14 @@ class WorstFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class RenderedError:
-    """How far frames are from exact ones. Images are compared as they are shown, cut to [0, 1]."""
+    """Error of frames against exact ones, both clamped to [0, 1]."""
 
     psnr_mean: float  # dB, mean over frames of their PSNR; at most 100
     psnr_worst: float  # dB, of the worst frame
-    worst_frame: WorstFrame | None  # None where nothing was drawn
+    worst_frame: WorstFrame | None  # None if nothing was drawn
     worst_pixel: float  # largest difference of a channel, in [0, 1]
-    position: float  # largest distance of a Gaussian that is left from where it belongs, scene units
-    position_pixels: float  # the same in an image, of the Gaussians that lie within it
+    position: float  # largest displacement of a Gaussian, scene units
+    position_pixels: float  # the same in pixels, of Gaussians inside the image
     frames: int
 
     def to_plain(self) -> dict[str, Any]:
@@ -50,7 +50,7 @@ class RenderedError:
 
 
 class ExactFrames:
-    """Frames of the model in float64, deformation and rasterizer, computed once and compared with many times over."""
+    """Frames of the model in float64, deformation and rasterizer, computed once and compared with many candidates."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class ExactFrames:
             first = next(iter(self._poses.values()), gaussians)
             self._poses[t] = Gaussians(gaussians.means, quats, scales, first.opacities, first.sh)
             for view in views_then:
-                self._frames.append(shown(gaussians, view.camera, background, model.rasterizer).astype(np.float32))
+                self._frames.append(render(gaussians, view.camera, background, model.rasterizer).astype(np.float32))
                 on_frame()
 
     def pose(self, t: float) -> Gaussians:
@@ -103,9 +103,9 @@ class ExactFrames:
             distances = np.linalg.norm(gaussians.means - exact_means, axis=1)
             position = max(position, float(distances.max(initial=0)))
             for view in views:
-                difference = np.abs(shown(gaussians, view.camera, self.background, options) - frames[id(view)])
-                psnrs.append(psnr_from_mse(float(np.mean(np.square(difference, dtype=np.float64)))))
-                worst_pixel = max(worst_pixel, float(difference.max()))
+                difference = compare(render(gaussians, view.camera, self.background, options), frames[id(view)])
+                psnrs.append(difference.psnr)
+                worst_pixel = max(worst_pixel, difference.worst_pixel)
                 offsets = _pixel_distances(view.camera, gaussians.means, exact_means)
                 position_pixels = max(position_pixels, float(offsets.max(initial=0)))
                 if psnrs[-1] < worst:
@@ -116,45 +116,19 @@ class ExactFrames:
 
 
 def by_time(views: Sequence[View]) -> Iterator[tuple[float, list[View]]]:
-    """Views that follow each other at one time, together."""
+    """Consecutive views of one time, grouped."""
     for t, group in itertools.groupby(views, key=lambda view: view.t):
         yield t, list(group)
 
 
 def within_memory(views: Sequence[View], gaussians: int) -> list[View]:
-    """As many of the views, evenly spread, as have room for their exact frames and poses."""
+    """As many of the views, evenly spread, as their exact frames and poses fit into `MEMORY`."""
     sizes = [12 * view.camera.width * view.camera.height + POSE_BYTES * gaussians for view in views]
     count = min(len(views), max(2, int(MEMORY / (sum(sizes) / len(sizes)))))
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
 
 
-@torch.no_grad()
-def posed(model: DynamicGaussians, t: float) -> Gaussians:
-    """The model's Gaussians at `t` in its own precision."""
-    return as_gaussians(model.pose(t))
-
-
-def as_gaussians(pose: PosedGaussians) -> Gaussians:
-    """The model's tensors as arrays."""
-    return Gaussians(*(tensor.detach().numpy() for tensor in pose))
-
-
-def shown(gaussians: Gaussians, camera: Camera, background: Sequence[float], options: RasterizerOptions) -> FloatArray:
-    """[H, W, 3] the frame as an image shows it, in [0, 1]."""
-    return np.clip(rasterize(gaussians, camera, background=background, options=options).rgb, 0, 1)
-
-
 def _pixel_distances(camera: Camera, got: FloatArray, exact: FloatArray) -> FloatArray:
-    """[M] how far apart two sets of points are in an image, of those that lie within it."""
-    imaged, depths = _projected(camera, exact)
-    inside = (depths > GSPLAT.near_plane) & (imaged >= 0).all(axis=1)
-    inside &= (imaged < [camera.width, camera.height]).all(axis=1)
-    return np.linalg.norm(_projected(camera, got[inside])[0] - imaged[inside], axis=1)
-
-
-def _projected(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels [M, 2] and depths [M]; points at the near plane and behind it are put there."""
-    in_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depths = in_camera[:, 2]
-    plane = in_camera[:, :2] / np.maximum(depths, GSPLAT.near_plane)[:, None]
-    return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy], depths
+    """[M] how far apart two sets of points are in a frame, of those that lie within it."""
+    inside = in_frame(exact, camera)
+    return np.linalg.norm(project(got[inside], camera)[0] - project(exact[inside], camera)[0], axis=1)

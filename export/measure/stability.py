@@ -1,38 +1,45 @@
-"""May a model's layers be computed in float32 when a frame is served? Measured in the image, foretold beforehand."""
+"""Whether a model's layers may be computed in float32 when a frame is served.
+
+Measured in frames, and predicted from how much the layers amplify errors.
+"""
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from export.measure.amplification import Growth, growth
-from export.measure.frames import NEAR, ImageGap, View, image_gap
-from export.measure.gap import PosedArrays, half_diagonal, largest_error, pose_arrays, pose_errors, usable_rows
+from export.measure.amplification import UNIT_ROUNDOFF, Growth, growth
+from export.measure.frames import NEAR, FrameDifference, PoseRenderer, compare
+from export.measure.poses import half_diagonal, largest_error, pose_errors, posed, usable_rows
 from export.measure.verify import times_to_verify
 from export.precision.formats import FLOAT32, Format, in_format
 from export.precision.limits import limits_met
 from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians
 from msdgs_serve.scene.camera import Camera
-from msdgs_train.gaussians.model import DynamicGaussians, carried
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MIN_PSNR = 50.0
-"""dB. Errors above it are invisible: the export's own default."""
+"""dB. Errors above it are invisible: the default of an export."""
 
 TIMES = 20
 SAMPLED = 2_000
-"""Gaussians whose amplification is followed at each time, others at each next one."""
+"""Gaussians per time whose amplification is computed; others at each next time."""
 
 FRAME_TIMES = 2
 FRAME_CAMERAS = 2
-"""Images are drawn at the times and from the cameras where float32 is furthest off."""
+"""Frames are drawn at the times and from the cameras with the largest errors of float32."""
 
-WORST_PART = 0.001
-"""The Gaussians looked at one by one."""
+WORST_FRACTION = 0.001
+"""Of the Gaussians: those with the largest errors, which are reported one by one."""
 
-NEAR_WORST = 1 - WORST_PART
+NEAR_WORST = 1 - WORST_FRACTION
+
+_Frames = list[tuple[Camera, np.ndarray]]
 
 
 def assess(
@@ -44,12 +51,13 @@ def assess(
     formats: Sequence[Format] = (FLOAT32,),
     on_time: Callable[[], object] = lambda: None,
 ) -> StabilityReport:
-    """Compare the model in float32, and in `formats`, with itself in float64: poses at `times` times, images at the
-    worst of them. `min_psnr`, in dB, is what counts as visible. The model isn't changed."""
+    """Compare the model in float32, and in `formats`, with itself in float64: poses at `times` times, frames at the
+    worst of them. Errors under `min_psnr`, in dB, count as visible. The model isn't changed."""
     if not len(model.deformation) or not len(model.gaussians):
         on_time()
-        return _at_rest(model, scene, min_psnr, times)
-    with np.errstate(over="ignore", invalid="ignore"):  # here they are findings
+        broken = _hidden(PoseRenderer(scene), model) if len(model.gaussians) else []
+        return StabilityReport(len(model.gaussians), times, min_psnr, limits_met(model, []), broken)
+    with np.errstate(over="ignore", invalid="ignore"):  # reported, not an accident
         return _Assessment(model, scene, min_psnr, formats).run(times, on_time)
 
 
@@ -63,22 +71,22 @@ class _Assessment:
         self.single = self.models[FLOAT32.name]
         self.double = in_format(model, Format("float64", torch.float64, torch.float64, "nowhere", "the reference"))
         self.mean_factors = _mean_factors(self.double)
-        self.view = View(scene, model.rasterizer)
+        self.renderer = PoseRenderer(scene, model.rasterizer)
 
     def run(self, times: int, on_time: Callable[[], object]) -> StabilityReport:
-        moments = []
+        found = []
         stride = max(1, math.ceil(self.count / SAMPLED))
         for i, t in enumerate(times_to_verify(*self.scene.time_range, times)):
-            moments.append(self._moment(t, np.arange(i % stride, self.count, stride)))
+            found.append(self._sample(t, np.arange(i % stride, self.count, stride)))
             on_time()
-        samples = _joined(moments)
-        by_error = sorted(moments, key=lambda m: np.quantile(m.errors[FLOAT32.name], NEAR_WORST, method="higher"))
-        frames = [self._frames(moment, samples) for moment in by_error[::-1][:FRAME_TIMES]]
-        gaps = [self._format_gap(f, moments, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
+        samples = _joined(found)
+        by_error = sorted(found, key=lambda m: np.quantile(m.errors[FLOAT32.name], NEAR_WORST, method="higher"))
+        frames = [self._frames(sample, samples) for sample in by_error[::-1][:FRAME_TIMES]]
+        gaps = [self._format_gap(f, found, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
         predicted = min(prediction for _, prediction, _ in frames)
         return StabilityReport(
             gaussians=self.count,
-            layers=list(self.model.config.layers),
+            layers=[layer.kind for layer in self.model.config.layers],
             times=times,
             min_psnr=self.min_psnr,
             median_amplification=float(np.median(samples.amplification)),
@@ -87,77 +95,86 @@ class _Assessment:
             predicted_psnr=predicted,
             formats=gaps,
             worst=frames[0][2],
-            limits=limits_met(self.double, [m.exact["scales"] for m in moments]),
-            broken=self._broken(moments),
-            unsteady=self._unsteady(gaps[0], predicted),
+            limits=limits_met(self.double, [sample.exact.scales for sample in found]),
+            broken=self._broken(found),
+            unstable=self._unstable(gaps[0], predicted),
             samples=samples,
         )
 
-    def _moment(self, t: float, ids: np.ndarray) -> "_Moment":
-        exact = pose_arrays(self.double, t, ids)
-        poses = {name: pose_arrays(model, t, ids) for name, model in self.models.items()}
+    def _sample(self, t: float, ids: np.ndarray) -> "_TimeSample":
+        exact = posed(self.double, t, ids)
+        poses = {name: posed(model, t, ids) for name, model in self.models.items()}
         errors = {name: largest_error(pose_errors(pose, exact, self.size)) for name, pose in poses.items()}
-        with torch.no_grad():
-            rows = self.double.gaussians.rows(torch.from_numpy(ids))
-            followed = carried(rows)
-        found = growth(self.double.deformation, self.single.deformation, rows.means, float(np.float32(t)), followed)
+        found = self._growth(ids, float(np.float32(t)))
         found = found._replace(predicted=found.predicted * self.mean_factors[ids])
-        return _Moment(t, ids, found, exact, poses[FLOAT32.name]["means"], errors)
+        return _TimeSample(t, ids, found, exact, poses[FLOAT32.name].means, errors)
 
-    def _broken(self, moments: list["_Moment"]) -> list[str]:
-        overflowed = sum(int((~usable_rows(moment.exact)).sum()) for moment in moments)
+    @torch.no_grad()
+    def _growth(self, ids: np.ndarray, t: float) -> Growth:
+        """Of the Gaussians `ids`. Followers of control nodes get the nodes', plus the measured round-off of skinning in
+        float32."""
+        double, single, rows = self.double, self.single, torch.from_numpy(ids)
+        points = double.canonical_points(double.gaussians.rows(rows))
+        found = growth(double.deformation, single.deformation, double.support.points(points), t)
+        if double.support.num_points is None:
+            return found
+
+        def spread(values: np.ndarray) -> np.ndarray:
+            return double.support.spread(torch.from_numpy(values), points.attributes).numpy()
+
+        moved = [
+            model.support(model.deformation, model.canonical_points(model.gaussians.rows(rows)), time, None).means
+            for model, time in ((double, torch.tensor(t, dtype=torch.float64)), (single, torch.tensor(t)))
+        ]
+        own = torch.linalg.vector_norm(moved[0] - moved[1].double(), dim=1).numpy()
+        own += UNIT_ROUNDOFF * torch.linalg.vector_norm(points.means, dim=1).numpy()
+        after = np.stack([spread(values) for values in found.after])
+        return Growth(after, spread(found.amplification), spread(found.predicted) + own)
+
+    def _broken(self, samples: list["_TimeSample"]) -> list[str]:
+        overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in samples)
         problems = [f"{overflowed:,} poses are NaN or infinite even in float64"] if overflowed else []
-        hidden = self.view.hidden_by_near_plane(self.double.gaussians.means.detach().numpy())
-        return [*problems, _hidden()] if hidden else problems
+        return problems + _hidden(self.renderer, self.double)
 
-    def _unsteady(self, gap: FormatGap, predicted: float) -> list[str]:
+    def _unstable(self, gap: FormatGap, predicted: float) -> list[str]:
         if gap.overflowed:
             return [f"{gap.overflowed:,} Gaussians overflow in float32"]
         if gap.psnr < self.min_psnr:
             return [f"float32 round-off is visible: {gap.psnr:.1f} dB in the worst frame, under {self.min_psnr:g}"]
         if predicted < self.min_psnr:
-            seen = (
-                f"none was at the times tried ({gap.psnr:.1f} dB), but its amplification lets expect {predicted:.1f} dB"
-            )
-            return [f"float32 round-off may be visible: {seen}, under {self.min_psnr:g}"]
+            found = f"{gap.psnr:.1f} dB at the times tried, but {predicted:.1f} dB predicted from the amplification"
+            return [f"float32 round-off may be visible: {found}, under {self.min_psnr:g}"]
         return []
 
-    def _frames(self, moment: "_Moment", samples: Samples) -> tuple[dict[str, "_FrameGap"], float, WorstGaussians]:
-        """Images of one time: gaps by format, dB of the predicted displacement, the worst Gaussians of float32."""
-        exact = pose_arrays(self.double, moment.t)
-        posed = {name: pose_arrays(model, moment.t) for name, model in self.models.items()}
-        cameras = self._cameras(posed[FLOAT32.name], exact)
-        pictures = [(camera, self.view.draw(exact, camera)) for camera in cameras]
-        gaps = {name: self._frame_gap(pose, exact, pictures) for name, pose in posed.items()}
-        displaced = exact | {"means": _displaced(exact["means"], moment, samples)}
-        predicted = min(image_gap(self.view.draw(displaced, c), picture).psnr for c, picture in pictures)
-        return gaps, predicted, self._worst(moment.t, posed[FLOAT32.name], exact, pictures)
+    def _frames(self, sample: "_TimeSample", joined: Samples) -> tuple[dict[str, "_FrameGap"], float, WorstGaussians]:
+        """Frames at one time: gaps by format, dB of the predicted displacement, the worst Gaussians of float32."""
+        exact = posed(self.double, sample.t)
+        poses = {name: posed(model, sample.t) for name, model in self.models.items()}
+        frames = [(c, self.renderer.draw(exact, c)) for c in self._cameras(poses[FLOAT32.name], exact)]
+        gaps = {name: self._frame_gap(pose, exact, frames) for name, pose in poses.items()}
+        displaced = replace(exact, means=_displaced(exact.means, sample, joined))
+        predicted = min(compare(self.renderer.draw(displaced, c), frame).psnr for c, frame in frames)
+        return gaps, predicted, self._worst(sample.t, poses[FLOAT32.name], exact, frames)
 
-    def _cameras(self, posed: PosedArrays, exact: PosedArrays) -> list[Camera]:
+    def _cameras(self, got: Gaussians, exact: Gaussians) -> list[Camera]:
         """Those from which the pose is furthest off, in pixels."""
-        gaps = [np.square(self.view.pixel_gaps(posed, exact, camera)).sum() for camera in self.view.cameras]
-        return [self.view.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]
+        gaps = [np.square(self.renderer.pixel_gaps(got, exact, camera)).sum() for camera in self.renderer.cameras]
+        return [self.renderer.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]
 
-    def _frame_gap(
-        self, posed: PosedArrays, exact: PosedArrays, pictures: list[tuple[Camera, np.ndarray]]
-    ) -> "_FrameGap":
-        worst = _worst_ids(posed, exact, self.size)
-        outliers_replaced = {name: array.copy() for name, array in posed.items()}
-        for name, array in outliers_replaced.items():
-            array[worst] = exact[name][worst]
-        frames = [
-            (image_gap(self.view.draw(posed, c), p), image_gap(self.view.draw(outliers_replaced, c), p).psnr)
-            for c, p in pictures
-        ]
-        gap, without = min(frames, key=lambda frame: frame[0].psnr)
-        pixels = max(float(self.view.pixel_gaps(posed, exact, c).max(initial=0)) for c, _ in pictures)
-        return _FrameGap(gap, without, pixels, int((~usable_rows(posed)).sum()))
+    def _frame_gap(self, got: Gaussians, exact: Gaussians, frames: _Frames) -> "_FrameGap":
+        without_worst = Gaussians(*(array.copy() for array in vars(got).values()))
+        worst = _worst_ids(got, exact, self.size)
+        for name, array in vars(without_worst).items():
+            array[worst] = getattr(exact, name)[worst]
+        draw = self.renderer.draw
+        pairs = [(compare(draw(got, c), frame), compare(draw(without_worst, c), frame).psnr) for c, frame in frames]
+        gap, without = min(pairs, key=lambda pair: pair[0].psnr)
+        pixels = max(float(self.renderer.pixel_gaps(got, exact, c).max(initial=0)) for c, _ in frames)
+        return _FrameGap(gap, without, pixels, int((~usable_rows(got)).sum()))
 
-    def _worst(
-        self, t: float, posed: PosedArrays, exact: PosedArrays, pictures: list[tuple[Camera, np.ndarray]]
-    ) -> WorstGaussians:
-        ids = _worst_ids(posed, exact, self.size)
-        means = np.nan_to_num(exact["means"][ids])
+    def _worst(self, t: float, got: Gaussians, exact: Gaussians, frames: _Frames) -> WorstGaussians:
+        ids = _worst_ids(got, exact, self.size)
+        means = np.nan_to_num(exact.means[ids])
         center = means.mean(axis=0)
         low, high = np.array(self.scene.bounds)
         canonical = self.double.gaussians.means.detach().numpy()[ids]
@@ -170,13 +187,13 @@ class _Assessment:
             spread=float(np.linalg.norm(means - center, axis=1).mean()) / self.size,
             outside_bounds=int(((means < low) | (means > high)).any(axis=1).sum()),
             moved=float(np.median(np.linalg.norm(means - canonical, axis=1))) / self.size,
-            pixels=max(float(self.view.pixel_gaps(posed, exact, c)[ids].max(initial=0)) for c, _ in pictures),
-            drawn_psnr=min(image_gap(self.view.draw(exact, c, keep=others), p).psnr for c, p in pictures),
+            pixels=max(float(self.renderer.pixel_gaps(got, exact, c)[ids].max(initial=0)) for c, _ in frames),
+            drawn_psnr=min(compare(self.renderer.draw(exact, c, keep=others), frame).psnr for c, frame in frames),
         )
 
-    def _format_gap(self, number_format: Format, moments: list["_Moment"], frames: list["_FrameGap"]) -> FormatGap:
-        errors = np.concatenate([moment.errors[number_format.name] for moment in moments])
-        worst = min(frames, key=lambda frame: frame.image.psnr)
+    def _format_gap(self, number_format: Format, samples: list["_TimeSample"], frames: list["_FrameGap"]) -> FormatGap:
+        errors = np.concatenate([sample.errors[number_format.name] for sample in samples])
+        worst = min(frames, key=lambda frame: frame.difference.psnr)
         return FormatGap(
             name=number_format.name,
             meaning=number_format.meaning,
@@ -184,26 +201,26 @@ class _Assessment:
             near_worst=_quantile(errors, NEAR_WORST),
             worst=float(errors.max()),
             pixels=max(frame.pixels for frame in frames),
-            psnr=worst.image.psnr,
-            worst_pixel=worst.image.worst_pixel,
+            psnr=worst.difference.psnr,
+            worst_pixel=worst.difference.worst_pixel,
             psnr_without_worst=worst.without_worst,
             overflowed=max(frame.overflowed for frame in frames),
         )
 
 
-class _Moment(NamedTuple):
-    """One time, at which some Gaussians were looked at."""
+class _TimeSample(NamedTuple):
+    """Some of the Gaussians at one time."""
 
     t: float
     ids: np.ndarray
     growth: Growth
-    exact: PosedArrays  # float64
+    exact: Gaussians  # float64
     single_means: np.ndarray
     errors: dict[str, np.ndarray]  # the largest of each Gaussian, by format
 
 
 class _FrameGap(NamedTuple):
-    image: ImageGap
+    difference: FrameDifference
     without_worst: float
     pixels: float
     overflowed: int
@@ -211,61 +228,39 @@ class _FrameGap(NamedTuple):
 
 @torch.no_grad()
 def _mean_factors(model: DynamicGaussians) -> np.ndarray:
-    """[N] what the modulation multiplies a Gaussian's whole displacement by, at most; 1 where it leaves means alone."""
+    """[N] largest modulation factor of each mean's displacement; 1 if means aren't modulated."""
     factors = None if model.modulation is None else model.modulation(model.gaussians.embeddings).means
     return np.ones(len(model.gaussians)) if factors is None else factors.amax(dim=1).numpy()
 
 
-def _at_rest(model: DynamicGaussians, scene: SceneInfo, min_psnr: float, times: int) -> StabilityReport:
-    """Of a model that has nothing to deform."""
-    none = np.ones(0)
-    hidden = len(model.gaussians) and View(scene).hidden_by_near_plane(model.gaussians.means.detach().numpy())
-    return StabilityReport(
-        gaussians=len(model.gaussians),
-        layers=[],
-        times=times,
-        min_psnr=min_psnr,
-        median_amplification=1.0,
-        worst_amplification=1.0,
-        layer_growth=[],
-        predicted_psnr=100.0,
-        formats=[],
-        worst=None,
-        limits=limits_met(model, []),
-        broken=[_hidden()] if hidden else [],
-        unsteady=[],
-        samples=Samples(none, none, none, np.ones((0, 0))),
-    )
+def _hidden(renderer: PoseRenderer, model: DynamicGaussians) -> list[str]:
+    if not renderer.hidden_by_near_plane(model.gaussians.means.detach().numpy()):
+        return []
+    near = f"everything in front of the cameras is within {NEAR} scene units, nearer than the near plane"
+    return [f"{near}; scale the scene up before training"]
 
 
-def _hidden() -> str:
-    return (
-        f"all that the cameras have in front of them is within {NEAR} scene units, nearer than the near plane; scale "
-        "the scene up before training"
-    )
+def _worst_ids(got: Gaussians, exact: Gaussians, size: float) -> np.ndarray:
+    """Those with the largest errors, at least one, the worst first."""
+    errors = largest_error(pose_errors(got, exact, size))
+    return np.argsort(errors, kind="stable")[::-1][: math.ceil(WORST_FRACTION * len(errors))]
 
 
-def _worst_ids(posed: PosedArrays, exact: PosedArrays, size: float) -> np.ndarray:
-    """The worst part of the Gaussians, at least one, the worst first."""
-    errors = largest_error(pose_errors(posed, exact, size))
-    return np.argsort(errors, kind="stable")[::-1][: math.ceil(WORST_PART * len(errors))]
-
-
-def _joined(moments: list[_Moment]) -> Samples:
-    distances = [np.linalg.norm(moment.single_means - moment.exact["means"], axis=1) for moment in moments]
+def _joined(samples: list[_TimeSample]) -> Samples:
+    distances = [np.linalg.norm(sample.single_means - sample.exact.means, axis=1) for sample in samples]
     return Samples(
-        amplification=np.concatenate([moment.growth.amplification for moment in moments]),
+        amplification=np.concatenate([sample.growth.amplification for sample in samples]),
         distance=np.concatenate([np.where(np.isfinite(d), d, math.inf) for d in distances]),
-        predicted=np.concatenate([moment.growth.predicted for moment in moments]),
-        after=np.concatenate([moment.growth.after for moment in moments], axis=1),
+        predicted=np.concatenate([sample.growth.predicted for sample in samples]),
+        after=np.concatenate([sample.growth.after for sample in samples], axis=1),
     )
 
 
-def _displaced(means: np.ndarray, moment: _Moment, samples: Samples) -> np.ndarray:
-    """Means moved by the predicted distance into directions drawn by lot; those not looked at take one of another."""
+def _displaced(means: np.ndarray, sample: _TimeSample, joined: Samples) -> np.ndarray:
+    """Means moved by the predicted distance in random directions; Gaussians not sampled take that of another."""
     rng = np.random.default_rng(0)
-    distances = rng.choice(samples.predicted, len(means))
-    distances[moment.ids] = moment.growth.predicted
+    distances = rng.choice(joined.predicted, len(means))
+    distances[sample.ids] = sample.growth.predicted
     directions = rng.normal(size=means.shape)
     return means + distances[:, None] * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 

@@ -1,4 +1,4 @@
-"""Milliseconds a frame of many candidates, measured in turns so that a busy moment of the machine hits all alike."""
+"""Milliseconds per frame of many candidates, interleaved so that load on the machine affects all alike."""
 
 import gc
 import statistics
@@ -11,21 +11,21 @@ from export.measure.views import View
 from msdgs_serve.rasterizer import rasterize
 
 REPEATS = 15
-SECONDS_A_CANDIDATE = 6.0
-"""Where frames take longer, there are fewer repeats, though never under `FEWEST_REPEATS`."""
+SECONDS_PER_CANDIDATE = 6.0
+"""If frames take longer, there are fewer repeats, but at least `MIN_REPEATS`."""
 
-FEWEST_REPEATS = 2
+MIN_REPEATS = 2
 
 
 class Milliseconds(NamedTuple):
-    """A time over interleaved repeats, the mean over a few views of what each took."""
+    """Minimum and median over interleaved repeats, averaged over a few views."""
 
     min: float
     median: float
 
 
 class FrameTime(NamedTuple):
-    """How long a frame takes, on this machine and on the service's own pool of threads."""
+    """Time of a frame on this machine, with the service's thread pool."""
 
     deformation: Milliseconds
     rasterization: Milliseconds
@@ -36,7 +36,7 @@ class FrameTime(NamedTuple):
         return {name: part._asdict() for name, part in self._asdict().items()}
 
 
-Lap = tuple[float, float, float]
+TimingRun = tuple[float, float, float]
 
 
 def time_frames(
@@ -48,39 +48,45 @@ def time_frames(
     on_repeat: Callable[[], object] = lambda: None,
 ) -> list[FrameTime]:
     """Time a frame of each candidate at each of the views, `repeats` times over; the first frames don't count."""
-    firsts = [_lap(candidate, views[0], background) for candidate in candidates]
+    firsts = [time_frame(candidate, views[0], background) for candidate in candidates]
     rounds = [
-        max(FEWEST_REPEATS, min(repeats, int(1e3 * SECONDS_A_CANDIDATE / (first[2] * len(views))))) for first in firsts
+        max(MIN_REPEATS, min(repeats, int(1e3 * SECONDS_PER_CANDIDATE / (first[2] * len(views))))) for first in firsts
     ]
-    laps: list[list[list[Lap]]] = [[[] for _ in views] for _ in candidates]
+    runs: list[list[list[TimingRun]]] = [[[] for _ in views] for _ in candidates]
     collecting = gc.isenabled()
     gc.disable()
     try:
         for turn in range(repeats):
             for place, candidate in enumerate(candidates):
                 for v, view in enumerate(views if turn < rounds[place] else ()):
-                    laps[place][v].append(_lap(candidate, view, background))
+                    runs[place][v].append(time_frame(candidate, view, background))
             on_repeat()
     finally:
         if collecting:
             gc.enable()
-    return [_frame_time(of_views) for of_views in laps]
+    return [_frame_time(of_views) for of_views in runs]
 
 
-def _lap(candidate: Candidate, view: View, background: Sequence[float]) -> Lap:
-    start = time.perf_counter()
+def time_frame(
+    candidate: Candidate,
+    view: View,
+    background: Sequence[float],
+    clock: Callable[[], float] = time.perf_counter,
+) -> TimingRun:
+    """Milliseconds of deformation, of rasterization, and of both, for one frame."""
+    start = clock()
     gaussians = candidate.session.gaussians(view.t)
-    posed = time.perf_counter()
+    posed = clock()
     rasterize(gaussians, view.camera, background=background, options=candidate.options)
-    drawn = time.perf_counter()
+    drawn = clock()
     return 1e3 * (posed - start), 1e3 * (drawn - posed), 1e3 * (drawn - start)
 
 
-def _frame_time(laps: list[list[Lap]]) -> FrameTime:
-    """`laps` of each view."""
+def _frame_time(runs: list[list[TimingRun]]) -> FrameTime:
+    """`runs` of each view."""
     parts = []
     for part in range(3):
-        of_views = [[lap[part] for lap in view] for view in laps]
+        of_views = [[run[part] for run in view] for view in runs]
         parts.append(
             Milliseconds(
                 statistics.fmean(min(view) for view in of_views),

@@ -1,4 +1,4 @@
-"""Where and when errors are measured: the training's cameras, at many times that need not be theirs."""
+"""Views at which errors are measured: the training cameras, at many times other than those of the training images."""
 
 import math
 from collections.abc import Sequence
@@ -10,12 +10,12 @@ from export.measure.verify import times_to_verify
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_train.gaussians.model_file import SceneInfo
 
-FEWEST_CAMERAS = 4
-"""With fewer, cameras on a circle about the scene are added: one side says little about the others."""
+MIN_CAMERAS = 4
+"""With fewer, cameras on a circle around the scene are added."""
 
 ADDED_CAMERAS = 6
 ADDED_SIZE, ADDED_FOV, ADDED_ELEVATION = 256, 40.0, 25.0
-"""Pixels and degrees of an added camera where no camera is stored that it could be like."""
+"""Pixels and degrees of an added camera if no camera is stored."""
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 
@@ -29,28 +29,28 @@ class View(NamedTuple):
 
 
 def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[str, Camera]]:
-    """The cameras of a scene by name: `training`'s where given, else those in the model file, and more where too few.
+    """The cameras of a scene by name: `training`'s if given, else those of the model, and more if too few.
 
     Raises `InvalidInput` for a stored camera that can't be used.
     """
     cameras = [(f"training {i}", camera) for i, camera in enumerate(training)]
     cameras = cameras or [(str(stored["name"]), _camera(stored)) for stored in info.cameras]
-    return cameras if len(cameras) >= FEWEST_CAMERAS else [*cameras, *_around(info, cameras)]
+    return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
 
 
-def measuring_views(
-    cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int, cameras_a_time: int
+def evaluation_views(
+    cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int, cameras_per_time: int
 ) -> list[View]:
-    """Views at `times` times, both ends and between frames, at each of which other cameras look."""
+    """Views at `times` times, both ends and between frames, from other cameras at each time."""
     views = []
     for i, t in enumerate(dict.fromkeys(times_to_verify(*time_range, times))):
-        chosen = {int((i * cameras_a_time + j) * GOLDEN % 1 * len(cameras)) for j in range(cameras_a_time)}
+        chosen = {int((i * cameras_per_time + j) * GOLDEN % 1 * len(cameras)) for j in range(cameras_per_time)}
         views += [View(cameras[c][1], t, cameras[c][0]) for c in sorted(chosen)]
     return views
 
 
-def deciding_views(cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int) -> list[View]:
-    """Views at evenly spread times, a camera each; none of the times between the ends is one of `measuring_views`."""
+def selection_views(cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int) -> list[View]:
+    """Views at evenly spread times, a camera each; none of the times between the ends is one of `evaluation_views`."""
     t0, t1 = time_range
     spread = dict.fromkeys(float(t) for t in np.linspace(t0, t1, times))
     chosen = [int((i * GOLDEN + 0.5) % 1 * len(cameras)) for i in range(len(spread))]

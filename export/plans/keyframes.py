@@ -9,24 +9,25 @@ import numpy as np
 import onnx
 
 from export.jobs.bake import Baked
+from export.plans.base import Plan, PlanSpec
 from export.plans.scene_graph import activated, finished, new_graph
-from export.plans.size import Size
-from export.trajectories.adaptive import fitted, own_poses, worst
+from export.trajectories.adaptive import COUNTS, adaptive_knots, fitted, worst
 from export.trajectories.sampling import Ids, Trajectories
+from export.trajectories.splines import MIN_CONTROL_POINTS
 from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 
 
-def keyframes(baked: Baked, trajectories: Trajectories, size: Size) -> onnx.ModelProto:
-    """The scene with `size.count` poses for all, or with as few of each Gaussian as are within `size.pixels`."""
+def keyframes(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.ModelProto:
+    """The scene with `spec.count` poses for all, or with as few of each Gaussian as are within `spec.max_pixels`."""
     every = np.arange(trajectories.count)
-    if size.count is None:
-        poses, errors = own_poses(trajectories, every, size.pixels or 0)
+    if spec.count is None:
+        poses, errors = adaptive_knots(trajectories, every, spec.max_pixels or 0)
     else:
-        poses, errors = _mostly_of_one_size(trajectories, every, size.count)
+        poses, errors = _mostly_of_one_size(trajectories, every, spec.count)
     graph, time_range = new_graph(baked), baked.scene.metadata.time_range
     activated(graph, of_ids(graph, poses, time_range))
     own = len(every) - max(len(rows) for rows, _ in poses.grids)
-    return finished(graph, baked, str(size), trajectories.promise(errors, own))
+    return finished(graph, baked, str(spec), trajectories.error_bound(errors, own))
 
 
 def _mostly_of_one_size(trajectories: Trajectories, every: Ids, count: int) -> tuple[GriddedPoses, np.ndarray]:
@@ -34,7 +35,18 @@ def _mostly_of_one_size(trajectories: Trajectories, every: Ids, count: int) -> t
     control, errors = fitted(trajectories, every, count)
     chosen = worst(trajectories, errors, None)
     rest = np.delete(every, chosen)
-    own, own_errors = own_poses(trajectories, chosen, errors[rest].max(initial=0) / trajectories.pixel)
+    own, own_errors = adaptive_knots(trajectories, chosen, errors[rest].max(initial=0) / trajectories.pixel)
     errors[chosen] = own_errors
     grids = [(chosen[rows], stored) for rows, stored in own.grids]
     return GriddedPoses(((rest, StoredPoses.of(control[rest])), *grids)), errors
+
+
+KEYFRAMES = Plan(
+    "keyframes",
+    f"keyframes:n, n poses, {MIN_CONTROL_POINTS} to {COUNTS[-1]}",
+    "#a463f2",
+    lambda baked, spec, sample: keyframes(baked, spec, sample()),
+    candidates=lambda layers: ["keyframes:2.0", "keyframes:0.5", "keyframes:0.1", "keyframes:0.03"],
+    counts=range(MIN_CONTROL_POINTS, COUNTS[-1] + 1),
+    fitted=True,
+)

@@ -15,9 +15,9 @@ from scipy.linalg import eigh
 
 from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
+from export.plans.base import Plan, PlanSpec
 from export.plans.scene_graph import activated, finished, new_graph
-from export.plans.size import Size
-from export.trajectories.adaptive import CHUNK, own_poses, worst
+from export.trajectories.adaptive import CHUNK, adaptive_knots, worst
 from export.trajectories.poses import POSE, QUATS
 from export.trajectories.sampling import Ids, Samples, Trajectories
 from export.trajectories.splines import along_time, design, fitting, samples_for, time_weights
@@ -35,20 +35,20 @@ SAMPLED = 4_096
 """Gaussians at which r is chosen."""
 
 
-def lowrank(baked: Baked, trajectories: Trajectories, size: Size) -> onnx.ModelProto:
-    """The scene with `size.count` terms, or with as many as make it cheapest within `size.pixels`."""
+def lowrank(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.ModelProto:
+    """The scene with `spec.count` terms, or with as many as make it cheapest within `spec.max_pixels`."""
     fit = _Fit(trajectories)
     first_guess = fit.functions(np.arange(trajectories.count))
-    rank = size.count or RANKS[len(RANKS) // 2]
+    rank = spec.count or RANKS[len(RANKS) // 2]
     outliers = worst(trajectories, fit.errors(np.arange(trajectories.count), first_guess[:, :rank]), None)
     functions = fit.functions(np.setdiff1d(np.arange(trajectories.count), outliers))
-    if size.pixels:
-        rank = _cheapest(trajectories, fit, functions, size.pixels)
+    if spec.max_pixels:
+        rank = _cheapest(trajectories, fit, functions, spec.max_pixels)
     functions = functions[:, :rank]
     errors = fit.errors(np.arange(trajectories.count), functions)
-    chosen = worst(trajectories, errors, size.pixels)
-    most = size.pixels or np.delete(errors, chosen).max(initial=0) / trajectories.pixel
-    own, own_errors = own_poses(trajectories, chosen, most)
+    chosen = worst(trajectories, errors, spec.max_pixels)
+    most = spec.max_pixels or np.delete(errors, chosen).max(initial=0) / trajectories.pixel
+    own, own_errors = adaptive_knots(trajectories, chosen, most)
     errors[chosen] = own_errors
     graph, time_range = new_graph(baked), baked.scene.metadata.time_range
     pose = _product(graph, fit.table(functions), fit.basis(functions), time_range)
@@ -56,7 +56,7 @@ def lowrank(baked: Baked, trajectories: Trajectories, size: Size) -> onnx.ModelP
         places = graph.constant("own.places", chosen[own.order][:, None])
         pose = graph.node("ScatterND", [pose, places, at_time(graph, own, time_range)], "own.merged")
     activated(graph, graph.node("Gather", [pose, "ids"], "ids.pose"))
-    return finished(graph, baked, str(size), trajectories.promise(errors, len(own)))
+    return finished(graph, baked, str(spec), trajectories.error_bound(errors, len(own)))
 
 
 def _cheapest(trajectories: Trajectories, fit: "_Fit", functions: np.ndarray, pixels: float) -> int:
@@ -148,3 +148,14 @@ class _Fit:
 def _chunks(ids: Ids) -> Iterator[Ids]:
     for start in range(0, len(ids), CHUNK):
         yield ids[start : start + CHUNK]
+
+
+LOWRANK = Plan(
+    "lowrank",
+    f"lowrank:r, r functions of time, 1 to {RANKS[-1]}",
+    "#3ca951",
+    lambda baked, spec, sample: lowrank(baked, spec, sample()),
+    candidates=lambda layers: ["lowrank:0.5", "lowrank:0.1"],
+    counts=range(1, RANKS[-1] + 1),
+    fitted=True,
+)

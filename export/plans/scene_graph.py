@@ -1,4 +1,4 @@
-"""What the graphs of all plans share: their inputs, constant outputs and metadata, and how raw values are activated."""
+"""Parts of the graphs of all plans: inputs, constant outputs and metadata, and activations."""
 
 from dataclasses import replace
 from typing import Any
@@ -11,20 +11,22 @@ from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.gaussians.model import MIN_SCALE
+from msdgs_train.gaussians.scale_space import MIN_SCALE
 
 
 def new_graph(baked: Baked) -> GraphBuilder:
-    """A graph that knows `ids`, all of them by default."""
+    """A graph with the input `ids`, by default all of them."""
     graph = GraphBuilder()
     graph.constant("ids", np.arange(len(baked.moving), dtype=np.int64))
     return graph
 
 
-def finished(graph: GraphBuilder, baked: Baked, plan: str, promise: dict[str, Any] | None = None) -> onnx.ModelProto:
-    """The whole scene file of a graph that computes `means`, `quats` and `scales`, or holds them as constants.
+def finished(
+    graph: GraphBuilder, baked: Baked, plan: str, error_bound: dict[str, Any] | None = None
+) -> onnx.ModelProto:
+    """The scene file of a graph that computes `means`, `quats` and `scales`, or holds them as constants.
 
-    `promise` is what a fitted plan knows of its own errors; it is `measured_error` until the file is measured.
+    `error_bound` of a fitted plan is `measured_error` until the file is measured.
     """
     scene = baked.scene
     count: int | str = "M" if scene.moving_count else 0
@@ -37,11 +39,11 @@ def finished(graph: GraphBuilder, baked: Baked, plan: str, promise: dict[str, An
     if "steps" in graph.constants:
         inputs["steps"] = (TensorProto.FLOAT, [1])
     return graph.model(
-        inputs, outputs, replace(scene.metadata, plan=plan, measured_error=promise or {}).to_properties()
+        inputs, outputs, replace(scene.metadata, plan=plan, measured_error=error_bound or {}).to_properties()
     )
 
 
-def still(baked: Baked, plan: str) -> onnx.ModelProto:
+def static_graph(baked: Baked, plan: str) -> onnx.ModelProto:
     """A scene in which nothing moves: under any plan a graph of no nodes."""
     graph = new_graph(baked)
     for name, columns in (("means", 3), ("quats", 4), ("scales", 3)):

@@ -1,2 +1,1 @@
-"""How exactly a model's deformation can be computed: in which number format, and how much a chain of layers multiplies
-every error made on the way."""
+"""Number formats for a model's deformation, and the report on its stability in them."""

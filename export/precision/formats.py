@@ -1,5 +1,5 @@
-"""A model's deformation in other number formats, emulated: every rounding that hardware would make is made, in float32
-or float64 arithmetic around it."""
+"""Emulation of a model's deformation in other number formats: every rounding of the hardware is made, in float32 or
+float64 arithmetic."""
 
 import copy
 from collections.abc import Callable
@@ -12,15 +12,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.supports.nodes import SkinningInputs
 
 
 @dataclass(frozen=True)
 class Format:
-    """Which numbers are rounded to what."""
+    """A number format, and which numbers are rounded to it."""
 
     name: str
-    carried: torch.dtype  # means, encodings, sums
+    base: torch.dtype  # means, encodings, sums
     rounded: torch.dtype
     where: Literal["nowhere", "products", "everywhere"]
     """Products: operands and results of the layers' matrix products. Everywhere: also before the encoding."""
@@ -38,9 +37,8 @@ FORMATS = (
 
 
 def in_format(model: DynamicGaussians, number_format: Format) -> DynamicGaussians:
-    """A copy of the model whose layers compute in `number_format`. What comes after them, activations and all, is done
-    in the precision that they carry."""
-    changed = copy.deepcopy(model).to(number_format.carried)
+    """A copy of the model whose layers compute in `number_format`, and all that follows them in its base type."""
+    changed = copy.deepcopy(model).to(number_format.base)
     if number_format.where == "nowhere":
         return changed
     rounded = _rounder(number_format.rounded)
@@ -56,23 +54,21 @@ def _rounder(dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
 
 
 class _Emulated(MultiStepDeformation):
-    """The same layers, with roundings between their operations."""
+    """The same layers with roundings between their operations."""
 
     def __init__(self, exact: MultiStepDeformation, number_format: Format) -> None:
         nn.Module.__init__(self)
         self.layers = exact.layers
         self.number_format = number_format
 
-    def forward(
-        self, means: Tensor, t: Tensor, steps: int | None = None, carried: SkinningInputs | None = None
-    ) -> Deltas:
+    def forward(self, means: Tensor, t: Tensor, num_layers: int | None = None) -> Deltas:
         with torch.no_grad(), _Rounding(self.number_format):
-            return super().forward(means, t, steps, carried)
+            return super().forward(means, t, num_layers)
 
 
 _PRODUCTS = ("aten::addmm", "aten::addmv", "aten::linear")
-"""Of the layers. `aten::mm` makes the encoding's phases, which are exact in every format that holds their means, and
-blends motion bases, which no reader would do in less than float32: there is little of it."""
+"""Products that are rounded. `aten::mm` computes phases of the encoding, which are exact in every format that holds the
+means, and blends motions, which is cheap in float32."""
 
 
 class _Rounding(TorchDispatchMode):
@@ -94,5 +90,5 @@ class _Rounding(TorchDispatchMode):
 
     def _operand(self, value: Any) -> Any:
         if self._everywhere or not (isinstance(value, Tensor) and value.is_floating_point()):
-            return value  # everywhere: it has been a result before
+            return value  # already rounded as a result
         return self._rounded(value)

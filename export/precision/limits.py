@@ -1,19 +1,20 @@
-"""Gaussians that a bound of the model holds back: what would otherwise overflow, vanish or have no direction."""
+"""Gaussians that are clamped by a limit of the model."""
 
 import numpy as np
 import torch
 
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.modulation import MAX_LOG_FACTOR
+from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
 
 NEARLY = 1e-6
-"""Relative distance to a bound from which a value counts as being at it."""
+"""Relative distance to a limit below which a value counts as being at it."""
 
 
 @torch.no_grad()
 def limits_met(model: DynamicGaussians, scales: list[np.ndarray]) -> dict[str, int]:
-    """How many Gaussians are at which bound; those at none are left out. `scales` are posed ones, [M, 3] a time."""
+    """The number of Gaussians at each limit, without zeros. `scales` are posed ones, [M, 3] per time."""
     g = model.gaussians
     canonical = (g.log_scales.abs() >= LOG_SCALE_LIMIT).any(dim=1)
     found = {

@@ -1,8 +1,8 @@
-"""Leaving out what a scene does not need, as rendered frames decide."""
+"""Pruning: removing what a scene does not need, as rendered frames decide."""
 
-from export.pruning.decide import LeftOut, trim, trimmed_model
-from export.pruning.mask import Cut, TrimmedModel, whole
+from export.pruning.decide import prune
+from export.pruning.mask import PrunedModel, PruningMask, full_mask, pruned
 from export.pruning.rules import RULES
-from export.pruning.statistics import Evidence
+from export.pruning.statistics import PruningStatistics
 
-__all__ = ["RULES", "Cut", "Evidence", "LeftOut", "TrimmedModel", "trim", "trimmed_model", "whole"]
+__all__ = ["RULES", "PrunedModel", "PruningMask", "PruningStatistics", "full_mask", "prune", "pruned"]

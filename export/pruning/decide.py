@@ -1,92 +1,53 @@
-"""Trimming: rule by rule, each measured in frames of what all rules before it have left."""
+"""Pruning: rule by rule, each measured in frames of what the rules before it have left."""
 
 import math
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple
+from typing import Any
 
-from export.pruning.mask import Cut, TrimmedModel, trimmed, whole
+from export.pruning.mask import PruningMask, full_mask
 from export.pruning.rules import RULES
-from export.pruning.statistics import Evidence
+from export.pruning.statistics import PruningStatistics
+from export.supports import support_export_of
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.supports.nodes import BasisLayer
-from msdgs_train.supports.skinning_kernels import K_NEAREST
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12
-BASIS_BYTES = K_NEAREST * (4 + 1)
-"""Of a Gaussian in a scene file: pose, opacity, an SH coefficient; and where it moves, its id and its modulation, or
-the motions that it follows and their weights."""
+"""Per Gaussian in a scene file: pose, opacity, an SH coefficient; and if it moves, its id and its modulation."""
 
 
-class LeftOut(NamedTuple):
-    """What one rule has left out."""
-
-    rule: str
-    what: str
-    count: int
-    of: int
-    bytes_saved: int
-    worst_frame_db: float  # PSNR of the worst deciding frame, all rules so far together
-
-    def __str__(self) -> str:
-        saved = f"{self.bytes_saved / 1e3:,.0f} kB saved" if self.bytes_saved else "no bytes saved"
-        return f"{self.what}: {self.count:,} of {self.of:,}, {saved}, worst frame {self.worst_frame_db:.1f} dB"
-
-
-def trim(
-    evidence: Evidence,
-    least_db: float,
+def prune(
+    statistics: PruningStatistics,
+    min_db: float,
     rules: Collection[str] = tuple(RULES),
     on_rule: Callable[[], object] = lambda: None,
-) -> tuple[Cut, list[LeftOut]]:
-    """What `rules` leave of the model while the worst deciding frame stays at `least_db` dB or more.
+) -> tuple[PruningMask, list[dict[str, Any]]]:
+    """What `rules` leave of the model while the worst selection frame stays at `min_db` dB or more, and the entries of
+    `left_out` in its scene file.
 
-    Each rule may use its share of the squared error that this allows, and what the rules before it have not used.
+    Each rule may spend its part of the squared error that this allows, and what the rules before it have not spent.
     """
-    cut, left_out = whole(evidence.model), []
-    for name, rule in RULES.items():
-        if name not in rules:
-            continue
-        smaller = rule.apply(evidence, cut, least_db - 10 * math.log10(rule.share))
+    mask, left_out = full_mask(statistics.model), []
+    for name in (name for name in RULES if name in rules):
+        rule = RULES[name]
+        smaller = rule.apply(statistics, mask, min_db - 10 * math.log10(rule.error_budget))
         on_rule()
-        count = left_out_count(name, cut, smaller)
+        count = rule.count(mask) - rule.count(smaller)
         if count:
-            saved = stored_bytes(evidence.model, cut) - stored_bytes(evidence.model, smaller)
-            of = out_of(name, cut)
-            left_out.append(LeftOut(name, rule.what, count, of, saved, evidence.worst_db(smaller)))
-            cut = smaller
-    return cut, left_out
+            saved = stored_bytes(statistics.model, mask) - stored_bytes(statistics.model, smaller)
+            numbers = {"count": count, "of": rule.count(mask), "bytes_saved": saved}
+            left_out.append(
+                {"rule": name, "what": rule.what, **numbers, "worst_frame_db": statistics.worst_db(smaller)}
+            )
+            mask = smaller
+    return mask, left_out
 
 
-def trimmed_model(evidence: Evidence, cut: Cut, left_out: list[LeftOut]) -> TrimmedModel:
-    """The model that is left, with the list that its scene file keeps of what isn't."""
-    plain: list[dict[str, Any]] = [entry._asdict() for entry in left_out]
-    return trimmed(evidence.model, cut, evidence.poses(cut.network).still, plain)
-
-
-def out_of(rule: str, cut: Cut) -> int:
-    """How many there are of what a rule leaves out."""
-    return {
-        "modulation": int(cut.network.modulated),
-        "heads": len(cut.network.heads),
-        "layers": len(cut.network.layers),
-        "unseen": int(cut.kept.sum()),
-        "still": int(cut.moves.sum()),
-        "bands": cut.sh_degree,
-    }[rule]
-
-
-def left_out_count(rule: str, cut: Cut, smaller: Cut) -> int:
-    """How many of them a smaller cut lacks."""
-    return out_of(rule, cut) - out_of(rule, smaller)
-
-
-def stored_bytes(model: DynamicGaussians, cut: Cut) -> int:
-    """About what a cut takes in a file of the plan `network`: Gaussians and layers."""
-    gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(cut.sh_degree)
-    layers = [model.deformation.layers[k] for k in cut.network.layers] if cut.moves.any() else []
-    follows = any(isinstance(layer, BasisLayer) for layer in layers)
-    moving = MOVING_BYTES + MODULATION_BYTES * cut.network.modulated + BASIS_BYTES * follows
+def stored_bytes(model: DynamicGaussians, mask: PruningMask) -> int:
+    """Approximate size of a file of the plan `network`: Gaussians and layers."""
+    gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(mask.sh_degree)
+    layers = [list(model.deformation)[k] for k in mask.network.layers] if mask.moves.any() else []
+    attributes = support_export_of(model.support).bytes_per_gaussian if layers else 0
+    moving = MOVING_BYTES + MODULATION_BYTES * mask.network.modulated + attributes
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())
-    return gaussian * int(cut.kept.sum()) + moving * int(cut.moves.sum()) + weights
+    return gaussian * int(mask.kept.sum()) + moving * int(mask.moves.sum()) + weights

@@ -1,29 +1,24 @@
-"""What is left of a model after trimming, and the smaller model that this makes."""
+"""What pruning leaves of a model, and the smaller model that this makes."""
 
-import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from export.measure.rendered_error import as_gaussians
+from export.layers import HEADS, export_of
+from export.measure.poses import posed
+from export.supports import support_export_of
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import MultiStepDeformation
-from msdgs_train.layers.mlp import MLPLayer
-from msdgs_train.layers.plane import PlaneLayer
-
-HEADS = ("means", "scales", "quats")
-"""What the heads of a layer change, in the order of their columns."""
-
-_COLUMNS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
+from msdgs_train.layers.deformation import DeformationLayer
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkMask:
     """The parts of a deformation that are left."""
 
     layers: tuple[int, ...]  # indices of the model's
@@ -32,73 +27,75 @@ class Network:
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class PruningMask:
     """What is left of a model."""
 
-    network: Network
+    network: NetworkMask
     kept: np.ndarray  # [N] bool
     moves: np.ndarray  # [N] bool, only Gaussians that are kept
     sh_degree: int
 
     @property
     def ids(self) -> np.ndarray:
-        """The model's ids of what is left: moving Gaussians, then still ones."""
+        """The model's ids of what is left: moving Gaussians, then static ones."""
         return np.concatenate([np.flatnonzero(self.moves), np.flatnonzero(self.kept & ~self.moves)])
 
-    def without(self, **changes: Any) -> "Cut":
-        """Another cut; Gaussians that aren't kept don't move."""
+    def without(self, **changes: Any) -> "PruningMask":
+        """The mask with changes; Gaussians that aren't kept don't move."""
         changed = replace(self, **changes)
         return replace(changed, moves=changed.moves & changed.kept)
 
 
 @dataclass(frozen=True, eq=False)
-class TrimmedModel:
-    """A smaller model of Gaussians that move, beside ones that don't."""
+class PrunedModel:
+    """A smaller model of the Gaussians that move, and those that don't."""
 
     moving: DynamicGaussians
-    still: Gaussians  # float32, activated
-    ids: np.ndarray  # [M + S] int64, the model's id of each: moving ones, then still ones
+    static: Gaussians  # float32, activated
+    ids: np.ndarray  # [M + S] int64, the model's id of each: moving ones, then static ones
     left_out: tuple[dict[str, Any], ...] = ()
 
 
-def whole(model: DynamicGaussians) -> Cut:
-    """The cut that leaves everything in."""
+def full_mask(model: DynamicGaussians) -> PruningMask:
+    """The mask that keeps everything."""
     count = len(model.gaussians)
-    heads = HEADS if any(kind != "bases" for kind in model.config.layers) else ()
-    network = Network(tuple(range(len(model.deformation))), frozenset(heads), model.modulation is not None)
+    heads = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation))
+    heads = heads if support_export_of(model.support).heads_are_removable else frozenset()
+    network = NetworkMask(tuple(range(len(model.deformation))), heads, model.modulation is not None)
     moves = np.full(count, len(model.deformation) > 0)
-    return Cut(network, np.ones(count, bool), moves, model.config.sh_degree)
+    return PruningMask(network, np.ones(count, bool), moves, model.config.sh_degree)
 
 
-def with_network(model: DynamicGaussians, network: Network) -> DynamicGaussians:
+def with_network(model: DynamicGaussians, network: NetworkMask) -> DynamicGaussians:
     """All Gaussians with what is left of the deformation; parameters are shared with `model`."""
     return _model(model, network, slice(None), model.config.sh_degree)
 
 
-def trimmed(model: DynamicGaussians, cut: Cut, still_poses: Gaussians, left_out: list[dict[str, Any]]) -> TrimmedModel:
-    """The model that a cut leaves; `still_poses` says of all N Gaussians how each would stand still."""
-    network = cut.network if cut.moves.any() else replace(cut.network, layers=())
-    still = np.flatnonzero(cut.kept & ~cut.moves)
-    moving = _model(model, network, torch.from_numpy(cut.moves), cut.sh_degree)
-    return TrimmedModel(moving, rows(still_poses, still, cut.sh_degree), cut.ids, tuple(left_out))
+def pruned(
+    model: DynamicGaussians, mask: PruningMask, mean_poses: Gaussians, left_out: list[dict[str, Any]]
+) -> PrunedModel:
+    """The model that a mask leaves; `mean_poses` are the poses of all N Gaussians if they are static."""
+    network = mask.network if mask.moves.any() else replace(mask.network, layers=())
+    static = np.flatnonzero(mask.kept & ~mask.moves)
+    moving = _model(model, network, torch.from_numpy(mask.moves), mask.sh_degree)
+    return PrunedModel(moving, rows(mean_poses, static, mask.sh_degree), mask.ids, tuple(left_out))
 
 
-def untrimmed(model: DynamicGaussians) -> TrimmedModel:
-    """All of a model."""
+def unpruned(model: DynamicGaussians) -> PrunedModel:
+    """A model as it is."""
     every = np.arange(len(model.gaussians))
-    with torch.no_grad():
-        canonical = as_gaussians(model.pose(0.0, deform=False))
-    return TrimmedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
+    canonical = posed(model, 0.0, deform=False)
+    return PrunedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
 
 
-def with_sh_degree(trimmed: TrimmedModel, sh_degree: int) -> TrimmedModel:
+def with_sh_degree(pruned: PrunedModel, sh_degree: int) -> PrunedModel:
     """The same Gaussians with the SH bands up to `sh_degree` alone."""
-    before = trimmed.moving.config.sh_degree
-    network = whole(trimmed.moving).network
-    still = rows(trimmed.still, np.arange(len(trimmed.still)), sh_degree)
+    before = pruned.moving.config.sh_degree
+    network = full_mask(pruned.moving).network
+    static = rows(pruned.static, np.arange(len(pruned.static)), sh_degree)
     entry = {"rule": "sh_degree", "what": "SH bands, as asked for", "count": before - sh_degree, "of": before}
-    moving = _model(trimmed.moving, network, slice(None), sh_degree)
-    return TrimmedModel(moving, still, trimmed.ids, (*trimmed.left_out, entry))
+    moving = _model(pruned.moving, network, slice(None), sh_degree)
+    return PrunedModel(moving, static, pruned.ids, (*pruned.left_out, entry))
 
 
 def rows(gaussians: Gaussians, ids: np.ndarray, sh_degree: int) -> Gaussians:
@@ -107,40 +104,29 @@ def rows(gaussians: Gaussians, ids: np.ndarray, sh_degree: int) -> Gaussians:
     return Gaussians(g.means[ids], g.quats[ids], g.scales[ids], g.opacities[ids], g.sh[ids, :coefficients])
 
 
-def _model(model: DynamicGaussians, network: Network, which: slice | torch.Tensor, sh_degree: int) -> DynamicGaussians:
+def _model(
+    model: DynamicGaussians, network: NetworkMask, which: slice | torch.Tensor, sh_degree: int
+) -> DynamicGaussians:
     tensors = {name: parameter.detach()[which] for name, parameter in model.gaussians.named_parameters()}
     tensors["sh_rest"] = tensors["sh_rest"][:, : sh_coefficients(sh_degree) - 1]
-    if not network.modulated:
-        tensors.pop("embeddings", None)
-    if not any(model.config.layers[k] == "bases" for k in network.layers):
-        tensors.pop("skinning_logits", None)
-        tensors.pop("node_ids", None)
-    layers = [model.deformation.layers[k] for k in network.layers]
+    layers = [list(model.deformation)[k] for k in network.layers]
     config = replace(
         model.config,
         layers=tuple(model.config.layers[k] for k in network.layers),
         sh_degree=sh_degree,
         embedding_dim=model.config.embedding_dim if network.modulated else 0,
     )
-    with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are not kept
+    unread = model.config.attributes().keys() - config.attributes().keys()
+    tensors = {name: values for name, values in tensors.items() if name not in unread}
+    with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are replaced
         smaller = DynamicGaussians(config, CanonicalGaussians(**tensors))
     smaller.deformation = MultiStepDeformation(_without_heads(layer, network.heads) for layer in layers)
+    smaller.support = model.support
     smaller.modulation = model.modulation if network.modulated else None
     return smaller.requires_grad_(requires_grad=False)
 
 
-def _without_heads(layer: torch.nn.Module, heads: frozenset[str]) -> torch.nn.Module:
-    """The layer with zeros in place of the heads that are left out; a plan stores no column that is all zeros."""
-    missing = [name for name in HEADS if name not in heads]
-    if not missing:
-        return layer
-    layer = copy.deepcopy(layer)
-    with torch.no_grad():
-        for name in missing:
-            if isinstance(layer, MLPLayer):
-                layer.heads.weight[_COLUMNS[name]] = 0
-                layer.heads.bias[_COLUMNS[name]] = 0
-            elif isinstance(layer, PlaneLayer):
-                for parameter in layer.heads[HEADS.index(name)].parameters():
-                    parameter.zero_()
-    return layer
+def _without_heads(layer: DeformationLayer, heads: frozenset[str]) -> DeformationLayer:
+    """The layer with zeros in place of the heads that are removed; a plan stores no column that is all zeros."""
+    missing = frozenset(HEADS) - heads
+    return export_of(layer).without_heads(layer, missing) if missing else layer

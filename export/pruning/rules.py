@@ -1,155 +1,135 @@
-"""The rules of trimming: each proposes what a scene could do without, and rendered frames decide how much of it."""
+"""The rules of pruning: each proposes what to remove, and rendered frames decide how much of it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from export.pruning.mask import HEADS, Cut, Network
-from export.pruning.statistics import Evidence
+from export.layers import HEADS
+from export.pruning.mask import PruningMask
+from export.pruning.statistics import PruningStatistics
 
-HALVINGS = 7
-"""Of the interval in which the number of Gaussians to leave out is searched for: to 1 in 128."""
+BISECTIONS = 7
+"""Steps of the search for the number of Gaussians that can be removed: to 1 in 128."""
 
-HOPELESS = 1.0
-"""Pixels. What moves the visible Gaussians by more than this on average is needed, and isn't tried."""
+MAX_MEAN_MOTION = 1.0
+"""Pixels. Parts of the network that move the visible Gaussians by more than this on average aren't tried."""
 
 VISIBLE_MOTION = 2.0
-"""Pixels. What moves further stays in motion however faint it is in the frames: from elsewhere it may not be."""
+"""Pixels. Gaussians that move further stay in motion even if they are faint: from other views they may not be."""
 
-WORK = 2e13
-"""Operations of layers that trials without some of them may take, in each trimming: minutes of two cores. Beyond it the
-rule leaves in what it has not tried; a scene of the paper's size would be posed anew for half an hour."""
-
-Rule = Callable[[Evidence, Cut, float], Cut]
-"""Leaves out of a cut what it can while the worst deciding frame stays at so many dB or more."""
+MAX_OPERATIONS = 2e13
+"""Operations for trials without some of the layers, minutes of two cores; layers not tried by then are kept. A scene of
+the paper's size would be posed for half an hour."""
 
 
 @dataclass(frozen=True)
-class RuleKind:
+class Rule:
     """One rule as users see it."""
 
-    what: str  # that it leaves out, in words
-    share: float  # of the squared error allowed, that may be used up when this rule is done
-    apply: Rule
+    what: str  # what it removes, in words
+    error_budget: float  # fraction of the squared error allowed that may be spent when this rule is done
+    apply: Callable[[PruningStatistics, PruningMask, float], PruningMask]
+    """Removes what it can while the worst selection frame stays at so many dB or more."""
+    count: Callable[[PruningMask], int]
+    """How many there still are of what it removes."""
 
 
-def modulation(evidence: Evidence, cut: Cut, enough: float) -> Cut:
-    """Scale modulation where it is 1, or as good as."""
-    if not cut.network.modulated:
-        return cut
-    return _if_enough(evidence, cut, _network(cut, modulated=False), enough)
+def modulation(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
+    """Modulation whose factors are 1, or nearly."""
+    return _if_allowed(statistics, mask, min_db, modulated=False) if mask.network.modulated else mask
 
 
-def heads(evidence: Evidence, cut: Cut, enough: float) -> Cut:
+def heads(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
     """Heads of all layers that change nothing: positions, scales or rotations."""
-    for name in sorted(cut.network.heads, key=lambda name: HEADS.index(name), reverse=True):
-        cut = _if_enough(evidence, cut, _network(cut, heads=cut.network.heads - {name}), enough)
-    return cut
+    for name in sorted(mask.network.heads, key=HEADS.index, reverse=True):
+        mask = _if_allowed(statistics, mask, min_db, heads=mask.network.heads - {name})
+    return mask
 
 
-def layers(evidence: Evidence, cut: Cut, enough: float) -> Cut:
-    """Whole layers whose weighted step is invisible: as many of the last ones as can go together, then single ones."""
-    work = WORK
+def layers(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
+    """Whole layers whose weighted step is invisible: as many of the last ones as possible, then single ones."""
+    work = MAX_OPERATIONS
 
-    def tried(left: tuple[int, ...]) -> Cut:
+    def tried(left: tuple[int, ...]) -> PruningMask:
         nonlocal work
-        smaller = _network(cut, layers=left)
-        work -= evidence.operations(smaller.network)
-        return _if_enough(evidence, cut, smaller, enough) if work >= 0 else cut
+        work -= statistics.operations(replace(mask.network, layers=left))
+        return _if_allowed(statistics, mask, min_db, layers=left) if work >= 0 else mask
 
-    last = len(cut.network.layers) - 1
+    last = len(mask.network.layers) - 1
     while last > 0:
-        smaller = tried(cut.network.layers[:-last])
+        smaller = tried(mask.network.layers[:-last])
         last = min(last // 2, len(smaller.network.layers) - 1)
-        cut = smaller
-    for k in reversed(cut.network.layers):
-        if len(cut.network.layers) > 1:
-            cut = tried(tuple(layer for layer in cut.network.layers if layer != k))
-    return cut
+        mask = smaller
+    for k in reversed(mask.network.layers):
+        if len(mask.network.layers) > 1:
+            mask = tried(tuple(layer for layer in mask.network.layers if layer != k))
+    return mask
 
 
-def unseen(evidence: Evidence, cut: Cut, enough: float) -> Cut:
-    """Gaussians that add nothing to any frame, those that add least first."""
-    order = _least(evidence.peaks * evidence.amounts, cut.kept)
-
-    def without(ids: np.ndarray) -> Cut:
-        return cut.without(kept=_cleared(cut.kept, ids))
-
-    return _as_many(evidence, cut, order, without, enough)
+def invisible(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
+    """Gaussians that contribute to no frame, those that contribute least first."""
+    return _as_many_as_allowed(statistics, mask, "kept", statistics.peaks * statistics.amounts, mask.kept, min_db)
 
 
-def still(evidence: Evidence, cut: Cut, enough: float) -> Cut:
+def static(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
     """Motion of Gaussians that don't move visibly, those that move least first."""
-    motion = evidence.motion(cut.network)
-    order = _least(motion * evidence.peaks, cut.moves & (motion < VISIBLE_MOTION))
-
-    def without(ids: np.ndarray) -> Cut:
-        return cut.without(moves=_cleared(cut.moves, ids))
-
-    return _as_many(evidence, cut, order, without, enough)
+    motion = statistics.motion(mask.network)
+    among = mask.moves & (motion < VISIBLE_MOTION)
+    return _as_many_as_allowed(statistics, mask, "moves", motion * statistics.peaks, among, min_db)
 
 
-def bands(evidence: Evidence, cut: Cut, enough: float) -> Cut:
+def sh(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
     """Upper bands of the spherical harmonics that change no color visibly."""
-    for degree in range(cut.sh_degree):
-        lower = cut.without(sh_degree=degree)
-        if evidence.worst_db(lower, enough) >= enough:
+    for degree in range(mask.sh_degree):
+        lower = mask.without(sh_degree=degree)
+        if statistics.worst_db(lower, min_db) >= min_db:
             return lower
-    return cut
+    return mask
 
 
 RULES = {
-    "heads": RuleKind("heads that change nothing", 0.05, heads),
-    "modulation": RuleKind("scale modulation that is 1", 0.1, modulation),
-    "layers": RuleKind("layers whose weighted step is invisible", 0.2, layers),
-    "unseen": RuleKind("Gaussians that never contribute", 0.45, unseen),
-    "still": RuleKind("motion of Gaussians that never move visibly", 0.9, still),
-    "bands": RuleKind("SH bands that change nothing", 1.0, bands),
+    "heads": Rule("heads that change nothing", 0.05, heads, lambda mask: len(mask.network.heads)),
+    "modulation": Rule("scale modulation that is 1", 0.1, modulation, lambda mask: int(mask.network.modulated)),
+    "layers": Rule("layers whose weighted step is invisible", 0.2, layers, lambda mask: len(mask.network.layers)),
+    "invisible": Rule("Gaussians that never contribute", 0.45, invisible, lambda mask: int(mask.kept.sum())),
+    "static": Rule("motion of Gaussians that never move visibly", 0.9, static, lambda mask: int(mask.moves.sum())),
+    "sh": Rule("SH bands that change nothing", 1.0, sh, lambda mask: mask.sh_degree),
 }
-"""In the order in which they are applied."""
+"""By name, in the order in which they are applied. `ExportOptions.keep_NAME` switches one off."""
 
 
-def _network(cut: Cut, **changes: object) -> Cut:
-    return cut.without(network=replace(cut.network, **changes))
+def _if_allowed(statistics: PruningStatistics, mask: PruningMask, min_db: float, **changes: object) -> PruningMask:
+    """The mask with a smaller network if frames allow it; a few poses are compared before any frame is rendered."""
+    network = replace(mask.network, **changes)
+    if not mask.moves.any() or statistics.change(mask.network, network) > MAX_MEAN_MOTION:
+        return mask
+    smaller = mask.without(network=network)
+    return smaller if statistics.worst_db(smaller, min_db) >= min_db else mask
 
 
-def _if_enough(evidence: Evidence, cut: Cut, smaller: Cut, enough: float) -> Cut:
-    if not cut.moves.any() or _hopeless(evidence, cut.network, smaller.network):
-        return cut
-    return smaller if evidence.worst_db(smaller, enough) >= enough else cut
-
-
-def _hopeless(evidence: Evidence, network: Network, smaller: Network) -> bool:
-    """Whether a few Gaussians at a few times tell that frames of the smaller network are another scene."""
-    return evidence.change(network, smaller) > HOPELESS
-
-
-def _least(amounts: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """The ids of `among`, [N] bool, those of the least amount first."""
+def _as_many_as_allowed(
+    statistics: PruningStatistics, mask: PruningMask, flags: str, amounts: np.ndarray, among: np.ndarray, min_db: float
+) -> PruningMask:
+    """Clear the flags, "kept" or "moves", of as many Gaussians of `among`, [N] bool, as frames allow, in the
+    order of `amounts`, [N]: all, or what bisection finds."""
     ids = np.flatnonzero(among)
-    return ids[np.argsort(amounts[ids], kind="stable")]
+    order = ids[np.argsort(amounts[ids], kind="stable")]
 
+    def without(count: int) -> PruningMask:
+        left = getattr(mask, flags).copy()
+        left[order[:count]] = False
+        return mask.without(**{flags: left})
 
-def _cleared(flags: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    flags = flags.copy()
-    flags[ids] = False
-    return flags
+    def allowed(count: int) -> bool:
+        return statistics.worst_db(without(count), min_db) >= min_db
 
-
-def _as_many(
-    evidence: Evidence, cut: Cut, order: np.ndarray, without: Callable[[np.ndarray], Cut], enough: float
-) -> Cut:
-    """Leave out as many of `order`, from its start, as the frames allow: all, or what halving an interval finds."""
     if not len(order):
-        return cut
-    everything = without(order)
-    if evidence.worst_db(everything, enough) >= enough:
-        return everything
-    low, high = 0, len(order)  # `low` of them may go, `high` may not
-    for _ in range(HALVINGS):
+        return mask
+    low, high = (len(order),) * 2 if allowed(len(order)) else (0, len(order))
+    for _ in range(BISECTIONS):
         middle = (low + high) // 2
         if middle == low:
             break
-        low, high = (middle, high) if evidence.worst_db(without(order[:middle]), enough) >= enough else (low, middle)
-    return without(order[:low])
+        low, high = (middle, high) if allowed(middle) else (low, middle)
+    return without(low)

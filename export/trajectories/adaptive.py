@@ -1,4 +1,4 @@
-"""How many poses a Gaussian keeps, so that the worst case of a plan is bounded and not only its mean."""
+"""Splines with as many control points per Gaussian as an error bound needs."""
 
 import numpy as np
 
@@ -8,19 +8,19 @@ from export.trajectories.splines import along_time, design, fitting, samples_for
 from export.trajectories.stored import GriddedPoses, StoredPoses
 
 COUNTS = (7, 11, 19, 35, 67, 131, 259, 515, FINEST // 2 + 3)
-"""Control points of the grids that a Gaussian may have."""
+"""Control points that a Gaussian's spline may have."""
 
-SHARE = 0.05
-"""Part of the Gaussians that a plan with a given size corrects: those that it gets most wrong."""
+MAX_CORRECTED = 0.05
+"""Fraction of the Gaussians, those with the largest errors, that a plan of a given size corrects."""
 
 VISIBLE = 0.02
-"""Pixels; a smaller error isn't corrected."""
+"""Smallest error that is corrected, pixels."""
 
 BLOCK = 4096
 """Gaussians whose control points are held in float32 at a time."""
 
 CHUNK = 2048
-"""Gaussians at a time that are sampled as usual; fewer of those that are sampled more densely."""
+"""Gaussians that are fitted at a time; fewer of those that are sampled more densely."""
 
 
 def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) -> Ids:
@@ -28,10 +28,10 @@ def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) ->
     if most is not None:
         return np.flatnonzero(errors > most * trajectories.pixel)
     over = np.flatnonzero(errors > VISIBLE * trajectories.pixel)
-    return np.sort(over[np.argsort(-errors[over])[: int(np.ceil(SHARE * trajectories.count))]])
+    return np.sort(over[np.argsort(-errors[over])[: int(np.ceil(MAX_CORRECTED * trajectories.count))]])
 
 
-def own_poses(trajectories: Trajectories, ids: Ids, most: float) -> tuple[GriddedPoses, np.ndarray]:
+def adaptive_knots(trajectories: Trajectories, ids: Ids, most: float) -> tuple[GriddedPoses, np.ndarray]:
     """Poses of the Gaussians `ids`, each on the coarsest grid that is within `most` pixels, and their errors [H]."""
     errors, fewest = np.full(len(ids), np.inf), trajectories.fewest_poses(most, ids)
     grids, left = [], np.arange(len(ids))
@@ -65,7 +65,7 @@ def fitted(trajectories: Trajectories, ids: Ids, count: int) -> tuple[np.ndarray
 
 
 def _fitted(trajectories: Trajectories, ids: Ids, count: int, checks: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same, compared at `checks` times."""
+    """The same for Gaussians that are compared at `checks` times."""
     samples, times = trajectories.on_grid(checks, ids), samples_for(count)
     matrix, shown = fitting(count, times).astype(np.float32), design(count, checks).astype(np.float32)
     control = along_time(matrix, samples[:, :: (checks - 1) // (times - 1)])

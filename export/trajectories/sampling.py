@@ -3,7 +3,7 @@
 All Gaussians are sampled at 65 times. Where a cubic misses a pose between them by more than a tenth of a pixel, that
 Gaussian is sampled again twice as densely, and so on up to 2,049 times: a fast motion that a coarse sampling misses is
 found at the times between, and only what moves fast pays for it. The times between are every second sample and a few
-that lie on no grid, which catch what repeats itself from sample to sample.
+at irregular times, which detect motion with the period of the samples.
 
 The times on no grid are sampled in float64 and in float32. Where float32 is as good as exact there, all other samples
 are taken in it: a network of the paper's size takes ten seconds a time in float64, one to two in float32.
@@ -22,22 +22,22 @@ from export.trajectories.poses import MEANS, POSE, QUATS, SCALES, ExactPoses, Po
 from msdgs_serve.scene.errors import SceneFileInvalid
 
 COARSE, USUAL, FINEST = 64, 512, 2048
-"""Intervals between samples: of all Gaussians, what errors are looked at between, and of the fastest."""
+"""Intervals between samples: of all Gaussians, for comparing fits, and of the fastest Gaussians."""
 
 RESOLVED = 0.1
-"""Pixels that a cubic may be off between the samples."""
+"""Largest error of a cubic between samples, pixels."""
 
 FLOAT32_ENOUGH = 0.005
-"""Pixels that float32 may be off at the times on no grid, for any Gaussian, where other samples are taken in it."""
+"""Largest error of float32 at the irregular times, pixels, for other samples to be taken in it."""
 
 PROBES = 9
-"""Times on no grid."""
+"""Number of irregular times."""
 
 WORK = 1e14
-"""Operations of layers that samples beyond the coarse ones may take: about ten minutes of two cores."""
+"""Largest number of operations for samples beyond the coarse ones: about ten minutes of two cores."""
 
 MEMORY = 2 * 2**30
-"""Bytes that samples beyond the coarse ones may take; the Gaussians with the largest errors come first."""
+"""Largest size in bytes of samples beyond the coarse ones; Gaussians with the largest errors come first."""
 
 Samples = npt.NDArray[np.floating]  # [M, T, 10] means, linear scales, unit quaternions of one sign along time
 Ids = npt.NDArray[np.int64]
@@ -45,10 +45,10 @@ OnTime = Callable[[int, int], object]
 
 
 class Trajectories:
-    """Samples of one baked scene, shared by all plans that are fitted to them."""
+    """Samples of one baked scene, used by all plans that are fitted to them."""
 
     def __init__(self, baked: Baked, on_time: OnTime = lambda done, total: None) -> None:
-        """`on_time(done, total)` is told after each time sampled; the total grows where motion is fast."""
+        """`on_time(done, total)` is called after each time sampled; the total grows if motion is fast."""
         self.exact = ExactPoses(baked)
         self.count = self.exact.count
         self.time_range = baked.scene.metadata.time_range
@@ -67,7 +67,7 @@ class Trajectories:
 
     @property
     def unresolved(self) -> Ids:
-        """Gaussians that move faster than their finest sampling shows."""
+        """Gaussians that move faster than their finest sampling resolves."""
         return np.flatnonzero(self._misses > RESOLVED * self.pixel)
 
     def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
@@ -89,8 +89,8 @@ class Trajectories:
             got[rows] = values[:, :: (values.shape[1] - 1) // (times - 1)]
         return got
 
-    def promise(self, errors: npt.NDArray[np.float64], own: int) -> dict[str, Any]:
-        """What a fitted plan says of itself, given each Gaussian's error in scene units at all samples."""
+    def error_bound(self, errors: npt.NDArray[np.float64], own: int) -> dict[str, Any]:
+        """The error bound of a fitted plan, given each Gaussian's largest error in scene units."""
         resolved = np.delete(errors, self.unresolved)
         return {
             "fitted": {
@@ -108,7 +108,7 @@ class Trajectories:
         return self._fewest.get(most, np.zeros(self.count, np.int64))[ids]
 
     def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
-        """What another plan of the same error, of what is trimmed further, need not find again."""
+        """Store counts for other plans with the same error bound."""
         self._fewest.setdefault(most, np.zeros(self.count, np.int64))[ids] = counts
 
     def distances(self, ids: Ids, differences: np.ndarray) -> npt.NDArray[np.float64]:
@@ -187,7 +187,7 @@ class Trajectories:
 
 
 class SomeTrajectories(Trajectories):
-    """Those of some of the Gaussians, `rows` of others that have been sampled already."""
+    """Trajectories of some of the Gaussians of another set, those in `rows`."""
 
     def __init__(self, sampled: Trajectories, rows: Ids) -> None:
         self._source, self._rows = sampled, rows
@@ -195,19 +195,19 @@ class SomeTrajectories(Trajectories):
         self.rotation_weights, self._misses = sampled.rotation_weights[rows], sampled._misses[rows]
 
     def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
-        """As of the others."""
+        """Of the other set."""
         return self._source.checks(self._rows[ids])
 
     def fewest_poses(self, most: float, ids: Ids) -> npt.NDArray[np.int64]:
-        """As of the others."""
+        """Of the other set."""
         return self._source.fewest_poses(most, self._rows[ids])
 
     def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
-        """With the others."""
+        """In the other set."""
         self._source.remember_poses(most, self._rows[ids], counts)
 
     def on_grid(self, times: int, ids: Ids) -> Samples:
-        """As of the others."""
+        """Of the other set."""
         return self._source.on_grid(times, self._rows[ids])
 
 
@@ -224,10 +224,11 @@ _recent: dict[bytes, Trajectories] = {}
 
 
 def trajectories_of(baked: Baked) -> Trajectories:
-    """Those of the scene's moving part, sampled once for all plans; those of the last two scenes are kept."""
+    """Of the scene's moving Gaussians, sampled once for all plans; those of the last two scenes are cached."""
     digest = hashlib.sha256(repr((baked.scene.metadata.time_range, pixel(baked))).encode() + layers_digest(baked))
-    for part in vars(baked.moving).values():
-        digest.update(b"" if part is None else part.tobytes())
+    m = baked.moving
+    for values in (m.means, m.log_scales, m.quats, *m.modulation.values(), *m.attributes.values()):
+        digest.update(values.tobytes())
     key = digest.digest()
     kept = _recent.pop(key, None) or Trajectories(baked)
     while len(_recent) >= _KEPT:
@@ -237,8 +238,8 @@ def trajectories_of(baked: Baked) -> Trajectories:
 
 
 def layers_digest(baked: Baked) -> bytes:
-    """Of all that moves a Gaussian, besides its own values."""
-    digest = hashlib.sha256(repr(baked.moving.scale_modulation is None).encode())
+    """SHA-256 of the layers."""
+    digest = hashlib.sha256(repr(sorted(baked.moving.modulation)).encode())
     for layer in baked.layers:
         for name, values in layer.state_dict().items():
             digest.update(name.encode() + values.cpu().numpy().tobytes())
@@ -246,7 +247,7 @@ def layers_digest(baked: Baked) -> bytes:
 
 
 def give_one_sign(samples: Samples) -> None:
-    """A quaternion and its negative are one rotation: let each be the one nearer to that before it."""
+    """Flip signs along time so that each quaternion is nearer to the one before it: q and −q are one rotation."""
     quats = samples[..., QUATS]
     turned = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
     quats[:, 1:] *= np.cumprod(turned, axis=1)[..., None].astype(samples.dtype)

@@ -15,13 +15,13 @@ from scipy.linalg import solve
 
 from export.layers.graph import GraphBuilder
 
-FEWEST = 4
-"""Control points of one interval."""
+MIN_CONTROL_POINTS = 4
+"""Of a spline with one interval."""
 
 
 @cache
 def design(count: int, samples: int) -> np.ndarray:
-    """[T, n] what each of `count` control points adds at each of `samples` evenly spread times."""
+    """[T, n] weights of `count` control points at `samples` evenly spread times."""
     return BSpline.design_matrix(np.linspace(0, 1, samples), _knots(count), 3).toarray()
 
 
@@ -41,7 +41,7 @@ def fitting(count: int, samples: int) -> np.ndarray:
 def along_time(matrix: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """[M, S, 10] the product of a matrix, [S, T], with poses over time, [M, T, 10].
 
-    One large product, not one of ten columns a Gaussian, which reads the matrix anew each time.
+    One large product, not one of ten columns a Gaussian, which reads the matrix again each time.
     """
     return np.ascontiguousarray(np.tensordot(matrix, poses, axes=(1, 1)).transpose(1, 0, 2))
 

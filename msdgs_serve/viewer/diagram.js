@@ -36,7 +36,7 @@ function pointOf(point) {
     kind: point.plan.split(":")[0],
     front: point.front,
     chosen: point.chosen,
-    trimmed: point.trim_db,
+    pruned: point.pruning_db,
     milliseconds: point.milliseconds.total.min,
     psnr: Math.min(point.error.psnr_worst ?? HIGHEST, HIGHEST),
     bytes: point.bytes,
@@ -103,10 +103,10 @@ function dot(point, x, y, tell) {
 }
 
 function sentence(point) {
-  const trimmed = point.trimmed === null ? "all of it" : `trimmed to ${point.trimmed} dB`;
+  const pruned = point.pruned === null ? "all of it" : `pruned to ${point.pruned} dB`;
   const error = point.psnr >= HIGHEST ? "exact" : `${point.psnr.toFixed(1)} dB in the worst frame`;
   const served = point.chosen ? "Chosen: " : "";
-  return `${served}${point.plan}, ${trimmed}. ${point.milliseconds.toFixed(1)} ms, ${error}, ${(point.bytes / 1e6).toFixed(2)} MB.`;
+  return `${served}${point.plan}, ${pruned}. ${point.milliseconds.toFixed(1)} ms, ${error}, ${(point.bytes / 1e6).toFixed(2)} MB.`;
 }
 
 function make(kind, attributes, text = "") {

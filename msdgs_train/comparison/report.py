@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from msdgs_train.comparison.results import Result, Spread
-from msdgs_train.files import replacing, write_text
+from msdgs_train.datasets.common.files import replacing, write_text
 from msdgs_train.layers.parts import to_text
 
 TABLE, NUMBERS, TIME_PLOT, LAYERS_PLOT = "comparison.md", "comparison.json", "time.png", "layers.png"

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from msdgs_train.layers.settings import Checked
+from msdgs_train.settings import Checked
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 

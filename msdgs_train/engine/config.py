@@ -12,8 +12,8 @@ from msdgs_train.density.config import DensityConfig
 from msdgs_train.engine.curriculum_config import CurriculumConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
-from msdgs_train.layers.settings import Checked
 from msdgs_train.losses.config import LossConfig
+from msdgs_train.settings import Checked
 
 SMALL_LAYER = MLPConfig(width=96, depth=2, xyz_frequencies=4, time_width=64)
 SMALL_MODEL = ModelConfig(sh_degree=2, layers=(SMALL_LAYER, SMALL_LAYER))

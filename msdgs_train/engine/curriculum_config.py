@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from msdgs_train.layers.settings import Checked
+from msdgs_train.settings import Checked
 
 
 @dataclass(frozen=True)

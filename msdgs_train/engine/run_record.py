@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.files import write_text
+from msdgs_train.datasets.common.files import write_text
 
 RECORD = "run.json"
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from msdgs_train.cli.extras import ExtraMissing
+from msdgs_train.engine.extras import ExtraMissing
 
 FOLDER = "tensorboard"
 TRAIN_SCALARS = ("loss", "psnr", "gaussians", "skipped", "clamped_scales", "seconds")

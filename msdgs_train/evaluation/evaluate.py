@@ -123,9 +123,11 @@ def _data_folder(run: Path, data: Path | None) -> Path:
         return data.absolute()
     record = read_record(run)
     if record is None:
-        raise RunInvalid(run / RECORD, f"no such file, so the dataset has to be given: msdgs-train eval {run} DATA")
+        raise RunInvalid(
+            run / RECORD, f"no such file, so the dataset has to be given: msdgs-train eval {run} --data DATA"
+        )
     if not record.data.is_dir():
-        where = f"if it is elsewhere now: msdgs-train eval {run} DATA"
+        where = f"if it is elsewhere now: msdgs-train eval {run} --data DATA"
         raise DatasetInvalid(record.data, "folder", f"does not exist; {where}")
     return record.data
 

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.datasets.common.files import write_text
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.evaluate import FILES, EvaluatedModel, Evaluation, Scores
 from msdgs_train.evaluation.sheets import ColourScale, Panel, color, draw_sheet
-from msdgs_train.files import write_text
 
 FOLDER = "eval"
 SHEET_ROWS = 8
@@ -105,6 +106,25 @@ def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
     names = " and ".join(f"{evaluated.name} (step {evaluated.loaded.step:,})" for evaluated in models)
     title = f"{evaluation.split}, {shown}{len(by_psnr)} frames, worst first: {names}"
     draw_sheet(path, title, rows, ColourScale("error", "0", f"≥ {FULL_ERROR}", COLOUR_MAP))
+
+
+def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
+    """Several runs on the same split: a row for each of some evenly spread frames, the image first, then the last model
+    of each run. Atomic. Raises `InvalidInput` unless all were evaluated on the same frames."""
+    first, *others = runs.values()
+    names = [frame.name for frame in first.frames]
+    if any([frame.name for frame in other.frames] != names for other in others):
+        raise InvalidInput("RUN", "runs on the same images", "others")
+    rows = []
+    for index in dict.fromkeys(round(place) for place in np.linspace(0, len(names) - 1, min(SHEET_ROWS, len(names)))):
+        frame = first.frames[index]
+        row = [Panel(_fitted(to_bytes(first.models[0].image(frame).numpy())), f"{frame.name}, t = {frame.t:.3g}")]
+        for run, evaluation in runs.items():
+            last = evaluation.models[0]
+            rendering = _fitted(to_bytes(last.render(evaluation.frames[index]).numpy()))
+            row.append(Panel(rendering, f"{Path(run).name}: {last.images[index].psnr:.1f} dB"))
+        rows.append(row)
+    draw_sheet(path, f"{first.split}, {len(rows)} of {len(names)} frames: {', '.join(runs)}", rows)
 
 
 def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:

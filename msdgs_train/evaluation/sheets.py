@@ -8,7 +8,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.files import replacing
+from msdgs_train.datasets.common.files import replacing
 
 DPI = 100
 MARGIN = 12  # pixels, around the sheet and between panels

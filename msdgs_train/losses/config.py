@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from msdgs_train.layers.settings import Checked
+from msdgs_train.settings import Checked
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self, get_args
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput, MsdgsError, quaternion
-from msdgs_train.cli.extras import ExtraMissing
+from msdgs_train.engine.extras import ExtraMissing
 from msdgs_train.gaussians.model_file import LoadedModel
 from msdgs_train.viewer.snapshot import Channel, Snapshot, snapshot_of_file
 from msdgs_train.viewer.stage import SceneView, view_of_file

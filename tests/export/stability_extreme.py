@@ -14,8 +14,8 @@ import onnx
 import torch
 
 from export.jobs.bake import bake
-from export.measure.frames import View, image_gap, in_image
-from export.measure.gap import half_diagonal, largest_error, pose_arrays, pose_errors
+from export.measure.frames import PoseRenderer, compare, in_frame
+from export.measure.poses import half_diagonal, largest_error, pose_errors, posed
 from export.plans.registry import build
 from export.precision.formats import FLOAT32, in_format
 from msdgs_serve.deformation import DeformationSession
@@ -27,8 +27,7 @@ from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.mlp import PositionalEncoding, frequency_matrix
 from msdgs_train.rendering.rasterize import rasterize as rasterize_for_training
 from tests.export.stability_rows import Row, measured, refused, relative
-from tests.support.exports import export_scene
-from tests.support.models import CAMERA, SCENE, random_model
+from tests.support.models import CAMERA, SCENE, export_scene, random_model
 from tests.support.scene_files import write_scene
 from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of
 
@@ -61,8 +60,7 @@ def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: Defor
     double, worst = in_format(model, FLOAT32).double(), 0.0
     for t in (scene.time_range[0], sum(scene.time_range) / 2, scene.time_range[1]):
         drawn = session.gaussians(t).validate()
-        got = {name: getattr(drawn, name) for name in ("means", "quats", "scales")}
-        errors = pose_errors(got, pose_arrays(double, t), half_diagonal(scene.bounds))
+        errors = pose_errors(drawn, posed(double, t), half_diagonal(scene.bounds))
         worst = max(worst, float(largest_error(errors).max(initial=0)))
     return worst
 
@@ -70,7 +68,7 @@ def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: Defor
 def image_error(gaussians: Gaussians, camera: Any) -> float:
     """dB of the float32 image against the one of the float64 kernels, which the oracle holds to its loops."""
     single, double = (rasterize(as_dtype(gaussians, d), camera, background=BACKGROUND).rgb for d in (np.float32, float))
-    return image_gap(single, double).psnr
+    return compare(single, double).psnr
 
 
 def traps() -> Iterator[Row]:
@@ -124,7 +122,7 @@ def _network(model: DynamicGaussians) -> bytes:
 
 def _scale_error(scale: float) -> float:
     model = changed(lambda m: m.gaussians.log_scales.fill_(math.log(scale)), layers=())
-    return relative(exported(model).scene.static_scales, pose_arrays(in_format(model, FLOAT32).double(), 0.0)["scales"])
+    return relative(exported(model).scene.static_scales, posed(in_format(model, FLOAT32).double(), 0.0).scales)
 
 
 def _head_bias(columns: slice, value: float) -> Change:
@@ -183,8 +181,8 @@ def a_million() -> Iterator[Row]:
         path.write_bytes(_network(model))
         means, quats, scales = DeformationSession(path).pose(0.5)
     ids = np.arange(0, len(means), 997)
-    got = {"means": means[ids], "quats": quats[ids], "scales": scales[ids]}
-    errors = pose_errors(got, pose_arrays(in_format(model, FLOAT32).double(), 0.5, ids), half_diagonal(SCENE.bounds))
+    got = Gaussians(means[ids], quats[ids], scales[ids], np.ones(len(ids)), np.zeros((len(ids), 1, 3)))
+    errors = pose_errors(got, posed(in_format(model, FLOAT32).double(), 0.5, ids), half_diagonal(SCENE.bounds))
     yield measured(f"N = {len(means):,}", MOVES, float(largest_error(errors).max()), "export.relative")
 
 
@@ -218,16 +216,15 @@ def extents() -> Iterator[Row]:
 def frames_error(model: DynamicGaussians, scene: SceneInfo, session: DeformationSession) -> tuple[int, float]:
     """The most Gaussians in a frame, and dB of the file's worst frame against the model in float64, at times that the
     assessment did not look at."""
-    view, double = View(scene), in_format(model, FLOAT32).double()
+    view, double = PoseRenderer(scene), in_format(model, FLOAT32).double()
     t0, t1 = scene.time_range
     seen, worst = 0, math.inf
     for t in t0 + (t1 - t0) * np.array([0.0, 0.137, 0.419, 0.733, 0.951, 1.0]):
-        drawn = session.gaussians(float(t))
-        got = {name: getattr(drawn, name) for name in ("means", "quats", "scales", "opacities", "sh")}
-        exact = pose_arrays(double, float(t))
+        got = session.gaussians(float(t))
+        exact = posed(double, float(t))
         for camera in view.cameras:
-            seen = max(seen, int(in_image(exact["means"], camera).sum()))
-            worst = min(worst, image_gap(view.draw(got, camera), view.draw(exact, camera)).psnr)
+            seen = max(seen, int(in_frame(exact.means, camera).sum()))
+            worst = min(worst, compare(view.draw(got, camera), view.draw(exact, camera)).psnr)
     return seen, worst
 
 
@@ -309,7 +306,7 @@ def broken_files() -> Iterator[Row]:
     for case, data in (
         ("a text", b"not a model"),
         ("a PNG", b"\x89PNG\r\n\x1a\n" + bytes(64)),
-        ("somebody else's checkpoint", _bytes({"state_dict": {"w": torch.zeros(3)}})),
+        ("another program's checkpoint", _bytes({"state_dict": {"w": torch.zeros(3)}})),
         ("a list", _bytes([1, 2, 3])),
         ("a model of a later format", _bytes({**_contents(), "format": "msdgs-model/9"})),
         ("bytes overwritten in the middle", bytes(flipped)),

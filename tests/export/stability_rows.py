@@ -5,7 +5,7 @@ exception than the package's own, a refusal that doesn't name its reason, NaN.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -63,10 +63,3 @@ def relative(got: np.ndarray, want: np.ndarray) -> float:
         return math.inf
     errors = np.abs(got - want) / np.maximum(np.abs(want), 1e-300)
     return float(np.where(np.isfinite(errors), errors, math.inf).max(initial=0))
-
-
-def markdown(rows: Iterable[Row]) -> str:
-    """The table as it stands in docs/stability.md."""
-    lines = ["| case | quantity | error against float64 | bound | verdict |", "|---|---|---|---|---|"]
-    lines += ["| " + " | ".join(cell.replace("|", "∣") for cell in row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from export.measure.amplification import growth
-from export.measure.frames import View, image_gap, in_image
-from export.measure.gap import pose_arrays
+from export.measure.frames import PoseRenderer, compare, in_frame
+from export.measure.poses import posed
 from export.measure.stability import assess
 from export.precision.formats import FLOAT32, in_format
 from export.precision.report import StabilityReport
@@ -109,11 +109,11 @@ CASES: dict[str, Callable[[], DynamicGaussians]] = {
 
 
 def rows_of(case: str) -> list[Row]:
-    """What is foretold must cover what is measured, and what is accepted must be exact in images not looked at."""
+    """What is predicted must cover what is measured, and what is accepted must be exact in images not looked at."""
     model = CASES[case]()
     report = assess(model, SCENE, times=TIMES if len(model.deformation) < 16 else 2)
     name = f"{case}: amplified × {report.worst_amplification:.2g}"
-    rows = _foretold(name, report)
+    rows = _predicted(name, report)
     if report.refusal("network") is None:
         seen, psnr = _unseen(model)
         quantity = f"float32 frames at other times, {seen} of {COUNT} Gaussians in them"
@@ -124,23 +124,23 @@ def rows_of(case: str) -> list[Row]:
     return [*rows, row]
 
 
-def _foretold(name: str, report: StabilityReport) -> list[Row]:
-    """Where little round-off is foretold, there must be no more; where much is, a chain isn't linear any more."""
+def _predicted(name: str, report: StabilityReport) -> list[Row]:
+    """Where little round-off is predicted, there must be no more; where much is, a chain isn't linear any more."""
     s = report.samples
     small = s.predicted < tolerance("stability.first_order")
     ratios = s.distance[small] / np.maximum(s.predicted[small], 1e-300)
-    quantity = f"float32 means, as part of what is foretold, for {small.mean():.0%} of them"
-    return [measured(name, quantity, float(ratios.max()), "stability.foretold")] if small.any() else []
+    quantity = f"float32 means, relative to the predicted error, for {small.mean():.0%} of them"
+    return [measured(name, quantity, float(ratios.max()), "stability.predicted")] if small.any() else []
 
 
 def _unseen(model: DynamicGaussians) -> tuple[int, float]:
     """Gaussians in float32 frames, and dB of the worst, at times that the assessment didn't choose."""
-    double, view = in_format(model, FLOAT32).double(), View(SCENE)
+    double, view = in_format(model, FLOAT32).double(), PoseRenderer(SCENE)
     camera, seen, worst = view.cameras[0], 0, np.inf
     for t in UNSEEN_TIMES:
-        single, exact = pose_arrays(model, t), pose_arrays(double, t)
-        seen = max(seen, int(in_image(exact["means"], camera).sum()))
-        worst = min(worst, image_gap(view.draw(single, camera), view.draw(exact, camera)).psnr)
+        single, exact = posed(model, t), posed(double, t)
+        seen = max(seen, int(in_frame(exact.means, camera).sum()))
+        worst = min(worst, compare(view.draw(single, camera), view.draw(exact, camera)).psnr)
     return seen, worst
 
 

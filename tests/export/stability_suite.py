@@ -1,5 +1,6 @@
-"""`python -m tests.export.stability_suite`: all made cases as a table; `--write` puts it into the docs."""
+"""`python -m tests.export.stability_suite`: all constructed cases as a table; `--write`: docs/data/stability.csv."""
 
+import csv
 import sys
 from collections.abc import Iterator
 
@@ -7,11 +8,10 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.export import stability_extreme, stability_stiff
-from tests.export.stability_rows import FAILS, Row, markdown
+from tests.export.stability_rows import FAILS, Row
 from tests.support.processes import ROOT
 
-PAGE = ROOT / "docs" / "stability.md"
-BEGIN, END = "<!-- the table: python -m tests.export.stability_suite --write -->\n", "<!-- end of the table -->\n"
+TABLE = ROOT / "docs" / "data" / "stability.csv"
 
 
 def all_rows() -> Iterator[Row]:
@@ -37,8 +37,8 @@ def main(arguments: list[str]) -> int:
     failed = [row for row in rows if row.verdict.startswith(FAILS)]
     console.print(f"{len(rows)} rows, {len(failed)} of them fail")
     if "--write" in arguments:
-        before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-        PAGE.write_text(before + BEGIN + "\n" + markdown(rows) + "\n" + END + rest.split(END)[1], encoding="utf-8")
+        with TABLE.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([Row._fields, *rows])
     return 1 if failed else 0
 
 

@@ -9,8 +9,10 @@ import pytest
 import torch
 from onnx import helper
 
-from export.jobs.job import Job
-from export.measure.rendered_error import ExactFrames, posed, shown
+from export.jobs.job import ExportJob
+from export.measure.frames import render
+from export.measure.poses import posed
+from export.measure.rendered_error import ExactFrames
 from export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, rasterize
@@ -23,11 +25,12 @@ from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
 from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
 from msdgs_train.viewer.snapshot import snapshot_of_file
-from tests.support.exports import export_scene
-from tests.support.models import CAMERA, SCENE, random_model, small_config
+from tests.support.models import CAMERA, SCENE, export_scene, random_model, small_config
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SHARED_MOTIONS, write_scene
 from tests.support.training_scene import small_config as training_config
+
+pytestmark = pytest.mark.slow
 
 T = 0.5
 EPS2D = 0.02
@@ -60,8 +63,8 @@ def camera() -> Camera:
 @pytest.fixture
 def expected(loaded: LoadedModel, camera: Camera) -> np.ndarray:
     gaussians = posed(loaded.model, T)
-    narrow = shown(gaussians, camera, SCENE.background, NARROW)
-    assert np.abs(narrow - shown(gaussians, camera, SCENE.background, GSPLAT)).max() > 0.05
+    narrow = render(gaussians, camera, SCENE.background, NARROW)
+    assert np.abs(narrow - render(gaussians, camera, SCENE.background, GSPLAT)).max() > 0.05
     return narrow
 
 
@@ -88,7 +91,7 @@ def test_exact_frames_of_an_export(
     rows = np.arange(len(loaded.model.gaussians))
     assert exact.measure(exact.pose, rows).psnr_worst == 100.0
     assert exact.measure(exact.pose, rows, options=GSPLAT).psnr_worst < 40.0
-    job = Job(folder / "model.pt", tmp_path)
+    job = ExportJob(folder / "model.pt", tmp_path)
     candidate = job.candidate("network", 50.0)
     assert candidate.options == NARROW
     assert job.error(candidate).psnr_worst > 50.0

@@ -15,6 +15,7 @@ import torch
 
 from export.jobs.bake import ModelNotExportable, bake, starting_cameras
 from export.measure.verify import VerificationFailed, times_to_verify, verify
+from export.options import ExportOptions
 from export.plans.registry import build
 from export.to_onnx import main
 from msdgs_serve import __version__
@@ -22,10 +23,11 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
-from tests.support.exports import export_scene
-from tests.support.models import SCENE, random_model
+from tests.support.models import SCENE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
+
+pytestmark = pytest.mark.slow
 
 
 def saved(folder: Path, model: DynamicGaussians) -> Path:
@@ -260,7 +262,7 @@ def test_the_command_says_what_is_wrong(
         path.write_bytes(contents)
     elif contents:
         path.mkdir()
-    assert main(path, tmp_path / "scene.onnx", quick=True) == 1
+    assert main(ExportOptions(path, tmp_path / "scene.onnx", quick=True)) == 1
     shown = capsys.readouterr().err
     assert "error: " in shown
     assert "model.pt" in shown
@@ -268,7 +270,7 @@ def test_the_command_says_what_is_wrong(
 
 
 def test_the_command_refuses_a_folder_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(saved(tmp_path, random_model(5)), tmp_path / "nowhere" / "scene.onnx", quick=True) == 1
+    assert main(ExportOptions(saved(tmp_path, random_model(5)), tmp_path / "nowhere" / "scene.onnx", quick=True)) == 1
     assert "nowhere" in capsys.readouterr().err
 
 
@@ -278,9 +280,9 @@ def test_the_script_runs_from_any_folder(tmp_path: Path):
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(ROOT / "export" / "to_onnx.py"), *arguments]
-        return subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, timeout=120)
+        return subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, timeout=600)
 
-    done = run("../model.pt", "--quick", "--no-unseen")
+    done = run("../model.pt", "--quick", "--keep-invisible")
     assert done.returncode == 0, done.stderr
     assert "passed" in done.stderr
     assert len(DeformationSession(tmp_path / "model.onnx").scene) == 50

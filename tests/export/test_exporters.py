@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
 from export.exporters.gltf import EXTENSION, read_gltf
-from export.exporters.proof import ConversionFailed, visionary_of
+from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_rules import VisionaryInvalid, check_visionary
@@ -29,8 +29,8 @@ from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
+from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.models import SCENE, random_model
-from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
@@ -173,6 +173,7 @@ def test_what_is_not_close_enough_does_not_replace_a_file(tmp_path: Path):
     assert LOSSLESS > LOSSY >= 45
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plan", ["network", "lowrank:8", "lowrank:1", "keyframes:7", "keyframes"])
 def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str):
     scene = scene_file(tmp_path, plan)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from export.exporters.spz import write_spz
-from export.importers import ImportFailed, read_splats, recognise
+from export.importers import ImportFailed, detect_format, read_splats
 from export.importers.detect import frame_files
 from export.importers.scene import digest, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
@@ -23,8 +23,7 @@ from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.spherical_harmonics import sh_basis
-from tests.support.images import psnr
-from tests.support.splat_files import (
+from tests.export.splat_files import (
     compressed_ply_bytes,
     inria_columns,
     ksplat_bytes,
@@ -36,6 +35,7 @@ from tests.support.splat_files import (
     write_sog,
     zipped,
 )
+from tests.support.images import psnr
 from tests.support.tolerances import tolerance
 
 REAL = os.environ.get("MSDGS_SPLATS")
@@ -81,7 +81,7 @@ def drawn(g: Gaussians) -> np.ndarray:
 def test_each_format_shows_what_was_put_into_it(tmp_path: Path, kind: str):
     g = some_gaussians(sh_degree=0 if kind in ("splat", "ksplat") else 2)
     file = made(tmp_path, kind, g)
-    assert recognise(file) == kind.split()[-1 if kind == "compressed ply" else 0]
+    assert detect_format(file) == kind.split()[-1 if kind == "compressed ply" else 0]
     read = read_splats(file)
     assert read.dropped == 0
     assert len(read) == len(g)
@@ -172,12 +172,13 @@ def test_a_header_that_promises_too_much_takes_no_memory(tmp_path: Path, form: s
         ("a.spz", struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0), r"SH of degree 4"),
         ("a.ksplat", bytes(5000), r"a.ksplat: unsupported version"),
         ("a.onnx", b"scene", r"is a scene file already"),
-        ("a.txt", b"nothing of ours", r"--from says what it is, one of model, ply"),
+        ("a.txt", b"nothing of ours", r"--format names it, one of model, ply"),
     ],
 )
 def test_what_cannot_be_read_says_why(tmp_path: Path, name: str, contents: bytes, message: str):
+    file = write(tmp_path, name, contents)
     with pytest.raises(ImportFailed, match=message):
-        read_splats(write(tmp_path, name, contents))
+        read_splats(file, detect_format(file))
 
 
 def test_a_sog_reads_no_files_outside_of_its_folder(tmp_path: Path):
@@ -224,7 +225,7 @@ def test_a_sog_is_stored_or_deflated(tmp_path: Path):
 def test_splat_files_of_other_names_are_no_sequence(tmp_path: Path, names: tuple[str, ...]):
     for name in names:
         write(tmp_path, name, POINTS)
-    for read in (recognise, read_sequence):
+    for read in (detect_format, read_sequence):
         with pytest.raises(ImportFailed, match=rf"{names[0]} and .* differ in more than a number"):
             read(tmp_path)
 
@@ -242,7 +243,7 @@ def test_frames_are_in_the_order_of_the_number_that_differs(tmp_path: Path, name
     for name in (*names, "notes_1.txt", ".hidden.ply"):
         write(tmp_path, name, b"")
     assert [file.name for file in frame_files(tmp_path)] == list(names)
-    assert recognise(tmp_path) == "sequence"
+    assert detect_format(tmp_path) == "sequence"
 
 
 def test_a_static_scene_is_the_file_and_can_be_drawn_without_saying_from_where(tmp_path: Path):

@@ -12,17 +12,18 @@ import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor
 
-from export.importers import ImportFailed, recognise
+from export.importers import ImportFailed, detect_format
 from export.importers.command import model_or_import
 from export.importers.runs import fourdgs
 from export.importers.runs.model import write_model
 from export.jobs.write import properties
+from export.options import ExportOptions
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.camera import orbit
 from msdgs_train.gaussians.model_file import load_model
 from tests.export import test_importers_runs
-from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
@@ -101,7 +102,7 @@ def camera(turn: int) -> dict[str, object]:
 def test_the_network_is_theirs(tmp_path: Path, scales: tuple[int, ...], lengths: float):
     state = their_state(scales)
     run = write_run(tmp_path / "run", state, lengths=lengths)
-    assert recognise(run) == "4dgs"
+    assert detect_format(run) == "4dgs"
     assert write_model(run, "4dgs", tmp_path / "model.pt", QUIET) == []
     model, info, step = load_model(tmp_path / "model.pt")
     assert (step, info.background, model.config.delta_space) == (20_000, (1.0, 1.0, 1.0), "raw")
@@ -158,10 +159,14 @@ def test_changing_opacities_and_colors_are_held_and_the_cost_is_said(tmp_path: P
 
 def test_a_run_is_exported_and_lists_what_is_held(tmp_path: Path):
     run = write_run(tmp_path / "run", their_state((1,)), SWITCHES + ", no_do=False, no_dshs=True")
-    assert to_onnx(run, tmp_path / "scene.onnx", quick=True, times=3) == 0
+    assert to_onnx(ExportOptions(run, tmp_path / "scene.onnx", quick=True, times=3)) == 0
     scene = DeformationSession(tmp_path / "scene.onnx")
     assert scene.scene.metadata.layers == ("plane",)
-    (held,) = (each for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"] if each["rule"] == "frozen")
+    (held,) = (
+        each
+        for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"]
+        if each["rule"] == "static_appearance"
+    )
     assert "opacities and colors" in held["what"]
 
 
@@ -180,7 +185,7 @@ def test_what_differs_is_named(tmp_path: Path, change: dict[str, Tensor], messag
     run = write_run(tmp_path / "run", {**their_state((1,)), **change})
     with (
         pytest.raises(ImportFailed, match=message),
-        model_or_import(run, None, tmp_path / "a.onnx", QUIET),
+        model_or_import(run, "detect", tmp_path / "a.onnx", QUIET),
     ):
         pass
 

@@ -12,15 +12,15 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from export.importers import ImportFailed, recognise
+from export.importers import ImportFailed, detect_format
 from export.importers.runs import deformgs
-from export.importers.runs.fidelity import bent
+from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
-from export.measure.rendered_error import posed
+from export.measure.poses import posed
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import load_model
-from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
@@ -90,9 +90,9 @@ def write_run(folder: Path, state: dict[str, Tensor]) -> Path:
 def test_the_network_is_theirs(tmp_path: Path, blender: bool, depth: int):
     state = their_state(blender, depth)
     run = write_run(tmp_path / "run", state)
-    assert recognise(run) == "deformgs"
+    assert detect_format(run) == "deformgs"
     (lost,) = write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
-    assert (lost["rule"], lost["count"]) == ("unbent", COUNT)
+    assert (lost["rule"], lost["count"]) == ("quaternion_fidelity", COUNT)
     assert 10 < lost["worst_frame_db"] < 100
     model, info, step = load_model(tmp_path / "model.pt")
     g = some_gaussians(COUNT, 3, seed=40_000)
@@ -112,7 +112,7 @@ def test_shapes_are_compared_with_those_that_they_draw(tmp_path: Path):
     state = their_state(True)
     write_model(write_run(tmp_path / "run", state), "deformgs", tmp_path / "model.pt", QUIET)
     model, g = load_model(tmp_path / "model.pt").model, some_gaussians(COUNT, 3, seed=40_000)
-    drawn, off = bent(model, 0.37, posed(model, 0.37))
+    drawn, off = as_trained(model, 0.37, posed(model, 0.37))
     _, d_quats, d_scales = (d.numpy() for d in their_deltas(state, torch.from_numpy(g.means).double(), 0.37))
     quats, scales = g.quats + d_quats, g.scales + d_scales
     squares = np.square(quats).sum(1)[:, None, None]  # a matrix of a length s is I + s² (R - I)

@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline
 from export.jobs.bake import Baked, bake
 from export.plans.registry import build
 from export.trajectories import sampling as module
-from export.trajectories.adaptive import fitted, own_poses
+from export.trajectories.adaptive import adaptive_knots, fitted
 from export.trajectories.poses import ExactPoses, SinglePoses, pixel
 from export.trajectories.sampling import SomeTrajectories, Trajectories
 from export.trajectories.splines import design, fitting, samples_for
@@ -19,6 +19,8 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance
+
+pytestmark = pytest.mark.slow
 
 COUNT = 40
 Motion = Callable[[float], np.ndarray]
@@ -132,7 +134,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
 
     _, trajectories = sampled(motion)
     every, some, tried = np.arange(COUNT), np.arange(3, COUNT, 4), list[int]()
-    poses, errors = own_poses(trajectories, every, 0.05)
+    poses, errors = adaptive_knots(trajectories, every, 0.05)
     assert len(poses.grids) > 1
 
     def counted(trajectories: Trajectories, ids: np.ndarray, count: int):
@@ -140,7 +142,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
         return fitted(trajectories, ids, count)
 
     monkeypatch.setattr("export.trajectories.adaptive.fitted", counted)
-    again, errors_again = own_poses(SomeTrajectories(trajectories, some), np.arange(len(some)), 0.05)
+    again, errors_again = adaptive_knots(SomeTrajectories(trajectories, some), np.arange(len(some)), 0.05)
     assert len(tried) == len(some)
     assert_close(errors_again, errors[some], "fitted_beside_others")
     sizes = {int(i): stored.points.shape[1] for rows, stored in poses.grids for i in rows}

@@ -9,7 +9,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.systems.registry import preset, systems
-from tests.support.exports import export_scene
+from tests.support.models import export_scene
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import shrunk, write_scene
 

@@ -14,25 +14,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from export.jobs.job import Job
-from export.jobs.points import DEFAULT_RASTERIZER, Look, Point, choose, front
+from export.jobs.job import ExportJob
+from export.jobs.points import DEFAULT_RASTERIZER, Point, QuickEstimate, choose, front
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
 from export.jobs.sweep import Sweep, SweepResult
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
+from export.options import ExportOptions
+from export.plans.registry import PLANS
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.gaussians.model_file import save_model
-from tests.support.models import SCENE, random_model
-from tests.support.moving_object import GROUND, OBJECT, moving_object
+from tests.support.models import GROUND, OBJECT, SCENE, moving_object, random_model
 
-pytestmark = pytest.mark.xdist_group("work precision")  # one worker, so that it sweeps once
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that it sweeps once
 
 POINT_FIELDS = {
     "front": bool,
     "chosen": bool,
     "plan": str,
-    "trim_db": (float, type(None)),
+    "pruning_db": (float, type(None)),
     "sh_degree": int,
     "rasterizer": str,
     "moving": int,
@@ -42,7 +43,7 @@ POINT_FIELDS = {
     "memory_bytes": (int, type(None)),
     "milliseconds": dict,
     "error": dict,
-    "photographs_psnr": (float, type(None)),
+    "images_psnr": (float, type(None)),
     "left_out": list,
 }
 
@@ -84,31 +85,32 @@ def test_what_no_file_can_ask_for_is_not_chosen():
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tuple[Job, SweepResult]:
+def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tuple[ExportJob, SweepResult]:
     job = new_job(tmp_path_factory.mktemp("swept"))
     return job, Sweep(job, 45.0).run()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_candidates() -> Iterator[None]:
-    """As many as the tests look at."""
+    """As many as the tests estimate at."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("export.jobs.sweep.TRIM_STEPS", (5.0, 1.0, -5.0))
-        patch.setattr("export.jobs.sweep.FITTED", ("keyframes:2.0",))
+        patch.setattr("export.jobs.sweep.PRUNING_STEPS", (5.0, 1.0, -5.0))
+        for name, texts in (("lowrank", []), ("keyframes", ["keyframes:2.0"])):
+            patch.setitem(PLANS, name, replace(PLANS[name], candidates=lambda layers, texts=texts: texts))
         yield
 
 
-def new_job(folder: Path) -> Job:
+def new_job(folder: Path) -> ExportJob:
     save_model(folder / "model.pt", moving_object(), SCENE, 1)
     (folder / "candidates").mkdir()
-    return Job(folder / "model.pt", folder / "candidates", min_psnr=45.0)
+    return ExportJob(folder / "model.pt", folder / "candidates", min_psnr=45.0)
 
 
 def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_the_error(
-    swept: tuple[Job, SweepResult],
+    swept: tuple[ExportJob, SweepResult],
 ):
     _, result = swept
-    whole = [p for p in result.points if p.candidate.plan == "network" and p.candidate.trim_db is None]
+    whole = [p for p in result.points if p.candidate.plan == "network" and p.candidate.pruning_db is None]
     most = max(p.candidate.sh_degree for p in whole)
     assert sum(p.rasterizer == DEFAULT_RASTERIZER and p.candidate.sh_degree == most for p in whole) == 1
     within = [p for p in result.points if p.error.psnr_worst >= 45 and p.rasterizer == DEFAULT_RASTERIZER]
@@ -117,25 +119,29 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
     assert any(p.candidate.session.scene.moving_count <= OBJECT for p in within)
 
 
-def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried(swept: tuple[Job, SweepResult]):
+def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried(swept: tuple[ExportJob, SweepResult]):
     job, _ = swept
     whole, fitted = job.candidate("network", None), job.candidate("keyframes:9", None)
     sweep = Sweep(job, 45.0)
-    sweep.looks = [Look(whole, DEFAULT_RASTERIZER, 90_000, 89_000, 90), Look(fitted, DEFAULT_RASTERIZER, 50, 5, 60)]
-    assert sweep._look("network", 46.0) is None
-    assert sweep._look("int8", None) is None
+    sweep.estimates = [
+        QuickEstimate(whole, DEFAULT_RASTERIZER, 90_000, 89_000, 90),
+        QuickEstimate(fitted, DEFAULT_RASTERIZER, 50, 5, 60),
+    ]
+    sweep.baseline = sweep.estimates[0]
+    assert sweep._estimate("network", 46.0) is None
+    assert sweep._estimate("int8", None) is None
     assert [why for _, why in sweep.refused if "keyframes:9 takes 50 ms" in why] == [why for _, why in sweep.refused]
-    sweep.looks[1] = replace(sweep.looks[1], worst_db=44)  # too far off to do without the layers
-    assert sweep._dear("network", None) is None
+    sweep.estimates[1] = replace(sweep.estimates[1], worst_db=44)  # too far off to do without the layers
+    assert sweep._too_expensive("network", None) is None
 
 
-def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: tuple[Job, SweepResult]):
-    def look(plan: str, cpu: float, size: int, db: float = 60.0) -> Look:
-        return Look(cast(Any, SimpleNamespace(plan=plan, size=size)), DEFAULT_RASTERIZER, cpu + 30, cpu, db)
+def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: tuple[ExportJob, SweepResult]):
+    def estimate(plan: str, cpu: float, size: int, db: float = 60.0) -> QuickEstimate:
+        return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), DEFAULT_RASTERIZER, cpu + 30, cpu, db)
 
     sweep = Sweep(swept[0], 45.0)
-    fine, coarse = look("keyframes:0.03", 10.0, 600), look("keyframes:0.1", 11.0, 400)
-    assert sweep._pairs([fine, coarse, look("prefix:1", 30.0, 2), look("int8", 1.0, 1, db=20.0)], 50.0) == {
+    fine, coarse = estimate("keyframes:0.03", 10.0, 600), estimate("keyframes:0.1", 11.0, 400)
+    assert sweep._pairs([fine, coarse, estimate("prefix:1", 30.0, 2), estimate("int8", 1.0, 1, db=20.0)], 50.0) == {
         ("keyframes:0.1", 50.0)
     }
     assert sweep._pairs([fine, replace(coarse, worst_db=51.0)], 50.0) == {
@@ -145,24 +151,24 @@ def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: 
     assert sweep._pairs([], 50.0) == set()
 
 
-def test_the_report_says_what_was_gained(swept: tuple[Job, SweepResult]):
+def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
     contents = report(*swept)
-    whole = next(p for p in contents["points"] if p["plan"] == "network" and p["trim_db"] is None)
+    whole = next(p for p in contents["points"] if p["plan"] == "network" and p["pruning_db"] is None)
     chosen = next(p for p in contents["points"] if p["chosen"])
     whole["milliseconds"]["deformation"]["min"], chosen["milliseconds"]["deformation"]["min"] = 1480.0, 3.7
-    assert "Deformation takes 3.7 ms a frame" in gain(contents)
+    assert "Deformation takes 3.7 ms per frame" in gain(contents)
     assert "all layers for all Gaussians take 1,480.0 ms, 400.0 times as long." in gain(contents)
 
 
-def test_the_same_model_has_the_same_errors(swept: tuple[Job, SweepResult], tmp_path: Path):
+def test_the_same_model_has_the_same_errors(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
     again, result = new_job(tmp_path), swept[1]
     for p in (result.points[result.chosen], result.points[front(result.points)[-1]]):
         c = p.candidate
-        lower = c.sh_degree if c.sh_degree < again.trimmed(c.trim_db).moving.config.sh_degree else None
-        assert again.error(again.candidate(c.plan, c.trim_db, lower)) == p.error
+        lower = c.sh_degree if c.sh_degree < again.pruned(c.pruning_db).moving.config.sh_degree else None
+        assert again.error(again.candidate(c.plan, c.pruning_db, lower)) == p.error
 
 
-def test_the_report_holds_what_it_promises(swept: tuple[Job, SweepResult], tmp_path: Path):
+def test_the_report_holds_what_it_promises(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
     contents = report(*swept)
     paths = write_report(contents, tmp_path / "ball.onnx")
     assert [path.name for path in paths] == ["ball.report.json", "ball.report.md", "ball.report.png"]
@@ -195,19 +201,19 @@ def saved(folder: Path, **changes: Any) -> Path:
 
 @pytest.mark.parametrize("min_psnr", [float("nan"), float("inf"), -1.0, 0.0, 101.0])
 def test_an_error_that_cannot_be_meant_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], min_psnr: float):
-    assert main(saved(tmp_path), tmp_path / "s.onnx", min_psnr=min_psnr) == 1
+    assert main(ExportOptions(saved(tmp_path), tmp_path / "s.onnx", min_psnr=min_psnr)) == 1
     assert "`min_psnr` must be a PSNR in dB from 10 to 100" in capsys.readouterr().err
     assert not (tmp_path / "s.onnx").exists()
 
 
 def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = saved(tmp_path)
-    assert main(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0) == 1
+    assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0)) == 1
     shown = capsys.readouterr().err
     assert "at most" in shown
     assert "which the plan prefix:1 reaches" in shown
     reachable = float(shown.split("at most ")[1].split(",")[0])
-    assert main(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=reachable) == 0
+    assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=reachable)) == 0
     metadata = DeformationSession(tmp_path / "s.onnx").scene.metadata
     assert metadata.plan == "prefix:1"
     assert metadata.measured_error["rendered"]["psnr_worst"] >= reachable
@@ -228,13 +234,13 @@ def test_wrong_wishes_are_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
 ):
     wishes: dict[str, Any] = {"output": tmp_path / "s.onnx"} | settings
-    assert main(saved(tmp_path), **wishes) == 1
+    assert main(ExportOptions(saved(tmp_path), **wishes)) == 1
     assert message in capsys.readouterr().err
 
 
 def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
-    assert main(tmp_path / "model.pt", min_psnr=45.0, no_bands=True) == 0
+    assert main(ExportOptions(tmp_path / "model.pt", min_psnr=45.0, keep_sh=True)) == 0
     shown = capsys.readouterr().err
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene
@@ -263,14 +269,14 @@ def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.Monke
         (tmp_path / name).write_bytes(contents)
     monkeypatch.setattr(place, interrupt)
     settings: dict[str, Any] = {} if place.endswith("run") else {"quick": True}
-    assert main(checkpoint, **settings) == 130
+    assert main(ExportOptions(checkpoint, **settings)) == 130
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path != checkpoint} == old
 
 
 def test_switched_off_on_the_command_line(tmp_path: Path):
     save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
-    off: dict[str, Any] = {"no_still": True, "no_unseen": True, "no_layers": True}
-    assert main(tmp_path / "model.pt", quick=True, **off) == 0
+    off: dict[str, Any] = {"keep_static": True, "keep_invisible": True, "keep_layers": True}
+    assert main(ExportOptions(tmp_path / "model.pt", quick=True, **off)) == 0
     scene = DeformationSession(tmp_path / "model.onnx").scene
     assert (scene.moving_count, scene.static_count) == (GROUND + OBJECT, 0)
     assert scene.metadata.layers == ("mlp", "mlp")

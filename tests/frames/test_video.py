@@ -9,6 +9,7 @@ from typing import Any
 import av
 import httpx
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from msdgs_serve import blocks
@@ -20,7 +21,7 @@ from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
 from msdgs_serve.video import write_video
 from tests.service.test_api_poison import check_problem
 from tests.support.images import decode, psnr
-from tests.support.scene_files import UP, write_scene
+from tests.support.scene_files import UP
 from tests.support.service import serving
 
 SIZE = 64
@@ -40,11 +41,6 @@ def frames_of(film: bytes) -> tuple[list[np.ndarray], float]:
         rate = container.streams.video[0].average_rate
         assert rate is not None
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], float(rate)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +105,19 @@ def test_a_film_shows_the_frames(client: httpx.Client, video_format: str):
         assert psnr(frame / 255, decode(alone.content, "png")[0] / 255) > 20
     by_path = client.post("/render/video", json={"path": nerfstudio(5), "fps": 5.0, "format": video_format})
     assert len(frames_of(by_path.content)[0]) == 5
+
+
+def test_an_animated_webp_shows_the_frames(tmp_path: Path):
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
+    path = tmp_path / "film.webp"
+    with path.open("wb") as file:
+        assert write_video((np.full((SIZE, SIZE, 3), color, np.uint8) for color in colors), 5.0, "webp", file) == 3
+    file = oiio.ImageInput.open(str(path))
+    assert file is not None
+    frames = [np.asarray(file.read_image(number, 0, 0, 3, oiio.UINT8)) for number in range(3)]
+    assert not file.seek_subimage(3, 0)
+    for frame, color in zip(frames, colors, strict=True):
+        assert psnr(frame / 255, np.broadcast_to(color, (SIZE, SIZE, 3)) / 255) > 20
 
 
 @pytest.mark.parametrize(
@@ -189,7 +198,7 @@ def test_a_path_of_nerfstudio_on_disk(scene: Path, tmp_path: Path):
         (["scene", "out", "--path", "missing.json"], "missing.json"),
         (["scene", "out", "--frames", "0"], "--frames"),
         (["scene", "out", "--width", "10"], "--height"),
-        (["scene", "film.gif"], "mp4, webm"),
+        (["scene", "film.gif"], "mp4, webm, webp"),
         (["scene", "film.mp4", "--transparent"], "--transparent"),
         (["scene", "taken"], "an empty folder"),
         (["missing.onnx", "out"], "missing.onnx"),

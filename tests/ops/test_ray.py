@@ -1,16 +1,20 @@
 """Work on a Ray cluster of this machine: the same bytes as drawn here, and what a worker that dies costs."""
 
+import filecmp
+import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from msdgs_serve.ray_tasks import MAX_LOSSES, RayTasks, WorkLost, in_turns, ray_cluster
 from msdgs_serve.render_cli import main
 from msdgs_serve.scene import MsdgsError
-from tests.support.ray_work import always_dies, dies_once, refuses
 from tests.support.scene_files import write_scene
+from tests.support.service_on_ray import always_dies, dies_once, refuses
 
 pytest.importorskip("ray", reason="needs Ray: make test-cluster")
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("ray")]  # one cluster at a time
@@ -19,8 +23,8 @@ CORES = 2
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cluster() -> Iterator[None]:
-    """Found by `auto`; small, with an object store to match."""
+def cluster() -> Iterator[Any]:
+    """Found by `auto`; one node to begin with, small, with an object store to match."""
     patch = pytest.MonkeyPatch()
     patch.setenv("RAY_AUTH_MODE", "disabled")  # nothing but this machine reaches it
     with warnings.catch_warnings():
@@ -31,7 +35,7 @@ def cluster() -> Iterator[None]:
         arguments = {"num_cpus": CORES, "object_store_memory": 80 << 20, "include_dashboard": False}
         nodes = Cluster(initialize_head=True, head_node_args=arguments)
     patch.setenv("RAY_ADDRESS", nodes.address)
-    yield
+    yield nodes
     patch.undo()
     ray.shutdown()
     nodes.shutdown()
@@ -60,6 +64,20 @@ def test_frames_are_the_same_bytes_and_are_not_drawn_twice(tmp_path: Path, capsy
     printed = capsys.readouterr()
     assert "8 of 9 frames are there already" in printed.out
     assert "frame 1 of 1" in printed.err
+
+
+def test_a_node_that_is_lost_costs_no_frame(tmp_path: Path, cluster: Any):
+    scene, size = write_scene(tmp_path / "balls.onnx"), ["--frames", "60", "--width", "200", "--height", "200"]
+    node = cluster.add_node(num_cpus=CORES, object_store_memory=80 << 20)
+    assert main([str(scene), str(tmp_path / "here"), *size]) == 0
+    with ThreadPoolExecutor(1) as pool:
+        drawing = pool.submit(main, [str(scene), str(tmp_path / "ray"), *size, "--ray", "auto"])
+        while not drawing.done() and len(list(tmp_path.glob("ray/frame_*"))) < 5:
+            time.sleep(0.02)
+        cluster.remove_node(node, allow_graceful=False)
+        assert drawing.result() == 0
+    names = sorted(file.name for file in (tmp_path / "here").iterdir())
+    assert filecmp.cmpfiles(tmp_path / "here", tmp_path / "ray", names, shallow=False) == (names, [], [])
 
 
 def test_a_worker_that_dies_costs_its_task_alone(tmp_path: Path):

@@ -7,24 +7,47 @@ import torch
 from torch import Tensor, nn
 
 from export.importers.errors import ImportFailed
+from export.importers.runs.base import Fidelity
+from export.importers.runs.fidelity import quaternion_fidelity
 from export.importers.runs.state import State
 from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
-from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.gaussians.model_file import SceneInfo
+from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 
 XYZ_FREQUENCIES = 10
-LEAST_LAYERS, MOST_LAYERS = 3, 64
+MIN_LAYERS, MAX_LAYERS = 3, 64
 """With two, the heads would read the input once more; ours don't."""
 
-MOST_UNITS, MOST_FREQUENCIES = 4_096, 64
+MAX_UNITS, MAX_FREQUENCIES = 4_096, 64
 """Sixteen times the usual width; what is above 2⁶⁴ turns in unit time is noise in float32."""
+
+
+class DeformGSImporter:
+    """Of Deformable-3D-Gaussians."""
+
+    white_background = False
+
+    def detects(self, run: Path) -> bool:
+        """Its networks are in files of their own."""
+        return next(run.glob("deform/iteration_*/deform.pth"), None) is not None
+
+    def read(
+        self, run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
+    ) -> tuple[DynamicGaussians, list[str]]:
+        """The model of an iteration, without notes."""
+        return read_deformgs(run, gaussians, iteration, settings), []
+
+    def fidelity(self, model: DynamicGaussians, info: SceneInfo) -> Fidelity:
+        """Its rasterizer doesn't normalise quaternions."""
+        return quaternion_fidelity(model, info)
 
 
 def read_deformgs(
     run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
-) -> tuple[DynamicGaussians, list[str]]:
-    """The model of an iteration, and notes. Raises `ImportFailed` for networks that are built otherwise."""
+) -> DynamicGaussians:
+    """The model of an iteration. Raises `ImportFailed` for networks that are built otherwise."""
     file = run / "deform" / f"iteration_{iteration}" / "deform.pth"
     if not file.is_file():
         raise ImportFailed(run, f"has point_cloud/iteration_{iteration} but no deform/iteration_{iteration}/deform.pth")
@@ -32,35 +55,38 @@ def read_deformgs(
     if settings.get("is_6dof") or "branch_w.weight" in state:
         raise ImportFailed(file, "was trained with --is_6dof, whose screw motions no layer of this project has")
     depth = sum(name.startswith("linear.") and name.endswith(".weight") for name in state.names())
-    if not LEAST_LAYERS <= depth <= MOST_LAYERS:
-        raise ImportFailed(file, f"has {depth} hidden layers; from {LEAST_LAYERS} to {MOST_LAYERS} can be read")
+    if not MIN_LAYERS <= depth <= MAX_LAYERS:
+        raise ImportFailed(file, f"has {depth} hidden layers; from {MIN_LAYERS} to {MAX_LAYERS} can be read")
     width = len(state.read("linear.0.bias", None))
     by_network = "timenet.0.weight" in state
     time_width, time_features, frequencies = _time_sizes(state, by_network, width)
-    if not all(1 <= size <= MOST_UNITS for size in (width, time_width, time_features)):
+    if not all(1 <= size <= MAX_UNITS for size in (width, time_width, time_features)):
         found = f"{width:,} units a layer, and {time_width:,} and {time_features:,} for time"
-        raise ImportFailed(file, f"has {found}; from 1 to {MOST_UNITS:,} can be read")
-    if not 0 <= frequencies <= MOST_FREQUENCIES:
-        raise ImportFailed(file, f"reads {frequencies:,} frequencies of time; up to {MOST_FREQUENCIES} can be read")
+        raise ImportFailed(file, f"has {found}; from 1 to {MAX_UNITS:,} can be read")
+    if not 0 <= frequencies <= MAX_FREQUENCIES:
+        raise ImportFailed(file, f"reads {frequencies:,} frequencies of time; up to {MAX_FREQUENCIES} can be read")
     config = ModelConfig(
         sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
-        layers=("mlp",),
-        width=width,
-        depth=depth,
-        time_frequencies=frequencies,
-        time_width=time_width,
-        time_features=time_features,
-        skip=depth // 2 + 1,
+        layers=(
+            MLPConfig(
+                width=width,
+                depth=depth,
+                time_frequencies=frequencies,
+                time_width=time_width,
+                time_features=time_features,
+                skip=depth // 2 + 1,
+            ),
+        ),
         weights=False,
         embedding_dim=0,
-        delta_space="activated",
+        scale_space="linear",
     )
     with torch.device("meta"):
         shapes_only = DynamicGaussians(config, gaussians)
     _fill(shapes_only, state, by_network)  # all tensors must fit before memory is taken for any
     model = DynamicGaussians(config, gaussians)
     _fill(model, state, by_network)
-    return model, []
+    return model
 
 
 def _time_sizes(state: State, by_network: bool, width: int) -> tuple[int, int, int]:

@@ -1,7 +1,9 @@
-"""Quaternions of any length and scales of any sign, where a scene file holds unit ones and positive ones: the price.
+"""What a scene file can't hold of a run, and the PSNR that this costs.
 
-The rasterizer of Deformable-3D-Gaussians writes a quaternion into a rotation matrix as it is. Where its length isn't 1,
-the matrix bends shapes; the sign of a scale is squared away. What comes out is an ellipsoid all the same.
+The rasterizer of Deformable-3D-Gaussians doesn't normalise quaternions: if the length isn't 1, the matrix is no
+rotation and shears the Gaussian; the sign of a scale is squared away. The result is an ellipsoid all the same.
+
+Opacities and colors that change with time are replaced by their means, since a scene file stores constants.
 """
 
 from dataclasses import replace
@@ -10,58 +12,61 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from export.measure.rendered_error import ExactFrames, RenderedError, posed, shown
-from export.measure.views import cameras_of, deciding_views
+from export.measure.frames import compare, render
+from export.measure.poses import posed
+from export.measure.rendered_error import ExactFrames, RenderedError
+from export.measure.views import cameras_of, selection_views
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
-from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import MIN_SCALE, DynamicGaussians, activated_scales, unit_quats
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
+from msdgs_train.gaussians.scale_space import MIN_SCALE, activated_scales
+from msdgs_train.layers.quaternions import unit_or_identity
 
 FRAMES = 12
-"""That are compared, each of another camera and time."""
+"""Number of frames that are compared, each of another camera and time."""
 
 
-class Unbent(NamedTuple):
-    """How far frames of a model are from those of the program that trained it."""
+class QuaternionFidelity(NamedTuple):
+    """Difference between frames with normalised quaternions and those of the program that trained them."""
 
     psnr_mean: float
     psnr_worst: float
-    longest: float  # by which a length differs from 1, at the times compared
+    longest: float  # largest difference of a length from 1, at the times compared
     gaussians: int
 
     def left_out(self) -> dict[str, Any]:
-        """As a scene file lists it."""
-        n, what = self.gaussians, "lengths of quaternions, which bend shapes, and signs of scales"
-        return {"rule": "unbent", "what": what, "count": n, "of": n, "worst_frame_db": self.psnr_worst}
+        """The entry of `left_out` in a scene file."""
+        n, what = self.gaussians, "lengths of quaternions, which shear shapes, and signs of scales"
+        return {"rule": "quaternion_fidelity", "what": what, "count": n, "of": n, "worst_frame_db": self.psnr_worst}
 
     def note(self) -> str:
-        """For whoever imports it."""
+        """One sentence for the user."""
         return (
             f"their renderer takes quaternions of any length, here up to {self.longest:.3g} from 1, and a scene file "
             f"unit ones: frames are {self.psnr_mean:.1f} dB from theirs, the worst of {FRAMES} {self.psnr_worst:.1f} dB"
         )
 
 
-def unbent(model: DynamicGaussians, info: SceneInfo) -> Unbent:
-    """Of a model with one layer that adds to scales and to unit quaternions."""
+def quaternion_fidelity(model: DynamicGaussians, info: SceneInfo) -> QuaternionFidelity:
+    """Of a model with one layer that adds to scales and to unit quaternions, as Deformable-3D-Gaussians has."""
     psnrs, longest = [], 0.0
-    for view in deciding_views(cameras_of(info), info.time_range, FRAMES):
+    for view in selection_views(cameras_of(info), info.time_range, FRAMES):
         ours = posed(model, view.t)
-        theirs, off = bent(model, view.t, ours)
-        frames = [shown(each, view.camera, info.background, model.rasterizer) for each in (theirs, ours)]
-        psnrs.append(psnr_from_mse(float(np.square(frames[0] - frames[1], dtype=np.float64).mean())))
+        theirs, off = as_trained(model, view.t, ours)
+        frames = [render(each, view.camera, info.background, model.rasterizer) for each in (theirs, ours)]
+        psnrs.append(compare(*frames).psnr)
         longest = max(longest, off)
-    return Unbent(float(np.mean(psnrs)), min(psnrs), longest, len(model.gaussians))
+    return QuaternionFidelity(float(np.mean(psnrs)), min(psnrs), longest, len(model.gaussians))
 
 
 @torch.no_grad()
-def bent(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaussians, float]:
-    """`ours` as the program that trained them draws them, and by how much a quaternion's length is off 1."""
+def as_trained(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaussians, float]:
+    """`ours` as the program that trained them draws them, and the largest difference of a length from 1."""
     g = model.gaussians
     step = model.deformation.layers[0](g.means, torch.tensor(t, dtype=g.means.dtype))
-    quats = (unit_quats(g.raw_quats) + step.delta_quats).double()
+    quats = (unit_or_identity(g.raw_quats) + step.delta_quats).double()
     scales = (activated_scales(g.log_scales) + step.delta_scales).double()
     axes, lengths, _ = torch.linalg.svd(_as_it_is(quats) * scales[:, None, :])
     axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
@@ -82,40 +87,37 @@ def _as_it_is(quats: torch.Tensor) -> torch.Tensor:
 
 
 TIMES = 41
-"""That means are taken over."""
+"""Number of times that are averaged."""
 
 FRAMES = 12
-"""That are compared, each of another camera and time."""
+"""Number of frames that are compared, each of another camera and time."""
 
 NEAREST_TO_END = 1e-7
 
 
-class Frozen(NamedTuple):
-    """A model whose layers change poses only, and how far its frames are from those of the whole."""
+class StaticAppearance(NamedTuple):
+    """A model whose layers change poses only, and the error of its frames against the full model."""
 
     model: DynamicGaussians
     error: RenderedError
 
     def left_out(self) -> dict[str, Any]:
-        """As a scene file lists it."""
-        what = "changes of opacities and colors with time, which are held at their means"
+        """The entry of `left_out` in a scene file."""
+        what = "changes of opacities and colors with time, replaced by their means"
         n = len(self.model.gaussians)
-        return {"rule": "frozen", "what": what, "count": n, "of": n, "worst_frame_db": self.error.psnr_worst}
+        return {"rule": "static_appearance", "what": what, "count": n, "of": n, "worst_frame_db": self.error.psnr_worst}
 
     def note(self) -> str:
-        """For whoever imports it."""
+        """One sentence for the user."""
         e = self.error
         return (
-            f"opacities and colors that change with time are held at their means, as a scene file stores them once: "
+            f"opacities and colors that change with time are replaced by their means: "
             f"frames are {e.psnr_mean:.1f} dB from the run's, the worst of {e.frames} {e.psnr_worst:.1f} dB"
         )
 
 
-def frozen(model: DynamicGaussians, info: SceneInfo) -> Frozen:
-    """The model without its heads of opacity and SH, each Gaussian as visible and as bright as it is on average.
-
-    Colors count as much as the Gaussian is visible while it has them.
-    """
+def static_appearance(model: DynamicGaussians, info: SceneInfo) -> StaticAppearance:
+    """The model without its heads of opacity and SH, with mean opacities, and mean colors weighted by opacity."""
     opacities, sh = _means(model, info.time_range)
     g = model.gaussians
     opacities = opacities.clamp(NEAREST_TO_END, 1 - NEAREST_TO_END)
@@ -130,9 +132,9 @@ def frozen(model: DynamicGaussians, info: SceneInfo) -> Frozen:
     )
     kept = {name for name in still.state_dict() if not name.startswith("gaussians.")}
     still.load_state_dict({n: v for n, v in model.state_dict().items() if n in kept}, strict=False)
-    views = deciding_views(cameras_of(info), info.time_range, FRAMES)
+    views = selection_views(cameras_of(info), info.time_range, FRAMES)
     exact = ExactFrames(model, views, info.background)
-    return Frozen(still, exact.measure(lambda t: posed(still, t), np.arange(len(g))))
+    return StaticAppearance(still, exact.measure(lambda t: posed(still, t), np.arange(len(g))))
 
 
 @torch.no_grad()

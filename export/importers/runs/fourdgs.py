@@ -12,8 +12,9 @@ from export.importers.runs.state import State
 from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
+from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import MAX_LOG_FACTOR
-from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
+from msdgs_train.layers.plane import PlaneConfig, PlaneGrid, PlaneLayer
 
 DEFAULTS = {"no_dx": False, "no_ds": False, "no_dr": False, "no_do": True, "no_dshs": True}
 """Of its switches, which cfg_args holds: which parts of a Gaussian don't change."""
@@ -22,7 +23,7 @@ HEADS = {"pos_deform": "no_dx", "scales_deform": "no_ds", "rotations_deform": "n
 HEADS |= {"opacity_deform": "no_do", "shs_deform": "no_dshs"}
 """Its networks in the order of `Heads.sizes`, and the switch of each."""
 
-CHANGE_THRESHOLD = ("no_grid", "grid_pe", "apply_rotation", "static_mlp", "empty_voxel")
+UNSUPPORTED_SWITCHES = ("no_grid", "grid_pe", "apply_rotation", "static_mlp", "empty_voxel")
 """Switches that make another network of it."""
 
 SH_DEGREE = 3
@@ -31,7 +32,7 @@ SH_DEGREE = 3
 SPACE, TIME = (0, 1, 3), (2, 4, 5)
 """Which of its six planes are xy, xz, yz, and xt, yt, zt."""
 
-MOST_UNITS = 4_096
+MAX_UNITS = 4_096
 """A layer, and channels of all grids: sixteen times the usual and more."""
 
 UNIT = 1e-4
@@ -45,6 +46,25 @@ class _Sizes(NamedTuple):
     width: int
 
 
+class FourDGSImporter:
+    """Of 4DGaussians."""
+
+    white_background = True
+
+    def detects(self, run: Path) -> bool:
+        """Its networks lie beside the Gaussians."""
+        return next(run.glob("point_cloud/iteration_*/deformation.pth"), None) is not None
+
+    def read(
+        self, run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
+    ) -> tuple[DynamicGaussians, list[str]]:
+        """The model of an iteration, and notes."""
+        return read_4dgs(run, gaussians, iteration, settings)
+
+    def fidelity(self, model: DynamicGaussians, info: SceneInfo) -> None:
+        """Its renderer draws the same."""
+
+
 def read_4dgs(
     run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
 ) -> tuple[DynamicGaussians, list[str]]:
@@ -53,7 +73,7 @@ def read_4dgs(
     if not file.is_file():
         raise ImportFailed(run, f"has point_cloud/iteration_{iteration} but no deformation.pth in it")
     state = State(file)
-    for name in CHANGE_THRESHOLD:
+    for name in UNSUPPORTED_SWITCHES:
         if settings.get(name) or any(key.startswith(f"deformation_net.{name}.") for key in state.names()):
             raise ImportFailed(file, f"was trained with {name}, which no layer of this project has")
     if "deformation_net.feature_out.2.weight" in state:
@@ -66,16 +86,18 @@ def read_4dgs(
     base = math.gcd(*sizes.nodes)
     config = ModelConfig(
         sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
-        layers=("plane",),
-        plane_features_dim=sizes.channels,
-        plane_resolution=base,
-        plane_time_resolution=sizes.time_nodes - first,
-        plane_width=sizes.width,
-        multires=tuple(nodes // base for nodes in sizes.nodes),
+        layers=(
+            PlaneConfig(
+                features=sizes.channels,
+                resolution=base,
+                time_resolution=sizes.time_nodes - first,
+                width=sizes.width,
+                multires=tuple(nodes // base for nodes in sizes.nodes),
+            ),
+        ),
         weights=False,
         embedding_dim=1 if scaled else 0,
         modulation_targets=("quats",),
-        delta_space="raw",
         opacity_head=not off["no_do"],
         sh_head=not off["no_dshs"],
     )
@@ -136,9 +158,9 @@ def _sizes(state: State) -> _Sizes:
         nodes.append(plane.shape[3])
     if not nodes or min(*nodes, time_nodes) < 2 or channels < 1 or math.gcd(*nodes) < 2:
         raise ImportFailed(state.file, f"has planes of {nodes} nodes over space and {time_nodes} over time")
-    if not (1 <= width <= MOST_UNITS and channels * len(nodes) <= MOST_UNITS):
+    if not (1 <= width <= MAX_UNITS and channels * len(nodes) <= MAX_UNITS):
         found = f"{width:,} units a layer and {len(nodes):,} grids of {channels:,} channels"
-        raise ImportFailed(state.file, f"has {found}; from 1 to {MOST_UNITS:,} of each in all can be read")
+        raise ImportFailed(state.file, f"has {found}; from 1 to {MAX_UNITS:,} of each in all can be read")
     return _Sizes(channels, nodes, time_nodes, width)
 
 

@@ -1,9 +1,9 @@
-"""Folders of other trainers' runs to a model.pt, which then goes the way of our own."""
+"""Run folders of other trainers to a model.pt, which is then exported as our own."""
 
 import ast
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,35 +12,31 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from export.importers.detect import read_splats
 from export.importers.errors import ImportFailed
-from export.importers.runs.deformgs import read_deformgs
-from export.importers.runs.fidelity import frozen, unbent
-from export.importers.runs.fourdgs import read_4dgs
+from export.importers.runs.base import Fidelity, RunImporter
+from export.importers.runs.deformgs import DeformGSImporter
+from export.importers.runs.fidelity import static_appearance
+from export.importers.runs.fourdgs import FourDGSImporter
 from export.importers.scene import metadata_of
 from export.importers.splats.base import Splats
-from export.measure.rendered_error import posed
+from export.importers.splats.formats import read_splats
+from export.measure.poses import posed
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
 
-Reader = Callable[[Path, CanonicalGaussians, int, dict[str, Any]], tuple[DynamicGaussians, list[str]]]
+RUNS: dict[str, RunImporter] = {"deformgs": DeformGSImporter(), "4dgs": FourDGSImporter()}
+"""By name of the format."""
 
-RUNS: dict[str, Reader] = {"deformgs": read_deformgs, "4dgs": read_4dgs}
-"""Reads the network of an iteration, given its canonical Gaussians and cfg_args: the model, and what to say of it."""
-
-WHITE_BY_DEFAULT = {"deformgs": False, "4dgs": True}
-"""Backgrounds, of runs without cfg_args."""
-
-MOST_CAMERAS = 1_000
+MAX_CAMERAS = 1_000
 CHECKED_TIMES = 3
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
-def write_model(run: Path, kind: str, output: Path, console: Console) -> list[dict[str, Any]]:
-    """Write the last iteration of a run, of one of `RUNS`, as a model.pt; returns what a scene file of it has lost.
+def write_model(run: Path, file_format: str, output: Path, console: Console) -> list[dict[str, Any]]:
+    """Write the last iteration of a run, of one of `RUNS`, as a model.pt; returns entries for `left_out`.
 
     Raises `ImportFailed` naming what is missing or differs.
     """
@@ -55,36 +51,33 @@ def write_model(run: Path, kind: str, output: Path, console: Console) -> list[di
     source = read_splats(clouds[iteration], "ply")
     if source.dropped:
         raise ImportFailed(clouds[iteration], f"{source.dropped:,} Gaussians hold NaN, infinity or no direction")
-    settings = _settings(run / "cfg_args")
-    model, notes = RUNS[kind](run, canonical(source), iteration, settings)
+    settings, importer = _settings(run / "cfg_args"), RUNS[file_format]
+    model, notes = importer.read(run, canonical(source), iteration, settings)
     _check_poses(run, model)
     metadata = metadata_of(source.gaussians.means, source.gaussians.sh_degree, "0" * 64)
     cameras = _cameras(run / "cameras.json") or [camera.to_plain() for camera in metadata.cameras]
     info = SceneInfo(
-        background=WHITE if settings.get("white_background", WHITE_BY_DEFAULT[kind]) else BLACK,
+        background=WHITE if settings.get("white_background", importer.white_background) else BLACK,
         bounds=[list(b) for b in metadata.bounds],
         cameras=cameras,
     )
     console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
-    lost = []
+    losses: list[Fidelity] = []
     if model.config.opacity_head or model.config.sh_head:
-        with console.status("holding opacities and colors"), _usable(run):
-            held = frozen(model, info)
-        model, lost = held.model, [held.left_out()]
-        notes.append(held.note())
-    if kind == "deformgs":
-        with console.status("comparing shapes"), _usable(run):
-            shapes = unbent(model, info)
-        lost.append(shapes.left_out())
-        notes.append(shapes.note())
+        with console.status("averaging opacities and colors"), _usable(run):
+            held = static_appearance(model, info)
+        model = held.model
+        losses.append(held)
+    with console.status("comparing frames"), _usable(run):
+        losses += [fidelity] if (fidelity := importer.fidelity(model, info)) else []
     save_model(output, model, info, iteration)
-    for note in notes:
+    for note in [*notes, *(loss.note() for loss in losses)]:
         console.print(note, markup=False)
-    return lost
+    return [loss.left_out() for loss in losses]
 
 
 def _check_poses(run: Path, model: DynamicGaussians) -> None:
-    """Raise `ImportFailed` where a network sends Gaussians to where none can be."""
+    """Raise `ImportFailed` if a network gives poses that aren't finite."""
     for t in np.linspace(0, 1, CHECKED_TIMES).tolist():
         with _usable(run, f" at t = {t:g}"):
             posed(model, t).validate()
@@ -92,7 +85,7 @@ def _check_poses(run: Path, model: DynamicGaussians) -> None:
 
 @contextmanager
 def _usable(run: Path, when: str = "") -> Iterator[None]:
-    """Say of what can't be drawn that it comes from a run: finite weights may be wild ones, at some times only."""
+    """Turn errors of Gaussians that can't be drawn into `ImportFailed`: finite weights may give infinite poses."""
     try:
         yield
     except InvalidInput as error:
@@ -100,7 +93,7 @@ def _usable(run: Path, when: str = "") -> Iterator[None]:
 
 
 def canonical(source: Splats) -> CanonicalGaussians:
-    """Activated Gaussians back in storage space, their quaternions as long as they were stored."""
+    """Activated Gaussians in storage space, with the original lengths of their quaternions."""
     g = source.gaussians
     lengths = np.ones(len(g), np.float32) if source.quat_lengths is None else source.quat_lengths
     opacities = g.opacities.astype(np.float64).clip(1e-7, 1 - 1e-7)
@@ -110,7 +103,7 @@ def canonical(source: Splats) -> CanonicalGaussians:
 
 
 def _settings(file: Path) -> dict[str, Any]:
-    """The plain values of cfg_args, which is the text of a Namespace; nothing of it is run."""
+    """The plain values of cfg_args, the text of a Namespace; it isn't executed."""
     try:
         call = ast.parse(file.read_text(), mode="eval").body
     except FileNotFoundError:
@@ -130,7 +123,7 @@ def _cameras(file: Path) -> list[dict[str, Any]]:
         return []
     try:
         cameras = []
-        for stored in json.loads(file.read_text())[:MOST_CAMERAS]:
+        for stored in json.loads(file.read_text())[:MAX_CAMERAS]:
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = stored["rotation"], stored["position"]
             size = int(stored["width"]), int(stored["height"])

@@ -15,8 +15,8 @@ from export.importers.splats.base import Splats, smallest_three, splats
 from export.importers.splats.webp import read_texture
 
 META = "meta.json"
-LARGEST_META = 1 << 24
-MOST = 1 << 26
+MAX_META_BYTES = 1 << 24
+MAX_GAUSSIANS = 1 << 26
 """Gaussians in one file: a texture has 16,383 pixels a side at most."""
 
 SLACK = 1 << 13
@@ -127,11 +127,11 @@ def _is_plain(name: Any) -> bool:
 
 def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
     """`read` gives a file's bytes by name, or fails where they are more than a number."""
-    meta = _Meta(path, read(META, LARGEST_META))
+    meta = _Meta(path, read(META, MAX_META_BYTES))
     if meta.get("version") != 2:
         problem = "of version 1" if meta.get("version") is None else f"of version {meta.get('version')}"
         raise ImportFailed(path, f"is SOG {problem}; version 2 can be read")
-    count = meta.whole("count", MOST)
+    count = meta.whole("count", MAX_GAUSSIANS)
 
     def texture(name: str, least: int) -> np.ndarray:
         pixels = least + least // 8 + SLACK

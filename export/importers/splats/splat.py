@@ -1,4 +1,4 @@
-"""`.splat`, 32 bytes a Gaussian: position and linear scales as float32, color, opacity and rotation as bytes."""
+"""`.splat`, 32 bytes per Gaussian: position and linear scales as float32, color, opacity and rotation as bytes."""
 
 from pathlib import Path
 

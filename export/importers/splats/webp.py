@@ -1,4 +1,4 @@
-"""Lossless WebP textures that hold numbers, not images."""
+"""Lossless WebP textures that hold numbers."""
 
 import struct
 import tempfile

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from msdgs_train.datasets.common.files import replacing
 from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame
-from msdgs_train.files import replacing
 
 
 class VideoInfo(NamedTuple):

@@ -22,6 +22,8 @@ from tests.support.training_scene import (
     state_of,
 )
 
+pytestmark = pytest.mark.slow
+
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
     model=MOTION_BASES,

@@ -17,6 +17,8 @@ from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 from tests.support.training_scene import shrunk
 
+pytestmark = pytest.mark.slow
+
 
 def sizes(config: ModelConfig, count: int = 3) -> tuple[int, int]:
     """Parameters of the deformation, and of the modulation with its embeddings."""

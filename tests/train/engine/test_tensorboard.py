@@ -18,7 +18,8 @@ from msdgs_train.engine.trainer import StepResult
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SIZE, small_config, write_scene
 
-pytestmark = pytest.mark.usefixtures("no_curve")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
+
 accumulator = pytest.importorskip(
     "tensorboard.backend.event_processing.event_accumulator",
     reason="tensorboard isn't installed: pip install 'msdgs[tensorboard]'",

@@ -15,6 +15,8 @@ from msdgs_train.cli import main as cli
 from msdgs_train.systems.registry import systems
 from tests.support.processes import ROOT
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     *("--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--log-every=1", "--sh-degree=1", "--embedding-dim=4"),
     *("--layers", *["mlp:width=16,depth=2,time_width=8"] * 2),
@@ -59,7 +61,7 @@ def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
     try:
         _wait_for_lines(run / "metrics.jsonl", process)
         process.send_signal(signal.SIGINT)
-        output = process.communicate(timeout=60)[0]
+        output = process.communicate(timeout=600)[0]
     finally:
         process.kill()
     assert process.returncode == cli.EXIT_INTERRUPTED, output

@@ -44,6 +44,8 @@ from tests.support.training_scene import (
     state_of,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def _steps(trainer: Trainer, count: int) -> None:
     for _ in range(count):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import sys
 import types
 from pathlib import Path
@@ -34,6 +35,8 @@ from msdgs_train.gaussians.model_file import load_model
 from tests.support.scenes import front_camera, gaussians_of
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import SIZE, small_config, write_scene
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +119,8 @@ def test_the_best_model_is_that_of_the_highest_psnr_on_val(run: Path) -> None:
     assert by_name["last"].mean.psnr <= highest["psnr"]
 
 
-def test_without_val_the_best_is_chosen_on_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+@pytest.mark.usefixtures("no_curve")
+def test_without_val_the_best_is_chosen_on_test(tmp_path: Path) -> None:
     data = write_scene(tmp_path / "scene")
     (data / "transforms_val.json").unlink()
     outcome = fit(small_config(steps=4, eval_every=2), data, tmp_path / "run")
@@ -125,8 +128,8 @@ def test_without_val_the_best_is_chosen_on_test(tmp_path: Path, monkeypatch: pyt
     assert (outcome.best.split, outcome.best.psnr >= outcome.metrics["test"].psnr) == ("test", True)
 
 
-def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+@pytest.mark.usefixtures("no_curve")
+def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = fit(small_config(steps=3), data, run).best
     assert first is not None
@@ -331,20 +334,33 @@ def test_missing_files_are_named(data: Path, run: Path, tmp_path: Path, capsys: 
     assert "model.pt: no such file" in message(tmp_path / "old")
     (tmp_path / "old" / "model.pt").write_bytes(model)
     assert "run.json: no such file, so the dataset has to be given" in message(tmp_path / "old")
-    assert "nowhere: `folder` does not exist" in message(tmp_path / "old", tmp_path / "nowhere")
+    assert "nowhere: `folder` does not exist" in message(tmp_path / "old", "--data", tmp_path / "nowhere")
     (tmp_path / "old" / "run.json").write_text(json.dumps({"data": str(tmp_path / "gone"), "best": None}))
     assert "gone: `folder` does not exist; if it is elsewhere now: msdgs-train eval" in message(tmp_path / "old")
     (tmp_path / "old" / "run.json").write_text("[]")
     assert "run.json: isn't the record of a run" in message(tmp_path / "old")
-    assert cli.main(["eval", str(tmp_path / "old"), str(data), "--split", "val"]) == cli.EXIT_INVALID
+    assert cli.main(["eval", str(tmp_path / "old"), "--data", str(data), "--split", "val"]) == cli.EXIT_INVALID
 
 
 def test_a_run_from_before_there_was_a_best_model(data: Path, run: Path, tmp_path: Path) -> None:
     for name in ("config.json", "model.pt"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
-    assert cli.main(["eval", str(tmp_path), str(data), "--split", "val"]) == 0
+    assert cli.main(["eval", str(tmp_path), "--data", str(data), "--split", "val"]) == 0
     assert "this run has kept no best.pt" in (tmp_path / "eval" / "val.md").read_text()
     assert set(json.loads((tmp_path / "eval" / "val.json").read_text())["models"]) == {"last"}
+
+
+def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other, path = tmp_path / "other", tmp_path / "sheet.png"
+    shutil.copytree(run, other)
+    shutil.copyfile(run / "best.pt", other / "model.pt")
+    assert cli.main(["eval", str(run), str(other), "--sheet", str(path)]) == 0
+    assert f"wrote {path}" in capsys.readouterr().out.replace("\n", "")
+    frame, sheet = evaluate_run(run).frames[0], to_bytes(_read(path))
+    times = -(-evaluation_report.SMALLEST_PANEL // SIZE)
+    for image in (_read(frame.image_path), *(_render(each / "model.pt", frame) for each in (run, other))):
+        assert _contains(sheet, to_bytes(image).repeat(times, axis=0).repeat(times, axis=1))
+    assert cli.main(["eval"]) == cli.EXIT_INVALID
 
 
 def test_help(capsys: pytest.CaptureFixture[str]) -> None:

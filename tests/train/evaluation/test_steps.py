@@ -16,6 +16,8 @@ from msdgs_train.evaluation.sheets import Panel, draw_sheet, panel_corners, shee
 from msdgs_train.gaussians.model_file import CheckpointInvalid, save_model
 from tests.support.models import CAMERA, SCENE, random_model
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 320, 240
 
 

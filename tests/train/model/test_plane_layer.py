@@ -57,6 +57,7 @@ def test_the_whole_time_range_is_used() -> None:
         torch.testing.assert_close(planes.lines(torch.tensor(t)), torch.full((3, 32, 16), expected))
 
 
+@pytest.mark.slow
 def test_gradients_match_finite_differences() -> None:
     planes = layer(multires=(1, 2))
     means = places(6).requires_grad_(True)

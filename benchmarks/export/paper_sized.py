@@ -1,0 +1,362 @@
+"""A scene of the paper's size from a small trained one: 106,500 Gaussians, ten layers, motion and image as trained.
+
+Each Gaussian is split into smaller ones, which the small model's field moves from where they are. A field of the size
+of `msdgs-mlp` begins as the small one, its layers made wider and deeper without a change of what they compute (Net2Net,
+Chen et al. 2016), and all ten layers are trained: regression on these trajectories, smoothed in time, over batches
+drawn by lot.
+"""
+
+import math
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from time import process_time
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from scipy.interpolate import BSpline
+from torch import Tensor, nn
+from torch.nn import functional
+
+from benchmarks.measuring import machine
+from export.measure.frames import compare, render
+from export.measure.poses import posed
+from export.measure.views import cameras_of, selection_views
+from export.trajectories.splines import fitting
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_train.evaluation.layer_strip import camera_of
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
+from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.layers.quaternions import rotate, unit_or_identity
+from msdgs_train.systems.registry import preset
+from tests.support.models import SCENE, random_model
+
+SHRINK = 0.6
+"""Of a part's axes against those of the Gaussian it is a part of. Centres are spread by √(1 − 0.6²) of them, so that
+all parts together are as wide as the whole."""
+
+MOST_OPACITY = 0.999
+
+SAMPLES = 257
+"""Times at which the small model is asked for its poses."""
+
+TIMES_A_STEP, GAUSSIANS_PER_TIME = 4, 384
+MOVING_SHARE = 0.75
+"""Of a batch, drawn from Gaussians whose motion is more than a pixel."""
+
+RATE, LAST_RATE = 1e-4, 1e-6
+OCTAVE_DAMPING = 0.5
+"""First weights of each next octave of the encoding, of those before it: a new field is smooth in place and time."""
+
+CHUNK = 8192
+"""Gaussians whose trajectories are held at a time."""
+
+MEANS, LOG_SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
+
+
+class SmoothMotion:
+    """Trajectories of a model through a low-pass: cubic splines of few control points, least squares."""
+
+    def __init__(self, model: DynamicGaussians, info: SceneInfo, control: int) -> None:
+        self._time_range = info.time_range
+        matrix = torch.from_numpy(fitting(control, SAMPLES)).float()
+        controls, travels = [], []
+        for ids in torch.arange(len(model.gaussians)).split(CHUNK):
+            samples = self._sampled(model, ids)
+            controls.append(torch.einsum("ct,tnk->nck", matrix, samples))
+            travels.append((samples[..., MEANS].amax(0) - samples[..., MEANS].amin(0)).norm(dim=1))
+        self._control, self.travel = torch.cat(controls), torch.cat(travels)  # [N, n, 10], [N]
+        self._knots = np.concatenate([np.zeros(3), np.linspace(0, 1, control - 2), np.ones(3)])
+
+    def at(self, t: float, ids: Tensor) -> Tensor:
+        """[M, 10] means, log-scales and unit quaternions at a time."""
+        t0, t1 = self._time_range
+        weights = BSpline.design_matrix(np.array([(t - t0) / (t1 - t0)]), self._knots, 3).toarray()[0]
+        pose = torch.einsum("c,mck->mk", torch.from_numpy(weights).float(), self._control[ids])
+        return torch.cat([pose[:, :6], unit_or_identity(pose[:, QUATS])], dim=1)
+
+    @torch.no_grad()
+    def _sampled(self, model: DynamicGaussians, ids: Tensor) -> Tensor:
+        """[T, M, 10] the same, of one sign along time."""
+        poses = [model.pose(t, ids=ids) for t in np.linspace(*self._time_range, SAMPLES)]
+        samples = torch.stack([torch.cat([p.means, p.scales.log(), p.quats], dim=1) for p in poses])
+        same = torch.where((samples[1:, :, QUATS] * samples[:-1, :, QUATS]).sum(-1) < 0, -1.0, 1.0)
+        samples[1:, :, QUATS] *= same.cumprod(0)[..., None]
+        return samples
+
+
+class Fit:
+    """The large model, and how far its training is."""
+
+    def __init__(self, model: DynamicGaussians, motion: SmoothMotion, info: SceneInfo) -> None:
+        self.model, self.motion, self.info = model, motion, info
+        self.seconds, self.steps, self.pixels = 0.0, 0, float("nan")
+        self.pixel = _pixel(model, info)
+        self._moving = torch.nonzero(motion.travel > self.pixel)[:, 0]
+        self._parameters = [p.requires_grad_(True) for p in model.deformation.parameters()]
+        self._optimizer = torch.optim.Adam(self._parameters, lr=RATE, eps=1e-15)
+        self._generator = torch.Generator().manual_seed(1)
+
+    def step(self, part: float) -> None:
+        """One batch; `part` of the training time is over."""
+        start = process_time()
+        rate = LAST_RATE + (RATE - LAST_RATE) * (1 + math.cos(math.pi * part)) / 2
+        self._optimizer.param_groups[0]["lr"] = rate * min(1.0, (self.steps + 1) / 50)
+        self._optimizer.zero_grad()
+        t0, t1 = self.info.time_range
+        errors = []
+        for _ in range(TIMES_A_STEP):
+            t = t0 + (t1 - t0) * float(torch.rand((), generator=self._generator))
+            errors.append(self.errors(t, self._batch()))
+        error = torch.cat(errors)
+        functional.smooth_l1_loss(error, torch.zeros_like(error)).backward()
+        torch.nn.utils.clip_grad_norm_(self._parameters, 1.0)
+        self._optimizer.step()
+        self.steps += 1
+        pixels = float(error.detach()[:, MEANS].norm(dim=1).median())
+        self.pixels = pixels if self.steps == 1 else 0.98 * self.pixels + 0.02 * pixels
+        self.seconds += process_time() - start
+
+    def errors(self, t: float, ids: Tensor) -> Tensor:
+        """[M, 10] pixels that means, axes and ends of turned axes are off."""
+        wanted = self.motion.at(t, ids)
+        pose = self.model.pose(t, ids=ids)
+        scales = wanted[:, LOG_SCALES].exp()
+        spread = (scales.amax(1, keepdim=True) - scales.amin(1, keepdim=True)) * 2
+        sign = torch.where((pose.quats.detach() * wanted[:, QUATS]).sum(1, keepdim=True) < 0, -1.0, 1.0)
+        turned = (sign * pose.quats - wanted[:, QUATS]) * spread
+        return torch.cat([pose.means - wanted[:, MEANS], pose.scales - scales, turned], dim=1) / self.pixel
+
+    def _batch(self) -> Tensor:
+        moving = round(MOVING_SHARE * GAUSSIANS_PER_TIME) if len(self._moving) else 0
+        any_ = torch.randint(len(self.model.gaussians), (GAUSSIANS_PER_TIME - moving,), generator=self._generator)
+        if not moving:
+            return any_
+        return torch.cat([any_, self._moving[torch.randint(len(self._moving), (moving,), generator=self._generator)]])
+
+
+def main(
+    model: Annotated[Path, tyro.conf.Positional] = Path("runs/toybench/model.pt"),
+    output: Annotated[Path, tyro.conf.Positional] = Path("runs/paper_sized/model.pt"),
+    count: int = 106_500,
+    minutes: float = 4.0,
+    size: int = 400,
+    control: int = 27,
+    threads: int = 1,
+    check: bool = False,
+) -> int:
+    """Make a scene of the paper's size from a small trained one, to measure exports on (docs/work_precision.md).
+
+    Its Gaussians are split until there are as many as in the paper, 106,500. A field of ten MLP layers of 4 × 256, the
+    preset msdgs-mlp, learns how the small one moves them, smoothed in time. How near it came is printed.
+
+    python -m benchmarks.export.paper_sized runs/toybench/model.pt runs/paper_sized/model.pt
+
+    python export/to_onnx.py runs/paper_sized/model.pt
+
+    Args:
+        model: A trained `model.pt` of MLP layers, as of toybench.
+        output: The `model.pt` to write.
+        count: Gaussians of the new scene, at least as many as there are.
+        minutes: Processor time to train for.
+        size: Width in pixels of the new scene's cameras, which are the old ones otherwise.
+        control: Control points of the splines that smooth a trajectory.
+        threads: Of torch.
+        check: Only see that this works, on a random model of 40 Gaussians.
+    """
+    if check:
+        return self_test()
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console.print(machine(), markup=False)
+    torch.set_num_threads(threads)
+    try:
+        small, info, _ = load_model(model)
+        if count < len(small.gaussians):
+            raise InvalidInput("count", f"{len(small.gaussians):,} or more, the model's Gaussians", count)
+        info = replace(info, cameras=[_resized(camera, size) for camera in info.cameras])
+        parts = split(small, count, torch.Generator().manual_seed(0))
+        fit = Fit(grown(parts), SmoothMotion(parts, info, control), info)
+        _train(fit, 60 * minutes, console)
+        save_model(output, fit.model, info, fit.steps)
+        _describe(fit, small, console)
+    except (MsdgsError, OSError) as error:
+        console.print(f"error: {error}", style="red", markup=False)
+        return 1
+    return 0
+
+
+@torch.no_grad()
+def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> DynamicGaussians:
+    """The model with `count` Gaussians, as many parts of each as of any other or one more, under the same layers.
+
+    Opacities are such that a ray through all parts of a Gaussian loses as much light as through the whole.
+    """
+    g, parents = small.gaussians, torch.arange(count) * len(small.gaussians) // count
+    places = (1 - SHRINK**2) ** 0.5 * torch.randn(count, 3, generator=generator).clamp(-2.5, 2.5)
+    offsets = rotate(unit_or_identity(g.raw_quats[parents]), places * g.log_scales[parents].exp())
+    parts = torch.bincount(parents, minlength=len(g))[parents]
+    clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MOST_OPACITY)).log() / (parts * SHRINK**2)
+    tensors = {
+        "means": g.means[parents] + offsets,
+        "log_scales": g.log_scales[parents] + np.log(SHRINK),
+        "raw_quats": g.raw_quats[parents],
+        "raw_opacities": torch.logit((1 - clear.exp()).clamp(1e-6, MOST_OPACITY)),
+        "sh_dc": g.sh_dc[parents],
+        "sh_rest": g.sh_rest[parents],
+    }
+    tensors |= {name: values[parents] for name, values in g.attributes.items()}
+    model = DynamicGaussians(small.config, CanonicalGaussians(**tensors)).requires_grad_(requires_grad=False)
+    model.deformation, model.modulation = small.deformation, small.modulation
+    return model
+
+
+@torch.no_grad()
+def grown(small: DynamicGaussians) -> DynamicGaussians:
+    """A model of the preset msdgs-mlp that does what the small one does; of its ten layers the last ones move nothing
+    yet."""
+    paper = preset("msdgs-mlp").model
+    config = replace(
+        paper,
+        sh_degree=small.config.sh_degree,
+        embedding_dim=small.config.embedding_dim,
+        modulation_targets=small.config.modulation_targets,
+        scale_space=small.config.scale_space,
+    )
+    torch.manual_seed(0)
+    large = DynamicGaussians(config, small.gaussians).requires_grad_(requires_grad=False)
+    large.modulation = small.modulation
+    for layer in _mlp_layers(large):
+        damping = OCTAVE_DAMPING ** torch.arange(layer.config.xyz_frequencies).repeat_interleave(3)
+        layer.first.weight[:, 3 : 3 + 2 * len(damping)] *= damping.repeat(2)
+    for layer, trained in zip(_mlp_layers(large), _mlp_layers(small), strict=False):
+        _grown(layer, trained)
+    return large
+
+
+def _mlp_layers(model: DynamicGaussians) -> list[MLPLayer]:
+    layers = [layer for layer in model.deformation.layers if isinstance(layer, MLPLayer)]
+    if len(layers) < len(model.deformation) or any(layer.skip for layer in layers):
+        raise InvalidInput(
+            "model", "of MLP layers that read their input once", ", ".join(layer.kind for layer in model.config.layers)
+        )
+    return layers
+
+
+def _grown(layer: MLPLayer, trained: MLPLayer) -> None:
+    """Make a larger layer compute what a smaller one does. Its other hidden units stay as they are drawn, unread."""
+    if layer.outputs != trained.outputs or len(layer.trunk) < len(trained.trunk):
+        raise InvalidInput("model", "of layers with the paper's heads, four hidden layers at most", "others")
+    width, places = trained.first.out_features, _columns(layer.xyz_frequency_matrix, trained.xyz_frequency_matrix)
+    times = layer.xyz_features + torch.arange(trained.time_output.out_features)
+    _copy(layer.time_hidden, trained.time_hidden, _columns(layer.time_frequency_matrix, trained.time_frequency_matrix))
+    _copy(layer.time_output, trained.time_output, torch.arange(trained.time_output.in_features))
+    _copy(layer.first, trained.first, torch.cat([places, times]))
+    for i, linear in enumerate(_linears(layer)):
+        if i < len(trained.trunk):
+            _copy(linear, _linears(trained)[i], torch.arange(width))
+        else:  # hidden units aren't negative, so a ReLU of the same changes nothing
+            same = nn.Linear(width, width)
+            nn.init.eye_(same.weight)
+            nn.init.zeros_(same.bias)
+            _copy(linear, same, torch.arange(width))
+    _copy(layer.heads, trained.heads, torch.arange(width))
+
+
+def _linears(layer: MLPLayer) -> list[nn.Linear]:
+    return [linear for linear in layer.trunk if isinstance(linear, nn.Linear)]
+
+
+def _columns(frequency_matrix: Tensor, fewer: Tensor) -> Tensor:
+    """Columns of a longer encoding, value, sines, cosines, that are those of a shorter one."""
+    size, many, few = frequency_matrix.shape[0], frequency_matrix.shape[1], fewer.shape[1]
+    if few > many:
+        raise InvalidInput("model", f"with at most {many // size} frequencies", few // size)
+    first = torch.arange(size + few)
+    return torch.cat([first, size + many + torch.arange(few)])
+
+
+def _copy(linear: nn.Linear, source: nn.Linear, columns: Tensor) -> None:
+    """The first outputs of a Linear read these columns as another one does, and no others."""
+    outputs = source.out_features
+    if outputs > linear.out_features or len(columns) > linear.in_features:
+        raise InvalidInput("model", "no wider than the preset msdgs-mlp", outputs)
+    linear.weight[:outputs] = 0
+    linear.weight[:outputs, columns] = source.weight
+    linear.bias[:outputs] = source.bias
+
+
+def _train(fit: Fit, seconds: float, console: Console) -> None:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("training", total=seconds)
+        while fit.seconds < seconds:
+            fit.step(fit.seconds / seconds)
+            described = f"step {fit.steps:,}, median {fit.pixels:.2f} pixels"
+            progress.update(task, completed=fit.seconds, description=described)
+
+
+@torch.no_grad()
+def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
+    """How near the field came to the smoothed motion and to the small model's images, and what each layer adds."""
+    ids = torch.arange(0, len(fit.model.gaussians), 37)
+    t0, t1 = fit.info.time_range
+    errors = torch.cat([fit.errors(t, ids)[:, MEANS].norm(dim=1) for t in np.linspace(t0, t1, 17)])
+    quantiles = ", ".join(f"{float(errors.quantile(q)):.2f}" for q in (0.5, 0.9, 0.99))
+    console.print(f"pixels off the smoothed motion: {quantiles} (50, 90, 99 % of Gaussians)", markup=False)
+    means, adds = fit.model.gaussians.means[ids], []
+    for t in np.linspace(t0, t1, 5):
+        at, moved = torch.tensor(t, dtype=means.dtype), torch.zeros_like(means)
+        for layer in fit.model.deformation.layers:
+            step = layer(means + moved, at)
+            moved = moved + step.weight * step.delta_means
+            adds.append((step.weight * step.delta_means).norm(dim=1).mean() / fit.pixel)
+    layers = torch.stack(adds).view(5, -1).mean(0)
+    console.print(f"pixels that a layer moves, mean: {', '.join(f'{v:.2f}' for v in layers)}", markup=False)
+    psnrs = []
+    for view in selection_views(cameras_of(fit.info), fit.info.time_range, 9):
+        frames = [render(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
+        psnrs.append(compare(*frames).psnr)
+    console.print(f"images against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
+
+
+def _pixel(model: DynamicGaussians, info: SceneInfo) -> float:
+    middle = model.gaussians.means.median(dim=0).values.numpy()
+    cameras = [camera for _, camera in cameras_of(info)]
+    return float(min(np.linalg.norm(c.position - middle) / max(c.fx, c.fy) for c in cameras))
+
+
+def _resized(entry: dict, width: int) -> dict:
+    camera = camera_of(entry, width)
+    return entry | {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+
+
+def self_test() -> int:
+    """Larger layers compute what the smaller ones did, to rounding; a short run writes what it should."""
+    small = random_model(40, layers=("mlp", "mlp"))
+    parts = split(small, 100, torch.Generator().manual_seed(0))
+    large = grown(parts).double()
+    parts.double()
+    assert len(large.deformation) == 10
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        for t in (0.0, 0.37, 1.0):
+            expected, found = parts.pose(t), large.pose(t)
+            for part in ("means", "quats", "scales"):
+                torch.testing.assert_close(getattr(found, part), getattr(expected, part), rtol=1e-12, atol=1e-12)
+        source, made = Path(folder) / "small.pt", Path(folder) / "large.pt"
+        save_model(source, random_model(40, layers=("mlp",)), SCENE, 1)
+        with torch.enable_grad():
+            assert main(source, made, count=90, size=64, minutes=0.005) == 0
+        assert len(load_model(made).model.gaussians) == 90
+        assert main(source, made, count=3) == 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

@@ -1,0 +1,61 @@
+"""Our PLY and SPZ in the hands of PlayCanvas' splat-transform, and what it writes of them read here again.
+
+python -m benchmarks.export.splat_transform playbot.onnx; needs Node.js: npx fetches @playcanvas/splat-transform. Ends
+with 1 if a file is refused or comes back as less than it was.
+"""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from benchmarks.measuring import machine
+from export.exporters.command import LOSSY, Settings, convert
+from export.exporters.round_trip import RoundTrip, require
+from export.importers import read_splats
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import MsdgsError
+
+WRITTEN = (".ply", ".spz")
+TURN = ["-r", "180,0,0"]
+"""Version 3 takes the numbers of an SPZ as they are, where version 2 turned them from SPZ's axes to those of a PLY."""
+
+
+def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanvas/splat-transform@3.7.0") -> int:
+    """Convert a scene's first moment, let splat-transform make a PLY of it, print how far that is from the scene.
+
+    Args:
+        scene: A scene file.
+        package: What npx runs.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(machine(), markup=False)
+    try:
+        session = DeformationSession(scene)
+        proof = RoundTrip(session)
+        t0, _ = session.scene.metadata.time_range
+        with tempfile.TemporaryDirectory() as folder:
+            for suffix in WRITTEN:
+                ours, theirs = Path(folder) / f"ours{suffix}", Path(folder) / f"theirs{suffix}.ply"
+                convert(Settings(scene, ours, t0, 1, None), Console(quiet=True))
+                turn = TURN if suffix == ".spz" else []
+                subprocess.run(["npx", "--yes", package, "-w", ours, *turn, theirs], check=True, capture_output=True)
+                read = read_splats(theirs)
+                psnr = proof.psnr(read.gaussians, t0)
+                console.print(f"{suffix}: {len(read):,} Gaussians, {psnr:.1f} dB from the scene", markup=False)
+                require(psnr, LOSSY, theirs.name)
+    except subprocess.CalledProcessError as error:
+        console.print(f"{package} refused: {error.stderr.decode(errors='replace').strip()}", markup=False)
+        return 1
+    except (MsdgsError, FileNotFoundError) as error:
+        console.print(f"error: {error}", markup=False)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

@@ -1,0 +1,1 @@
+"""The rasterizer alone: stages and limits (run the package), `renderers`, `constants`, `avx512`."""

@@ -1,0 +1,237 @@
+"""This rasterizer beside others, in turns: times, and how far the images differ."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import OpenImageIO as oiio
+import tyro
+from rich.console import Console
+
+from benchmarks.measuring import Times, machine, minimum_and_median, psnr
+from benchmarks.rasterizer.avx512 import Avx512Renderer, why_not
+from benchmarks.rasterizer.report import table
+from benchmarks.rasterizer.scenes import Case, file_cases, seeded_cases, write_splat
+from benchmarks.rasterizer.stages import STAGES, draw_in_stages
+from msdgs_serve.rasterizer import GSPLAT, rasterize
+
+WORKER, ROOT = Path(__file__).with_name("renderer_worker.py"), Path(__file__).resolve().parents[2]
+LONG_ENOUGH = 0.03
+"""Seconds that each draws a case in a turn: the minimum over single frames of 1 ms is the machine's mood."""
+
+NEAREST = {
+    # F3D adds 0.3 / size² to a covariance in clip space, where the image is 2 wide and not 1. It has neither the cut
+    # at alpha 1/255 nor that at transmittance 1e-4, but ends a splat at 3 sigma.
+    "F3D": GSPLAT._replace(eps2d=0.3 / 4)
+}
+"""Our options that come nearest to another renderer's constants, if they are not gsplat's."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Draw seeded scenes or files of splats with this rasterizer and others in turns.
+
+    python -m benchmarks.rasterizer.renderers --avx512
+
+    python -m benchmarks.rasterizer.renderers --against ../msdgs-before --counts 100000
+
+    python -m venv .venv-f3d && .venv-f3d/bin/pip install f3d==4.0.0
+
+    python -m benchmarks.rasterizer.renderers --f3d-python .venv-f3d/bin/python --counts 20000 --sizes 400x400
+
+    F3D (https://f3d.app, 80 MB, glibc 2.34 or newer) draws by OpenGL through EGL; without a GPU, Mesa's software does
+    (Debian: apt install libegl1 libgl1-mesa-dri). Open3D (https://www.open3d.org, 400 MB, 0.20 or newer) draws by
+    Vulkan (apt install mesa-vulkan-drivers libusb-1.0-0). Both get a .splat file: 8 bits for color, opacity and
+    rotation, no harmonics beyond the constant; they are compared with our frames of that file.
+    """
+
+    counts: tuple[int, ...] = (100_000, 300_000)
+    """Numbers of Gaussians of the seeded scenes."""
+    sizes: tuple[str, ...] = ("800x800",)
+    """Widths and heights in pixels."""
+    splats: tuple[Path, ...] = ()
+    """Files of splats to draw, at the first size, instead of the seeded scenes."""
+    seed: int = 0
+    repeats: int = 5
+    """Turns."""
+    avx512: bool = False
+    """A renderer written by hand for AVX-512; needs g++ and such a processor."""
+    against: Path | None = None
+    """Another checkout of this project: its times are against those of this one in a process of its own, too."""
+    f3d_python: Path | None = None
+    """An interpreter that can import f3d."""
+    open3d_python: Path | None = None
+    """An interpreter that can import open3d."""
+    alpha_min: float = GSPLAT.alpha_min
+    """At which alpha our splats end in the image that F3D's and Open3D's are compared with; F3D has no such cut."""
+    check: bool = False
+    """Only see that this benchmark works: this checkout against itself, and AVX-512 if there is."""
+
+
+class Renderer(NamedTuple):
+    """One way to draw one case."""
+
+    draw: Callable[[Times], Any]  # one frame, adds its seconds as "total" and maybe as stages
+    image: Callable[[], np.ndarray]  # [H, W, 3]
+    version: str = ""
+
+
+def ours(case: Case) -> Renderer:
+    """The rasterizer of this checkout, as a whole and in stages."""
+    return Renderer(lambda times: draw_in_stages(case, times), lambda: rasterize(case.gaussians, case.camera).rgb)
+
+
+def by_hand(renderer: Avx512Renderer, case: Case) -> Renderer:
+    """The renderer of avx512.cpp."""
+
+    def draw(times: Times) -> None:
+        drawn = times.time("total", renderer.draw, case.gaussians, case.camera, GSPLAT)
+        for name, seconds in drawn.seconds.items():
+            times.add(name, seconds)
+
+    return Renderer(draw, lambda: renderer.draw(case.gaussians, case.camera, GSPLAT).rgb)
+
+
+@contextlib.contextmanager
+def in_a_process(
+    name: str, python: Path | str, case: Case, file: Path, checkout: Path | None = None
+) -> Iterator[Renderer]:
+    """F3D, Open3D or a checkout of this project, which draws the case's file as renderer_worker.py says."""
+    with tempfile.TemporaryDirectory() as temporary, tempfile.TemporaryFile("w+") as errors:
+        image = Path(temporary, "frame.npy" if checkout else "frame.png")
+        job = {"renderer": "msdgs" if checkout else name, "file": str(file), "image": str(image), **_view(case)}
+        process = subprocess.Popen(
+            [str(python), str(WORKER), json.dumps(job)],
+            env={**os.environ, "PYTHONPATH": str(checkout)} if checkout else None,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
+        )  # fmt: skip
+        assert process.stdin
+        assert process.stdout
+        orders, answers = process.stdin, process.stdout
+
+        def ask(order: str, key: str) -> Any:
+            with contextlib.suppress(BrokenPipeError):  # what it died of is in its errors
+                print(order, end="", file=orders, flush=True)
+            for line in answers:
+                if line.startswith(f'{{"{key}"'):  # the libraries print too
+                    return json.loads(line)[key]
+            errors.seek(0)
+            raise SystemExit(f"{name} did not draw:\n{errors.read()[-3000:]}")
+
+        def saved() -> np.ndarray:
+            ask("save\n", "saved")
+            return np.load(image) if checkout else np.asarray(oiio.ImageBuf(str(image)).get_pixels(oiio.FLOAT))[..., :3]
+
+        try:
+            version = str(ask("", "version"))
+            yield Renderer(lambda times: times.add("total", ask("draw\n", "seconds")), saved, version)
+        finally:
+            process.kill()
+            process.communicate()
+
+
+def _view(case: Case) -> dict[str, Any]:
+    camera, pose = case.camera, case.camera.camera_to_world
+    return {
+        "size": [camera.width, camera.height],
+        "position": pose[:3, 3].tolist(),
+        "focal_point": (pose[:3, 3] + pose[:3, 2]).tolist(),
+        "view_up": (-pose[:3, 1]).tolist(),
+        "view_angle": float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
+    }
+
+
+def in_turns(renderers: dict[str, Renderer], repeats: int) -> dict[str, Times]:
+    """Each draws the case for a while, in another order each turn; the first turn loads and compiles."""
+    times: dict[str, Times] = {}
+    for turn in range(repeats + 1):
+        times = times if turn > 1 else {name: Times() for name in renderers}
+        for name in list(renderers)[:: 1 if turn % 2 else -1]:
+            end = time.perf_counter() + LONG_ENOUGH
+            renderers[name].draw(times[name])
+            while time.perf_counter() < end:
+                renderers[name].draw(times[name])
+    return times
+
+
+def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterator[dict[str, Any]]:
+    """Ours, then the others, of one case."""
+    pythons = {"F3D": options.f3d_python, "Open3D": options.open3d_python}
+    checkouts = {"this checkout": ROOT, "the other": options.against.resolve()} if options.against else {}
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        exact, rounded = folder / "exact.npz", folder / "8 bits.splat"
+        np.savez(exact, **vars(case.gaussians))
+        write_splat(rounded, case.gaussians)
+        others = {"by hand": by_hand(hand, case)} if hand else {}
+        for name, checkout in checkouts.items():  # both in processes, so that they differ in nothing else
+            others[name] = stack.enter_context(in_a_process(name, sys.executable, case, exact, checkout))
+        yield from _rows(case, others, options.repeats)
+        (coarse,) = file_cases((rounded,))
+        coarse = coarse._replace(camera=case.camera)
+        others = {n: stack.enter_context(in_a_process(n, p, coarse, rounded)) for n, p in pythons.items() if p}
+        yield from _rows(coarse, others, options.repeats, options.alpha_min)
+
+
+def _rows(
+    case: Case, others: dict[str, Renderer], repeats: int, alpha_min: float = GSPLAT.alpha_min
+) -> Iterator[dict[str, Any]]:
+    if not others:
+        return
+    times = in_turns({"msdgs": ours(case), **others}, repeats)
+    for name, taken in times.items():
+        base = "this checkout" if name == "the other" else "msdgs"
+        ratio = taken.minimum("total") / times[base].minimum("total")
+        row = {"name": name, "case": case, "milliseconds": taken.milliseconds(), "ratio": ratio}
+        if name in others:
+            nearest = NEAREST.get(name, GSPLAT)._replace(alpha_min=alpha_min)
+            image = rasterize(case.gaussians, case.camera, options=nearest).rgb
+            row |= {"psnr": psnr(image, others[name].image()), "name": f"{name} {others[name].version}".strip()}
+        yield row
+
+
+def main(options: Compare) -> int:
+    """Draw in turns, print one table."""
+    if options.check:
+        return check()
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 170)
+    cases = seeded_cases(options.counts, options.sizes, options.seed)
+    if options.splats:
+        cases = file_cases(options.splats, *map(int, options.sizes[0].split("x")))
+    if not (options.avx512 or options.against or options.f3d_python or options.open3d_python):
+        raise SystemExit("nothing to compare with: --avx512, --against, --f3d-python or --open3d-python")
+    if options.avx512 and (reason := why_not()):
+        raise SystemExit(f"no renderer written by hand for AVX-512: {reason}")
+    with Avx512Renderer() if options.avx512 else contextlib.nullcontext() as hand:
+        rows = [row for case in cases for row in rows_of(case, options, hand)]
+    console.print(machine())
+    made = table("Milliseconds, minimum (median)", "renderer", "scene", "size", *STAGES, "× ours", "PSNR to ours")
+    for row in rows:
+        cells = [minimum_and_median(row["milliseconds"][n]) if n in row["milliseconds"] else "" for n in STAGES]
+        agreement = ("same" if row["psnr"] == float("inf") else f"{row['psnr']:.1f} dB") if "psnr" in row else ""
+        made.add_row(row["name"], row["case"].title(), row["case"].size(), *cells, f"{row['ratio']:.2f}", agreement)
+    console.print(made)
+    return 0
+
+
+def check() -> int:
+    """The other checkout is this one, so its images are the same, bit by bit."""
+    options = Compare((300,), ("64x48",), repeats=1, against=ROOT, avx512=why_not() is None)
+    (case,) = seeded_cases(options.counts, options.sizes, 0)
+    rows = {row["name"].split(" /")[0]: row for row in rows_of(case, options, None)}
+    assert {"msdgs", "this checkout", "the other"} == set(rows)
+    assert rows["the other"]["psnr"] == rows["this checkout"]["psnr"] == float("inf")
+    return main(options)
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Compare)))

@@ -1,0 +1,98 @@
+"""Scenes of the rasterizer's benchmarks: seeded ones with the footprint of a trained object, and files of splats."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from export.importers import read_splats
+from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene.spherical_harmonics import SH_C0
+
+MEDIAN_SCALES = {10_000: 0.010, 100_000: 0.007, 300_000: 0.005, 1_000_000: 0.0035}
+"""Median standard deviation for a number of Gaussians, as part of the object's diameter."""
+
+CAMERA_ANGLE_X = 0.6911
+DISTANCE = 4.0
+SH_DEGREE = 3
+SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+"""A record of a .splat file; quaternions wxyz as 128 + 128 q."""
+
+
+class Case(NamedTuple):
+    """One frame to draw."""
+
+    name: str
+    gaussians: Gaussians
+    camera: Camera
+
+    def title(self) -> str:
+        return f"{self.name} {len(self.gaussians):,}"
+
+    def size(self) -> str:
+        return f"{self.camera.width}×{self.camera.height}"
+
+
+def seeded_cases(counts: tuple[int, ...], sizes: tuple[str, ...], seed: int) -> list[Case]:
+    """Every number of Gaussians at every size, WIDTHxHEIGHT in pixels."""
+    cameras = [object_camera(*map(int, size.split("x"))) for size in sizes]
+    return [Case("seeded", scene, camera) for scene in (object_scene(n, seed) for n in counts) for camera in cameras]
+
+
+def file_cases(files: tuple[Path, ...], width: int = 800, height: int = 800) -> list[Case]:
+    """Files that `export/to_onnx.py` reads as one set of Gaussians, each seen from outside."""
+    scenes = [(path.name, read_splats(path).gaussians) for path in files]
+    return [Case(name, gaussians, around(gaussians, width, height)) for name, gaussians in scenes]
+
+
+def write_splat(file: Path, gaussians: Gaussians) -> None:
+    """Rounded to 8 bits for color, opacity and rotation, without harmonics beyond the constant."""
+    records = np.zeros(len(gaussians), SPLAT)
+    records["means"], records["scales"] = gaussians.means, gaussians.scales
+    colors = 0.5 + SH_C0 * gaussians.sh[:, 0]
+    records["rgba"] = np.clip(np.round(255 * np.column_stack([colors, gaussians.opacities])), 0, 255)
+    records["quats"] = np.clip(np.round(gaussians.quats * 128 + 128), 0, 255)
+    records.tofile(file)
+
+
+def object_scene(count: int, seed: int = 0) -> Gaussians:
+    """A bumpy shell of flat splats, most of them either opaque or faint, and a tenth floating about, float32."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radii = 1 + 0.1 * np.sin(5 * directions).sum(axis=1) + rng.normal(0, 0.01, count)
+    floaters = rng.random(count) < 0.1
+    radii[floaters] = 1.3 * np.cbrt(rng.random(np.count_nonzero(floaters)))
+    scales = np.exp(rng.normal(np.log(2 * median_scale(count)), 0.5, (count, 3)))
+    scales[np.arange(count), rng.integers(0, 3, count)] *= 0.15
+    faint = rng.random(count) < 0.35
+    opacities = np.where(faint, rng.beta(1.2, 8, count), rng.beta(8, 1.2, count))
+    sh = rng.normal(0, 0.04, (count, (SH_DEGREE + 1) ** 2, 3))
+    sh[:, 0] = 1.2 * np.sin(4 * directions + [0, 1, 2]) + rng.normal(0, 0.15, (count, 3))
+    quats = rng.normal(size=(count, 4))
+    arrays = (directions * radii[:, None], quats / np.linalg.norm(quats, axis=1, keepdims=True), scales, opacities, sh)
+    return Gaussians(*(np.ascontiguousarray(array, np.float32) for array in arrays))
+
+
+def median_scale(count: int) -> float:
+    """Between the table's counts, on a straight line of logarithms."""
+    counts, scales = np.log(list(MEDIAN_SCALES)), np.log(list(MEDIAN_SCALES.values()))
+    return float(np.exp(np.interp(np.log(count), counts, scales)))
+
+
+def object_camera(width: int, height: int, turn: float = 0.6) -> Camera:
+    """At distance 4, `turn` radians around the object and a little above it; `CAMERA_ANGLE_X` wide."""
+    eye = DISTANCE * np.array([np.sin(turn) * np.cos(0.4), -np.sin(0.4), -np.cos(turn) * np.cos(0.4)])
+    focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)
+    pose = Camera.from_look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), width, height, 40.0).camera_to_world
+    return Camera(focal, focal, width / 2, height / 2, width, height, pose)
+
+
+def around(gaussians: Gaussians, width: int = 800, height: int = 800) -> Camera:
+    """Along +z, so far away that nine in ten Gaussians are in an image `CAMERA_ANGLE_X` wide."""
+    target = np.median(gaussians.means, axis=0).astype(float)
+    radius = np.quantile(np.linalg.norm(gaussians.means - target, axis=1), 0.9)
+    focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)
+    pose = np.eye(4)
+    pose[:3, 3] = target - [0, 0, radius / np.sin(0.5 * CAMERA_ANGLE_X)]
+    return Camera(focal, focal, width / 2, height / 2, width, height, pose)

@@ -1,0 +1,1 @@
+"""The service over HTTP: service levels (run the package), `scaling`."""

@@ -1,0 +1,133 @@
+"""`msdgs-serve` in a process of its own, and scenes to serve."""
+
+import http.client
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tests.support.processes import free_port
+from tests.support.scene_files import write_scene
+
+START_SECONDS = 120
+MOMENT = 0.01
+PROGRAM = "import sys; from msdgs_serve.api.cli import main; sys.exit(main())"
+JSON = {"Content-Type": "application/json"}
+NONE: dict[str, str] = {}
+
+
+class Answer(NamedTuple):
+    """What came back."""
+
+    status: int
+    headers: dict[str, str]  # names in small letters
+    body: bytes
+
+
+class Connection:
+    """To a port of this machine; opened anew where the service closed it."""
+
+    def __init__(self, port: int) -> None:
+        self._http = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
+
+    def ask(self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None) -> Answer:
+        """With a body of JSON where one is given."""
+        if body is None:
+            return self.send(method, path, None, headers or {})
+        return self.send(method, path, json.dumps(body).encode(), {**JSON, **(headers or {})})
+
+    def send(self, method: str, path: str, content: bytes | None, headers: dict[str, str] = NONE) -> Answer:
+        """With these very bytes; once more where the service has closed the connection, as it does after 5 idle s."""
+        try:
+            return self._once(method, path, content, headers)
+        except (BrokenPipeError, ConnectionResetError, http.client.RemoteDisconnected):
+            self._http.close()
+            return self._once(method, path, content, headers)
+
+    def _once(self, method: str, path: str, content: bytes | None, headers: dict[str, str]) -> Answer:
+        self._http.request(method, path, content, headers)
+        response = self._http.getresponse()
+        return Answer(response.status, {k.lower(): v for k, v in response.getheaders()}, response.read())
+
+    def close(self) -> None:
+        self._http.close()
+
+
+class Running(NamedTuple):
+    """A service that is ready."""
+
+    port: int
+    process: subprocess.Popen
+
+    def ask(self, method: str, path: str, body: Any = None) -> Answer:
+        """On a connection of its own."""
+        connection = Connection(self.port)
+        try:
+            return connection.ask(method, path, body)
+        finally:
+            connection.close()
+
+    def metric(self, name: str) -> float:
+        """One without labels."""
+        text = self.ask("GET", "/metrics").body.decode()
+        found = re.search(rf"^{name} (\S+)$", text, re.MULTILINE)
+        assert found, name
+        return float(found[1])
+
+    def resident_bytes(self) -> int:
+        """Memory of the process (Linux)."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        found = re.search(r"^VmRSS:\s+(\d+) kB", status, re.MULTILINE)
+        assert found
+        return int(found[1]) << 10
+
+    def processor_seconds(self) -> float:
+        """That all threads of the process have worked (Linux)."""
+        user, system = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+@contextmanager
+def service(*scenes: Path, **flags: Any) -> Iterator[Running]:
+    """`msdgs-serve` over these scenes, with `flag=value` for `--flag value`, or True; it is stopped in the end."""
+    port = free_port()
+    options = [
+        text for name, value in flags.items()
+        for text in (f"--{name.replace('_', '-')}", *([] if value is True else [str(value)]))
+    ]  # fmt: skip
+    command = [sys.executable, "-c", PROGRAM, *map(str, scenes), "--port", str(port), *options]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        running = Running(port, process)
+        try:
+            wait_until_ready(running)
+            yield running
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def wait_until_ready(running: Running) -> None:
+    """Until scenes are loaded and kernels compiled."""
+    deadline = time.monotonic() + START_SECONDS
+    while time.monotonic() < deadline and running.process.poll() is None:
+        with suppress(OSError, http.client.HTTPException):
+            if running.ask("GET", "/ready").status == 200:
+                return
+        time.sleep(MOMENT)
+    raise SystemExit("the service did not become ready")
+
+
+def make_scenes(folder: Path, scene: Path) -> Path:
+    """A folder of three: the scene given, the same once more, and two small balls."""
+    folder.mkdir()
+    for name in ("first", "second"):
+        shutil.copyfile(scene, folder / f"{name}.onnx")
+    write_scene(folder / "balls.onnx")
+    return folder

@@ -1,0 +1,127 @@
+"""How well the systems of a comparison can follow motion at all: their layers are trained on the
+known trajectories of points of the synthetic scene instead of images."""
+
+import statistics
+import sys
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from benchmarks.measuring import machine
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.comparison.matrix import Budget, ComparedSystem, read_systems
+from msdgs_train.datasets.synthetic.motion import OBJECTS, world_positions
+from msdgs_train.datasets.synthetic.trajectories import surface_points
+from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
+from msdgs_train.engine.schedule import Schedule
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.base import SceneBounds
+
+MOVING = OBJECTS[2:]
+HALF_EXTENT = 1.3  # scene units
+EVALUATED_TIMES = 61
+
+
+def main(
+    systems: Annotated[tuple[str, ...], tyro.conf.Positional] = ("benchmarks/training/ablation.toml",),
+    steps: int = 1_200,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    points: int = 400,
+    check: bool = False,
+) -> int:
+    """Train each system on the trajectories of points, and print how far from them it ends.
+
+    python -m benchmarks.training.known_motion benchmarks/training/ablation.toml --steps 1200 --seeds 0 1 2
+
+    The canonical means are the points at the middle of time; learning rates are those of the system's training, all of
+    time takes part from the start. A step is one time and all points.
+
+    Args:
+        systems: Presets, or files as `msdgs-train compare` takes them.
+        steps: Of the optimiser.
+        seeds: Of the layers' weights and the order of the times.
+        points: Of each of the objects that move.
+        check: Only see that this works: a model that isn't trained stays in the middle, one that is comes nearer.
+    """
+    if check:
+        return self_test()
+    console = Console(soft_wrap=True, highlight=False)
+    try:
+        known = read_systems(systems, Budget(steps))
+    except InvalidInput as error:
+        console.print(f"error: {error}", style="red", markup=False)
+        return 1
+    torch.set_num_threads(1)
+    table = Table("system", *MOVING, "all", "± over seeds", box=None, title=f"1/1000 scene units, rms, {steps:,} steps")
+    followed = [system for system in known if system.config.model.layers]
+    for system in track(followed, "systems", console=Console(stderr=True)):
+        errors = np.array([errors_of(system, seed, points) for seed in seeds])
+        overall = np.sqrt((errors**2).mean(axis=1))
+        spread = statistics.stdev(overall) if len(seeds) > 1 else 0.0
+        table.add_row(system.name, *(f"{e:.1f}" for e in (*errors.mean(axis=0), overall.mean())), f"{spread:.1f}")
+    console.print(machine(), table)
+    return 0
+
+
+def errors_of(system: ComparedSystem, seed: int, points: int) -> np.ndarray:
+    """[objects] rms distance of a trained model's points to where they are, thousandths of a scene unit."""
+    local = [surface_points(name, points, seed) for name in MOVING]
+    model, config = _new_model(system, seed, _places(local, 0.5)), system.config
+    schedule, groups = Schedule.from_config(config), model.motion_groups()
+    optimizer = make_optimizer(groups, schedule)
+    random = np.random.default_rng(seed)
+    for step in range(schedule.num_steps):
+        set_learning_rates(optimizer, groups, schedule, step, factor=1.0)
+        t = float(random.uniform())
+        loss = (model.pose(t).means - _places(local, t)).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    squares = np.zeros(len(MOVING))
+    with torch.no_grad():
+        for t in np.linspace(0, 1, EVALUATED_TIMES):
+            off = (model.pose(float(t)).means - _places(local, float(t))).square().sum(dim=1)
+            squares += off.reshape(len(MOVING), points).mean(dim=1).double().numpy() / EVALUATED_TIMES
+    return 1e3 * np.sqrt(squares)
+
+
+def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicGaussians:
+    sizes, generator = system.config.model, torch.Generator().manual_seed(seed)
+    gray = torch.full_like(canonical, 0.5)
+    gaussians = CanonicalGaussians.from_points(canonical, gray, sizes.sh_degree, generator, sizes.attributes())
+    for name in ("means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"):
+        gaussians.get_parameter(name).requires_grad = False
+    torch.manual_seed(seed)
+    return DynamicGaussians(sizes, gaussians, SceneBounds(HALF_EXTENT))
+
+
+def _places(local: list[np.ndarray], t: float) -> Tensor:
+    """[objects · points, 3] of all objects at a time."""
+    places = [world_positions(name, points, t) for name, points in zip(MOVING, local, strict=True)]
+    return torch.from_numpy(np.concatenate(places)).float()
+
+
+def self_test() -> int:
+    """Errors before training are those of points at rest in the middle of their way."""
+    torch.set_num_threads(1)
+    (before,), (after,) = (read_systems(["msdgs-small"], Budget(steps)) for steps in (1, 150))
+    at_rest = []
+    for name in MOVING:
+        local = surface_points(name, 20, 0)
+        middle = world_positions(name, local, 0.5)
+        off = [world_positions(name, local, t) - middle for t in np.linspace(0, 1, EVALUATED_TIMES)]
+        at_rest.append(1e3 * np.sqrt(np.mean(np.sum(np.square(off), axis=2))))
+    np.testing.assert_allclose(errors_of(before, 0, 20), at_rest, rtol=0.05)
+    assert (errors_of(after, 0, 20) < 0.8 * np.array(at_rest)).all()
+    return main(("msdgs-small",), steps=10, seeds=(0, 1), points=10)
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

@@ -1,0 +1,57 @@
+"""Formats of one set of Gaussians: which one a file is, and its reader."""
+
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from export.importers.errors import ImportFailed
+from export.importers.splats.base import Splats
+from export.importers.splats.ksplat import read_ksplat
+from export.importers.splats.ply import read_ply
+from export.importers.splats.sog import META, ZIP_PROBLEMS, read_sog
+from export.importers.splats.splat import read_splat
+from export.importers.splats.spz import read_spz
+
+READERS: dict[str, Callable[[Path], Splats]] = {
+    "ply": read_ply,
+    "spz": read_spz,
+    "spz:unturned": partial(read_spz, turned=False),
+    "sog": read_sog,
+    "splat": read_splat,
+    "ksplat": read_ksplat,
+}
+"""By name of the format."""
+
+
+def splat_format(path: Path) -> str | None:
+    """The format of a file, or of a folder that is a SOG; None if it is none of `READERS`. Raises `ImportFailed`."""
+    if path.is_dir():
+        return "sog" if (path / META).is_file() else None
+    with path.open("rb") as file:
+        start = file.read(16)
+    if start.startswith(b"ply"):
+        return "ply"
+    if start.startswith((b"NGSP", b"\x1f\x8b")):
+        return "spz"
+    if path.name == META:
+        return "sog"
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                return "sog" if any(name.rsplit("/", 1)[-1] == META for name in archive.namelist()) else None
+    except ZIP_PROBLEMS as error:
+        raise ImportFailed(path, f"isn't a whole zip: {error}") from error
+    suffix = path.suffix.lower()
+    return suffix[1:] if suffix in (".splat", ".ksplat", ".sog", ".spz") else None
+
+
+def read_splats(path: Path, file_format: str | None = None) -> Splats:
+    """One set of Gaussians, from a file in any of the formats or in the one named. Raises `ImportFailed`."""
+    try:
+        file_format = file_format or splat_format(path)
+        if file_format not in READERS:
+            raise ImportFailed(path, f"isn't a file of one set of Gaussians: {', '.join(READERS)}")
+        return READERS[file_format](path)
+    except OSError as error:
+        raise ImportFailed(path, f"can't be read: {error.strerror or error}") from error

@@ -1,0 +1,79 @@
+"""What an export needs to know of a kind of deformation layer."""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+
+from export.layers.graph import GraphBuilder
+from msdgs_serve.scene.errors import MsdgsError
+from msdgs_train.layers.base import HEAD_COLUMNS
+from msdgs_train.layers.deformation import DeformationLayer
+
+HEADS = tuple(HEAD_COLUMNS)
+
+
+class ModelNotExportable(MsdgsError):
+    """A model has values or parts that a scene file can't hold."""
+
+
+class LayerInputs(NamedTuple):
+    """One layer, and the names of the graph's values that it may read."""
+
+    name: str  # prefix of the layer's nodes and constants
+    layer: DeformationLayer
+    means: str  # [P, 3] points, Gaussians or control nodes, as moved by the layers before it
+    time: str  # [1, 1]
+    gate: str  # [1] how much of the layer the input `steps` applies, in [0, 1]
+
+
+class LayerExport(Protocol):
+    """How layers of one kind are exported. Register one in `export.layers.LAYERS` under the kind's name."""
+
+    removable_heads: frozenset[str]
+    """Those of `HEADS` that `without_heads` can remove."""
+    scale_columns: int
+    """Of a delta of scales: 3, or 6 of a stretch tensor on control nodes."""
+
+    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+        """Add the nodes of one layer. Returns the deltas of the heads `used`, side by side, times weight and gate."""
+        ...
+
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
+        """Those of `HEADS` whose deltas are always 0."""
+        ...
+
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
+        """A copy of the layer in which the heads `names` give 0. The layer itself isn't changed."""
+        ...
+
+
+class FieldLayerExport:
+    """Base of kinds whose layers evaluate a field at the means and have one output per head column."""
+
+    removable_heads = frozenset(HEADS)
+    scale_columns = 3
+
+
+def output_rows(used: list[str], has_weight: bool) -> np.ndarray:
+    """Indices of the outputs that are computed: those of the heads `used`, then the weight's."""
+    columns = np.arange(HEAD_COLUMNS[HEADS[-1]].stop + 1)
+    deltas = [columns[HEAD_COLUMNS[head]] for head in used]
+    return np.concatenate([*deltas, columns[-1:]] if has_weight else deltas)
+
+
+def weighted(graph: GraphBuilder, inputs: LayerInputs, outputs: str, columns: int, has_weight: bool) -> str:
+    """Deltas times the layer's weight, if it predicts one as the last of `columns` outputs, and its gate."""
+    name = inputs.name
+    if not has_weight:
+        return graph.node("Mul", [outputs, inputs.gate], f"{name}.shared")
+    deltas, logit = graph.split(outputs, [f"{name}.unweighted", f"{name}.logit"], [columns - 1, 1])
+    weight = graph.node("Sigmoid", [logit], f"{name}.weight")
+    return graph.node("Mul", [graph.node("Mul", [weight, inputs.gate], f"{name}.shared"), deltas], f"{name}.weighted")
+
+
+def zero(*parameters: torch.Tensor) -> None:
+    """Set views of parameters to 0 in place."""
+    with torch.no_grad():
+        for parameter in parameters:
+            parameter.zero_()

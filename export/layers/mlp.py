@@ -1,0 +1,96 @@
+"""A layer of kind `mlp` as a graph: encodings and matrix products."""
+
+import copy
+from typing import cast
+
+import numpy as np
+import torch
+
+from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
+from export.layers.graph import GraphBuilder, to_numpy
+from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.mlp import MLPLayer
+
+
+class MLPExport(FieldLayerExport):
+    """Of `MLPLayer`."""
+
+    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+        """Encoded means and time through the hidden layers, then one product for all heads."""
+        layer = cast(MLPLayer, inputs.layer)
+        rows = output_rows(used, layer.outputs.weight)
+        outputs = _outputs(graph, inputs.name, layer, inputs.means, inputs.time, rows)
+        return weighted(graph, inputs, outputs, len(rows), layer.outputs.weight)
+
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
+        """Heads whose rows of the last Linear are all 0."""
+        heads = cast(MLPLayer, layer).heads
+        return frozenset(
+            n for n, rows in HEAD_COLUMNS.items() if not (heads.weight[rows].any() or heads.bias[rows].any())
+        )
+
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
+        """Rows of the last Linear set to 0."""
+        layer = copy.deepcopy(cast(MLPLayer, layer))
+        for name in names:
+            zero(layer.heads.weight[HEAD_COLUMNS[name]], layer.heads.bias[HEAD_COLUMNS[name]])
+        return layer
+
+
+def _outputs(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str, rows: np.ndarray) -> str:
+    """[M, len(rows)] deltas, then the logit of the weight, of means [M, 3]."""
+    encoded, code = (
+        _encode(graph, f"{name}.xyz", means, layer.xyz_frequency_matrix),
+        _time_code(graph, name, layer, time),
+    )
+    hidden = _read_input(graph, f"{name}.first", layer, layer.first, encoded, code)
+    hidden = graph.node("Relu", [hidden], f"{name}.first.relu")
+    for i, linear in enumerate(layer.trunk):
+        trunk = f"{name}.trunk{i}"
+        if i + 1 == layer.skip:
+            read = _read_input(graph, trunk, layer, linear, encoded, code)
+            weight = graph.constant(f"{trunk}.weight", to_numpy(linear.weight)[:, layer.input_features :])
+            out = graph.node("Gemm", [hidden, weight, read], f"{trunk}.out", transB=1)
+        else:
+            out = _linear(graph, trunk, linear, hidden)
+        hidden = graph.node("Relu", [out], f"{trunk}.relu")
+    weight = graph.constant(f"{name}.heads.weight", to_numpy(layer.heads.weight)[rows])
+    bias = graph.constant(f"{name}.heads.bias", to_numpy(layer.heads.bias)[rows])
+    return graph.node("Gemm", [hidden, weight, bias], f"{name}.heads.out", transB=1)
+
+
+def _time_code(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:
+    """[1, time_features] what the layer knows of the time: one row a call, whatever the number of ids."""
+    encoded = _encode(graph, f"{name}.time", time, layer.time_frequency_matrix)
+    hidden = graph.node(
+        "Relu", [_linear(graph, f"{name}.time_hidden", layer.time_hidden, encoded)], f"{name}.time_relu"
+    )
+    return _linear(graph, f"{name}.time_output", layer.time_output, hidden)
+
+
+def _read_input(
+    graph: GraphBuilder, name: str, layer: MLPLayer, linear: torch.nn.Module, encoded: str, code: str
+) -> str:
+    """[M, width] the part of a Linear that reads encoded means and, as a bias of one row a call, time."""
+    weight = to_numpy(linear.weight)
+    weight_time = graph.constant(f"{name}.weight_time", weight[:, layer.xyz_features : layer.input_features])
+    bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
+    time_bias = graph.node("Gemm", [code, weight_time, bias], f"{name}.time_bias", transB=1)
+    weight_xyz = graph.constant(f"{name}.weight_xyz", weight[:, : layer.xyz_features])
+    return graph.node("Gemm", [encoded, weight_xyz, time_bias], f"{name}.read", transB=1)
+
+
+def _encode(graph: GraphBuilder, name: str, value: str, frequency_matrix: torch.Tensor) -> str:
+    """`PositionalEncoding`: value, sines, cosines side by side."""
+    phases = graph.node(
+        "MatMul", [value, graph.constant(f"{name}.octaves", to_numpy(frequency_matrix))], f"{name}.phases"
+    )
+    sines = graph.node("Sin", [phases], f"{name}.sines")
+    cosines = graph.node("Cos", [phases], f"{name}.cosines")
+    return graph.node("Concat", [value, sines, cosines], f"{name}.encoded", axis=1)
+
+
+def _linear(graph: GraphBuilder, name: str, linear: torch.nn.Module, value: str) -> str:
+    weight = graph.constant(f"{name}.weight", to_numpy(linear.weight))
+    bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
+    return graph.node("Gemm", [value, weight, bias], f"{name}.out", transB=1)

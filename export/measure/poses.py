@@ -1,0 +1,72 @@
+"""Poses of a model, and how far two computations of the same pose are apart, Gaussian by Gaussian."""
+
+import math
+
+import numpy as np
+import torch
+
+from msdgs_serve.scene.baked import MOVING_OUTPUTS
+from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.supports.base import Support
+
+SMALLEST_VISIBLE = 1e-3
+"""Scales below this part of the scene's half diagonal are less than a pixel; their errors are relative to this size."""
+
+UNIT_TOLERANCE = 1e-3
+"""Of the norm of a quaternion, as `Gaussians.validate` has it."""
+
+
+@torch.no_grad()
+def posed(model: DynamicGaussians, t: float, ids: np.ndarray | None = None, *, deform: bool = True) -> Gaussians:
+    """The Gaussians `ids`, int64 [M], or all, at time `t`, in the model's precision; canonical ones if not `deform`.
+
+    The time is rounded to float32, as a scene file takes it.
+    """
+    rows = None if ids is None else torch.from_numpy(ids)
+    pose = model.pose(float(np.float32(t)), ids=rows, deform=deform)
+    return Gaussians(*(tensor.numpy() for tensor in pose))
+
+
+def operations(support: Support, chain: MultiStepDeformation, count: int) -> float:
+    """Approximate operations per Gaussian and pose, of `count` Gaussians that share the chain's points."""
+    points = count if support.num_points is None else support.num_points
+    return support.operations() + chain.operations() * points / max(count, 1)
+
+
+def half_diagonal(bounds: object) -> float:
+    """Of a box given by its two corners, [2, 3]; above 0."""
+    low, high = np.array(bounds)
+    return max(float(np.linalg.norm(high - low)) / 2, 1e-30)
+
+
+def pose_errors(got: Gaussians, expected: Gaussians, scene_size: float) -> dict[str, np.ndarray]:
+    """[M] the largest error of each Gaussian, by output; infinite where `got` is NaN or infinite.
+
+    Means: relative to the scene's half diagonal or, further out, to the largest coordinate. Quaternions: absolute.
+    Scales: relative to the Gaussian's largest scale, or to `SMALLEST_VISIBLE` of the scene.
+    """
+    sizes = {
+        "means": np.maximum(np.abs(expected.means).max(axis=1), scene_size),
+        "quats": 1.0,
+        "scales": np.maximum(expected.scales.max(axis=1), SMALLEST_VISIBLE * scene_size),
+    }
+    with np.errstate(invalid="ignore", over="ignore"):
+        errors = {
+            name: np.abs(getattr(got, name).astype(np.float64) - getattr(expected, name)).max(axis=1) / sizes[name]
+            for name in MOVING_OUTPUTS
+        }
+    return {name: np.where(np.isfinite(values), values, math.inf) for name, values in errors.items()}
+
+
+def largest_error(errors: dict[str, np.ndarray]) -> np.ndarray:
+    """[M] of each Gaussian, over all outputs."""
+    return np.max([*errors.values()], axis=0)
+
+
+def usable_rows(posed: Gaussians) -> np.ndarray:
+    """[M] whether a Gaussian can be drawn: finite, with a unit quaternion, which one that overflows isn't."""
+    finite = np.all([np.isfinite(array.reshape(len(array), -1)).all(axis=1) for array in vars(posed).values()], axis=0)
+    norms = np.linalg.norm(np.where(finite[:, None], posed.quats, 1), axis=1)
+    return finite & (np.abs(norms - 1) < UNIT_TOLERANCE)

@@ -1,0 +1,81 @@
+"""The options of `to_onnx.py`. Without torch, so that `--help` is printed at once."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Turn a trained model into one self-contained ONNX scene file (contract msdgs/1, described in docs/contract.md).
+
+    Ways to compute the motion (plans) are tried together with pruning: removing what is invisible in rendered frames.
+    Frames of each candidate are compared with those of the exact network in float64, and timed. The fastest whose worst
+    frame has at least --min-psnr is written, and beside it a report as .json, .md and .png: error against run time.
+
+    Type this:
+
+    python export/to_onnx.py runs/ball/model.pt -o scenes/ball.onnx
+
+    msdgs-serve scenes/ball.onnx
+
+    Scenes of other programs are detected by their contents: INRIA's and SuperSplat's .ply, .spz, SOG, .splat and
+    .ksplat, numbered sequences of them, and runs of Deformable-3D-Gaussians and 4DGaussians (docs/formats.md):
+
+    python export/to_onnx.py garden.ply -o scenes/garden.onnx
+
+    In seconds instead of minutes, all layers as trained, pruned:
+
+    python export/to_onnx.py runs/ball/model.pt --quick
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """The `model.pt` of a training run, or a file or folder of another program."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
+    """The scene file to write; by default beside the model, ending in .onnx."""
+    format: Annotated[str, tyro.conf.arg(metavar="FORMAT")] = "detect"
+    """Format of the input, as docs/formats.md lists them: model, ply, ..., deformgs, 4dgs. `detect` looks inside."""
+    min_psnr: float = 50.0
+    """PSNR of the worst frame against the exact network, dB. From about 50 no difference is visible; less is faster."""
+    plan: str | None = None
+    """Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all."""
+    quick: Flag = False
+    """No sweep and no report: the plan `network`, pruned."""
+    data: Path | None = None
+    """The folder of the dataset. Errors are measured from its training cameras, and held-out images compared."""
+    keep_invisible: Flag = False
+    """Keep Gaussians that never contribute to a frame."""
+    keep_static: Flag = False
+    """Keep Gaussians in the graph that never move visibly."""
+    keep_layers: Flag = False
+    """Keep layers whose weighted step is invisible."""
+    keep_heads: Flag = False
+    """Keep heads that change nothing."""
+    keep_modulation: Flag = False
+    """Keep modulation whose factors are 1."""
+    keep_sh: Flag = False
+    """Keep SH bands that change nothing."""
+    tolerance: float = 1e-4
+    """Largest relative error of poses that the plan `network` may have against the model's layers."""
+    times: int = 50
+    """The number of times at which these are compared."""
+
+    @property
+    def scene_file(self) -> Path:
+        """Where the scene file is written."""
+        return self.model.with_suffix(".onnx") if self.output is None else self.output
+
+    @property
+    def chosen_plan(self) -> str | None:
+        """The plan to write; None: a sweep chooses."""
+        return "network" if self.quick and self.plan is None else self.plan
+
+    @property
+    def keep(self) -> frozenset[str]:
+        """Names of the pruning rules that are switched off."""
+        names = [field.name for field in fields(self) if field.name.startswith("keep_")]
+        return frozenset(name.removeprefix("keep_") for name in names if getattr(self, name))

@@ -1,0 +1,59 @@
+"""What a plan is, and how one of a given size is named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import onnx
+
+from export.jobs.bake import Baked
+
+if TYPE_CHECKING:
+    from export.trajectories.sampling import Trajectories
+
+BASELINE = "network"
+"""The plan that computes what the model computes, in float32: all others are compared with it."""
+
+DEFAULT_PIXELS = 0.1
+"""Error bound of a fitted plan whose text names no size."""
+
+
+@dataclass(frozen=True)
+class PlanSpec:
+    """A plan and its size as a text names them: `prefix:2` is ("prefix", 2), `lowrank:0.05` ("lowrank", None, 0.05)."""
+
+    name: str
+    count: int | None = None
+    pixels: float | None = None
+
+    def __str__(self) -> str:
+        size = self.count if self.pixels is None else self.pixels
+        return self.name if size is None else f"{self.name}:{size}"
+
+    @property
+    def max_pixels(self) -> float | None:
+        """Error bound of a fitted plan, pixels of the scene's nearest camera; None if `count` says how large it is."""
+        return None if self.count is not None else self.pixels or DEFAULT_PIXELS
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One way to compute a deformation in a graph. Register it in `export.plans.registry.PLANS` under its name."""
+
+    name: str
+    usage: str
+    """Its text and what it means, for messages."""
+    color: str
+    """Of its points in the figure of a report."""
+    build: Callable[[Baked, PlanSpec, Callable[[], Trajectories]], onnx.ModelProto]
+    """The scene file of a baked scene in which something moves. The last argument samples its trajectories."""
+    candidates: Callable[[int], Sequence[str]] = lambda layers: ()
+    """The texts that a sweep tries for a model of so many layers."""
+    counts: range | None = None
+    """The counts that its text may name; None: it has no size."""
+    fitted: bool = False
+    """Whether it is fitted to float64 trajectories and may name an error bound; else it runs layers for each frame."""
+    speedup: float = 1.0
+    """How many times faster its layers run than in float32."""

@@ -1,0 +1,226 @@
+"""Pruning: only what moves stays in the graph, each rule can be switched off, and the error allowed is kept."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from export.jobs.job import Candidate, ExportJob
+from export.jobs.write import write_scene
+from export.measure.views import cameras_of, evaluation_views, selection_views
+from export.pruning import RULES
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.scene import Gaussians
+from msdgs_serve.scene.camera import Camera
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from tests.support.images import psnr
+from tests.support.models import CAMERA, GROUND, OBJECT, SCENE, moving_object, random_model
+from tests.support.tolerances import tolerance
+
+pytestmark = pytest.mark.slow
+
+GAUSSIAN_BYTES = 40 + 4
+"""Pose and opacity of a static Gaussian; its SH coefficients have 12 each."""
+
+
+def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> ExportJob:
+    save_model(folder / "model.pt", model, info, 1)
+    (folder / "candidates").mkdir()
+    return ExportJob(folder / "model.pt", folder / "candidates", **settings)
+
+
+def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: SceneInfo) -> float:
+    """PSNR of the worst of frames at times that the export has not looked at, the model in float64."""
+    double, worst = model.double(), np.inf
+    session, (t0, t1) = DeformationSession(candidate.path), info.time_range
+    camera = Camera(**{**cast(dict[str, Any], CAMERA), "camera_to_world": np.array(CAMERA["camera_to_world"])})
+    for t in t0 + (t1 - t0) * np.random.default_rng(7).uniform(size=12):
+        with torch.no_grad():
+            posed = double.pose(float(np.float32(t)))
+        exact = rasterize(Gaussians(*(x.numpy() for x in posed)), camera, background=info.background).rgb
+        got = rasterize(session.gaussians(float(t)), camera, background=info.background).rgb
+        worst = min(worst, psnr(np.clip(got, 0, 1), np.clip(exact, 0, 1)))
+    return worst
+
+
+def test_of_a_scene_with_one_moving_object_only_that_stays_in_the_graph(tmp_path: Path):
+    model = moving_object()
+    job = job_of(tmp_path, model)
+    candidate = job.candidate("network", 50.0)
+    scene = candidate.session.scene
+    moving = candidate.pruned.ids[: scene.moving_count]
+    assert 0 < scene.moving_count <= OBJECT
+    assert (moving >= GROUND).all()
+    assert independent_worst_db(candidate, model, SCENE) >= 50
+
+
+def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_path: Path):
+    candidate = job_of(tmp_path, with_hidden_one(moving_object())).candidate("network", 50.0)
+    scene, ids = candidate.session.scene, candidate.pruned.ids
+    left_out = {entry["rule"]: entry for entry in scene.metadata.left_out}
+    assert set(left_out) == set(RULES)
+    assert GROUND not in ids  # the hidden one
+    assert (ids[: scene.moving_count] > GROUND).all()
+    assert (ids[scene.moving_count :] < GROUND).all()
+    assert left_out["static"]["count"] == scene.static_count
+    assert (left_out["layers"]["count"], left_out["layers"]["of"]) == (1, 2)
+    assert (left_out["heads"]["count"], left_out["heads"]["of"]) == (2, 3)
+    assert (left_out["sh"]["count"], left_out["modulation"]["count"]) == (1, 1)
+    assert all(entry["worst_frame_db"] >= 50 for entry in left_out.values())
+    assert scene.metadata.layers == ("mlp",)
+    graph = onnx.load(candidate.path).graph
+    stored = {tensor.name: tensor.dims for tensor in graph.initializer}
+    assert list(stored["layer1.heads.weight"]) == [4, 32]  # means and the weight
+    assert "scale_modulation" not in stored
+
+
+@pytest.mark.parametrize("rule", list(RULES))
+def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str):
+    others = [name for name in RULES if name != rule]
+    candidate = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0)
+    scene = candidate.session.scene
+    assert rule not in {entry["rule"] for entry in scene.metadata.left_out}
+    if rule == "static":
+        assert scene.static_count == 0
+    if rule == "invisible":
+        assert len(scene) == GROUND + OBJECT
+    if rule == "layers":
+        assert len(scene.metadata.layers) == 2
+    if rule == "sh":
+        assert scene.metadata.sh_degree == 1
+
+
+def test_layers_whose_trial_would_be_too_dear_stay_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("export.pruning.rules.MAX_OPERATIONS", 0.0)
+    pruned = job_of(tmp_path, moving_object()).pruned(45.0)
+    left_out = {entry["rule"] for entry in pruned.left_out}
+    assert "layers" not in left_out
+    assert "static" in left_out
+    assert len(pruned.moving.deformation) == 2
+
+
+def test_without_rules_nothing_is_left_out(tmp_path: Path):
+    candidate = job_of(tmp_path, with_hidden_one(moving_object()), rules=()).candidate("network", 20.0)
+    assert candidate.session.scene.moving_count == GROUND + OBJECT
+    assert candidate.session.scene.metadata.left_out == ()
+
+
+def test_a_scene_that_does_not_move_has_no_graph_and_the_size_of_its_gaussians(tmp_path: Path):
+    model = random_model(3000, layers=("mlp",), sh_degree=3)
+    heads = model.deformation.layers[0].get_submodule("heads")
+    with torch.no_grad():
+        for parameter in heads.parameters():
+            parameter.zero_()
+    rules = [rule for rule in RULES if rule not in ("invisible", "sh")]
+    candidate = job_of(tmp_path, model, rules=rules).candidate("network", 50.0)
+    assert not onnx.load(candidate.path).graph.node
+    assert candidate.session.scene.static_count == 3000
+    stored = 3000 * (GAUSSIAN_BYTES + 16 * 12)
+    assert stored < candidate.size < 1.05 * stored
+
+
+@pytest.mark.parametrize("pruning_db", [30.0, 45.0, 60.0])
+def test_the_error_allowed_is_kept_in_frames_of_our_own(tmp_path: Path, pruning_db: float):
+    model = random_model(400, sh_degree=1, noise=0.02)
+    job = job_of(tmp_path, model)
+    candidate = job.candidate("network", pruning_db)
+    assert job.error(candidate).psnr_worst >= pruning_db
+    # at other times a frame may be worse, though not by much
+    assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("pruning.other_times_db")
+
+
+def test_trimming_less_leaves_more_in(tmp_path: Path):
+    job = job_of(tmp_path, random_model(400, sh_degree=1, noise=0.02))
+    sizes = [job.candidate("network", pruning_db).size for pruning_db in (30.0, 55.0, None)]
+    assert sizes == sorted(sizes)
+    assert sizes[0] < sizes[-1]
+
+
+def test_an_error_of_zero_is_found_for_the_whole_network(tmp_path: Path):
+    job = job_of(tmp_path, moving_object())
+    error = job.error(job.candidate("network", None))
+    assert error.psnr_worst >= tolerance("export.float32_db")
+    assert error.position <= tolerance("export.relative")
+
+
+def test_a_change_of_one_gaussian_is_measured(tmp_path: Path):
+    model = moving_object()
+    job = job_of(tmp_path, model)
+    ids = np.arange(GROUND + OBJECT)
+    moved = 0.125
+
+    def pose(t: float) -> Gaussians:
+        g = job.exact.pose(t)
+        means = g.means.copy()
+        means[-1] += [0, moved, 0]
+        return Gaussians(means, g.quats, g.scales, g.opacities, g.sh)
+
+    error = job.exact.measure(pose, ids)
+    np.testing.assert_allclose(error.position, moved, rtol=tolerance("float32.relative"))
+    assert error.worst_pixel > 0
+    assert error.psnr_worst <= error.psnr_mean
+    depth = 4 - 1  # the camera is at z = -4, and no point nearer than z = -1
+    assert 0 < error.position_pixels <= moved * CAMERA["fx"] / depth
+
+
+def test_times_that_decide_are_not_the_times_that_are_measured():
+    cameras = cameras_of(SCENE)
+    deciding = {view.t for view in selection_views(cameras, (0.0, 1.0), 33)}
+    measured = {view.t for view in evaluation_views(cameras, (0.0, 1.0), 16, 3)}
+    assert len(deciding) == 33
+    assert len(measured) == 16
+    assert deciding & measured == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_cameras_are_added_where_too_few_are_stored(count: int):
+    cameras = cameras_of(SceneInfo(cameras=SCENE.cameras[:count], bounds=SCENE.bounds))
+    assert len(cameras) > count
+    for _, camera in cameras[count:]:  # they see the scene's middle in theirs
+        in_camera = camera.world_to_camera @ [0, 0, 0, 1]
+        assert in_camera[2] > 0
+        assert np.abs(in_camera[:2]).max() < tolerance("pixel")
+
+
+@pytest.mark.parametrize(
+    ("count", "changes", "info"),
+    [
+        (0, {}, SCENE),
+        (1, {}, SCENE),
+        (5, {"layers": ()}, SCENE),
+        (5, {"layers": (), "embedding_dim": 0}, SCENE),
+        (40, {"layers": ("plane", "mlp")}, SCENE),
+        (40, {"layers": ("bases",), "num_nodes": 5}, SCENE),
+        (40, {"layers": ("bases", "mlp"), "num_nodes": 5}, SCENE),
+        (40, {"weights": False, "modulation_targets": ("means", "scales", "quats")}, SCENE),
+        (40, {"delta_space": "activated"}, SCENE),
+        (40, {}, SceneInfo(bounds=SCENE.bounds)),
+        (40, {}, SceneInfo(time_range=(0.5, 0.5), bounds=SCENE.bounds, cameras=SCENE.cameras[:2])),
+    ],
+)
+def test_unusual_scenes_are_trimmed_and_written(tmp_path: Path, count: int, changes: dict[str, Any], info: SceneInfo):
+    job = job_of(tmp_path, random_model(count, **changes), info)
+    candidate = job.candidate("network", 50.0)
+    error = job.error(candidate)
+    assert error.psnr_worst >= 50
+    contents = onnx.load(candidate.path)
+    exported = write_scene(tmp_path / "s.onnx", contents, candidate.pruned.moving, rendered=error.to_plain(), times=4)
+    assert exported.measured_error["rendered"]["psnr_worst"] == error.psnr_worst
+    assert exported.moving_count + exported.static_count == len(candidate.pruned.ids)
+
+
+def test_shared_motions_have_no_heads_to_leave_out(tmp_path: Path):
+    candidate = job_of(tmp_path, random_model(40, layers=("bases",), num_nodes=5), SCENE).candidate("network", 50.0)
+    assert "heads" not in {entry["rule"] for entry in candidate.pruned.left_out}
+
+
+def with_hidden_one(model: DynamicGaussians) -> DynamicGaussians:
+    """The object's first Gaussian is behind all cameras."""
+    with torch.no_grad():
+        model.gaussians.means[GROUND] = torch.tensor([0.0, 0.0, -50.0])
+    return model
