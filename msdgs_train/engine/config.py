@@ -1,6 +1,7 @@
 """Training configuration: groups of settings, each beside the code that reads it, and a system with its model."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -147,13 +148,20 @@ def _group_of(name: str) -> str:
 
 
 RESUMABLE_CHANGES = frozenset({"steps", "threads", "max_minutes", "log_every", "eval_every", "checkpoint_every"})
-"""Settings that may change when a run is resumed. All others shape what has been trained already."""
+"""Settings that may change when a run is resumed. All others have shaped what is trained already."""
 
 
 def check_resumable(stored: TrainConfig, wanted: TrainConfig) -> None:
     """Raise `InvalidInput` naming the first setting that a resumed run may not change."""
-    for group, settings in stored.to_dict().items():
-        other = wanted.to_dict()[group]
+    for name, before, now in differences(stored, wanted):
+        if name not in RESUMABLE_CHANGES:
+            raise InvalidInput(f"config.{name}", f"{before}, as when the run was started", now)
+
+
+def differences(one: TrainConfig, other: TrainConfig) -> Iterator[tuple[str, Any, Any]]:
+    """Name and both plain values of each setting in which two configurations differ."""
+    groups = other.to_dict()
+    for group, settings in one.to_dict().items():
         for name, value in settings.items():
-            if name not in RESUMABLE_CHANGES and other[name] != value:
-                raise InvalidInput(f"config.{name}", f"{value}, as when the run began", other[name])
+            if value != groups[group][name]:
+                yield name, value, groups[group][name]
