@@ -209,7 +209,7 @@ def test_a_missing_file_is_named(tmp_path: Path, ending: str, part: str):
 
 def test_a_missing_model_and_missing_images_are_named(tmp_path: Path):
     (tmp_path / "sparse").mkdir()
-    with pytest.raises(DatasetInvalid, match=r"sparse: `cameras` is missing: there is no cameras\.bin or cameras\.txt"):
+    with pytest.raises(DatasetInvalid, match=r"sparse: `cameras` is missing: there is not a valid cameras\.bin or cameras\.txt"):
         load_scene(tmp_path)
     folder = write_model(tmp_path, "bin", ["0.png", "1.png"])
     (folder / "images" / "1.png").unlink()
@@ -237,7 +237,7 @@ def test_a_binary_file_that_is_cut_off_is_refused_wherever_the_cut_is(tmp_path: 
     [
         (Pose(q=(0.9, float("nan"), 0.1, 0.2)), "qvec` must be finite, got .*nan"),
         (Pose(t=(float("inf"), 0.0, 0.0)), "tvec` must be finite, got .*inf"),
-        (Pose(q=(0.0, 0.0, 0.0, 0.0)), "qvec` is no rotation"),
+        (Pose(q=(0.0, 0.0, 0.0, 0.0)), "qvec` is not a rotation"),
     ],
     ids=["nan", "inf", "zero"],
 )
@@ -267,7 +267,7 @@ def swapped(old: str, new: str) -> Change:
 WRONG = [
     ("cameras", swapped("PINHOLE", "FOV"), "`line 3` is FOV, and only"),
     ("cameras", swapped("310", "nan"), r"`line 3\.fy` must be finite, got nan"),
-    ("cameras", swapped("310", "-1"), r"`cameras\[7\]` is no camera: `camera\.fy` must be finite and above 0"),
+    ("cameras", swapped("310", "-1"), r"`cameras\[7\]` is not a valid camera: `camera\.fy` must be finite and above 0"),
     ("cameras", swapped(" 117", ""), "`line 3` must have 4 parameters for PINHOLE, got 3"),
     ("cameras", swapped("320", "wide"), "`line 3` must be CAMERA_ID MODEL WIDTH HEIGHT"),
     ("cameras", swapped(" 320 240 300 310 164.5 117", ""), "`line 3` must be CAMERA_ID MODEL"),
@@ -293,7 +293,7 @@ def test_what_is_wrong_in_text_files_is_named(tmp_path: Path, part: str, change:
 def test_what_is_no_text_is_refused(tmp_path: Path):
     folder = write_model(tmp_path, "txt", ["0.png"])
     (folder / "sparse" / "0" / "images.txt").write_bytes(b"\xff\xfe\0")
-    with pytest.raises(DatasetInvalid, match=r"images\.txt: `file` is no text"):
+    with pytest.raises(DatasetInvalid, match=r"images\.txt: `file` is not text"):
         load_scene(folder)
 
 
@@ -308,5 +308,5 @@ def test_a_lens_that_shows_places_twice_is_refused(tmp_path: Path):
     folder = write_model(tmp_path, "txt", ["0.png"], "SIMPLE_RADIAL")
     file = folder / "sparse" / "0" / "cameras.txt"
     file.write_text(file.read_text().replace("-0.15", "-2"))
-    with pytest.raises(DatasetInvalid, match=r"`cameras\[7\]` is Distortion\(k1=-2.* would show places twice"):
+    with pytest.raises(DatasetInvalid, match=r"`cameras\[7\]` is Distortion\(k1=-2.* maps two points to one"):
         load_scene(folder)

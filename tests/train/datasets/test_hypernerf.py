@@ -224,7 +224,7 @@ WRONG = [
     (CAMERA, "skew", 0.5, "skew", "must be 0, got 0.5"),
     (CAMERA, "radial_distortion", MISSING, "radial_distortion", "is missing"),
     (CAMERA, "radial_distortion", [0.0, 0.0], "radial_distortion", "must be 3 finite numbers"),
-    (CAMERA, "radial_distortion", [-9.0, 0.0, 0.0], "radial_distortion", "would show places twice"),
+    (CAMERA, "radial_distortion", [-9.0, 0.0, 0.0], "radial_distortion", "maps two points to one"),
     (CAMERA, "tangential_distortion", MISSING, "tangential_distortion", "is missing"),
     (CAMERA, "tangential_distortion", [0.0, float("nan")], "tangential_distortion", "must be 2 finite numbers"),
     (CAMERA, "image_size", [240, 320], "image_size", "is 240×320, but the image is 320×240"),

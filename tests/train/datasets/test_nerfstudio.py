@@ -206,8 +206,8 @@ def test_points_may_lack_colors_and_files_points(tmp_path: Path):
 
 
 BAD_PLY = [
-    (lambda content: content[:40], "`file` is no PLY"),
-    (lambda content: b"", "`file` is no PLY"),
+    (lambda content: content[:40], "`file` is not a PLY file"),
+    (lambda content: b"", "`file` is not a PLY file"),
     (lambda content: content[:-24], "`vertex` is cut off: the header says 2, the file holds 1"),
     (lambda content: content.replace(b"ascii", b"latin"), "`format` must be one of ascii, .* got 'latin'"),
     (lambda content: content.replace(b"vertex 2", b"vertex -2"), "`element` must be vertex and a number"),
@@ -272,7 +272,7 @@ WRONG = [
     (with_value(100, "w"), "frames[0].w", "and h are 100×240, but the image is 320×240"),
     (without("h"), "frames[0].h", "is missing"),
     (with_value("a", "k1"), "frames[0].k1", "must be a finite number, got 'a'"),
-    (with_value(-2.0, "k1"), "frames[0].k1", "would show places twice: undistort the images"),
+    (with_value(-2.0, "k1"), "frames[0].k1", "map two points to one: undistort the images"),
     (with_value(0.1, "frames", 1, "k4"), "frames[1].k4", "must be 0"),
     (with_value("OPENCV_FISHEYE", "camera_model"), "frames[0].camera_model", "got 'OPENCV_FISHEYE'"),
     (with_value("FULL_OPENCV", "frames", 1, "camera_model"), "frames[1].camera_model", "got 'FULL_OPENCV'"),

@@ -203,7 +203,7 @@ def test_a_cache_that_cant_be_written_is_named(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "occupied").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "occupied"))
     frame = load_scene(write_videos(tmp_path)).splits["test"][0]
-    with pytest.raises(DatasetInvalid, match=r"cam00\.mp4: `video` can't be kept decoded in .*XDG_CACHE_HOME"):
+    with pytest.raises(DatasetInvalid, match=r"cam00\.mp4: `video` can't be stored decoded in .*XDG_CACHE_HOME"):
         frame.load_rgba()
 
 
@@ -295,7 +295,7 @@ def test_poses_that_are_missing_or_no_array(tmp_path: Path, content: bytes | Non
     file.unlink()
     if content is not None:
         file.write_bytes(content)
-    with pytest.raises(DatasetInvalid, match=r"poses_bounds\.npy: `file` (can't be read|is no NumPy array)"):
+    with pytest.raises(DatasetInvalid, match=r"poses_bounds\.npy: `file` (can't be read|is not a NumPy array)"):
         load_scene(tmp_path)
 
 
