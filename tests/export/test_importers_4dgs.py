@@ -24,7 +24,7 @@ from msdgs_serve.scene.camera import orbit
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.layers.plane import PlaneConfig
 from tests.export import test_importers_runs
-from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)

@@ -20,7 +20,7 @@ from export.measure.poses import posed
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import load_model
-from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)

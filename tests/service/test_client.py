@@ -111,7 +111,7 @@ def test_scenes_are_listed_added_and_deleted(tmp_path: Path):
 
 
 def test_keys_are_sent(scene: Path, tmp_path: Path):
-    (tmp_path / "keys").write_text("0123456789abcdef")
+    (tmp_path / "keys").write_text("read 0123456789abcdef")
     with serving(scene, api_keys_file=tmp_path / "keys") as http:
         with Client(str(http.base_url)) as client, pytest.raises(Problem) as error:
             client.scenes()

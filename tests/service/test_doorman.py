@@ -28,8 +28,8 @@ REFUSED = 'msdgs_problems_total{kind="overloaded"}', 'msdgs_requests_total{metho
 def full(queue: WorkQueue, places: int) -> Iterator[None]:
     """All places are taken by calls that do nothing."""
     with ExitStack() as calls:
-        for _ in range(places):
-            calls.enter_context(queue.admitted())
+        for number in range(places):
+            calls.enter_context(queue.admitted(str(number)))
         yield
 
 

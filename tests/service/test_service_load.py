@@ -88,7 +88,9 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
         ThreadPoolExecutor(5) as pool,
     ):
         poses.slow = True
-        accepted = [pool.submit(client.post, "/render", json=FRAME) for _ in range(5)]
+        # addresses as a proxy names them: each client has its share
+        addresses = [{"X-Forwarded-For": f"10.0.0.{number}"} for number in range(5)]
+        accepted = [pool.submit(client.post, "/render", json=FRAME, headers=address) for address in addresses]
         queue = server[0].service.queue
         until(lambda: (queue.running, queue.waiting) == (2, 3))
         for _ in range(3):

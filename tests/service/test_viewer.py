@@ -331,7 +331,7 @@ def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Pat
 
 
 def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_path: Path):
-    (tmp_path / "keys").write_text(KEY)
+    (tmp_path / "keys").write_text(f"read {KEY}")
     with serving(scenes, api_keys_file=tmp_path / "keys") as client:
         page.goto(f"{client.base_url}/#scene=balls")
         page.locator("#key").fill("wrong")

@@ -1,5 +1,6 @@
 """A moving scene small enough to train on in a test: three blobs, one of which crosses the image."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -18,6 +19,7 @@ from msdgs_train.engine.run import Observer
 from msdgs_train.engine.trainer import StepResult
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.layers.base import LayerConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.layers.plane import PlaneConfig
@@ -55,6 +57,29 @@ def small_config(**changes: Any) -> TrainConfig:
 def parameter_groups(gaussians: CanonicalGaussians) -> list[ParamGroup]:
     """A group of its own for each attribute, all with one rate."""
     return [ParamGroup(name, [p], constant(1e-3), "static") for name, p in gaussians.named_parameters()]
+
+
+def _narrow(layer: LayerConfig) -> LayerConfig:
+    if isinstance(layer, MLPConfig):
+        return dataclasses.replace(layer, width=16, time_width=8, time_features=4)
+    if isinstance(layer, PlaneConfig):
+        return dataclasses.replace(layer, features=4, resolution=6, time_resolution=5, width=8)
+    return layer
+
+
+def shrunk(config: TrainConfig) -> TrainConfig:
+    """The same system on few Gaussians and in few steps, narrow, with most of its steps after the static phase."""
+    support = config.model.support
+    model = dataclasses.replace(
+        config.model,
+        support=dataclasses.replace(support, num_nodes=20) if isinstance(support, NodesConfig) else support,
+        layers=tuple(map(_narrow, config.model.layers[:3])),
+        embedding_dim=min(config.model.embedding_dim, 4),
+    )
+    return config.updated(
+        model=model, steps=12, static_fraction=0.25, threads=2, init_num_pts=60, max_gaussians=90,
+        refine_start=4, refine_every=4, sh_degree_interval=4,
+    )  # fmt: skip
 
 
 class StopAfter(Observer):

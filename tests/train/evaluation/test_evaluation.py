@@ -363,7 +363,7 @@ def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: 
     assert cli.main(["eval"]) == cli.EXIT_INVALID
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         cli.main(["eval", "--help"])
     assert exit_info.value.code == 0

@@ -27,7 +27,7 @@ def test_equal_images_get_the_cap_and_nan_stays() -> None:
     assert math.isnan(psnr(picture * math.nan, picture))
 
 
-def test_quality_is_of_what_a_screen_shows() -> None:
+def test_renderings_are_clamped_first() -> None:
     white = torch.ones(12, 12, 3)
     assert image_metrics(white + 0.5, white) == pytest.approx((MAX_PSNR, 1.0))
 
