@@ -30,6 +30,8 @@ from tests.train.engine.viewer_page import PageClient, PageServer, page, wait_fo
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
 
+pytestmark = pytest.mark.usefixtures("no_curve")
+
 __all__ = ["page"]
 
 WIDTH, HEIGHT = 60, 40
@@ -43,7 +45,7 @@ def loaded() -> LoadedModel:
 
 
 def _expected(loaded: LoadedModel, camera: Camera, t: float, layers: int) -> np.ndarray:
-    posed = loaded.model.pose(t, steps=layers)
+    posed = loaded.model.pose(t, num_layers=layers)
     gaussians = Gaussians(*(tensor.detach().numpy() for tensor in posed))
     return to_bytes(rasterize(gaussians, camera, background=loaded.scene.background).rgb)
 
@@ -127,9 +129,9 @@ def test_depth_is_white_where_it_is_nearest() -> None:
 
 
 def test_a_model_without_motion_or_cameras_can_be_seen(page: PageServer) -> None:
-    still = LoadedModel(random_model(layers=(), embedding_dim=0), SceneInfo(time_range=(1.0, 1.0)), 3)
+    static = LoadedModel(random_model(layers=(), embedding_dim=0), SceneInfo(time_range=(1.0, 1.0)), 3)
     with Viewer("127.0.0.1", 0) as viewer:
-        show_model(viewer, still, "model.pt")
+        show_model(viewer, static, "model.pt")
         page.clients[0] = client = PageClient(VIEW)
         wait_for(lambda: len(client.images) == 2)
         assert client.images[1].any()
@@ -160,16 +162,16 @@ def test_the_first_view_is_that_of_an_image(data: Path) -> None:
 
 
 def test_a_snapshot_stays_as_it_was(data: Path) -> None:
-    """Also in the warm-up, in which nothing is deformed."""
+    """Also in the static phase, in which nothing is deformed."""
     trainer = Trainer(small_config(), load_scene(data))
-    camera = trainer.frames[0].camera
+    camera = trainer.scene.splits["train"][0].camera
     for deforms in (False, True):
-        assert trainer.parts_in_use[0] is deforms
+        assert trainer.schedule.deforms(trainer.step_count) is deforms
         snapshot = snapshot_of_training(trainer)
         before = snapshot.draw(camera, 0.3, 2)
         for _ in range(8):
             trainer.step()
-        again = Snapshot(snapshot.model, snapshot.background, snapshot.deform, snapshot.sh_degree)  # poses anew
+        again = Snapshot(snapshot.model, snapshot.background, snapshot.deform, snapshot.sh_degree)  # poses again
         np.testing.assert_array_equal(before, again.draw(camera, 0.3, 2))
         assert not np.array_equal(before, snapshot_of_training(trainer).draw(camera, 0.3, 2))
 
@@ -195,12 +197,12 @@ def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, ba
     fit(config, data, tmp_path / "alone")
     looks_on = _LooksOn(page)
     with Viewer("127.0.0.1", 0) as viewer:
-        fit(config, data, tmp_path / "seen", observer=Observers(TrainingView(viewer, config.steps), looks_on))
+        fit(config, data, tmp_path / "seen", observer=Observers(TrainingView(viewer, config.run.steps), looks_on))
     pictures = [picture for picture in looks_on.client.images if picture.shape == (HEIGHT, WIDTH, 3)]
     assert len(pictures) >= 2
     assert not np.array_equal(pictures[0], pictures[-1]), "training should have been seen"
     alone, seen = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("alone", "seen"))
-    for part in ("model", "optimizer", "density", "generators", "order", "averages"):
+    for part in ("system", "optimizer", "generators", "curriculum", "averages"):
         _assert_equal(alone[part], seen[part])
     assert "**step 24** of 24" in page.texts[0].content
     assert "PSNR" in page.texts[0].content
@@ -241,7 +243,7 @@ class _Stoppable(Observer):
 def test_a_pause_holds_the_run_takes_no_time_and_can_be_stopped(data: Path, tmp_path: Path, page: PageServer) -> None:
     config, watched, outcomes = small_config(steps=100_000, eval_every=0), _Stoppable(), list[RunResult]()
     with Viewer("127.0.0.1", 0) as viewer:
-        observers = Observers(watched, TrainingView(viewer, config.steps))
+        observers = Observers(watched, TrainingView(viewer, config.run.steps))
         thread = threading.Thread(
             target=lambda: outcomes.append(fit(config, data, tmp_path / "run", observer=observers))
         )

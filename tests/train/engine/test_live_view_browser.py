@@ -28,7 +28,7 @@ from tests.train.engine.viewer_page import wait_for
 pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
 pytestmark = pytest.mark.slow
 
-SMALL = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--model.width=16", "--model.depth=2"]
+SMALL = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--layers", *["mlp:width=16,depth=2"] * 2]
 MILLISECONDS = 60_000
 
 

@@ -70,7 +70,7 @@ def test_a_run_that_broke_off_is_seen_once(data: Path, tmp_path: Path) -> None:
     assert [event.step for event in _events(run).Scalars("train/loss")][-1] == 14
     fit(config, data, run, resume=True, tensorboard=True)
     _assert_as_in_metrics(run)
-    assert len(_events(run).Scalars("train/loss")) == config.steps
+    assert len(_events(run).Scalars("train/loss")) == config.run.steps
 
 
 def test_asked_for_when_resumed_the_past_is_there_too(data: Path, tmp_path: Path) -> None:

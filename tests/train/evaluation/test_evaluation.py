@@ -125,7 +125,7 @@ def test_without_val_the_best_is_chosen_on_test(tmp_path: Path) -> None:
     (data / "transforms_val.json").unlink()
     outcome = fit(small_config(steps=4, eval_every=2), data, tmp_path / "run")
     assert outcome.best is not None
-    assert (outcome.best.split, outcome.best.psnr >= outcome.qualities["test"].psnr) == ("test", True)
+    assert (outcome.best.split, outcome.best.psnr >= outcome.metrics["test"].psnr) == ("test", True)
 
 
 @pytest.mark.usefixtures("no_curve")
@@ -363,7 +363,7 @@ def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: 
     assert cli.main(["eval"]) == cli.EXIT_INVALID
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         cli.main(["eval", "--help"])
     assert exit_info.value.code == 0
