@@ -55,7 +55,7 @@ class Compare:
 
     def execute(self) -> int:
         from msdgs_serve.threads import thread_count
-        from msdgs_train.cli.progress import ComparisonProgress
+        from msdgs_train.cli.compare_progress import ComparisonProgress
         from msdgs_train.comparison.matrix import Budget, make_runs, read_systems
         from msdgs_train.comparison.pools import processes, ray_tasks
         from msdgs_train.comparison.report import HEADINGS, table, write_comparison

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli.console import console, rich_table
+from msdgs_train.cli.console import console, frame_progress, rich_table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -39,7 +39,6 @@ class Evaluate:
     """With several runs, the PNG to write: a row for each of some images, then the rendering of each run."""
 
     def execute(self) -> int:
-        from msdgs_train.cli.progress import frame_progress
         from msdgs_train.evaluation.evaluate import evaluate_run
         from msdgs_train.evaluation.report import draw_runs, notes, write_evaluation
 
@@ -47,7 +46,7 @@ class Evaluate:
             raise InvalidInput("RUN", "the folder of one run or more", "none")
         evaluations = {}
         for run in self.runs:
-            with frame_progress(console, 0) as progress:
+            with frame_progress(0) as progress:
                 evaluation = evaluations[str(run)] = evaluate_run(run, self.data, self.split, progress)
             paths = write_evaluation(run, evaluation)
             console.print(_table(str(run), evaluation))

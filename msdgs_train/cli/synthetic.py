@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from msdgs_train.cli.console import console
+from msdgs_train.cli.console import console, frame_progress
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,9 @@ class Synthetic:
     """Of the cameras and times."""
 
     def execute(self) -> int:
-        from msdgs_train.cli.progress import frame_progress
         from msdgs_train.datasets.synthetic.generate import generate
 
-        with frame_progress(console, self.train_frames + self.test_frames) as progress:
+        with frame_progress(self.train_frames + self.test_frames) as progress:
             generate(
                 self.out,
                 size=self.size,

@@ -16,7 +16,9 @@ from msdgs_serve.ray_tasks import RayTasks, ray_cluster
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.threads import THREADS_VARIABLE
 from msdgs_train.comparison.matrix import Run
-from msdgs_train.engine.run import CHECKPOINT, Observer, fit
+from msdgs_train.engine.observer import Observer
+from msdgs_train.engine.run import fit
+from msdgs_train.engine.run_record import CHECKPOINT
 
 POLL_SECONDS = 0.5
 _stop: Event | None = None  # of a worker process, set by its parent

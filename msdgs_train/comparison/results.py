@@ -13,7 +13,8 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.runner import final_metrics, is_finished
 from msdgs_train.engine.metrics_log import read_metrics
-from msdgs_train.engine.run import MODEL, SELECTION_SPLITS
+from msdgs_train.engine.run import SELECTION_SPLITS
+from msdgs_train.engine.run_record import MODEL
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.gaussians.modulation import EMBEDDINGS

@@ -10,7 +10,8 @@ from typing import Any
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import Pool, RunEnd
-from msdgs_train.engine.run import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
+from msdgs_train.engine.config import differences
+from msdgs_train.engine.run_record import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
 
 
 def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, RunEnd], None]) -> bool:
@@ -68,9 +69,7 @@ def final_metrics(run: Run) -> dict[str, Any] | None:
 def _check_settings(run: Run) -> None:
     if not (run.folder / CONFIG).exists() or not (run.folder / CHECKPOINT).exists():
         return
-    stored, wanted = (config.updated(threads=1).to_dict() for config in (stored_config(run.folder), run.config))
-    for name, value in ((name, value) for group in stored.values() for name, value in group.items()):
-        if value != {name: v for group in wanted.values() for name, v in group.items()}[name]:
-            raise InvalidInput(
-                "out", "a new folder, or one of the same comparison", f"{run.folder} with other settings: {name}"
-            )
+    changed = [name for name, *_ in differences(stored_config(run.folder), run.config) if name != "threads"]
+    if changed:
+        problem = f"{run.folder} with other settings: {', '.join(changed)}"
+        raise InvalidInput("out", "a new folder, or one of the same comparison", problem)

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, composite, load_scene
-from msdgs_train.engine.run import BEST, CONFIG, MODEL
-from msdgs_train.engine.run_record import RECORD, Best, RunInvalid, read_record
+from msdgs_train.engine.run_record import BEST, CONFIG, MODEL, RECORD, Best, RunInvalid, read_record
 from msdgs_train.evaluation.metrics import image_metrics, masked_psnr
 from msdgs_train.evaluation.moving_region import moving_region
 from msdgs_train.evaluation.perceptual import PerceptualMetrics, perceptual_metrics

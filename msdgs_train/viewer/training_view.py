@@ -1,6 +1,6 @@
 """A run looked at while it trains: the viewer with the run's state, a pause, and a bound on what looking costs."""
 
-from msdgs_train.engine.run import Observer
+from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.evaluation.metrics import ImageMetrics
 from msdgs_train.viewer.snapshot import snapshot_of_training

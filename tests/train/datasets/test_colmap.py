@@ -98,7 +98,7 @@ def test_a_binary_file_that_is_cut_off_is_refused_wherever_the_cut_is(tmp_path: 
     [
         ((0.9, float("nan"), 0.1, 0.2, 0.3, -0.2, 4.0), "qvec` must be finite, got .*nan"),
         ((0.9, 0.1, -0.3, 0.2, float("inf"), 0.0, 0.0), "tvec` must be finite, got .*inf"),
-        ((0.0, 0.0, 0.0, 0.0, 0.3, -0.2, 4.0), "qvec` is no rotation"),
+        ((0.0, 0.0, 0.0, 0.0, 0.3, -0.2, 4.0), "qvec` is not a rotation"),
     ],
     ids=["nan", "inf", "zero"],
 )
