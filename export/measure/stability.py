@@ -111,7 +111,7 @@ class _Assessment:
 
     @torch.no_grad()
     def _growth(self, ids: np.ndarray, t: float) -> Growth:
-        """Of the Gaussians `ids`. Those that follow control nodes get the nodes', plus the measured round-off of skinning in
+        """Of the Gaussians `ids`. Followers of control nodes get the nodes', plus the measured round-off of skinning in
         float32."""
         double, single, rows = self.double, self.single, torch.from_numpy(ids)
         points = double.canonical_points(double.gaussians.rows(rows))

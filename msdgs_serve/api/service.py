@@ -18,6 +18,7 @@ from msdgs_serve.api.errors import Refused
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.schemas import RenderRequest
 from msdgs_serve.api.settings import Settings
+from msdgs_serve.api.uploads import Uploads
 from msdgs_serve.api.work import WorkQueue
 from msdgs_serve.imaging import encode
 from msdgs_serve.renderer import Renderer
@@ -49,6 +50,7 @@ class Service:
         self.renderer = renderer
         self.settings = settings
         self.queue = WorkQueue(settings.concurrent_renders, settings.queued_renders, settings.render_seconds)
+        self.uploads = Uploads(store.folder, settings)
         self.metrics = Metrics(store, renderer.cache, self.queue)
         self.phase = Phase.STARTING
         self.failure: MsdgsError | None = None

@@ -3,6 +3,8 @@
 import argparse
 import contextlib
 import inspect
+import io
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,15 +134,30 @@ def _cli(kind: type[Fit], arguments: Sequence[str], default: Fit) -> Fit:
     description = (
         f"{inspect.cleandoc(Fit.__doc__ or '')}\n\nPresets:\n{names}\n\n{HELP_ALL} shows the settings of all groups."
     )
-    with PARTS:
-        return tyro.cli(
-            kind,
-            args=arguments,
-            prog="msdgs-train fit",
-            default=default,
-            description=description,
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
+    errors = io.StringIO()
+    try:
+        with PARTS, contextlib.redirect_stderr(errors):
+            return tyro.cli(
+                kind,
+                args=arguments,
+                prog="msdgs-train fit",
+                default=default,
+                description=description,
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+    except SystemExit as end:
+        if (refused := _refused_setting(end)) is not None:  # tyro has drawn a box; every command prints one line
+            raise refused from None
+        sys.stderr.write(errors.getvalue())
+        raise
+
+
+def _refused_setting(end: SystemExit) -> InvalidInput | None:
+    """The error of a setting for which tyro ends the program; None if it is another reason."""
+    cause: BaseException | None = end
+    while cause is not None and not isinstance(cause, InvalidInput):
+        cause = cause.__context__
+    return cause
 
 
 @contextlib.contextmanager

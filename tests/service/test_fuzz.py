@@ -18,6 +18,8 @@ from tests.service.test_api_poison import FRAME, MATRIX, ORBIT, check_problem
 from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
+pytestmark = pytest.mark.slow
+
 EVERY_DAY = 300
 CASES = int(os.environ.get("MSDGS_FUZZ", EVERY_DAY))
 SETTINGS = settings(

@@ -17,7 +17,6 @@ from tests.support.scene_files import write_scene
 from tests.support.service import own_connection, serving
 
 FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
-SECONDS = 0.5
 
 
 @pytest.fixture
@@ -28,7 +27,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def client(folder: Path) -> Iterator[httpx.Client]:
-    with serving(folder, uploads=True, max_scene_megabytes=1, body_seconds=SECONDS) as client:
+    with serving(folder, uploads=True, max_scene_megabytes=1) as client:
         yield client
 
 
@@ -105,22 +104,19 @@ def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path)
 
 
 @own_connection
-def test_a_file_that_stops_coming_is_given_up(client: httpx.Client, folder: Path):
-    assert client.base_url.port
-    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
-        connection.sendall(b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nhalf a scene")
-        eventually(lambda: len(files(folder)) == 1)
-        assert connection.recv(65536).startswith(b"HTTP/1.1 408 ")
-    eventually(lambda: files(folder) == [])
-
-
-@own_connection
-def test_a_client_that_leaves_in_the_middle_leaves_nothing(client: httpx.Client, folder: Path):
-    assert client.base_url.port
-    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=10) as connection:
-        connection.sendall(b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nhalf a scene")
-        eventually(lambda: len(files(folder)) == 1)
-    eventually(lambda: files(folder) == [])
+@pytest.mark.slow
+@pytest.mark.parametrize("limits", [{}, {"body_seconds": 2}], ids=["leaves", "waits"])
+def test_a_file_that_stops_coming_leaves_nothing(folder: Path, limits: dict[str, Any]):
+    """Its client leaves, or is given up."""
+    with serving(folder, uploads=True, **limits) as client:
+        assert client.base_url.port
+        with socket.create_connection((client.base_url.host, client.base_url.port), timeout=60) as connection:
+            head = b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
+            connection.sendall(head + b"half a scene")
+            eventually(lambda: len(files(folder)) == 1)
+            if limits:
+                assert connection.recv(65536).startswith(b"HTTP/1.1 408 ")
+        eventually(lambda: files(folder) == [])
 
 
 def test_where_it_is_not_allowed_nothing_is_added_or_deleted(folder: Path, file: bytes):

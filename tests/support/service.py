@@ -56,6 +56,6 @@ def serving(
             yield client
     finally:
         running.should_exit = True
-        thread.join(10)
+        thread.join(60)
         listener.close()
     assert not thread.is_alive()

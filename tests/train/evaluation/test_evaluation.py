@@ -36,10 +36,7 @@ from tests.support.scenes import front_camera, gaussians_of
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import SIZE, small_config, write_scene
 
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -122,17 +119,17 @@ def test_the_best_model_is_that_of_the_highest_psnr_on_val(run: Path) -> None:
     assert by_name["last"].mean.psnr <= highest["psnr"]
 
 
-def test_without_val_the_best_is_chosen_on_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+@pytest.mark.usefixtures("no_curve")
+def test_without_val_the_best_is_chosen_on_test(tmp_path: Path) -> None:
     data = write_scene(tmp_path / "scene")
     (data / "transforms_val.json").unlink()
     outcome = fit(small_config(steps=4, eval_every=2), data, tmp_path / "run")
     assert outcome.best is not None
-    assert (outcome.best.split, outcome.best.psnr >= outcome.qualities["test"].psnr) == ("test", True)
+    assert (outcome.best.split, outcome.best.psnr >= outcome.metrics["test"].psnr) == ("test", True)
 
 
-def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+@pytest.mark.usefixtures("no_curve")
+def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = fit(small_config(steps=3), data, run).best
     assert first is not None
@@ -366,7 +363,7 @@ def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: 
     assert cli.main(["eval"]) == cli.EXIT_INVALID
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         cli.main(["eval", "--help"])
     assert exit_info.value.code == 0
