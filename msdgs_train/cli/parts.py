@@ -1,4 +1,4 @@
-"""Layers and supports as words of a command line: `mlp:width=96,depth=2`."""
+"""Layers and supports as command-line values: `mlp:width=96,depth=2`."""
 
 import inspect
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from msdgs_train.supports.base import SupportConfig
 from msdgs_train.supports.registry import SUPPORTS
 
 PARTS = ConstructorRegistry()
-"""Tells tyro how to read them."""
+"""How tyro parses and prints them."""
 
 
 @PARTS.primitive_rule

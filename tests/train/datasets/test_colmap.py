@@ -209,7 +209,7 @@ def test_a_missing_file_is_named(tmp_path: Path, ending: str, part: str):
 
 def test_a_missing_model_and_missing_images_are_named(tmp_path: Path):
     (tmp_path / "sparse").mkdir()
-    with pytest.raises(DatasetInvalid, match=r"sparse: `cameras` is missing: there is not a valid cameras\.bin or cameras\.txt"):
+    with pytest.raises(DatasetInvalid, match=r"sparse: `cameras` is missing: there is no cameras\.bin or cameras\.txt"):
         load_scene(tmp_path)
     folder = write_model(tmp_path, "bin", ["0.png", "1.png"])
     (folder / "images" / "1.png").unlink()
