@@ -12,7 +12,7 @@ SERVE := .venv-serve
 FULL := .venv
 CLUSTER := .venv-cluster
 VIEWER := .venv-viewer
-HTTP_TESTS := tests/service tests/frames/test_video.py
+HTTP_TESTS := tests/service tests/frames/test_video.py --ignore-glob='*/test_viewer*'
 BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.avx512 service.scaling \
 	training.training_step training.known_motion export.imported_formats export.paper_sized
 INSTALL := -m pip --disable-pip-version-check install --no-compile
@@ -22,7 +22,7 @@ DEMO_FLAGS = --port $(PORT) $(if $(filter-out 0,$(ONCE)),--once)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-train test test-cluster test-viewer bench-check lint format clean
+.PHONY: help demo demo-train test fast test-fast test-cluster test-viewer bench-check lint format clean
 
 help:  ## show this list
 	@awk -F ':.*## +' '/^[a-z-]+:.*##/ { printf "  make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -38,6 +38,12 @@ demo-train: $(FULL)/.installed-train  ## make a moving scene, train, export, ser
 
 test: lint  ## install everything, check style, types and imports, run the tests
 	$(FULL)/bin/python -m pytest $(ARGS)
+
+fast: $(FULL)/.installed-dev  ## the same checks and the tests that take less than a second, in a minute
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint test-fast
+
+test-fast: $(FULL)/.installed-dev
+	$(FULL)/bin/python -m pytest -m 'not slow' --durations 5 --durations-min 1 $(ARGS)
 
 test-cluster: $(CLUSTER)/.installed  ## Ray beside everything: the tests on a cluster of this machine, HTTP ones on Ray Serve
 	$(CLUSTER)/bin/python -m pytest -n 0 tests/ops/test_ray.py $(ARGS)

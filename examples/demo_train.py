@@ -20,7 +20,7 @@ from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame, composite, load_scene
 from msdgs_train.datasets.common.images import read_rgba
 from msdgs_train.engine.metrics_log import write_png
-from msdgs_train.evaluation.metrics import mean_metrics, quality
+from msdgs_train.evaluation.metrics import image_metrics, mean_metrics
 from serving import get, render, say, serving, stay_up
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,8 +48,9 @@ def main() -> None:
 
 def fit_flags(arguments: argparse.Namespace) -> list[object]:
     """Settings for minutes rather than for quality: few Gaussians, narrow layers, too small to share among threads."""
-    sizes = ["--init-num-pts", 2500, "--max-gaussians", 4000, "--model.width", 48, "--model.time-width", 32]
-    pace = ["--refine-start", 200, "--grow-grad2d", 1e-3, "--sh-degree-interval", 500, "--deform-lr-final", 2e-4]
+    layer = "mlp:width=48,depth=2,xyz_frequencies=4,time_width=32,lr_final=2e-4"
+    sizes = ["--init-num-pts", 2500, "--max-gaussians", 4000, "--layers", layer, layer]
+    pace = ["--refine-start", 200, "--grow-grad2d", 1e-3, "--sh-degree-interval", 500]
     rest = ["--window-full-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500, "--threads", 1]
     return ["--steps", arguments.steps, "--max-minutes", arguments.minutes, *sizes, *pace, *rest]
 
@@ -64,12 +65,12 @@ def compare(url: str, frames: list[Frame], folder: Path, out: Path) -> None:
         path = folder / f"{Path(frame.name).name}.png"
         path.write_bytes(render(url, request_for(frame)))
         pairs.append((composite(frame.load_rgba(), background), composite(read_rgba(path), background)))
-    qualities = [quality(torch.from_numpy(rgb), torch.from_numpy(truth)) for truth, rgb in pairs]
+    metrics = [image_metrics(torch.from_numpy(rgb), torch.from_numpy(target)) for target, rgb in pairs]
     shown = len(frames) // 2
     write_png(out, np.concatenate(pairs[shown], axis=1))
-    mean = mean_metrics(qualities)
+    mean = mean_metrics(metrics)
     say(f"wrote {out}: image | render, {frames[shown].name} at t = {frames[shown].t:.3f}")
-    say(f"  this frame: PSNR {qualities[shown].psnr:.2f} dB, SSIM {qualities[shown].ssim:.4f}")
+    say(f"  this frame: PSNR {metrics[shown].psnr:.2f} dB, SSIM {metrics[shown].ssim:.4f}")
     say(f"  all {len(frames)} held-out frames: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
     if not mean.psnr >= MINIMUM_PSNR:
         raise SystemExit(f"the frames do not look like the images: {mean.psnr:.2f} dB < {MINIMUM_PSNR} dB")

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_serve.scene.camera import orbit
+from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
 
 DEFAULT_FPS = 24.0
 MAX_FPS = 240.0
+LARGEST = 1e9
+"""Of any number of a path: single precision neither overflows nor underflows."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def _scene_name(camera: Any, at: str) -> str:
 def _document(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InvalidInput("path", "a JSON file that can be read", f"{path}: {error}") from None
     if not isinstance(document, dict):
         raise InvalidInput("path", "a JSON object, as nerfstudio writes it", f"{path}: {type(document).__name__}")
@@ -125,8 +127,9 @@ def _fps(document: Mapping[str, Any]) -> float:
 
 def _whole(document: Mapping[str, Any], name: str) -> int:
     value = document.get(name)
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise InvalidInput(name, "a whole number of pixels", value)
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_PIXELS_PER_SIDE:
+        got = value if isinstance(value, float) else type(value).__name__
+        raise InvalidInput(name, f"a whole number of pixels in [1, {MAX_PIXELS_PER_SIDE}]", got)
     return value
 
 
@@ -134,7 +137,7 @@ def _numbers(value: Any, count: int, name: str) -> np.ndarray:
     good = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
     if not good or any(isinstance(each, bool) or not isinstance(each, int | float) for each in value):
         raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", "something else")
-    array = np.array(value, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise InvalidInput(name, "finite", "NaN or infinity")
-    return array
+    numbers: list[float] = list(value)
+    if not all(-LARGEST <= each <= LARGEST for each in numbers):
+        raise InvalidInput(name, f"finite and at most {LARGEST:g}", "NaN, infinity or more")
+    return np.array(numbers, dtype=np.float64)

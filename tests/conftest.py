@@ -1,12 +1,23 @@
 """Shared settings of the tests."""
 
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
 # the pool has two threads wherever the tests run, so that parallel code is tested as parallel code
 os.environ.setdefault("MSDGS_THREADS", "2")
 
+import hypothesis
 import numpy as np
 import pytest
+
+from tests.support.scene_files import write_scene
+from tests.support.skips import not_tested, unexpected
+
+hypothesis.settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("any machine")
 
 
 @pytest.fixture(autouse=True)
@@ -14,3 +25,26 @@ def tiny_numbers_stay():
     """A test that makes its process flush denormals would change every test that comes after it on its worker."""
     yield
     assert np.float32(1e-38) * np.float32(1e-2) > 0
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene file of two balls, one of which moves; nobody writes to it."""
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> Iterator[None]:
+    """At the very end: what was not tested. In CI a skip that is not on the list is a failure."""
+    yield
+    terminal = session.config.pluginmanager.get_plugin("terminalreporter")
+    if terminal is None or hasattr(session.config, "workerinput"):
+        return
+    reports = terminal.stats.get("skipped", [])
+    reasons = [report.longrepr[2].removeprefix("Skipped: ") for report in reports]
+    unlisted = unexpected(reasons)
+    if unlisted and (os.environ.get("CI") or os.environ.get("MSDGS_CI")):
+        terminal.write_line(f"FAILED: skipped, and not on the list in tests/support/skips.py: {unlisted}", red=True)
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+    elif line := not_tested(reasons):
+        terminal.write_line(line, yellow=True)

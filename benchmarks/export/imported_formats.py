@@ -20,7 +20,8 @@ from benchmarks.measuring import machine
 from benchmarks.rasterizer.scenes import object_scene, write_splat
 from benchmarks.service.process import Running, service
 from export.exporters.ply import write_ply
-from export.importers import ImportFailed, recognise
+from export.importers import ImportFailed, detect_format
+from export.options import ExportOptions
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.evaluation.sheets import Panel, draw_sheet
@@ -53,9 +54,9 @@ def draw(inputs: list[Path], output: Path, size: int) -> int:
     images, failed = [], []
     with tempfile.TemporaryDirectory() as folder:
         sources = {}
-        for i, (source, kind) in enumerate(each for path in inputs for each in recognised(path)):
+        for i, (source, kind) in enumerate(each for path in inputs for each in detected(path)):
             scene = Path(folder) / f"scene{i}.onnx"
-            if to_onnx(source, scene):
+            if to_onnx(ExportOptions(source, scene)):
                 failed.append(str(source))
             else:
                 sources[scene] = f"{source.parent.name}/{source.name}", kind
@@ -74,16 +75,16 @@ def draw(inputs: list[Path], output: Path, size: int) -> int:
     return bool(failed)
 
 
-def recognised(path: Path) -> Iterator[tuple[Path, str]]:
+def detected(path: Path) -> Iterator[tuple[Path, str]]:
     """Inputs and what they are."""
     try:
-        yield path, recognise(path)
+        yield path, detect_format(path)
     except ImportFailed as error:
         if not path.is_dir():
             print(error)
             return
         for each in sorted(path.iterdir()):
-            yield from recognised(each)
+            yield from detected(each)
 
 
 def rendered(running: Running, scene: Path, size: int) -> Iterator[tuple[float, np.ndarray]]:

@@ -29,13 +29,13 @@ from export.measure.poses import posed
 from export.measure.views import cameras_of, selection_views
 from export.trajectories.splines import fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
-from msdgs_train.density.gradient import rotate
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.mlp import MLPLayer
-from msdgs_train.systems.presets import PRESETS
+from msdgs_train.layers.quaternions import rotate, unit_or_identity
+from msdgs_train.systems.registry import preset
 from tests.support.models import SCENE, random_model
 
 SHRINK = 0.6
@@ -80,7 +80,7 @@ class SmoothMotion:
         t0, t1 = self._time_range
         weights = BSpline.design_matrix(np.array([(t - t0) / (t1 - t0)]), self._knots, 3).toarray()[0]
         pose = torch.einsum("c,mck->mk", torch.from_numpy(weights).float(), self._control[ids])
-        return torch.cat([pose[:, :6], unit_quats(pose[:, QUATS])], dim=1)
+        return torch.cat([pose[:, :6], unit_or_identity(pose[:, QUATS])], dim=1)
 
     @torch.no_grad()
     def _sampled(self, model: DynamicGaussians, ids: Tensor) -> Tensor:
@@ -200,7 +200,7 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
     """
     g, parents = small.gaussians, torch.arange(count) * len(small.gaussians) // count
     places = (1 - SHRINK**2) ** 0.5 * torch.randn(count, 3, generator=generator).clamp(-2.5, 2.5)
-    offsets = rotate(unit_quats(g.raw_quats[parents]), places * g.log_scales[parents].exp())
+    offsets = rotate(unit_or_identity(g.raw_quats[parents]), places * g.log_scales[parents].exp())
     parts = torch.bincount(parents, minlength=len(g))[parents]
     clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MOST_OPACITY)).log() / (parts * SHRINK**2)
     tensors = {
@@ -211,8 +211,7 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
         "sh_dc": g.sh_dc[parents],
         "sh_rest": g.sh_rest[parents],
     }
-    if g.embeddings is not None:
-        tensors["embeddings"] = g.embeddings[parents]
+    tensors |= {name: values[parents] for name, values in g.attributes.items()}
     model = DynamicGaussians(small.config, CanonicalGaussians(**tensors)).requires_grad_(requires_grad=False)
     model.deformation, model.modulation = small.deformation, small.modulation
     return model
@@ -222,19 +221,19 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
 def grown(small: DynamicGaussians) -> DynamicGaussians:
     """A model of the preset msdgs-mlp that does what the small one does; of its ten layers the last ones move nothing
     yet."""
-    paper = PRESETS["msdgs-mlp"].model
+    paper = preset("msdgs-mlp").model
     config = replace(
         paper,
         sh_degree=small.config.sh_degree,
         embedding_dim=small.config.embedding_dim,
         modulation_targets=small.config.modulation_targets,
-        delta_space=small.config.delta_space,
+        scale_space=small.config.scale_space,
     )
     torch.manual_seed(0)
     large = DynamicGaussians(config, small.gaussians).requires_grad_(requires_grad=False)
     large.modulation = small.modulation
     for layer in _mlp_layers(large):
-        damping = OCTAVE_DAMPING ** torch.arange(config.xyz_frequencies).repeat_interleave(3)
+        damping = OCTAVE_DAMPING ** torch.arange(layer.config.xyz_frequencies).repeat_interleave(3)
         layer.first.weight[:, 3 : 3 + 2 * len(damping)] *= damping.repeat(2)
     for layer, trained in zip(_mlp_layers(large), _mlp_layers(small), strict=False):
         _grown(layer, trained)
@@ -244,7 +243,9 @@ def grown(small: DynamicGaussians) -> DynamicGaussians:
 def _mlp_layers(model: DynamicGaussians) -> list[MLPLayer]:
     layers = [layer for layer in model.deformation.layers if isinstance(layer, MLPLayer)]
     if len(layers) < len(model.deformation) or any(layer.skip for layer in layers):
-        raise InvalidInput("model", "of MLP layers that read their input once", ", ".join(model.config.layers))
+        raise InvalidInput(
+            "model", "of MLP layers that read their input once", ", ".join(layer.kind for layer in model.config.layers)
+        )
     return layers
 
 

@@ -18,7 +18,7 @@ from benchmarks.rasterizer.report import print_tables
 from benchmarks.rasterizer.roofline import Roofline
 from benchmarks.rasterizer.scenes import Case, file_cases, object_scene, seeded_cases, write_splat
 from benchmarks.rasterizer.stages import Gradient, draw_in_stages, draw_scene, memory_of, row_of, work_of
-from export.views import GOLDEN
+from export.measure.views import GOLDEN
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import MsdgsError

@@ -35,7 +35,7 @@ CLIENTS = 32
 CATALOGUE = 96  # different requests of the mixed load
 FIRST = "first"  # of the scenes, the one that single measurements are made with
 DEFAULTS = Settings()
-PLACES = DEFAULTS.concurrent_renders + DEFAULTS.queued_renders  # for work, being done and in line
+PLACES = (DEFAULTS.concurrent_renders + DEFAULTS.queued_renders) // 2  # that one address may have, in work and in line
 TOO_MUCH, OVERLOAD_TURNS = 4, 3
 KILLS = 5
 PACE = 0.5  # of the peak: below saturation
@@ -137,7 +137,7 @@ def load(setting: Setting) -> Iterator[Row]:
     requests, offline = mixed(CATALOGUE, ["first", "second", "balls"]), Offline(setting.folder)
     expected = {wanted: digest(offline.draw(wanted)) for wanted in requests}
     before = _raw(offline, requests)
-    with service(setting.folder, queued_renders=CLIENTS) as running:
+    with service(setting.folder, queued_renders=2 * CLIENTS) as running:
         client = time.process_time()
         tally = saturate(running, requests, CLIENTS, setting.seconds)
         client = (time.process_time() - client) / tally.lasted

@@ -27,7 +27,7 @@ from export.trajectories.splines import design
 from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.gaussians.model import MIN_SCALE
+from msdgs_train.gaussians.scale_space import MIN_SCALE
 
 CONSTANT = 0.02
 """Opacities and SH coefficients may differ by this between frames that are blended: two steps of 8 bits."""

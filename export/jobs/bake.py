@@ -5,16 +5,27 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from export.layers import ModelNotExportable, export_of
+from export.layers.base import ModelNotExportable
 from msdgs_serve import __version__
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.gaussians.model import DynamicGaussians, unit_quats
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
+from msdgs_train.gaussians.modulation import EMBEDDINGS
+from msdgs_train.gaussians.scale_space import ScaleSpace
+from msdgs_train.layers.arrays import to_array
+from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.quaternions import unit_or_identity
+from msdgs_train.supports.base import Support
+from msdgs_train.supports.gaussians import GaussiansConfig
 
 STARTING_CAMERAS = 8
 """Cameras stored in a scene file, evenly spread over the training cameras."""
+
+
+DELTA_SPACES: dict[ScaleSpace, str] = {"log": "raw", "linear": "activated"}
+"""As scene files name them."""
 
 
 @dataclass(frozen=True)
@@ -24,12 +35,10 @@ class Moving:
     means: FloatArray  # [M, 3]
     log_scales: FloatArray  # [M, 3]
     quats: FloatArray  # [M, 4] wxyz, unit
-    modulation: dict[str, FloatArray] = field(
-        default_factory=dict
-    )  # by head: factors of its deltas (equation 12), [M, 3] or [M, 4]
-    attributes: dict[str, np.ndarray] = field(
-        default_factory=dict
-    )  # what layers read besides: `LayerExport.attributes`
+    modulation: dict[str, FloatArray] = field(default_factory=dict)
+    """By head: factors of its deltas (equation 12), [M, 3] or [M, 4]."""
+    attributes: dict[str, np.ndarray] = field(default_factory=dict)  # what the support stores per Gaussian
+    baked_attributes: dict[str, np.ndarray] = field(default_factory=dict)  # and as a graph reads it: `Support.baked`
 
     @classmethod
     def none(cls) -> "Moving":
@@ -47,7 +56,8 @@ class Baked:
 
     scene: BakedScene
     moving: Moving
-    layers: tuple[torch.nn.Module, ...]  # float32; empty where nothing moves
+    layers: tuple[DeformationLayer, ...]  # float32; empty where nothing moves
+    support: Support = field(default_factory=lambda: GaussiansConfig().build())
 
 
 def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Baked:
@@ -61,8 +71,8 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
         canonical = model.pose(info.time_range[0], deform=False)
         moves = bool(len(model.deformation)) and len(model.gaussians) > 0
         moving = _moving(model) if moves else Moving.none()
-    layers = tuple(model.deformation.layers) if moves else ()
-    kinds = tuple(str(getattr(layer, "kind", "")) for layer in layers)
+    layers = tuple(model.deformation) if moves else ()
+    kinds = tuple(layer.kind for layer in layers)
     scene = BakedScene(
         _metadata(model, info, kinds, checkpoint_sha256),
         moving_count=len(moving),
@@ -72,20 +82,20 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
         opacities=_array(canonical.opacities),
         sh=_array(canonical.sh),
     )
-    return Baked(scene.validate("the baked scene"), moving, layers)
+    return Baked(scene.validate("the baked scene"), moving, layers, model.support)
 
 
 def _moving(model: DynamicGaussians) -> Moving:
-    g, attributes = model.gaussians, dict[str, np.ndarray]()
-    for layer in model.deformation.layers:
-        attributes |= export_of(layer).attributes(g)
-    factors = {} if model.modulation is None else model.modulation(g.embeddings).present()
+    g = model.gaussians
+    stored = {name: values for name, values in g.attributes.items() if name != EMBEDDINGS}
+    factors = {} if model.modulation is None else model.modulation(g.attributes[EMBEDDINGS]).present()
     return Moving(
         _array(g.means),
         _array(g.log_scales),
-        _array(unit_quats(g.raw_quats)),
+        _array(unit_or_identity(g.raw_quats)),
         {head: _array(values) for head, values in factors.items()},
-        attributes,
+        {name: to_array(values) for name, values in stored.items()},
+        model.support.baked(stored),
     )
 
 
@@ -99,7 +109,7 @@ def _metadata(
         time_range=(float(info.time_range[0]), float(info.time_range[1])),
         bounds=(tuple(info.bounds[0]), tuple(info.bounds[1])),
         sh_degree=model.config.sh_degree,
-        delta_space=model.config.delta_space,
+        delta_space=DELTA_SPACES[model.config.scale_space],
         background=info.background,
         antialiasing="dilate",
         cameras=starting_cameras(info),

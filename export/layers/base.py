@@ -1,18 +1,14 @@
 """What an export needs to know of a kind of deformation layer."""
 
-from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
-from torch import nn
 
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.gaussians.canonical import CanonicalGaussians
-
-HEAD_COLUMNS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
-"""Columns of a layer's deltas, in the order of `Heads.sizes`; that of the step weight, if any, is the last one."""
+from msdgs_train.layers.base import HEAD_COLUMNS
+from msdgs_train.layers.deformation import DeformationLayer
 
 HEADS = tuple(HEAD_COLUMNS)
 
@@ -25,13 +21,10 @@ class LayerInputs(NamedTuple):
     """One layer, and the names of the graph's values that it may read."""
 
     name: str  # prefix of the layer's nodes and constants
-    layer: nn.Module
-    means: str  # [M, 3] as moved by the layers before it
-    canonical_means: str  # [M, 3]
-    canonical_quats: str  # [M, 4] wxyz, unit
+    layer: DeformationLayer
+    means: str  # [P, 3] points, Gaussians or control nodes, as moved by the layers before it
     time: str  # [1, 1]
     gate: str  # [1] how much of the layer the input `steps` applies, in [0, 1]
-    attributes: Mapping[str, np.ndarray]  # what `LayerExport.attributes` gave, of all moving Gaussians
 
 
 class LayerExport(Protocol):
@@ -39,24 +32,18 @@ class LayerExport(Protocol):
 
     removable_heads: frozenset[str]
     """Those of `HEADS` that `without_heads` can remove."""
-    parameters: frozenset[str]
-    """Parameters of `CanonicalGaussians` that only layers of this kind read."""
-    bytes_per_gaussian: int
-    """What `attributes` take in a scene file."""
-
-    def attributes(self, gaussians: CanonicalGaussians) -> dict[str, np.ndarray]:
-        """Arrays of N rows that the graph of a layer stores per Gaussian, by name."""
-        ...
+    scale_columns: int
+    """Of a delta of scales: 3, or 6 of a stretch tensor on control nodes."""
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
         """Add the nodes of one layer. Returns the deltas of the heads `used`, side by side, times weight and gate."""
         ...
 
-    def inert_heads(self, layer: nn.Module) -> frozenset[str]:
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Those of `HEADS` whose deltas are always 0."""
         ...
 
-    def without_heads(self, layer: nn.Module, names: frozenset[str]) -> nn.Module:
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
         """A copy of the layer in which the heads `names` give 0. The layer itself isn't changed."""
         ...
 
@@ -65,12 +52,7 @@ class FieldLayerExport:
     """Base of kinds whose layers evaluate a field at the means and have one output per head column."""
 
     removable_heads = frozenset(HEADS)
-    parameters: frozenset[str] = frozenset()
-    bytes_per_gaussian = 0
-
-    def attributes(self, gaussians: CanonicalGaussians) -> dict[str, np.ndarray]:
-        """None."""
-        return {}
+    scale_columns = 3
 
 
 def output_rows(used: list[str], has_weight: bool) -> np.ndarray:

@@ -5,10 +5,10 @@ from typing import cast
 
 import numpy as np
 import torch
-from torch import nn
 
 from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
 from export.layers.graph import GraphBuilder, to_numpy
+from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.mlp import MLPLayer
 
 
@@ -22,14 +22,14 @@ class MLPExport(FieldLayerExport):
         outputs = _outputs(graph, inputs.name, layer, inputs.means, inputs.time, rows)
         return weighted(graph, inputs, outputs, len(rows), layer.outputs.weight)
 
-    def inert_heads(self, layer: nn.Module) -> frozenset[str]:
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose rows of the last Linear are all 0."""
         heads = cast(MLPLayer, layer).heads
         return frozenset(
             n for n, rows in HEAD_COLUMNS.items() if not (heads.weight[rows].any() or heads.bias[rows].any())
         )
 
-    def without_heads(self, layer: nn.Module, names: frozenset[str]) -> nn.Module:
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
         """Rows of the last Linear set to 0."""
         layer = copy.deepcopy(cast(MLPLayer, layer))
         for name in names:

@@ -6,10 +6,10 @@ from typing import cast
 import numpy as np
 import torch
 from onnx import TensorProto
-from torch import nn
 
 from export.layers.base import HEADS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
 from export.layers.graph import GraphBuilder, to_numpy
+from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
 FIRST_AXES = np.array([0, 0, 1], np.int64)  # of the planes xy, xz, yz
@@ -26,12 +26,12 @@ class PlaneExport(FieldLayerExport):
         outputs = _outputs(graph, inputs.name, layer, inputs.means, inputs.time, rows)
         return weighted(graph, inputs, outputs, len(rows), layer.outputs.weight)
 
-    def inert_heads(self, layer: nn.Module) -> frozenset[str]:
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose Linear is all 0."""
         heads = zip(HEADS, cast(PlaneLayer, layer).heads, strict=False)  # the weight's comes after those of the deltas
         return frozenset(name for name, head in heads if not any(p.any() for p in head.parameters()))
 
-    def without_heads(self, layer: nn.Module, names: frozenset[str]) -> nn.Module:
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
         """Linears of heads set to 0."""
         layer = copy.deepcopy(cast(PlaneLayer, layer))
         for name in names:

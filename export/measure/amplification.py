@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msdgs_train.layers.chain import MultiStepDeformation, step_of
-from msdgs_train.supports.nodes import SkinningInputs
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.deformation import DeformationLayer
 
 UNIT_ROUNDOFF = 2.0**-24
 """Largest relative error of one rounding to float32."""
 
 
 class Growth(NamedTuple):
-    """Error growth of M Gaussians at one time through K layers, in float64."""
+    """Error growth of M points, Gaussians or control nodes, at one time through K layers, in float64."""
 
     after: np.ndarray  # [K, M] ‖J_k … J_1‖: growth of a displacement of the canonical mean after layer k
     amplification: np.ndarray  # [M] the largest ‖J_j … J_i‖ of products that end at the last layer, at least 1
@@ -29,23 +29,16 @@ class Growth(NamedTuple):
     )  # [M] scene units, expected distance of the float32 mean: Σ_k ‖J_K … J_{k+1}‖ · (δ_k + u‖x_k‖)
 
 
-def growth(
-    double: MultiStepDeformation,
-    single: MultiStepDeformation,
-    means: Tensor,
-    t: float,
-    carried: SkinningInputs | None = None,
-) -> Growth:
+def growth(double: MultiStepDeformation, single: MultiStepDeformation, means: Tensor, t: float) -> Growth:
     """Follow float64 `means`, [M, 3], through the layers at time `t`; `single` are the same layers in float32.
-    `carried` are the same Gaussians as a layer of kind `bases` wants them.
 
     δ_k is the error of layer k alone, measured from the same float32 means in both precisions, and u‖x_k‖ that of
     rounding the means it leaves. To first order their amplified sum bounds the error of the whole chain.
     """
     positions, jacobians, own_errors = means.detach(), [], []
-    for layer, rounded in zip(double.layers, single.layers, strict=True):
-        own_errors.append(_own_error(layer, rounded, positions, t, carried))
-        positions, jacobian = _moved_and_jacobian(layer, positions, t, carried)
+    for layer, rounded in zip(double, single, strict=True):
+        own_errors.append(_own_error(layer, rounded, positions, t))
+        positions, jacobian = _moved_and_jacobian(layer, positions, t)
         own_errors[-1] += UNIT_ROUNDOFF * torch.linalg.vector_norm(positions, dim=1)
         jacobians.append(jacobian)
     after, product = [], torch.eye(3, dtype=means.dtype).expand(len(means), 3, 3)
@@ -81,32 +74,24 @@ def spectral_norm(matrices: Tensor) -> Tensor:
     return torch.where(finite, sizes * (middle + 2 * width * angle.cos()).clamp_min(0).sqrt(), math.inf)
 
 
-def _moved(layer: torch.nn.Module, means: Tensor, t: float, carried: SkinningInputs | None) -> Tensor:
+def _moved(layer: DeformationLayer, means: Tensor, t: float) -> Tensor:
     """[M, 3] x + w f(x, t)."""
-    if carried is not None:
-        carried = carried._replace(
-            means=means, quats=carried.quats.to(means.dtype), skinning_weights=carried.skinning_weights.to(means.dtype)
-        )
-    step = step_of(layer, means, torch.tensor(t, dtype=means.dtype), carried)
+    step = layer(means, torch.tensor(t, dtype=means.dtype))
     return torch.addcmul(means, step.weight, step.delta_means)
 
 
-def _moved_and_jacobian(
-    layer: torch.nn.Module, means: Tensor, t: float, carried: SkinningInputs | None
-) -> tuple[Tensor, Tensor]:
+def _moved_and_jacobian(layer: DeformationLayer, means: Tensor, t: float) -> tuple[Tensor, Tensor]:
     """x + w f(x, t), [M, 3], and its derivative with respect to x, [M, 3, 3]."""
     with torch.enable_grad():
         start = means.detach().requires_grad_()
-        moved = _moved(layer, start, t, carried)
+        moved = _moved(layer, start, t) + 0 * start  # a layer may not read the means at all
         rows = [torch.autograd.grad(moved[:, i].sum(), start, retain_graph=i < 2)[0] for i in range(3)]
     return moved.detach(), torch.stack(rows, dim=1)
 
 
 @torch.no_grad()
-def _own_error(
-    layer: torch.nn.Module, rounded: torch.nn.Module, means: Tensor, t: float, carried: SkinningInputs | None
-) -> Tensor:
+def _own_error(layer: DeformationLayer, rounded: DeformationLayer, means: Tensor, t: float) -> Tensor:
     """[M] distance of a layer's float32 result from its float64 one, both from the same float32 means."""
     start = means.float()
-    exact = _moved(layer, start.double(), t, carried)
-    return torch.linalg.vector_norm(_moved(rounded, start, t, carried).double() - exact, dim=1)
+    exact = _moved(layer, start.double(), t)
+    return torch.linalg.vector_norm(_moved(rounded, start, t).double() - exact, dim=1)

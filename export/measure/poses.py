@@ -8,6 +8,8 @@ import torch
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.supports.base import Support
 
 SMALLEST_VISIBLE = 1e-3
 """Scales below this part of the scene's half diagonal are less than a pixel; their errors are relative to this size."""
@@ -25,6 +27,12 @@ def posed(model: DynamicGaussians, t: float, ids: np.ndarray | None = None, *, d
     rows = None if ids is None else torch.from_numpy(ids)
     pose = model.pose(float(np.float32(t)), ids=rows, deform=deform)
     return Gaussians(*(tensor.numpy() for tensor in pose))
+
+
+def operations(support: Support, chain: MultiStepDeformation, count: int) -> float:
+    """Approximate operations per Gaussian and pose, of `count` Gaussians that share the chain's points."""
+    points = count if support.num_points is None else support.num_points
+    return support.operations() + chain.operations() * points / max(count, 1)
 
 
 def half_diagonal(bounds: object) -> float:

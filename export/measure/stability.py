@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from export.measure.amplification import Growth, growth
+from export.measure.amplification import UNIT_ROUNDOFF, Growth, growth
 from export.measure.frames import NEAR, FrameDifference, PoseRenderer, compare
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed, usable_rows
 from export.measure.verify import times_to_verify
@@ -20,7 +20,7 @@ from export.precision.limits import limits_met
 from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.gaussians.model import DynamicGaussians, carried
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MIN_PSNR = 50.0
@@ -86,7 +86,7 @@ class _Assessment:
         predicted = min(prediction for _, prediction, _ in frames)
         return StabilityReport(
             gaussians=self.count,
-            layers=list(self.model.config.layers),
+            layers=[layer.kind for layer in self.model.config.layers],
             times=times,
             min_psnr=self.min_psnr,
             median_amplification=float(np.median(samples.amplification)),
@@ -105,12 +105,31 @@ class _Assessment:
         exact = posed(self.double, t, ids)
         poses = {name: posed(model, t, ids) for name, model in self.models.items()}
         errors = {name: largest_error(pose_errors(pose, exact, self.size)) for name, pose in poses.items()}
-        with torch.no_grad():
-            rows = self.double.gaussians.rows(torch.from_numpy(ids))
-            skinning = carried(rows)
-        found = growth(self.double.deformation, self.single.deformation, rows.means, float(np.float32(t)), skinning)
+        found = self._growth(ids, float(np.float32(t)))
         found = found._replace(predicted=found.predicted * self.mean_factors[ids])
         return _TimeSample(t, ids, found, exact, poses[FLOAT32.name].means, errors)
+
+    @torch.no_grad()
+    def _growth(self, ids: np.ndarray, t: float) -> Growth:
+        """Of the Gaussians `ids`. Followers of control nodes get the nodes', plus the measured round-off of skinning in
+        float32."""
+        double, single, rows = self.double, self.single, torch.from_numpy(ids)
+        points = double.canonical_points(double.gaussians.rows(rows))
+        found = growth(double.deformation, single.deformation, double.support.points(points), t)
+        if double.support.num_points is None:
+            return found
+
+        def spread(values: np.ndarray) -> np.ndarray:
+            return double.support.spread(torch.from_numpy(values), points.attributes).numpy()
+
+        moved = [
+            model.support(model.deformation, model.canonical_points(model.gaussians.rows(rows)), time, None).means
+            for model, time in ((double, torch.tensor(t, dtype=torch.float64)), (single, torch.tensor(t)))
+        ]
+        own = torch.linalg.vector_norm(moved[0] - moved[1].double(), dim=1).numpy()
+        own += UNIT_ROUNDOFF * torch.linalg.vector_norm(points.means, dim=1).numpy()
+        after = np.stack([spread(values) for values in found.after])
+        return Growth(after, spread(found.amplification), spread(found.predicted) + own)
 
     def _broken(self, samples: list["_TimeSample"]) -> list[str]:
         overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in samples)

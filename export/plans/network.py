@@ -4,26 +4,26 @@ from dataclasses import replace
 
 import numpy as np
 import onnx
-from torch import nn
 
-from export.jobs.bake import Baked, Moving
-from export.layers import HEAD_COLUMNS, HEADS, LayerInputs, export_of
+from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
 from export.plans.base import Plan
 from export.plans.scene_graph import finished, new_graph, unit_quats
+from export.supports import SupportInputs, support_export_of
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, MIN_SCALE
+from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT, MIN_SCALE
 
 
 def network(baked: Baked, plan: str = "network") -> onnx.ModelProto:
     """The scene with all its layers, exactly as trained."""
     graph = new_graph(baked)
-    _deform(graph, baked.moving, baked.layers, baked.scene.metadata.delta_space)
+    _deform(graph, baked)
     return finished(graph, baked, plan)
 
 
-def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[nn.Module, ...], delta_space: str) -> None:
-    """Canonical values of the ids, moved by each layer in turn, then activated: `DynamicGaussians.pose`."""
+def _deform(graph: GraphBuilder, baked: Baked) -> None:
+    """Canonical values of the ids, moved by the chain on its support, then activated: `DynamicGaussians.pose`."""
+    moving = baked.moving
     means = graph.node("Gather", [graph.constant("canonical_means", moving.means), "ids"], "ids.means")
     log_scales = graph.node(
         "Gather", [graph.constant("canonical_log_scales", moving.log_scales), "ids"], "ids.log_scales"
@@ -31,29 +31,13 @@ def _deform(graph: GraphBuilder, moving: Moving, layers: tuple[nn.Module, ...], 
     quats = graph.node("Gather", [graph.constant("canonical_quats", moving.quats), "ids"], "ids.quats")
     time = graph.node("Reshape", ["t", graph.constant("time_shape", np.array([1, 1], np.int64))], "time")
 
-    steps = graph.constant("steps", np.array([len(layers)], np.float32))
-    used = used_heads(layers)
-    sizes = [HEAD_COLUMNS[part].stop - HEAD_COLUMNS[part].start for part in used]
-    deltas, moved, parts = "", means, dict[str, str]()
-    for k, layer in enumerate(layers, start=1):
-        name = f"layer{k}"
-        inputs = LayerInputs(name, layer, moved, means, quats, time, _gate(graph, name, steps, k), moving.attributes)
-        step = export_of(layer).deltas(graph, inputs, used)  # equation 7
-        deltas = graph.node("Add", [deltas, step], f"{name}.deltas") if deltas else step  # equation 9
-        parts = dict(zip(used, graph.split(deltas, [f"{name}.{part}" for part in used], sizes), strict=True))
-        if k < len(layers) and "means" in parts:
-            moved = graph.node("Add", [means, parts["means"]], f"{name}.moved")  # equation 8
-
+    steps = graph.constant("steps", np.array([len(baked.layers)], np.float32))
+    inputs = SupportInputs(baked.support, baked.layers, means, quats, time, steps, moving.baked_attributes)
+    parts = support_export_of(baked.support).deltas(graph, inputs)
     parts = {part: _modulated(graph, part, moving.modulation.get(part), value) for part, value in parts.items()}
     graph.node(*(("Add", [means, parts["means"]]) if "means" in parts else ("Identity", [means])), "means")
-    _scales(graph, log_scales, parts.get("scales"), delta_space)
+    _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space)
     unit_quats(graph, graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats)
-
-
-def used_heads(layers: tuple[nn.Module, ...]) -> list[str]:
-    """Heads that change anything in any of the layers; one at least."""
-    inert = [export_of(layer).inert_heads(layer) for layer in layers]
-    return [head for head in HEADS if any(head not in heads for heads in inert)] or ["means"]
 
 
 def _modulated(graph: GraphBuilder, part: str, factors: np.ndarray | None, deltas: str) -> str:
@@ -80,13 +64,6 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_spac
         canonical = graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "ids.scales")
         least = graph.constant("scales.min", np.array(MIN_SCALE, np.float32))
         graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], "scales")
-
-
-def _gate(graph: GraphBuilder, name: str, steps: str, k: int) -> str:
-    """[1] how much of layer k is applied after `steps`: all, nothing, or a part of the last one."""
-    before = graph.constant(f"{name}.before", np.array([k - 1], np.float32))
-    limits = [graph.constant(f"{name}.share.{n}", np.array(v, np.float32)) for n, v in (("min", 0), ("max", 1))]
-    return graph.node("Clip", [graph.node("Sub", [steps, before], f"{name}.steps"), *limits], f"{name}.share")
 
 
 def prefix(baked: Baked, count: int) -> onnx.ModelProto:

@@ -11,7 +11,7 @@ from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.gaussians.model import MIN_SCALE
+from msdgs_train.gaussians.scale_space import MIN_SCALE
 
 
 def new_graph(baked: Baked) -> GraphBuilder:

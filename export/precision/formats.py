@@ -12,7 +12,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.supports.nodes import SkinningInputs
 
 
 @dataclass(frozen=True)
@@ -62,11 +61,9 @@ class _Emulated(MultiStepDeformation):
         self.layers = exact.layers
         self.number_format = number_format
 
-    def forward(
-        self, means: Tensor, t: Tensor, steps: int | None = None, carried: SkinningInputs | None = None
-    ) -> Deltas:
+    def forward(self, means: Tensor, t: Tensor, num_layers: int | None = None) -> Deltas:
         with torch.no_grad(), _Rounding(self.number_format):
-            return super().forward(means, t, steps, carried)
+            return super().forward(means, t, num_layers)
 
 
 _PRODUCTS = ("aten::addmm", "aten::addmv", "aten::linear")

@@ -4,8 +4,9 @@ import numpy as np
 import torch
 
 from msdgs_serve.scene.quaternion import MIN_NORM
-from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.modulation import MAX_LOG_FACTOR
+from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
 
 NEARLY = 1e-6
 """Relative distance to a limit below which a value counts as being at it."""

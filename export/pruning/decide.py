@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable, Collection
 from typing import Any
 
-from export.layers import export_of
 from export.pruning.mask import PruningMask, full_mask
 from export.pruning.rules import RULES
 from export.pruning.statistics import PruningStatistics
+from export.supports import support_export_of
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.model import DynamicGaussians
 
@@ -46,8 +46,8 @@ def prune(
 def stored_bytes(model: DynamicGaussians, mask: PruningMask) -> int:
     """Approximate size of a file of the plan `network`: Gaussians and layers."""
     gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(mask.sh_degree)
-    layers = [model.deformation.layers[k] for k in mask.network.layers] if mask.moves.any() else []
-    attributes = sum(kind.bytes_per_gaussian for kind in {export_of(layer) for layer in layers})
+    layers = [list(model.deformation)[k] for k in mask.network.layers] if mask.moves.any() else []
+    attributes = support_export_of(model.support).bytes_per_gaussian if layers else 0
     moving = MOVING_BYTES + MODULATION_BYTES * mask.network.modulated + attributes
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())
     return gaussian * int(mask.kept.sum()) + moving * int(mask.moves.sum()) + weights

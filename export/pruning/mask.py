@@ -8,11 +8,13 @@ import torch
 
 from export.layers import HEADS, export_of
 from export.measure.poses import posed
+from export.supports import support_export_of
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.deformation import DeformationLayer
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,8 @@ class PrunedModel:
 def full_mask(model: DynamicGaussians) -> PruningMask:
     """The mask that keeps everything."""
     count = len(model.gaussians)
-    heads = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation.layers))
+    heads = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation))
+    heads = heads if support_export_of(model.support).heads_are_removable else frozenset()
     network = NetworkMask(tuple(range(len(model.deformation))), heads, model.modulation is not None)
     moves = np.full(count, len(model.deformation) > 0)
     return PruningMask(network, np.ones(count, bool), moves, model.config.sh_degree)
@@ -106,27 +109,24 @@ def _model(
 ) -> DynamicGaussians:
     tensors = {name: parameter.detach()[which] for name, parameter in model.gaussians.named_parameters()}
     tensors["sh_rest"] = tensors["sh_rest"][:, : sh_coefficients(sh_degree) - 1]
-    if not network.modulated:
-        tensors.pop("embeddings", None)
-    layers = [model.deformation.layers[k] for k in network.layers]
-    read = frozenset[str]().union(*(export_of(layer).parameters for layer in layers))
-    for layer in model.deformation.layers:
-        for name in export_of(layer).parameters - read:
-            tensors.pop(name, None)
+    layers = [list(model.deformation)[k] for k in network.layers]
     config = replace(
         model.config,
         layers=tuple(model.config.layers[k] for k in network.layers),
         sh_degree=sh_degree,
         embedding_dim=model.config.embedding_dim if network.modulated else 0,
     )
+    unread = model.config.attributes().keys() - config.attributes().keys()
+    tensors = {name: values for name, values in tensors.items() if name not in unread}
     with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are replaced
         smaller = DynamicGaussians(config, CanonicalGaussians(**tensors))
     smaller.deformation = MultiStepDeformation(_without_heads(layer, network.heads) for layer in layers)
+    smaller.support = model.support
     smaller.modulation = model.modulation if network.modulated else None
     return smaller.requires_grad_(requires_grad=False)
 
 
-def _without_heads(layer: torch.nn.Module, heads: frozenset[str]) -> torch.nn.Module:
+def _without_heads(layer: DeformationLayer, heads: frozenset[str]) -> DeformationLayer:
     """The layer with zeros in place of the heads that are removed; a plan stores no column that is all zeros."""
     missing = frozenset(HEADS) - heads
     return export_of(layer).without_heads(layer, missing) if missing else layer

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from export.measure.frames import compare, render
-from export.measure.poses import posed
+from export.measure.poses import operations, posed
 from export.measure.views import View
 from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_network
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
@@ -15,7 +15,7 @@ from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.layers.chain import operations
+from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.rendering.rasterize import rasterize
 
 MEMORY, POSE_BYTES = 2e9, 40
@@ -81,8 +81,12 @@ class PruningStatistics:
 
     def operations(self, network: NetworkMask) -> float:
         """Approximate operations to pose all Gaussians at the selection times with this part of the network."""
-        layers = [self.model.deformation.layers[k] for k in network.layers]
-        return operations(layers) * len(self.model.gaussians) * len(self._whole[1].times)
+        chain = MultiStepDeformation(list(self.model.deformation)[k] for k in network.layers)
+        return (
+            operations(self.model.support, chain, len(self.model.gaussians))
+            * len(self.model.gaussians)
+            * len(self._whole[1].times)
+        )
 
     def worst_db(self, mask: PruningMask, min_db: float = -np.inf) -> float:
         """PSNR in dB of the worst selection frame, or of the first that is under `min_db`."""

@@ -6,14 +6,16 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from export.jobs.bake import Baked
+from export.jobs.bake import DELTA_SPACES, Baked
 from export.layers import HEAD_COLUMNS, HEADS
-from export.layers.spline import skinning_inputs
+from export.measure.poses import operations
 from export.plans.network import network
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.gaussians.model import MIN_SCALE, activated_scales, unit_quats
-from msdgs_train.layers.chain import MultiStepDeformation, operations
+from msdgs_train.gaussians.scale_space import ScaleSpace, add_to_scales
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.quaternions import unit_or_identity
+from msdgs_train.supports.base import CanonicalPoints
 
 POSE = 10
 """Columns of a pose: means 3, scales 3, quats 4 (wxyz)."""
@@ -28,16 +30,18 @@ class ExactPoses:
     def __init__(self, baked: Baked) -> None:
         m = baked.moving
         self.count = len(m)
-        self._raw = baked.scene.metadata.delta_space == "raw"
+        self._space: ScaleSpace = "log" if baked.scene.metadata.delta_space == DELTA_SPACES["log"] else "linear"
         self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
         self._factors = {head: _double(factors) for head, factors in m.modulation.items()}
-        self._skinning = skinning_inputs(self._means, self._quats, m.attributes)
+        self._attributes = {name: torch.from_numpy(values) for name, values in m.attributes.items()}
+        self._attributes |= {n: v.double() for n, v in self._attributes.items() if v.is_floating_point()}
+        self._support = copy.deepcopy(baked.support).double()
         self._deformation = MultiStepDeformation(copy.deepcopy(layer).double() for layer in baked.layers)
 
     @property
-    def operations(self) -> int:
+    def operations(self) -> float:
         """Approximate operations per Gaussian and pose."""
-        return max(operations(self._deformation.layers), 1)
+        return max(operations(self._support, self._deformation, self.count), 1)
 
     def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
         """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`, or of all."""
@@ -46,17 +50,14 @@ class ExactPoses:
     @torch.no_grad()
     def _posed(self, t: float, ids: torch.Tensor) -> Poses:
         means, log_scales = self._means[ids], self._log_scales[ids]
-        skinning = self._skinning.rows(ids) if self._skinning else None
-        deltas = self._deformation(means, torch.tensor(t, dtype=torch.float64), carried=skinning)
+        points = CanonicalPoints(means, self._quats[ids], {name: v[ids] for name, v in self._attributes.items()})
+        deltas = self._support(self._deformation, points, torch.tensor(t, dtype=torch.float64), None)
         of_means, of_scales, of_quats = (
             self._factors[head][ids] * getattr(deltas, head) if head in self._factors else getattr(deltas, head)
             for head in HEADS  # equation 12
         )
-        if self._raw:
-            scales = activated_scales(log_scales + of_scales)
-        else:
-            scales = (activated_scales(log_scales) + of_scales).clamp_min(MIN_SCALE)
-        return torch.cat([means + of_means, scales, unit_quats(self._quats[ids] + of_quats)], dim=1).numpy()
+        scales = add_to_scales(self._space, log_scales, of_scales)
+        return torch.cat([means + of_means, scales, unit_or_identity(self._quats[ids] + of_quats)], dim=1).numpy()
 
 
 def _double(array: np.ndarray) -> torch.Tensor:

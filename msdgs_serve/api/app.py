@@ -50,7 +50,8 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
         for method in route.methods or ()
     }
     # the last is the outermost
-    app.add_middleware(Admission, service.queue, queued)
+    streamed = {("POST", "/render/batch"), ("POST", "/render/video")}
+    app.add_middleware(Admission, service.queue, queued, streamed)
     app.add_middleware(BodyLimit, settings.max_body_bytes, settings.body_seconds, STREAMED)
     if keys is not None:
         app.add_middleware(KeyCheck, keys)

@@ -57,7 +57,7 @@ def _reported_milliseconds(store: SceneStore, scenes: list[ServedScene]) -> dict
             for point in report.get("points", []):
                 key = (point["plan"], point["error"]["psnr_worst"])
                 found.setdefault(key, float(point["milliseconds"]["total"]["min"]))
-        except (SceneFileInvalid, LookupError, TypeError, ValueError):
+        except (SceneFileInvalid, LookupError, TypeError, ValueError, OverflowError):
             continue  # a report of another shape: as if there were none
     return found
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Mapping
 
 from msdgs_serve.api.errors import Refused, refusal
+from msdgs_serve.api.keys import address_of
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.observe import IDENTITY, Answered, record, request_id, usable_id
 from msdgs_serve.api.work import WorkQueue
@@ -44,7 +45,7 @@ class Doorman:
             return None
         started = time.perf_counter()
         try:
-            self._queue.refuse_if_full()
+            self._queue.refuse_if_full(address_of(client))
         except Refused as error:
             refused = error
         else:

@@ -1,5 +1,6 @@
 """Errors as HTTP: one table from domain errors to a status, one body shape (RFC 9457, application/problem+json)."""
 
+import itertools
 import json
 import logging
 from collections.abc import Sequence
@@ -27,6 +28,10 @@ KIND = "msdgs.problem"
 """Key of an ASGI scope: what kind of problem it was answered with, for the metrics."""
 
 CLIENT_CLOSED_REQUEST = 499  # nginx's
+
+UNIONS = ("camera", "background", "t")
+MEMBERS = ("orbit", "look_at", "matrix", "scene", "name", "color", "one", "list")
+"""Of the unions: pydantic puts which one it took behind the field's name."""
 
 MEDIA_TYPE = "application/problem+json"
 MAX_BODY_BYTES = 8192
@@ -185,10 +190,9 @@ def _field_error(item: dict[str, Any]) -> FieldError:
 
 
 def _field_name(location: Sequence[str | int]) -> str:
-    """`("body", "camera", "orbit", "azimuth")` → `camera.azimuth`: unions put the chosen member's name third."""
-    where, *path = location
-    if len(path) > 1 and path[0] in ("camera", "background", "t"):
-        del path[1]
+    """`("body", "camera", "orbit", "azimuth")` → `camera.azimuth`: the chosen member of a union isn't named."""
+    where, *parts = location
+    path = [part for before, part in itertools.pairwise((where, *parts)) if not (before in UNIONS and part in MEMBERS)]
     if not path or (len(path) == 1 and isinstance(path[0], int)):  # no body, or the offset of a JSON error
         return str(where)
     return ".".join(str(part) for part in path)

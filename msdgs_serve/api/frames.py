@@ -6,6 +6,7 @@ import json
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from urllib.parse import quote
 
 import numpy as np
@@ -92,23 +93,33 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
 
 
-def draw_frame(service: Service, plan: FramePlan, watch: Watch) -> bytes:
-    """The file of a plan. The watch has the stages `pose`, `draw` and `encode`."""
+def draw_frame(service: Service, plan: FramePlan, t: float, watch: Watch) -> bytes:
+    """The file of one frame. The watch has the stages `pose`, `draw` and `encode`."""
+    image = _draw(service, plan, t, watch)
+    with watch.stage("encode"):
+        return encode(image, plan.request.format, plan.request.quality, plan.channels, plan.depth_range)
 
-    def draw(t: float) -> Image:
-        return service.renderer.render(plan.scene.session, plan.camera, t, plan.options, watch)
 
-    def encoded(image: Image) -> bytes:
-        with watch.stage("encode"):
-            return encode(image, plan.request.format, plan.request.quality, plan.channels, plan.depth_range)
-
+async def draw_plan(service: Service, plan: FramePlan, watch: Watch) -> bytes:
+    """The file of a plan, when its turns come: where it has several times, each is a part of the work."""
+    run = service.queue.run
     if not isinstance(plan.request.t, list):
-        return encoded(draw(plan.times[0]))
+        return await run(lambda: draw_frame(service, plan, plan.times[0], watch), watch)
     if plan.request.format == "npy":
-        frames = [numbers(draw(t), plan.channels) for t in plan.times]
-        with watch.stage("encode"):
-            return npy(np.stack(frames))
-    return _zipped([encoded(draw(t)) for t in plan.times], FORMATS[plan.request.format].extension)
+        draw = partial(_draw_numbers, service, plan, watch=watch)
+        arrays = [await run(partial(draw, t), watch, part=True) for t in plan.times]
+        return await run(lambda: npy(np.stack(arrays)), watch, part=True)
+    draw = partial(draw_frame, service, plan, watch=watch)
+    files = [await run(partial(draw, t), watch, part=True) for t in plan.times]
+    return await run(lambda: _zipped(files, FORMATS[plan.request.format].extension), watch, part=True)
+
+
+def _draw(service: Service, plan: FramePlan, t: float, watch: Watch) -> Image:
+    return service.renderer.render(plan.scene.session, plan.camera, t, plan.options, watch)
+
+
+def _draw_numbers(service: Service, plan: FramePlan, t: float, watch: Watch) -> np.ndarray:
+    return numbers(_draw(service, plan, t, watch), plan.channels)
 
 
 def server_timing(watch: Watch) -> str:

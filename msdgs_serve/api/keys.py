@@ -1,10 +1,12 @@
-"""Keys: who has none is answered 401, on every route but the health checks and the page, which asks for one."""
+"""Keys and what they open: 401 without one, 403 where it lacks the scope; health and the page's files need none."""
 
 import hashlib
 import hmac
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from http import HTTPStatus
 from pathlib import Path
+from typing import Literal, NamedTuple, get_args
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -12,9 +14,54 @@ from msdgs_serve.api.errors import KIND, problem_response
 from msdgs_serve.api.prefix import route_path
 from msdgs_serve.scene import InvalidInput
 
+KeyScope = Literal["read", "write", "operate"]
+"""read: frames, scenes, documents. write: add, replace, delete scenes. operate: metrics."""
+
+SCOPES: tuple[KeyScope, ...] = get_args(KeyScope)
 OPEN_PATHS = ("/live", "/ready", "/")
 OPEN_FOLDER = "/viewer/"
+OPERATED_PATHS = ("/metrics",)
+WRITTEN_PATH, WRITTEN_FOLDER = "/scenes", "/scenes/"
 SHORTEST_KEY = 16
+MAX_BYTES = 1 << 20
+CLIENT = "msdgs.client"
+"""Key of an ASGI scope: whose key was used, as the first digits of its digest."""
+CLIENT_DIGITS = 16
+
+LINE = re.compile(rf"(?P<scopes>\w+(,\w+)*)[ \t]+(?P<key>\S{{{SHORTEST_KEY},}})")
+
+
+class Key(NamedTuple):
+    """One line of the file."""
+
+    digest: bytes
+    scopes: frozenset[str]
+
+    @property
+    def client(self) -> str:
+        """Who uses it, without saying what it is."""
+        return self.digest.hex()[:CLIENT_DIGITS]
+
+
+def client_of(scope: Scope) -> str:
+    """Who calls, for what is shared out among clients: a key, or else an address."""
+    return scope.get(CLIENT) or address_of(scope.get("client"))
+
+
+def address_of(client: Sequence[object] | None) -> str:
+    """Of a connection, or of whom a trusted proxy names."""
+    return str(client[0]) if client else "unknown"
+
+
+def scope_of(method: str, path: str) -> KeyScope | None:
+    """What a key must have for a call; None where it needs none."""
+    if path in OPEN_PATHS or path.startswith(OPEN_FOLDER):
+        return None
+    if path in OPERATED_PATHS:
+        return "operate"
+    if (path == WRITTEN_PATH or path.startswith(WRITTEN_FOLDER)) and method not in ("GET", "HEAD", "OPTIONS"):
+        return "write"
+    return "read"
 
 
 class KeyCheck:
@@ -23,41 +70,62 @@ class KeyCheck:
     Digests are compared, in constant time, and always with all keys: how long it takes tells nothing.
     """
 
-    def __init__(self, app: ASGIApp, keys: Iterable[str]) -> None:
+    def __init__(self, app: ASGIApp, keys: Iterable[Key]) -> None:
         self._app = app
-        self._digests = [_digest(key.encode()) for key in keys]
+        self._keys = list(keys)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_open(route_path(scope)) or self._fits(scope):
-            await self._app(scope, receive, send)
-            return
-        scope[KIND] = "unauthorized"
-        detail = "A key is needed: `Authorization: Bearer <key>` or `X-API-Key: <key>`."
-        response = problem_response(HTTPStatus.UNAUTHORIZED, detail, headers={"WWW-Authenticate": "Bearer"})
-        await response(scope, receive, send)
+        needed = scope_of(scope["method"], route_path(scope)) if scope["type"] == "http" else None
+        if needed is not None:
+            key = self._key(scope)
+            if key is None:
+                scope[KIND] = "unauthorized"
+                detail = "A key is needed: `Authorization: Bearer <key>` or `X-API-Key: <key>`."
+                response = problem_response(HTTPStatus.UNAUTHORIZED, detail, headers={"WWW-Authenticate": "Bearer"})
+                await response(scope, receive, send)
+                return
+            if needed not in key.scopes:
+                scope[KIND] = "forbidden"
+                detail = f"This key lacks the scope `{needed}`; it has {', '.join(sorted(key.scopes))}."
+                await problem_response(HTTPStatus.FORBIDDEN, detail)(scope, receive, send)
+                return
+            scope[CLIENT] = key.client
+        await self._app(scope, receive, send)
 
-    def _fits(self, scope: Scope) -> bool:
+    def _key(self, scope: Scope) -> Key | None:
         headers = dict(scope["headers"])
         kind, _, bearer = headers.get(b"authorization", b"").partition(b" ")
         given = bearer.strip() if kind.lower() == b"bearer" else headers.get(b"x-api-key", b"")
         digest = _digest(given)
-        return sum([hmac.compare_digest(digest, known) for known in self._digests]) > 0
+        fitting = [key for key in self._keys if hmac.compare_digest(digest, key.digest)]
+        return fitting[0] if fitting else None
 
 
-def _is_open(path: str) -> bool:
-    return path in OPEN_PATHS or path.startswith(OPEN_FOLDER)
+def read_keys(path: Path) -> list[Key]:
+    """Scopes, joined by commas, and a key a line; empty lines and those that begin with # don't count.
 
-
-def read_keys(path: Path) -> list[str]:
-    """One key a line; empty lines and those that begin with # don't count. Raises `InvalidInput`."""
+    Raises `InvalidInput` that says which line is wrong and what it needs, and repeats no key.
+    """
     try:
-        lines = [line.strip() for line in path.read_text().splitlines()]
+        with path.open("rb") as file:
+            lines = file.read(MAX_BYTES).decode().splitlines()
     except (OSError, UnicodeDecodeError):
         raise InvalidInput("api_keys_file", "a text file that can be read", path) from None
-    keys = [line for line in lines if line and not line.startswith("#")]
-    if not keys or any(len(key) < SHORTEST_KEY for key in keys):
-        raise InvalidInput("api_keys_file", f"keys of {SHORTEST_KEY} or more letters, one a line", f"{len(keys)} keys")
+    texts = [(number, line.strip()) for number, line in enumerate(lines, 1)]
+    keys = [_key_of(number, text) for number, text in texts if text and not text.startswith("#")]
+    if len({key.digest for key in keys}) < len(keys) or not keys:
+        raise InvalidInput("api_keys_file", "a file of different keys, one a line", f"{len(keys)} keys")
     return keys
+
+
+def _key_of(number: int, text: str) -> Key:
+    match = LINE.fullmatch(text)
+    scopes = frozenset(match["scopes"].split(",")) if match else frozenset()
+    if match is None or not scopes <= set(SCOPES):
+        form = f"`scopes key`, as in `{','.join(SCOPES)} <a key of {SHORTEST_KEY} or more letters>`"
+        got = "a key without scopes" if " " not in text and "\t" not in text else "something else"
+        raise InvalidInput(f"api_keys_file, line {number}", form, got)
+    return Key(_digest(match["key"].encode()), scopes)
 
 
 def _digest(key: bytes) -> bytes:

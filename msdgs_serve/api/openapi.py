@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from msdgs_serve.api.errors import MEDIA_TYPE, FieldError, Problem
-from msdgs_serve.api.keys import OPEN_PATHS
+from msdgs_serve.api.keys import scope_of
 from msdgs_serve.api.schemas import BatchItem
 from msdgs_serve.imaging import FORMATS
 from msdgs_serve.scene.camera import orbit
@@ -103,18 +103,18 @@ def render_examples(store: SceneStore) -> Examples:
 
 
 def _add_keys(document: dict[str, Any]) -> None:
-    """That every call but the health checks needs a key."""
+    """What scope of a key each call needs."""
     schemes = {
         "bearer": {"type": "http", "scheme": "bearer"},
         "key": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
     }
     document["components"]["securitySchemes"] = schemes
-    refusal = problems(HTTPStatus.UNAUTHORIZED)[HTTPStatus.UNAUTHORIZED.value]
+    refusals = problems(HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN)
     for path, calls in document["paths"].items():
-        if path not in OPEN_PATHS:
-            for call in calls.values():
-                call["security"] = [{name: []} for name in schemes]
-                call["responses"][str(HTTPStatus.UNAUTHORIZED.value)] = refusal
+        for method, call in calls.items():
+            if (scope := scope_of(method.upper(), path)) is not None:
+                call["security"] = [{name: [scope]} for name in schemes]
+                call["responses"] |= {str(status): response for status, response in refusals.items()}
 
 
 def _examples(served: ServedScene, scene: dict[str, str]) -> Examples:

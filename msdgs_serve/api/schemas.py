@@ -2,39 +2,41 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from msdgs_serve.api.numbers import (
+    Color,
+    Decibels,
+    Direction,
+    Distance,
+    Elevation,
+    FieldOfView,
+    Focal,
+    FramesPerSecond,
+    Index,
+    LaxDecibels,
+    LaxIndex,
+    LaxNumber,
+    LaxPixels,
+    LaxQuality,
+    LaxSteps,
+    List,
+    Name,
+    Number,
+    Pixels,
+    Quality,
+    Row,
+    Samples,
+    Steps,
+    Unit,
+    Vector,
+)
 from msdgs_serve.imaging import Channel, ImageFormat
-from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, CameraModel
-from msdgs_serve.store import MAX_NAME_LENGTH
+from msdgs_serve.scene.camera import CameraModel
 from msdgs_serve.video import VideoFormat
 
 MAX_TIMES = 1000
 MAX_BATCH = 1000
-
-# Bounds far beyond any sensible value, within which single precision neither overflows nor underflows
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
-Focal = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e8)]
-FieldOfView = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.01, le=179.0)]
-Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_PIXELS_PER_SIDE)]
-Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
-Decibels = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=200)]
-Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME_LENGTH)]
-Steps = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1000)]
-LaxNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
-LaxPixels = Annotated[int, Field(ge=1, le=MAX_PIXELS_PER_SIDE)]
-Vector = tuple[Number, Number, Number]
-Row = tuple[Number, Number, Number, Number]
-Color = tuple[Unit, Unit, Unit]
-
-
-def _not_tiny(vector: Vector) -> Vector:
-    if sum(x * x for x in vector) < 1e-12:
-        raise ValueError("must be longer than 1e-6")
-    return vector
-
-
-Direction = Annotated[Vector, AfterValidator(_not_tiny)]
 
 
 class Strict(BaseModel):
@@ -47,7 +49,10 @@ class MatrixCamera(Strict):
     """A pose and intrinsics. Give either `fov_y` or `fx`; pixels are those of the request's `width` × `height`."""
 
     type: Literal["matrix"]
-    camera_to_world: tuple[Row, Row, Row, Row] = Field(description="4×4, by rows: rotation and position, no scale")
+    camera_to_world: tuple[Row, Row, Row, Row] = Field(
+        description="4×4, by rows: rotation and position, no scale",
+        examples=[[[0, 0, -1, 4], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]],
+    )
     axes: Literal["opencv", "opengl"] = Field(
         default="opencv",
         description="of the camera: `opencv` x right, y down, z forward; `opengl` x right, y up, z backward "
@@ -75,11 +80,14 @@ class LookAtCamera(Strict):
     """A camera at `eye` that sees `target` in the middle of the image."""
 
     type: Literal["look_at"]
-    eye: Vector = Field(description="where the camera is, world")
-    target: Vector | None = Field(default=None, description="what it looks at, world; default: the middle of the scene")
-    up: Direction | None = Field(
-        default=None, description="which direction is up in the image, world; default: the scene's"
+    eye: Vector = Field(description="where the camera is, world", examples=[[4, 0, 1]])
+    target: Vector | None = Field(
+        default=None, description="what it looks at, world; default: the middle of the scene", examples=[[0, 0, 0]]
     )
+    up: Direction | None = Field(
+        default=None, description="which direction is up in the image, world; default: the scene's",
+        examples=[[0, 0, 1]],
+    )  # fmt: skip
     fov_y: FieldOfView | None = Field(
         default=None, description="vertical, degrees; default: that of the scene's first camera"
     )
@@ -90,14 +98,14 @@ class OrbitCamera(Strict):
 
     type: Literal["orbit"]
     azimuth: Number = Field(description="degrees around `up`")
-    elevation: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-89.9, le=89.9)] = Field(
-        description="degrees above the horizon of `target`"
-    )
-    distance: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-6, le=1e9)] | None = Field(
+    elevation: Elevation = Field(description="degrees above the horizon of `target`")
+    distance: Distance | None = Field(
         default=None, description="scene units; default: as far as the scene's cameras are"
     )
-    target: Vector | None = Field(default=None, description="world; default: the middle of the scene")
-    up: Direction | None = Field(default=None, description="world; default: the scene's")
+    target: Vector | None = Field(
+        default=None, description="world; default: the middle of the scene", examples=[[0, 0, 0]]
+    )
+    up: Direction | None = Field(default=None, description="world; default: the scene's", examples=[[0, 0, 1]])
     fov_y: FieldOfView | None = Field(
         default=None, description="vertical, degrees; default: that of the scene's first camera"
     )
@@ -107,11 +115,11 @@ class SceneCamera(Strict):
     """One of the cameras that the scene was made with; `GET /scenes/{name}` lists them."""
 
     type: Literal["scene"]
-    name: Name | None = Field(default=None, description="give either `name` or `index`")
-    index: Annotated[int, Field(strict=True, ge=0, le=1_000_000)] | None = Field(default=None, description="from 0")
+    name: Name | None = Field(default=None, description="give either `name` or `index`", examples=["view_0"])
+    index: Index | None = Field(default=None, description="from 0")
 
 
-CameraSpec = Annotated[MatrixCamera | LookAtCamera | OrbitCamera | SceneCamera, Field(discriminator="type")]
+CameraSpec = Annotated[OrbitCamera | LookAtCamera | MatrixCamera | SceneCamera, Field(discriminator="type")]
 
 
 def _kind_of_background(value: Any) -> str:
@@ -140,7 +148,7 @@ class ShutterSpec(Strict):
 
     open: Number = Field(description="scene time, relative to `t`", examples=[-0.01])
     close: Number = Field(description="scene time, relative to `t`; after `open`", examples=[0.01])
-    samples: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
+    samples: Samples = Field(
         default=8, description="moments drawn and averaged in linear light; the service has a limit"
     )
 
@@ -181,10 +189,14 @@ class RenderRequest(Strict):
         "forward.v. `gaussians` is how many add to each pixel: where the time goes",
     )
     depth_range: tuple[Number, Number] | None = Field(
-        default=None, description="depths drawn white and darkest in an image of depth; default: those of the frame"
+        default=None,
+        description="depths drawn white and darkest in an image of depth; default: those of the frame",
+        examples=[[1, 9]],
     )
     dt: Number | None = Field(
-        default=None, description="`motion` leads to where things are at `t + dt`; needed for it, scene time"
+        default=None,
+        description="`motion` leads to where things are at `t + dt`; needed for it, scene time",
+        examples=[0.1],
     )
     shutter: ShutterSpec | None = Field(default=None, description="motion blur; default: a single moment")
     steps: Steps | None = Field(
@@ -192,9 +204,7 @@ class RenderRequest(Strict):
         description="after so many of the scene's deformation layers: 0 as the Gaussians are stored, 1.5 the first and "
         "half of what the second does. Default: all. For scenes with `steps`, see `GET /scenes/{name}`",
     )
-    quality: Annotated[int, Field(strict=True, ge=1, le=100)] | None = Field(
-        default=None, description="for `jpeg` and `webp` only; default 90"
-    )
+    quality: Quality | None = Field(default=None, description="for `jpeg` and `webp` only; default 90")
     background: Background = Field(
         default="auto",
         description="`scene`: the color that the scene was trained on. `transparent` or null: none, and the frame "
@@ -209,29 +219,23 @@ class RenderQuery(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     scene: Name | None = Field(default=None, description="may be left out where only one is served")
-    min_psnr: Annotated[float, Field(allow_inf_nan=False, ge=0, le=200)] | None = Field(
-        default=None, description="dB, as in `POST /render`"
-    )
+    min_psnr: LaxDecibels | None = Field(default=None, description="dB, as in `POST /render`")
     t: LaxNumber | None = Field(default=None, description="default: the scene's first time")
-    steps: Annotated[float, Field(allow_inf_nan=False, ge=0, le=1000)] | None = Field(
-        default=None, description="as in `POST /render`"
-    )
+    steps: LaxSteps | None = Field(default=None, description="as in `POST /render`")
     width: LaxPixels | None = Field(default=None, description="pixels")
     height: LaxPixels | None = Field(default=None, description="pixels")
     format: ImageFormat = Field(default="png", description="as in `POST /render`")
-    quality: Annotated[int, Field(ge=1, le=100)] | None = Field(default=None, description="of `jpeg` and `webp`")
-    channels: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["depth"])
-    background: Annotated[str, Field(max_length=100)] | None = Field(
-        default=None, description="`scene`, `transparent` or `r,g,b`", examples=["1,1,1"]
-    )
+    quality: LaxQuality | None = Field(default=None, description="of `jpeg` and `webp`")
+    channels: List | None = Field(default=None, examples=["depth"])
+    background: List | None = Field(default=None, description="`scene`, `transparent` or `r,g,b`", examples=["1,1,1"])
     camera: Name | None = Field(default=None, description="a camera of the scene, by name")
-    index: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(default=None, description="or by number")
+    index: LaxIndex | None = Field(default=None, description="or by number")
     azimuth: LaxNumber | None = Field(default=None, description="degrees; default 30")
     elevation: LaxNumber | None = Field(default=None, description="degrees; default 20")
     distance: LaxNumber | None = Field(default=None, description="scene units")
-    eye: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["4,0,1"])
-    target: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["0,0,0"])
-    up: Annotated[str, Field(max_length=100)] | None = Field(default=None, examples=["0,0,1"])
+    eye: List | None = Field(default=None, examples=["4,0,1"])
+    target: List | None = Field(default=None, examples=["0,0,0"])
+    up: List | None = Field(default=None, examples=["0,0,1"])
     fov_y: LaxNumber | None = Field(default=None, description="vertical field of view, degrees")
 
 
@@ -258,7 +262,26 @@ class FilmFrame(Strict):
     """A frame of a film."""
 
     camera: CameraSpec
-    t: Number = Field(description="time, within the scene's `time_range`")
+    t: Number = Field(description="time, within the scene's `time_range`", examples=[0.5])
+
+
+class PathCamera(BaseModel):
+    """A camera of nerfstudio's camera_path.json, OpenGL axes; its other keys are passed over."""
+
+    camera_to_world: Annotated[list[Number], Field(min_length=16, max_length=16)] = Field(
+        description="4×4, row after row", examples=[[0, 0, 1, 4, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]]
+    )
+    fov: FieldOfView = Field(description="vertical, degrees")
+    render_time: Unit | None = Field(default=None, description="a part of the scene's time, which else runs evenly")
+
+
+class NerfstudioPath(BaseModel):
+    """The contents of nerfstudio's camera_path.json; its other keys are passed over."""
+
+    camera_path: Annotated[list[PathCamera], Field(min_length=1, max_length=MAX_TIMES)]
+    render_width: Pixels | None = Field(default=None, description="pixels; needed where the request has no size")
+    render_height: Pixels | None = Field(default=None, description="pixels; see `render_width`")
+    fps: FramesPerSecond | None = Field(default=None, description="frames a second")
 
 
 class VideoRequest(Strict):
@@ -268,16 +291,10 @@ class VideoRequest(Strict):
     frames: Annotated[list[FilmFrame], Field(min_length=1, max_length=MAX_TIMES)] | None = Field(
         default=None, description="one camera and one time each"
     )
-    path: dict[str, Any] | None = Field(
-        default=None,
-        description="the contents of nerfstudio's camera_path.json; `render_time` in [0, 1] of a camera is a part of "
-        "the scene's time, which otherwise runs evenly",
-    )
+    path: NerfstudioPath | None = Field(default=None, description="of nerfstudio, in place of `frames`")
     width: Pixels | None = Field(default=None, description="pixels; default: the path's, else the first camera's")
     height: Pixels | None = Field(default=None, description="pixels; goes with `width`")
-    fps: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=240)] | None = Field(
-        default=None, description="frames a second; default: the path's, else 24"
-    )
+    fps: FramesPerSecond | None = Field(default=None, description="frames a second; default: the path's, else 24")
     format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9. `webp`: animated")
     background: tuple[Unit, Unit, Unit] | Literal["scene"] = Field(default="scene", description="sRGB-encoded, 0 to 1")
 
@@ -288,6 +305,7 @@ class SceneEntry(BaseModel):
     name: str
     loaded: bool = Field(description="whether it is in memory; a scene is loaded by the first request for it")
     problem: bool = Field(description="whether its file, as it is now, is broken; an earlier version may be served")
+    reason: str | None = Field(description="why it is broken")
 
 
 class SceneList(BaseModel):
@@ -322,6 +340,23 @@ class SceneView(BaseModel):
     height: int = Field(description="pixels")
 
 
+class GraphLimit(BaseModel):
+    """What a scene may take at most."""
+
+    gaussians: int
+    memory_bytes: int
+    operations: float
+
+
+class GraphCost(BaseModel):
+    """What posing takes at most, known from the file before anything runs and the same at all times."""
+
+    memory_bytes: int = Field(description="of the values of one call of the graph and of all poses")
+    operations: int = Field(description="of posing all moving Gaussians once")
+    calls: int = Field(description="of the graph, that this takes")
+    limits: GraphLimit
+
+
 class SceneDetail(SceneEntry):
     """A scene, from what its file says of itself."""
 
@@ -345,6 +380,7 @@ class SceneDetail(SceneEntry):
     package_version: str
     checkpoint_sha256: str
     sha256: str = Field(description="of the scene's file")
+    cost: GraphCost
 
 
 class Live(BaseModel):

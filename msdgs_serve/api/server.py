@@ -36,6 +36,7 @@ class Server(uvicorn.Server):
             access_log=False,
             timeout_graceful_shutdown=CLOSING_SECONDS,
             server_header=False,
+            forwarded_allow_ips=settings.proxies,
         )
         super().__init__(config)
         self._drain_seconds = settings.drain_seconds

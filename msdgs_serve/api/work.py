@@ -1,20 +1,22 @@
-"""The queue of renders: bounded, with a time limit for each, and without work for clients that are gone."""
+"""The queue of renders: bounded, fair, with a time limit for each, and without work for clients that are gone."""
 
 import asyncio
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from starlette.requests import Request
 
 from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.turns import Turns
 from msdgs_serve.threads import give_way
 from msdgs_serve.watch import Watch
 
@@ -23,20 +25,46 @@ Result = TypeVar("Result")
 LONGEST_RETRY = 60
 FIRST_GUESS = 0.5  # seconds a piece of work takes, until one was measured
 SMOOTHING = 0.1
+UNKNOWN = "unknown"
 
 
-@dataclass
+@dataclass(eq=False)
 class _Call:
-    """One that was admitted."""
+    """One that was admitted, or will be where it has work."""
 
-    has_place: bool = True  # which goes over to its first piece of work
+    client: str
+    streamed: bool
+    has_place: bool = False
+    future: Future[Any] | None = None  # of its last piece of work
 
 
-_admitted: ContextVar[_Call | None] = ContextVar("admitted", default=None)
+@dataclass(eq=False)
+class _Piece:
+    """Work in line."""
+
+    future: Future[Any]
+    work: Callable[[], Any]
+
+    def do(self) -> None:
+        """Unless nobody waits for it."""
+        if self.future.set_running_or_notify_cancel():
+            try:
+                result = self.work()
+            except BaseException as error:
+                self.future.set_exception(error)
+            else:
+                self.future.set_result(result)
+
+
+_call: ContextVar[_Call | None] = ContextVar("call", default=None)
 
 
 class WorkQueue:
-    """`workers` pieces of work at once and places for `waiting` more in line; what comes on top is refused."""
+    """`workers` pieces of work at once and places for `waiting` more calls; what comes on top is refused.
+
+    A client has at most as many places as it leaves free, and streamed calls, whose work comes in parts, have at most
+    half of all. Whose work is done next: see `Turns`.
+    """
 
     def __init__(self, workers: int, waiting: int, seconds: float) -> None:
         self._workers = workers
@@ -44,7 +72,9 @@ class WorkQueue:
         self._seconds = seconds
         self._executor = ThreadPoolExecutor(workers, "render", initializer=give_way)
         self._lock = threading.Lock()
-        self._taken = 0
+        self._turns: Turns[_Piece] = Turns()
+        self._held: Counter[str] = Counter()  # places by client
+        self._streams = 0  # places of streamed calls
         self._running = 0
         self._mean_seconds = FIRST_GUESS
         self._closed = False
@@ -52,7 +82,7 @@ class WorkQueue:
     @property
     def waiting(self) -> int:
         """Places that are taken, and whose work isn't being done yet."""
-        return max(0, self._taken - self._running)
+        return max(0, self._held.total() - self._running)
 
     @property
     def running(self) -> int:
@@ -60,27 +90,30 @@ class WorkQueue:
         return self._running
 
     @contextmanager
-    def admitted(self) -> Iterator[None]:
-        """Around a call: it has a place from now until its first work is done, and later work of it is never refused.
+    def admitted(self, client: str, *, streamed: bool = False, at_once: bool = True) -> Iterator[None]:
+        """Around a call: it has a place from now, or unless `at_once` from its first work, until that is done.
 
-        Raises `Refused` where all places are taken.
+        A streamed call has its place to the end, and no later work of any call is refused. Raises `Refused` where there
+        is no place for it.
         """
-        with self._lock:
-            self._refuse_if_full()
-            self._taken += 1
-        call = _Call()
-        token = _admitted.set(call)
+        call = _Call(client, streamed)
+        if at_once:
+            with self._lock:
+                self._take_place(call)
+        token = _call.set(call)
         try:
             yield
         finally:
-            _admitted.reset(token)
-            if call.has_place:
-                self._leave()
+            _call.reset(token)
+            if call.future is None or call.future.done():
+                self._leave(call)
+            else:
+                call.future.add_done_callback(lambda _: self._leave(call))
 
-    def refuse_if_full(self) -> None:
-        """Raise `Refused` where a call would not be admitted now."""
+    def refuse_if_full(self, client: str) -> None:
+        """Raise `Refused` where a call that isn't streamed would not be admitted now."""
         with self._lock:
-            self._refuse_if_full()
+            self._refuse_if_full(client)
 
     def close(self) -> None:
         """Refuse new work; what is there is finished."""
@@ -91,16 +124,17 @@ class WorkQueue:
         self.close()
         self._executor.shutdown(wait=False, cancel_futures=True)
 
-    async def run(self, work: Callable[[], Result], watch: Watch) -> Result:
+    async def run(self, work: Callable[[], Result], watch: Watch, *, part: bool = False) -> Result:
         """Do `work` when its turn comes; where the call wasn't admitted before, it may be refused here.
 
-        Whoever awaits this may be cancelled: work that waits is dropped, and work that runs is ended by its watch.
+        `part`: of work that goes on, so that the call keeps its place; single frames of others come in between. Whoever
+        awaits this may be cancelled: work that waits is dropped, and work that runs is ended by its watch.
 
         Raises:
             Refused: with 503 where the queue is full or closed, with 504 when the time is over.
         """
-        future = self._submit(work, watch)
-        waiter = asyncio.wrap_future(future)
+        piece = self._submit(work, watch, part=part)
+        waiter = asyncio.wrap_future(piece.future)
         waiter.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody may be left to look
         try:
             async with asyncio.timeout(self._seconds):
@@ -109,12 +143,16 @@ class WorkQueue:
             detail = f"It took longer than {self._seconds:g} s, the time limit of a request."
             raise Refused(HTTPStatus.GATEWAY_TIMEOUT, "deadline", detail) from None
         finally:
-            if not future.done():
+            if not piece.future.done():
                 watch.stop()
-                future.cancel()
+                if piece.future.cancel():
+                    with self._lock:
+                        self._turns.remove(piece)
 
-    def _submit(self, work: Callable[[], Result], watch: Watch) -> Future[Result]:
+    def _submit(self, work: Callable[[], Result], watch: Watch, *, part: bool) -> _Piece:
         submitted = time.perf_counter()
+        admitted = _call.get()
+        call = admitted or _Call(UNKNOWN, streamed=False)
 
         def timed() -> Result:
             started = time.perf_counter()
@@ -129,33 +167,55 @@ class WorkQueue:
                     self._running -= 1
                     self._mean_seconds += SMOOTHING * (time.perf_counter() - started - self._mean_seconds)
 
-        self._take_place(_admitted.get())
-        future = self._executor.submit(timed)
-        future.add_done_callback(lambda _: self._leave())
-        return future
-
-    def _take_place(self, call: _Call | None) -> None:
+        piece = _Piece(Future(), timed)
         with self._lock:
-            if call is not None and call.has_place:
+            if not call.has_place:
+                self._take_place(call, again=call.future is not None)
+            call.future = piece.future
+            self._turns.add(piece, call.client, part=part)
+        if admitted is None or not (part or call.streamed):
+            piece.future.add_done_callback(lambda _: self._leave(call))
+        self._executor.submit(self._do_next)
+        return piece
+
+    def _do_next(self) -> None:
+        with self._lock:
+            piece = self._turns.next()
+        if piece is not None:
+            piece.do()
+
+    def _take_place(self, call: _Call, *, again: bool = False) -> None:
+        if not again:
+            self._refuse_if_full(call.client, streamed=call.streamed)
+        self._held[call.client] += 1
+        self._streams += call.streamed
+        call.has_place = True
+
+    def _leave(self, call: _Call) -> None:
+        with self._lock:
+            if call.has_place:
                 call.has_place = False
-                return
-            if call is None:
-                self._refuse_if_full()
-            self._taken += 1
+                self._streams -= call.streamed
+                self._held[call.client] -= 1
+                if not self._held[call.client]:
+                    del self._held[call.client]
 
-    def _leave(self) -> None:
-        with self._lock:
-            self._taken -= 1
-
-    def _refuse_if_full(self) -> None:
+    def _refuse_if_full(self, client: str, *, streamed: bool = False) -> None:
         if self._closed:
             detail = "The service is about to stop; ask again, another one may answer."
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "draining", detail, retry_after=1)
-        if self._taken >= self._places:
-            seconds = math.ceil(self._taken * self._mean_seconds / self._workers)
+        taken = self._held.total()
+        if taken >= self._places:
             detail = f"All {self._places} places for work and in the queue are taken; try again later."
-            retry_after = min(max(1, seconds), LONGEST_RETRY)
-            raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
+        elif self._held[client] >= self._places - taken:
+            detail = f"You have {self._held[client]} places for work and in the queue, as many as are left for others."
+        elif streamed and self._streams >= max(1, self._places // 2):
+            detail = f"All {self._streams} places for batches and films are taken; try again later."
+        else:
+            return
+        seconds = math.ceil(taken * self._mean_seconds / self._workers)
+        retry_after = min(max(1, seconds), LONGEST_RETRY)
+        raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
 
 
 async def unless_gone(request: Request, call: Awaitable[Result]) -> Result:

@@ -3,6 +3,8 @@
 import argparse
 import contextlib
 import inspect
+import io
+import sys
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
@@ -113,15 +115,31 @@ def parse_fit(arguments: Sequence[str]) -> Fit:
 def _cli(arguments: Sequence[str], default: Fit) -> Fit:
     names = "\n".join(f"  {entry.name}: {entry.description}" for entry in systems().values())
     description = f"{inspect.cleandoc(Fit.__doc__ or '')}\n\nPresets:\n{names}"
-    with PARTS:
-        return tyro.cli(
-            type(default),
-            args=arguments,
-            prog="msdgs-train fit",
-            default=default,
-            description=description,
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
+    errors = io.StringIO()
+    try:
+        with PARTS, contextlib.redirect_stderr(errors):
+            return tyro.cli(
+                type(default),
+                args=arguments,
+                prog="msdgs-train fit",
+                default=default,
+                description=description,
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+    except SystemExit as end:
+        invalid = _invalid_setting(end)
+        if invalid is not None:  # reported in one line, as by the other commands, instead of tyro's box
+            raise invalid from None
+        sys.stderr.write(errors.getvalue())
+        raise
+
+
+def _invalid_setting(end: SystemExit) -> InvalidInput | None:
+    """The error of a setting for which tyro exits; None if it exits for another reason."""
+    cause: BaseException | None = end
+    while cause is not None and not isinstance(cause, InvalidInput):
+        cause = cause.__context__
+    return cause
 
 
 def _short_help(command: Fit) -> Any:

@@ -11,9 +11,7 @@ from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.sheets import Panel, draw_sheet
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 
-DEFAULT_TIME = (
-    0.3  # fraction of the scene's time; in the middle, where the time window starts, deformations are small
-)
+DEFAULT_TIME = 0.3  # fraction of the scene's time; in the middle, where the time window starts, deformations are small
 
 
 def write_steps(

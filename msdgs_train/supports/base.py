@@ -55,8 +55,9 @@ class SupportConfig:
 class Support(nn.Module):
     """Runs a chain of layers on its points. It knows nothing of the kinds of layers."""
 
+    kind: ClassVar[str]
     num_points: int | None = None
-    """Of control nodes; None where the points are the Gaussians themselves."""
+    """Of control nodes; None if the points are the Gaussians themselves."""
 
     def forward(
         self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None
@@ -79,6 +80,10 @@ class Support(nn.Module):
         """Arrays of N rows that a scene file stores per Gaussian, of the support's own attributes."""
         return {}
 
+    def spread(self, values: Tensor, attributes: dict[str, Tensor]) -> Tensor:
+        """Numbers of the points, [P], as numbers of the Gaussians, [N], that follow them."""
+        return values
+
     def operations(self) -> int:
-        """Floating-point operations a Gaussian, besides those of the chain."""
+        """Floating-point operations per Gaussian, besides those of the chain."""
         return 0

@@ -29,6 +29,8 @@ class GaussiansConfig(SupportConfig):
 class GaussiansSupport(Support):
     """Points are the canonical means."""
 
+    kind = "gaussians"
+
     def __init__(self, config: GaussiansConfig) -> None:
         super().__init__()
         self.config = config

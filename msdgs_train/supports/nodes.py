@@ -78,6 +78,7 @@ class NodesConfig(SupportConfig):
 class NodesSupport(Support):
     """Points are control nodes, which stay where they were put."""
 
+    kind = "nodes"
     nodes: Tensor
     neighbors: Tensor
 
@@ -152,6 +153,10 @@ class NodesSupport(Support):
         """`skinning_weights`, [N, F], whose rows sum to 1, and `node_ids`, int64 [N, F]."""
         weights = skinning_weights(attributes["skinning_logits"])
         return {"skinning_weights": to_array(weights), "node_ids": to_array(attributes["node_ids"])}
+
+    def spread(self, values: Tensor, attributes: dict[str, Tensor]) -> Tensor:
+        weights = skinning_weights(attributes["skinning_logits"])
+        return (weights * values[attributes["node_ids"]]).sum(dim=1)
 
     def operations(self) -> int:
         return 2 * MOTION * self.config.followed

@@ -4,7 +4,7 @@ A motion is `MOTION` numbers: a matrix A [3, 3] row by row, an offset o [3], a q
 weights of a Gaussian at x, of unit quaternion q and rotation R, they give
 
 - A x + o - x, by how much its mean moves,
-- log |A R_j|, by how much the logarithms of its scales grow, from `LEAST_STRETCH` on,
+- log |A R_j|, by how much the logarithms of its scales grow, from `MIN_STRETCH` on,
 - r q / |r| - q, by how much its quaternion changes.
 """
 
@@ -24,7 +24,7 @@ MAX_NEAREST = 8
 MOTION = 16
 OFFSET, TURN = 9, 12
 """Where the parts of a motion that follow the matrix begin."""
-LEAST_STRETCH = 0.05
+MIN_STRETCH = 0.05
 """Of a Gaussian's own axes."""
 DELTAS = 10
 """Columns that a Gaussian changes by: mean 3, logarithms of scales 3, quaternion 4."""
@@ -52,7 +52,7 @@ def skin_forward(
         axes = rotation_columns(*quat)
         for i in range(3):
             deltas[n, i] = moved[i] + blended[OFFSET + i] - mean[i]
-            deltas[n, 3 + i] = 0.5 * math.log(max(_square(_times(matrix, axes[i])), LEAST_STRETCH**2))
+            deltas[n, 3 + i] = 0.5 * math.log(max(_square(_times(matrix, axes[i])), MIN_STRETCH**2))
         for i in range(4):
             deltas[n, 6 + i] = turned[i] - quat[i]
 
@@ -161,7 +161,7 @@ def _on_stretched(matrix: tuple, axis: tuple, pull: float) -> tuple:
     """The gradient of c = A R_j from that of log |c|: c / |c|², and none where |c| is kept from vanishing."""
     c = _times(matrix, axis)
     square = _square(c)
-    share = pull / square if square > LEAST_STRETCH**2 else 0 * square
+    share = pull / square if square > MIN_STRETCH**2 else 0 * square
     return share * c[0], share * c[1], share * c[2]
 
 

@@ -173,6 +173,7 @@ def test_what_is_not_close_enough_does_not_replace_a_file(tmp_path: Path):
     assert LOSSLESS > LOSSY >= 45
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plan", ["network", "lowrank:8", "lowrank:1", "keyframes:7", "keyframes"])
 def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str):
     scene = scene_file(tmp_path, plan)

@@ -20,14 +20,15 @@ from export.stability import UNSTABLE, main
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import save_model
 from msdgs_train.layers.chain import MultiStepDeformation
-from msdgs_train.layers.mlp import LayerStep
+from msdgs_train.layers.deformation import DeformationLayer, LayerStep
 from tests.export import stability_extreme, stability_stiff
 from tests.export.stability_rows import FAILS, Row
 from tests.export.stability_suite import TABLE
-from tests.support.exports import export_scene
-from tests.support.models import SCENE, random_model
+from tests.support.models import SCENE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close, tolerance
+
+pytestmark = pytest.mark.slow
 
 
 def assert_none_fails(rows: list[Row]):
@@ -40,7 +41,6 @@ def test_a_stiff_model_is_exact_enough_or_refused(case: str):
     assert_none_fails(stability_stiff.rows_of(case))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("group", stability_extreme.GROUPS, ids=lambda group: group.__name__)
 def test_an_extreme_case_holds_or_is_refused(group):
     assert_none_fails([*group()])
@@ -50,7 +50,7 @@ def test_products_of_jacobians_are_those_of_differences():
     assert_none_fails([*stability_stiff.jacobian_rows()])
 
 
-class Linear(torch.nn.Module):
+class Linear(DeformationLayer):
     """x → x + w A x."""
 
     def __init__(self, matrix: torch.Tensor, weight: float) -> None:
@@ -176,7 +176,7 @@ def test_what_does_not_move_is_steady(count: int, layers: tuple[str, ...]):
 
 
 def test_bounds_that_hold_a_gaussian_back_are_counted():
-    model = random_model(9, layers=("mlp",), delta_space="activated")
+    model = random_model(9, layers=("mlp",), scale_space="linear")
     with torch.no_grad():
         model.gaussians.log_scales[:2] = 30.0
         model.gaussians.raw_quats[0] = 0
@@ -243,7 +243,7 @@ def test_the_command_refuses_settings_that_make_no_sense(
 
 def test_the_command_runs_from_any_folder(tmp_path: Path):
     command = [sys.executable, str(ROOT / "export" / "stability.py"), "nowhere.pt"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 1
     assert "nowhere.pt: no such file" in done.stderr
 

@@ -25,10 +25,9 @@ from export.plans.registry import PLANS
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.gaussians.model_file import save_model
-from tests.support.models import SCENE, random_model
-from tests.support.moving_object import GROUND, OBJECT, moving_object
+from tests.support.models import GROUND, OBJECT, SCENE, moving_object, random_model
 
-pytestmark = pytest.mark.xdist_group("work precision")  # one worker, so that it sweeps once
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that it sweeps once
 
 POINT_FIELDS = {
     "front": bool,

@@ -43,7 +43,7 @@ class CountingSession(DeformationSession):
 
     def gaussians(self, t: float, steps: float | None = None) -> Gaussians:
         self.times.append(t)
-        assert self.release.wait(10)
+        assert self.release.wait(60)
         if self.failure:
             raise self.failure
         return self._gaussians
@@ -110,7 +110,7 @@ def test_one_computation_for_all_who_ask_together(counting: CountingSession):
     with ThreadPoolExecutor(8) as pool:
         futures = [pool.submit(renderer.posed, counting, 0.5) for _ in range(8)]
         counting.release.set()
-        results = {id(future.result(10)) for future in futures}
+        results = {id(future.result(60)) for future in futures}
     assert len(results) == 1
     assert counting.times == [0.5]
 

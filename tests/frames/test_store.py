@@ -114,7 +114,7 @@ def test_others_are_served_the_old_scene_while_one_loads_the_new(tmp_path: Path)
             raise AssertionError("loaded twice")
         if store_has_scene:
             loading.set()
-            assert go_on.wait(10)
+            assert go_on.wait(60)
         return DeformationSession(path)
 
     store_has_scene = False
@@ -125,12 +125,12 @@ def test_others_are_served_the_old_scene_while_one_loads_the_new(tmp_path: Path)
     change(path, plan="prefix:1")
     with ThreadPoolExecutor(1) as pool:
         slow = pool.submit(store.refresh)
-        assert loading.wait(10)
+        assert loading.wait(60)
         assert store.get("walk") is before
         store.refresh()
         assert store.get("walk") is before
         go_on.set()
-        slow.result(10)
+        slow.result(60)
     assert store.get("walk").session.scene.metadata.plan == "prefix:1"
 
 

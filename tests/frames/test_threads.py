@@ -19,7 +19,7 @@ def test_a_part_that_another_thread_has_is_waited_for(two_threads: None):
 
     def work() -> bool:
         if threading.get_ident() == caller:
-            assert begun.wait(10)
+            assert begun.wait(60)
             return False  # the other thread is not done
         begun.set()
         threading.Event().wait(0.1)
@@ -35,7 +35,7 @@ def test_what_another_thread_raises_is_raised(two_threads: None):
 
     def work() -> bool:
         if threading.get_ident() == caller:
-            assert begun.wait(10)
+            assert begun.wait(60)
             return False
         begun.set()
         raise MemoryError("no room for a tile")
@@ -50,9 +50,9 @@ def test_nobody_is_waited_for_when_all_is_done(two_threads: None):
     def work() -> bool:
         if threading.get_ident() != caller:
             begun.set()
-            assert go_on.wait(10)
+            assert go_on.wait(60)
             return True
-        return begun.wait(10)
+        return begun.wait(60)
 
     run_together(work, ())
     assert not go_on.is_set()

@@ -21,7 +21,7 @@ from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
 from msdgs_serve.video import write_video
 from tests.service.test_api_poison import check_problem
 from tests.support.images import decode, psnr
-from tests.support.scene_files import UP, write_scene
+from tests.support.scene_files import UP
 from tests.support.service import serving
 
 SIZE = 64
@@ -41,11 +41,6 @@ def frames_of(film: bytes) -> tuple[list[np.ndarray], float]:
         rate = container.streams.video[0].average_rate
         assert rate is not None
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], float(rate)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 @pytest.fixture(scope="module")

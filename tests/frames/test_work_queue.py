@@ -22,7 +22,7 @@ def queue() -> Iterator[WorkQueue]:
 
 def is_full(queue: WorkQueue) -> bool:
     try:
-        with queue.admitted():
+        with queue.admitted("another"):
             return False
     except Refused:
         return True
@@ -30,9 +30,9 @@ def is_full(queue: WorkQueue) -> bool:
 
 def test_calls_have_their_places_before_they_have_any_work(queue: WorkQueue):
     with ExitStack() as calls:
-        calls.enter_context(queue.admitted())
+        calls.enter_context(queue.admitted("one"))
         assert not is_full(queue)
-        calls.enter_context(queue.admitted())
+        calls.enter_context(queue.admitted("two"))
         assert is_full(queue)
         assert queue.waiting == 2
     assert not is_full(queue), "calls that had no work give their places back"
@@ -41,7 +41,7 @@ def test_calls_have_their_places_before_they_have_any_work(queue: WorkQueue):
 
 def test_a_place_is_free_when_the_work_is_done_though_its_answer_is_still_sent(queue: WorkQueue):
     async def call() -> None:
-        with queue.admitted(), queue.admitted():
+        with queue.admitted("one"), queue.admitted("two"):
             assert is_full(queue)
             await queue.run(lambda: None, Watch())
             while queue.waiting > 1:  # the future is done a moment before its callbacks have run
@@ -53,11 +53,11 @@ def test_a_place_is_free_when_the_work_is_done_though_its_answer_is_still_sent(q
 
 def test_later_work_of_a_call_is_never_refused(queue: WorkQueue):
     async def call() -> bool:
-        with queue.admitted():
+        with queue.admitted("three"):
             await queue.run(lambda: None, Watch())
             while queue.waiting:
                 await asyncio.sleep(0.001)
-            with queue.admitted(), queue.admitted():
+            with queue.admitted("one"), queue.admitted("two"):
                 return await queue.run(lambda: is_full(queue), Watch())
 
     assert asyncio.run(call())
@@ -68,5 +68,5 @@ def test_work_of_a_call_that_was_not_admitted_is_refused_where_all_places_are_ta
         with pytest.raises(Refused):
             await queue.run(lambda: None, Watch())
 
-    with queue.admitted(), queue.admitted():
+    with queue.admitted("one"), queue.admitted("two"):
         contextvars.Context().run(lambda: asyncio.run(work()))

@@ -18,6 +18,7 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from msdgs_serve.api.keys import SHORTEST_KEY
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.work import WorkQueue
@@ -29,6 +30,7 @@ from tests.support.service import in_this_process, serving
 
 DOCKER = ROOT / "docker"
 SKIPPED = 77
+METRICS_KEY, READER_KEY = "metrics-0123456789", "reader-0123456789"
 PIN = re.compile(r"^([\w.-]+)==([^\s;\\]+)", re.MULTILINE)
 
 
@@ -80,8 +82,42 @@ def composition() -> dict[str, Any]:
 def test_services_have_no_rights_they_don_t_need():
     for name, service in composition().items():
         assert service["cap_drop"] == ["ALL"], name
-        assert service["security_opt"] == ["no-new-privileges:true"], name
-    assert all(composition()[name]["read_only"] for name in ("render", "proxy", "prometheus"))
+        assert service["security_opt"] == ["no-new-privileges:true"], f"{name}: and Docker's own seccomp profile"
+        assert service["read_only"], name
+        assert service["user"].split(":")[0] not in ("0", "root"), name
+        assert not {"privileged", "cap_add", "devices", "pid", "network_mode", "userns_mode"} & service.keys(), name
+
+
+def test_services_have_limits():
+    for name, service in composition().items():
+        assert service["mem_limit"] == service["memswap_limit"], name
+        assert 0 < service["pids_limit"] <= 512, name
+
+
+def test_nothing_can_be_run_from_where_a_service_may_write():
+    volumes = yaml.safe_load((DOCKER / "compose.yaml").read_text())["volumes"]
+    for name, service in composition().items():
+        assert all("noexec" in each for each in service.get("tmpfs", ())), name
+        writable = [each.split(":")[0] for each in service.get("volumes", ()) if not each.endswith(":ro")]
+        assert writable == {"render": ["uploads"], "prometheus": ["measurements"]}.get(name, [])
+    assert volumes["uploads"]["driver_opts"]["o"].startswith("noexec,nosuid,nodev")
+
+
+def test_prometheus_has_a_key_where_keys_are_asked_for():
+    document = yaml.safe_load((DOCKER / "compose.yaml").read_text())
+    (job,) = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yaml").read_text())["scrape_configs"]
+    (secret,) = document["services"]["prometheus"]["secrets"]
+    assert job["authorization"]["credentials_file"] == f"/run/secrets/{secret}"
+    default = re.search(r":-(\S+)}", document["secrets"][secret]["file"])
+    assert default
+    assert len((DOCKER / default[1]).read_text().strip()) < SHORTEST_KEY, "what is there by default is nobody's key"
+
+
+def test_the_proxy_says_whom_it_asks_for_and_is_believed():
+    assert "proxy_set_header X-Forwarded-For $remote_addr;" in (DOCKER / "nginx" / "nginx.conf").read_text()
+    render = composition()["render"]
+    assert render["environment"]["MSDGS_PROXIES"] == "*"
+    assert "ports" not in render, "or everybody would be believed"
 
 
 def test_the_service_is_told_nothing_that_it_doesn_t_know():
@@ -113,14 +149,18 @@ def test_the_dashboard_asks_for_metrics_that_there_are():
 @pytest.mark.skipif(shutil.which("prometheus") is None, reason="there is no prometheus to run")
 def test_prometheus_answers_every_query_of_the_dashboard(tmp_path: Path):
     scene = write_scene(tmp_path / "balls.onnx")
-    with serving(scene) as client, prometheus(tmp_path, client.base_url.netloc.decode()) as answer:
+    (tmp_path / "keys").write_text(f"operate {METRICS_KEY}\nread {READER_KEY}")
+    with (
+        serving(scene, api_keys_file=tmp_path / "keys") as client,
+        prometheus(tmp_path, client.base_url.netloc.decode()) as answer,
+    ):
         unanswered = queries_of_the_dashboard()
         assert unanswered
         deadline = time.monotonic() + 60
         while unanswered and time.monotonic() < deadline:
             for camera, status in (({"type": "orbit", "azimuth": 0, "elevation": 0}, 200), (None, 422)):
                 body = {"camera": camera, "t": 0.5, "width": 16, "height": 16}
-                assert client.post("/render", json=body).status_code == status
+                assert client.post("/render", json=body, headers={"X-API-Key": READER_KEY}).status_code == status
             time.sleep(0.2)
             unanswered = [query for query in unanswered if not answer(query)]
         assert not unanswered
@@ -133,6 +173,9 @@ def prometheus(folder: Path, target: str) -> Iterator[Callable[[str], list[Any]]
     settings["global"]["scrape_interval"] = "1s"
     (job,) = settings["scrape_configs"]
     del job["dns_sd_configs"]
+    key = folder / "metrics.key"
+    key.write_text(METRICS_KEY)
+    job["authorization"]["credentials_file"] = str(key)
     job["static_configs"] = [{"targets": [target]}]
     (folder / "prometheus.yaml").write_text(yaml.safe_dump(settings))
     address = f"127.0.0.1:{free_port()}"

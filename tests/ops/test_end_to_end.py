@@ -9,9 +9,8 @@ import torch
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_train.gaussians.model_file import save_model
 from msdgs_train.rendering.rasterize import rasterize
-from tests.support.exports import export_scene
 from tests.support.images import decode, linear_to_srgb
-from tests.support.models import CAMERA, SCENE, random_model
+from tests.support.models import CAMERA, SCENE, export_scene, random_model
 from tests.support.reference import render
 from tests.support.service import serving
 from tests.support.tolerances import tolerance
@@ -26,6 +25,7 @@ def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_service_draws_what_the_trainer_draws(model_file: Path) -> None:
     model = random_model()
     camera = Camera(**{**CAMERA, "camera_to_world": np.array(CAMERA["camera_to_world"])})

@@ -27,9 +27,10 @@ def container(name: str) -> dict[str, Any]:
     return only
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("manifest", OBJECTS, ids=lambda each: f"{each['kind']}-{each['metadata']['name']}")
 def test_it_is_valid(manifest: dict[str, Any]):
-    validate = pytest.importorskip("kubernetes_validate", reason="needs: pip install kubernetes-validate").validate
+    validate = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate isn't installed").validate
     assert validate(manifest, KUBERNETES, strict=True) == KUBERNETES
 
 

@@ -13,8 +13,8 @@ import pytest
 from msdgs_serve.ray_tasks import MAX_LOSSES, RayTasks, WorkLost, in_turns, ray_cluster
 from msdgs_serve.render_cli import main
 from msdgs_serve.scene import MsdgsError
-from tests.support.ray_work import always_dies, dies_once, refuses
 from tests.support.scene_files import write_scene
+from tests.support.service_on_ray import always_dies, dies_once, refuses
 
 pytest.importorskip("ray", reason="needs Ray: make test-cluster")
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("ray")]  # one cluster at a time

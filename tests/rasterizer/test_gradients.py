@@ -303,6 +303,7 @@ numpy.savez(sys.argv[1], **gradients(draw(parameters, camera), weighted(clear), 
 """
 
 
+@pytest.mark.slow
 def test_without_the_compiler_gradients_are_the_same(tmp_path: Path):
     run_python(WITHOUT_COMPILER, tmp_path / "gradients.npz", NUMBA_DISABLE_JIT="1")
     parameters, camera, clear = small_scene(60)

@@ -1,13 +1,18 @@
-"""Machine code on disk that is damaged, or that can't be written, costs a compilation and never a call."""
+"""Machine code on disk: void when a source changes, mended where it is damaged, complete before the first request."""
 
+import ast
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from msdgs_serve.api.cli import USAGE_ERROR, main
 from msdgs_serve.rasterizer.kernel_files import CheckedFiles, copy_kernels, is_writable
 from tests.support.processes import ROOT, run_python
+
+pytestmark = pytest.mark.slow
 
 KERNEL = """
 from msdgs_serve.rasterizer.jit import kernel
@@ -23,9 +28,6 @@ sys.path.insert(0, sys.argv[1])
 from room.caller import double
 print(double(21.0), len(double.stats.cache_misses))
 """
-
-
-pytestmark = pytest.mark.xdist_group("kernel files")  # one worker, so that the room is compiled once
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +61,7 @@ def flip(contents: bytes) -> bytes:
     return contents[:middle] + bytes([contents[middle] ^ 1]) + contents[middle + 1 :]
 
 
+@pytest.mark.xdist_group("kernel files")  # one worker, so that the folder is compiled once
 @pytest.mark.parametrize(
     ("suffix", "damage"),
     [(".nbi", cut), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", lambda _: b""), (".nbc", flip)],
@@ -147,3 +150,139 @@ def test_code_whose_file_is_gone_is_compiled_anew(tmp_path: Path):
     for file in tmp_path.glob("*.nbc"):
         file.unlink()
     assert files_of(tmp_path).load("float32") is None
+
+
+CALLER_OF_OTHERS = """
+import numpy as np
+from msdgs_serve.rasterizer.harmonics import harmonics_above_0
+from msdgs_serve.rasterizer.jit import kernel
+from room.constants import FACTOR
+
+@kernel
+def double(x):
+    return FACTOR * harmonics_above_0(0.0, -1.0, 0.0)[0] * x
+"""
+
+EDITS = {  # what a kernel of `room` is compiled from, beside its own file
+    "kernel": ("msdgs_serve/rasterizer/harmonics.py", "        -SH_C1 * y,", "        -2 * SH_C1 * y,"),
+    "constant": ("msdgs_serve/scene/spherical_harmonics.py", "SH_C1 = 0.48", "SH_C1 = 3 * 0.48"),
+    "neighbour": ("room/constants.py", "1.0", "5.0"),
+}
+
+
+def test_machine_code_follows_every_source(tmp_path: Path):
+    shutil.copytree(ROOT / "msdgs_serve", tmp_path / "msdgs_serve", ignore=shutil.ignore_patterns("__pycache__"))
+    room = tmp_path / "room"
+    room.mkdir()
+    (room / "caller.py").write_text(CALLER_OF_OTHERS)
+    (room / "constants.py").write_text("FACTOR = 1.0\n")
+
+    expected, compiled = call(tmp_path, tmp_path / "cache")
+    assert compiled
+    assert call(tmp_path, tmp_path / "cache") == (expected, False)
+    for (name, old, new), factor in zip(EDITS.values(), (2, 3, 5), strict=True):
+        file = tmp_path / name
+        source = file.read_text()
+        assert old in source
+        file.write_text(source.replace(old, new))
+        expected *= factor
+        value, compiled = call(tmp_path, tmp_path / "cache")
+        assert compiled
+        assert value == pytest.approx(expected, rel=1e-12), f"{name} was changed"
+
+
+def kernel_files() -> list[Path]:
+    files = [path for package in ("msdgs_serve", "msdgs_train") for path in (ROOT / package).rglob("*.py")]
+    return [path for path in files if "@kernel" in path.read_text()]
+
+
+@pytest.mark.parametrize("file", kernel_files(), ids=lambda file: file.stem)
+def test_kernels_use_only_what_their_stamp_follows(file: Path):
+    """From the package's own modules: the rasterizer, the scene's vocabulary, the kernel's own folder."""
+    tree = ast.parse(file.read_text())
+    own = ".".join(file.relative_to(ROOT).parent.parts)
+    followed = ("msdgs_serve.rasterizer", "msdgs_serve.scene", own)
+    origins = {
+        alias.asname or alias.name: node.module or ""
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    for function in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
+        if any(isinstance(mark, ast.Name) and mark.id == "kernel" for mark in function.decorator_list):
+            names = {node.id for node in ast.walk(function) if isinstance(node, ast.Name)}
+            for name in names & origins.keys():
+                origin = origins[name]
+                if origin.startswith("msdgs_"):
+                    assert origin.rpartition(".")[0] in followed, f"{function.name} uses {name} of {origin}"
+
+
+KERNELS_AFTER = """
+import importlib, json, pkgutil, sys
+from numba.core.dispatcher import Dispatcher
+import msdgs_serve.rasterizer as rasterizer
+from msdgs_serve.rasterizer.ahead import compile_kernels
+
+def compiled():
+    names = [f"{rasterizer.__name__}.{module.name}" for module in pkgutil.iter_modules(rasterizer.__path__)]
+    return {
+        f"{name}.{kernel}": sorted(map(str, value.signatures))
+        for name in names
+        for kernel, value in vars(importlib.import_module(name)).items()
+        if isinstance(value, Dispatcher)
+    }
+
+compile_kernels()
+ahead = compiled()
+"""
+
+FRAMES = (
+    KERNELS_AFTER
+    + """
+import dataclasses
+from pathlib import Path
+from msdgs_serve.api.cameras import resolve_camera
+from msdgs_serve.api.schemas import RenderRequest
+from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
+from msdgs_serve.store import SceneStore
+
+served = SceneStore([Path(sys.argv[1])]).get("toybench")
+session = served.session
+request = RenderRequest.model_validate(
+    {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 40, "height": 30}
+)
+camera = resolve_camera(request, served)
+renderer = Renderer()
+for model in ("pinhole", "orthographic", "fisheye"):
+    view = dataclasses.replace(camera, model=model)
+    for options in (
+        RenderOptions(),
+        RenderOptions(depth=True),
+        RenderOptions(background="transparent"),
+        RenderOptions(background=(1.0, 0.5, 0.0), motion_dt=0.1),
+        RenderOptions(shutter=Shutter(0.0, 0.1, 3)),
+    ):
+        renderer.render(session, view, 0.5, options)
+print(json.dumps([ahead, compiled()]))
+"""
+)
+
+
+def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
+    ahead, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
+    assert ahead["msdgs_serve.rasterizer.projection._project_parts"]
+    assert ahead["msdgs_serve.rasterizer.compositing._composite_tiles"]
+    assert after == ahead
+
+
+def test_compiling_says_where_the_kernels_are() -> None:
+    printed = run_python("from msdgs_serve.api.cli import main; main(['--compile'])", NUMBA_CACHE_DIR="")
+    folder = Path(printed.rsplit(" in ", 1)[1].strip())
+    assert list(folder.glob("rasterizer/__pycache__/compositing._composite_tiles-*.nbc"))
+
+
+def test_compiling_for_nothing_is_refused(tmp_path: Path, capsys, monkeypatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "kernels"))
+    assert main(["--compile"]) == USAGE_ERROR
+    assert "can't be written" in capsys.readouterr().err

@@ -14,6 +14,8 @@ from msdgs_serve.rasterizer import rasterize
 from tests.support.scenes import Scene, as_dtype, random_scene
 from tests.support.tolerances import tolerance
 
+pytestmark = pytest.mark.slow
+
 THREADS = 16
 SECONDS = float(os.environ.get("MSDGS_HAMMER_SECONDS", "3"))
 SIZES = ((1, 1), (16, 16), (53, 37), (300, 200), (17, 400), (640, 480), (128, 129), (1000, 40))

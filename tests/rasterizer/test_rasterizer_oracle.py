@@ -10,6 +10,9 @@ from tests.support.reference import DEPTH_BAND, Reference, render
 from tests.support.scenes import ADVERSARIAL, as_dtype, draw, front_camera, gaussians_of, random_scene, select
 from tests.support.tolerances import tolerance
 
+MANY = "ten_thousand_on_a_pixel"
+NAMES = [*sorted(ADVERSARIAL.keys() - {MANY}), pytest.param(MANY, marks=pytest.mark.slow)]
+
 BACKGROUND = (0.2, 0.6, 0.9)
 EXACT_DEPTHS = {"equal_depths"}
 
@@ -65,13 +68,14 @@ def test_random_scenes(seed: int, count: int, width: int, height: int, degree: i
     assert_same_image(got, render(gaussians, camera, BACKGROUND), "float32")
 
 
-@pytest.mark.parametrize("name", sorted(ADVERSARIAL))
+@pytest.mark.parametrize("name", NAMES)
 def test_adversarial_scenes(name: str):
     gaussians, camera = ADVERSARIAL[name]()
     want = render(gaussians, camera, BACKGROUND, depth_band=0.0 if name in EXACT_DEPTHS else DEPTH_BAND)
     assert_same_image(draw(gaussians, camera, background=BACKGROUND), want, "float32")
 
 
+@pytest.mark.slow
 def test_largest_image():
     """8192 × 8192, in which a few splats are found where they belong, small, large and at the far corner."""
     side = 8192
@@ -91,7 +95,7 @@ def test_largest_image():
 
 
 @pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
-@pytest.mark.parametrize("name", ["random", *sorted(ADVERSARIAL)])
+@pytest.mark.parametrize("name", ["random", *NAMES])
 def test_float64_agrees_to_rounding(name: str, options: RasterizerOptions):
     gaussians, camera = random_scene(8, 200) if name == "random" else ADVERSARIAL[name]()
     gaussians = as_dtype(gaussians, np.float64)

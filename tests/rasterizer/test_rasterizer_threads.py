@@ -79,6 +79,7 @@ def test_repeated_calls_give_the_same_bytes():
     assert bytes_of(draw(*scene)) == bytes_of(draw(*scene))
 
 
+@pytest.mark.slow
 def test_second_process_compiles_nothing(tmp_path: Path):
     """The first leaves its kernels in the cache on disk; the second finds all of them there."""
     draw(*random_scene(40, 12, 19, 13))
@@ -87,6 +88,7 @@ def test_second_process_compiles_nothing(tmp_path: Path):
     assert hits > 0
 
 
+@pytest.mark.slow
 def test_without_the_compiler_the_image_is_the_same(tmp_path: Path):
     """The kernels are plain Python too: what a debugger and a coverage report see is what runs."""
     run_python(RENDER_TO_FILE, tmp_path / "image.npz", NUMBA_DISABLE_JIT="1")

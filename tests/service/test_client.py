@@ -21,11 +21,6 @@ LEVEL = Orbit(0, 0, distance=5, fov_y=40)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
-
-
-@pytest.fixture(scope="module")
 def url(scene: Path) -> Iterator[str]:
     with serving(scene) as client:
         yield str(client.base_url)
@@ -116,7 +111,7 @@ def test_scenes_are_listed_added_and_deleted(tmp_path: Path):
 
 
 def test_keys_are_sent(scene: Path, tmp_path: Path):
-    (tmp_path / "keys").write_text("0123456789abcdef")
+    (tmp_path / "keys").write_text("read 0123456789abcdef")
     with serving(scene, api_keys_file=tmp_path / "keys") as http:
         with Client(str(http.base_url)) as client, pytest.raises(Problem) as error:
             client.scenes()

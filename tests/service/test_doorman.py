@@ -28,8 +28,8 @@ REFUSED = 'msdgs_problems_total{kind="overloaded"}', 'msdgs_requests_total{metho
 def full(queue: WorkQueue, places: int) -> Iterator[None]:
     """All places are taken by calls that do nothing."""
     with ExitStack() as calls:
-        for _ in range(places):
-            calls.enter_context(queue.admitted())
+        for number in range(places):
+            calls.enter_context(queue.admitted(str(number)))
         yield
 
 
@@ -117,7 +117,7 @@ def test_nobody_can_tell_the_difference(tmp_path: Path, caplog: pytest.LogCaptur
     with serving(tmp_path / "ball.onnx", server=servers, concurrent_renders=1, queued_renders=1) as client:
         service = servers[0].service
         address = client.base_url.host, client.base_url.port
-        with socket.create_connection(address, timeout=20) as connection:
+        with socket.create_connection(address, timeout=60) as connection:
             with full(service.queue, 2):
                 answers = [sent(connection, data) for data in (CALL, slow, CALL)]
                 assert sent(connection, named)[1]["x-request-id"] == "mine"

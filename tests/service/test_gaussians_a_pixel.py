@@ -3,11 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from msdgs_serve.client import Client, Orbit
 from tests.support.images import decode
-from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
 SIZE = 40
@@ -18,11 +16,6 @@ FRAME = {
     "height": SIZE,
     "channels": ["gaussians"],
 }
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 def test_as_numbers_and_as_an_image(scene: Path):

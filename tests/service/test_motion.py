@@ -13,18 +13,13 @@ from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import orbit
 from tests.support.images import decode
-from tests.support.scene_files import UP, write_scene
+from tests.support.scene_files import UP
 from tests.support.service import serving
 from tests.support.tolerances import assert_close
 
 SIZE = 96
 ORBIT = {"type": "orbit", "azimuth": 40, "elevation": 10, "distance": 5, "fov_y": 40}
 FRAME = {"camera": ORBIT, "width": SIZE, "height": SIZE, "t": 0.1, "channels": ["motion"], "dt": 0.2}
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 def place(camera: Camera, point: list[float]) -> np.ndarray:

@@ -17,6 +17,8 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
+pytestmark = pytest.mark.slow
+
 EVERY_DAY = 200
 # JSON Schema can't say which times and cameras a scene has, nor which fields go together: such requests are refused
 NOT_EXPRESSIBLE = [positive_data_acceptance]

@@ -17,7 +17,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from msdgs_serve.api.body_limit import BodyLimit
-from msdgs_serve.api.keys import KeyCheck
+from msdgs_serve.api.keys import KeyCheck, read_keys
 from msdgs_serve.api.observe import JsonLines, request_id
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
 from msdgs_serve.imaging.images import FARTHEST_GREY
@@ -31,11 +31,6 @@ SIZE = 48
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0, "distance": 5, "fov_y": 40}
 FRAME = {"camera": ORBIT, "t": 0.5, "width": SIZE, "height": SIZE}
 KEYS = ["0123456789abcdef", "fedcba9876543210"]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 @pytest.fixture(scope="module")
@@ -270,7 +265,7 @@ def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixtur
 
 
 def test_without_a_key_nothing_but_health_is_answered(scene: Path, tmp_path: Path):
-    (tmp_path / "keys").write_text("# ours\n" + "\n".join(KEYS) + "\n")
+    (tmp_path / "keys").write_text("# ours\n" + "".join(f"read {key}\n" for key in KEYS))
     with serving(scene) as client:
         paths = client.get("/openapi.json").json()["paths"]
     calls = [(method.upper(), path.replace("{name}", "balls")) for path, methods in paths.items() for method in methods]
@@ -294,11 +289,13 @@ def test_without_a_key_nothing_but_health_is_answered(scene: Path, tmp_path: Pat
         assert "401" in document["paths"]["/render"]["post"]["responses"]
 
 
-def test_under_a_prefix_paths_mean_the_same():
+def test_under_a_prefix_paths_mean_the_same(tmp_path: Path):
     async def inside(scope: Scope, receive: Receive, send: Send) -> None:
         await Response(status_code=204)(scope, receive, send)
 
-    app = BodyLimit(KeyCheck(inside, KEYS), max_bytes=4, seconds=5, streamed=[("POST", "/live")])
+    (tmp_path / "keys").write_text(f"read {KEYS[0]}")
+    checked = KeyCheck(inside, read_keys(tmp_path / "keys"))
+    app = BodyLimit(checked, max_bytes=4, seconds=5, streamed=[("POST", "/live")])
     transport = httpx.ASGITransport(app, root_path="/scenes")
 
     async def status(method: str, path: str, body: bytes = b"") -> int:

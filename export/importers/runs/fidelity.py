@@ -19,8 +19,10 @@ from export.measure.views import cameras_of, selection_views
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import MIN_SCALE, DynamicGaussians, activated_scales, unit_quats
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
+from msdgs_train.gaussians.scale_space import MIN_SCALE, activated_scales
+from msdgs_train.layers.quaternions import unit_or_identity
 
 FRAMES = 12
 """Number of frames that are compared, each of another camera and time."""
@@ -64,7 +66,7 @@ def as_trained(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaus
     """`ours` as the program that trained them draws them, and the largest difference of a length from 1."""
     g = model.gaussians
     step = model.deformation.layers[0](g.means, torch.tensor(t, dtype=g.means.dtype))
-    quats = (unit_quats(g.raw_quats) + step.delta_quats).double()
+    quats = (unit_or_identity(g.raw_quats) + step.delta_quats).double()
     scales = (activated_scales(g.log_scales) + step.delta_scales).double()
     axes, lengths, _ = torch.linalg.svd(_as_it_is(quats) * scales[:, None, :])
     axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]

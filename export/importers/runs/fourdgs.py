@@ -14,7 +14,7 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import MAX_LOG_FACTOR
-from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
+from msdgs_train.layers.plane import PlaneConfig, PlaneGrid, PlaneLayer
 
 DEFAULTS = {"no_dx": False, "no_ds": False, "no_dr": False, "no_do": True, "no_dshs": True}
 """Of its switches, which cfg_args holds: which parts of a Gaussian don't change."""
@@ -86,16 +86,18 @@ def read_4dgs(
     base = math.gcd(*sizes.nodes)
     config = ModelConfig(
         sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
-        layers=("plane",),
-        plane_features_dim=sizes.channels,
-        plane_resolution=base,
-        plane_time_resolution=sizes.time_nodes - first,
-        plane_width=sizes.width,
-        multires=tuple(nodes // base for nodes in sizes.nodes),
+        layers=(
+            PlaneConfig(
+                features=sizes.channels,
+                resolution=base,
+                time_resolution=sizes.time_nodes - first,
+                width=sizes.width,
+                multires=tuple(nodes // base for nodes in sizes.nodes),
+            ),
+        ),
         weights=False,
         embedding_dim=1 if scaled else 0,
         modulation_targets=("quats",),
-        delta_space="raw",
         opacity_head=not off["no_do"],
         sh_head=not off["no_dshs"],
     )

@@ -4,6 +4,7 @@ import base64
 import json
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Any
 
@@ -34,7 +35,7 @@ class Item:
         self.index = index
         self.status = status
         self.plan = plan
-        self.body = body  # the image, or the problem where there is no plan
+        self.body = body  # the image, for a line in base64; the problem where there is no plan
         self.timing = ""
 
 
@@ -69,15 +70,18 @@ async def render_batch(
 
 
 async def _written(service: Service, frames: list[dict[str, Any]], multipart: bool) -> AsyncIterator[bytes]:
-    async with aclosing(_items(service, frames)) as items:
+    async with aclosing(_items(service, frames, multipart)) as items:
         async for item in items:
             yield _part(item) if multipart else _line(item)
     if multipart:
         yield f"--{BOUNDARY}--\r\n".encode()
 
 
-async def _items(service: Service, frames: list[dict[str, Any]]) -> AsyncGenerator[Item]:
-    """First those that are wrong, then equal ones together, in the order of scenes and times."""
+async def _items(service: Service, frames: list[dict[str, Any]], multipart: bool) -> AsyncGenerator[Item]:
+    """First those that are wrong, then equal ones together, in the order of scenes and times.
+
+    A frame is drawn when the one before has been sent on.
+    """
     planned: dict[str, list[tuple[int, FramePlan]]] = {}
     for index, frame in enumerate(frames):
         try:
@@ -89,7 +93,8 @@ async def _items(service: Service, frames: list[dict[str, Any]]) -> AsyncGenerat
     for same in sorted(planned.values(), key=lambda plans: (plans[0][1].scene.name, plans[0][1].times[0])):
         plan, watch = same[0][1], Watch()
         try:
-            image = await service.queue.run(lambda p=plan, w=watch: draw_frame(service, p, w), watch)
+            work = partial(_drawn, service, plan, watch, multipart)
+            image = await service.queue.run(work, watch, part=True)
         except Exception as error:
             for index, _ in same:
                 yield _failed(index, error)
@@ -99,6 +104,12 @@ async def _items(service: Service, frames: list[dict[str, Any]]) -> AsyncGenerat
             item = Item(index, HTTPStatus.OK, plan=plan, body=image)
             item.timing = server_timing(watch)
             yield item
+
+
+def _drawn(service: Service, plan: FramePlan, watch: Watch, multipart: bool) -> bytes:
+    """As it is sent, made where it is drawn: base64 of a large frame would keep all other calls waiting."""
+    image = draw_frame(service, plan, plan.times[0], watch)
+    return image if multipart else base64.b64encode(image)
 
 
 def _plan(service: Service, frame: dict[str, Any]) -> FramePlan:
@@ -117,9 +128,10 @@ def _line(item: Item) -> bytes:
     line = BatchItem(index=item.index, status=item.status)
     if item.plan is None:
         line.problem = json.loads(item.body)
-    else:
-        line.media_type, line.data = item.plan.media_type, base64.b64encode(item.body).decode()
-    return line.model_dump_json(exclude_none=True).encode() + b"\n"
+        return line.model_dump_json(exclude_none=True).encode() + b"\n"
+    line.media_type = item.plan.media_type
+    head = line.model_dump_json(exclude_none=True).encode().removesuffix(b"}")
+    return b"".join((head, b',"data":"', item.body, b'"}\n'))
 
 
 def _part(item: Item) -> bytes:

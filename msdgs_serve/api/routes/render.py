@@ -8,7 +8,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 
-from msdgs_serve.api.frames import FramePlan, draw_frame, is_unchanged, plan_frame, server_timing
+from msdgs_serve.api.frames import FramePlan, draw_plan, is_unchanged, plan_frame, server_timing
 from msdgs_serve.api.openapi import IMAGE_RESPONSE, NOT_MODIFIED, problems
 from msdgs_serve.api.queries import request_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
@@ -73,8 +73,7 @@ async def answer(
     if is_unchanged(if_none_match, plan.etag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     watch = Watch()
-    work = service.queue.run(lambda: draw_frame(service, plan, watch), watch)
-    image = await unless_gone(request, work)
+    image = await unless_gone(request, draw_plan(service, plan, watch))
     service.metrics.count_stages(watch.seconds)
     headers["Server-Timing"] = server_timing(watch)
     return Response(image, media_type=plan.media_type, headers=headers)

@@ -5,6 +5,7 @@ import hashlib
 import hmac
 import uuid
 from collections.abc import AsyncIterator
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path as FilePath
 from typing import Annotated, Any
@@ -16,18 +17,31 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
 from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.keys import CLIENT
+from msdgs_serve.api.numbers import Name
 from msdgs_serve.api.openapi import SCENE_BODY, problems
-from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList, SceneView
+from msdgs_serve.api.schemas import (
+    GaussianCounts,
+    GraphCost,
+    GraphLimit,
+    SceneAdded,
+    SceneDetail,
+    SceneEntry,
+    SceneList,
+    SceneView,
+)
 from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.api.uploads import Stored
 from msdgs_serve.framing import Framing
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.scene.scene_file import SceneCost
 from msdgs_serve.scene_report import read_report, report_path
-from msdgs_serve.store import MAX_NAME_LENGTH, SceneStore
+from msdgs_serve.store import SceneStatus, SceneStore
 
-SceneName = Annotated[str, Path(max_length=MAX_NAME_LENGTH, description="as in `GET /scenes`", examples=["toybench"])]
-NewName = Annotated[
-    str, Query(min_length=1, max_length=MAX_NAME_LENGTH, description="plain text, no separators", examples=["walk"])
-]
+MAX_REASON = 300
+
+SceneName = Annotated[Name, Path(description="as in `GET /scenes`", examples=["toybench"])]
+NewName = Annotated[Name, Query(description="plain text, no separators", examples=["walk"])]
 Sha256 = Annotated[str | None, Query(pattern="^[0-9a-f]{64}$", description="of the file; checked where it is given")]
 
 router = APIRouter(tags=["scenes"])
@@ -37,9 +51,7 @@ router = APIRouter(tags=["scenes"])
 def list_scenes(service: SharedService) -> SceneList:
     """Names, without loading anything."""
     statuses = service.store.statuses()
-    return SceneList(
-        scenes=[SceneEntry(name=each.name, loaded=each.loaded, problem=each.problem is not None) for each in statuses]
-    )
+    return SceneList(scenes=[SceneEntry(name=each.name, loaded=each.loaded, **_problem(each)) for each in statuses])
 
 
 @router.get(
@@ -79,6 +91,7 @@ def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
         HTTPStatus.CONFLICT,
         HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
         HTTPStatus.UNPROCESSABLE_ENTITY,
+        HTTPStatus.INSUFFICIENT_STORAGE,
     ),
 )
 async def add_scene(
@@ -89,18 +102,22 @@ async def add_scene(
     replace: Annotated[bool, Query(description="whether a scene of this name may be replaced")] = False,
     sha256: Sha256 = None,
 ) -> SceneAdded:
-    """Takes a scene file as the body. It is opened and checked before it takes its place; who draws the scene that it
-    replaces is not disturbed. Only where the service was started with `--uploads`."""
+    """Takes a scene file as the body. It is checked, and posed in a process of its own, before it takes its place;
+    who draws the scene that it replaces is not disturbed. Only where the service was started with `--uploads`."""
     service.check_uploads()
-    incoming = service.store.incoming(uuid.uuid4().hex)
+    incoming, uploads = service.store.incoming(uuid.uuid4().hex), service.uploads
+    await anyio.to_thread.run_sync(uploads.scan)
     try:
-        digest = await _receive(request, incoming, service)
-        if sha256 is not None and not hmac.compare_digest(digest, sha256):
-            raise InvalidInput("sha256", "that of the file", "another")
-        added = await anyio.to_thread.run_sync(lambda: service.store.add(name, incoming, replace=replace))
+        with uploads.room(name, request.scope.get(CLIENT)) as upload:
+            digest = await _receive(request, incoming, service, upload)
+            if sha256 is not None and not hmac.compare_digest(digest, sha256):
+                raise InvalidInput("sha256", "that of the file", "another")
+            add = partial(service.add_scene, name, incoming, replace=replace)
+            added = await anyio.to_thread.run_sync(add, limiter=uploads.opening)
+            uploads.added(upload)
     except SceneFileInvalid as error:
         service.log_problem(error)
-        detail = f"The file breaks the contract msdgs/1 at `{error.field}`; docs/contract.md says what belongs there."
+        detail = f"The file breaks the contract msdgs/1: `{error.field}` {error.problem}"
         raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
@@ -114,22 +131,19 @@ async def add_scene(
     status_code=HTTPStatus.NO_CONTENT,
     responses=problems(HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY),
 )
-def delete_scene(name: SceneName, service: SharedService) -> None:
+async def delete_scene(name: SceneName, service: SharedService) -> None:
     """Deletes its file; frames in work are finished. Only where the service was started with `--uploads`."""
     service.check_uploads()
-    service.store.remove(name)
+    await anyio.to_thread.run_sync(service.store.remove, name, limiter=service.uploads.opening)
+    service.uploads.removed(name)
 
 
-async def _receive(request: Request, target: FilePath, service: Service) -> str:
+async def _receive(request: Request, target: FilePath, service: Service, upload: Stored) -> str:
     """Write the body to a file, and return its SHA-256."""
-    limit = service.settings.max_scene_megabytes << 20
-    digest, size = hashlib.sha256(), 0
+    digest = hashlib.sha256()
     async with await anyio.open_file(target, "xb") as file:
         async for part in _parts(request, service.settings.body_seconds):
-            size += len(part)
-            if size > limit:
-                detail = f"A scene file must be at most {service.settings.max_scene_megabytes} MiB."
-                raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "large_body", detail, field="body")
+            service.uploads.grow(upload, len(part))
             digest.update(part)
             await file.write(part)
     return digest.hexdigest()
@@ -161,7 +175,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
     return SceneDetail(
         name=name,
         loaded=status.loaded,
-        problem=status.problem is not None,
+        **_problem(status),
         contract=metadata.contract,
         plan=metadata.plan,
         layers=list(metadata.layers),
@@ -182,7 +196,19 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         package_version=metadata.package_version,
         checkpoint_sha256=metadata.checkpoint_sha256,
         sha256=served.sha256,
+        cost=_cost(served.session.cost),
     )
+
+
+def _problem(status: SceneStatus) -> dict[str, Any]:
+    reason = None if status.problem is None else f"`{status.problem.field}` {status.problem.problem}"
+    return {"problem": reason is not None, "reason": reason and reason[:MAX_REASON]}
+
+
+def _cost(cost: SceneCost) -> GraphCost:
+    allowed = cost.limits
+    limits = GraphLimit(gaussians=allowed.gaussians, memory_bytes=allowed.memory_bytes, operations=allowed.operations)
+    return GraphCost(memory_bytes=cost.memory_bytes, operations=cost.operations, calls=cost.calls, limits=limits)
 
 
 def _view(seen: Framing) -> SceneView:

@@ -1,12 +1,14 @@
 """A film along a camera path."""
 
-import io
+from collections.abc import AsyncGenerator
+from contextlib import aclosing
+from functools import partial
 from http import HTTPStatus
+from typing import BinaryIO, cast
 
 import anyio.to_thread
-import numpy as np
 from fastapi import APIRouter, Request
-from fastapi.responses import Response
+from fastapi.responses import Response, StreamingResponse
 
 from msdgs_serve.api.cameras import resolve_camera
 from msdgs_serve.api.frames import check_pixels
@@ -16,9 +18,9 @@ from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
 from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_nerfstudio
 from msdgs_serve.renderer import RenderOptions, check_times
-from msdgs_serve.scene import InvalidInput
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
-from msdgs_serve.video import VIDEO_FORMATS, check_video, write_video
+from msdgs_serve.video import VIDEO_FORMATS, FilmWriter, check_video
 from msdgs_serve.watch import Watch
 
 router = APIRouter(tags=["frames"])
@@ -43,31 +45,61 @@ router = APIRouter(tags=["frames"])
     },
 )
 async def render_video(body: VideoRequest, service: SharedService, request: Request) -> Response:
-    """Draws every frame and answers with the film. The time limit holds for each frame, others draw in between.
+    """Draws every frame, and sends the film while it does. The time limit holds for each frame, others draw in between;
+    where one fails the connection is closed, so that the film is known to be incomplete.
 
     For long films `msdgs-render` on the machine itself shows its progress and goes on where it was stopped.
     """
     check_video(body.format)
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
-    film = await unless_gone(request, _film(service, body, scene, path))
-    return Response(film, media_type=VIDEO_FORMATS[body.format].media_type)
+    film = _film(service, body, scene, path)
+    first = await unless_gone(request, anext(film))  # what goes wrong at once still has its status
+    return StreamingResponse(_joined(first, film), media_type=VIDEO_FORMATS[body.format].media_type)
 
 
-async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> bytes:
-    """Each frame takes its turn in the queue; so does putting them together."""
-    images: list[np.ndarray] = []
-    options, watch = RenderOptions(body.background), Watch()
+class _Unsent:
+    """A file that can only be written to, and what of it nobody has taken yet."""
+
+    def __init__(self) -> None:
+        self._pieces: list[bytes] = []
+
+    def write(self, data: bytes) -> int:
+        self._pieces.append(bytes(data))
+        return len(data)
+
+    def take(self) -> bytes:
+        taken = b"".join(self._pieces)
+        self._pieces.clear()
+        return taken
+
+
+async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> AsyncGenerator[bytes]:
+    """The file in pieces. Each frame is drawn and encoded when its turn comes and the piece before has been sent on."""
+    options, watch, unsent = RenderOptions(body.background), Watch(), _Unsent()
+    writer = FilmWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
+
+    def add(camera: Camera, t: float) -> bytes:
+        pixels = service.renderer.render(scene.session, camera, t, options, watch).display_pixels()
+        with watch.stage("encode"):
+            writer.add(pixels)
+        return unsent.take()
+
+    def close() -> bytes:
+        writer.close()
+        return unsent.take()
+
     for camera, t in path.frames:
-
-        def draw(camera=camera, t=t) -> np.ndarray:  # noqa: ANN001  # of this turn of the loop
-            return service.renderer.render(scene.session, camera, t, options, watch).display_pixels()
-
-        images.append(await service.queue.run(draw, watch))
-    file = io.BytesIO()
-    fps = body.fps or path.fps
-    await service.queue.run(lambda: write_video(images, fps, body.format, file), watch)
+        yield await service.queue.run(partial(add, camera, t), watch, part=True)
+    yield await service.queue.run(close, watch, part=True)
     service.metrics.count_stages(watch.seconds)
-    return file.getvalue()
+
+
+async def _joined(first: bytes, rest: AsyncGenerator[bytes]) -> AsyncGenerator[bytes]:
+    async with aclosing(rest):
+        yield first
+        async for piece in rest:
+            if piece:
+                yield piece
 
 
 def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath]:
@@ -79,7 +111,7 @@ def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath
         raise InvalidInput("width", "given together with height", "one of them")
     size = None if body.width is None or body.height is None else (body.width, body.height)
     if body.path is not None:
-        path = read_nerfstudio(body.path, metadata.time_range, size)
+        path = read_nerfstudio(body.path.model_dump(exclude_none=True), metadata.time_range, size)
     else:
         width, height, given = body.width, body.height, body.frames or ()
         requests = [RenderRequest(camera=each.camera, t=each.t, width=width, height=height) for each in given]

@@ -101,6 +101,7 @@ def share_that_fits(errors: list[np.ndarray]) -> float:
     return float((np.concatenate(errors) < 0.2).mean())
 
 
+@pytest.mark.slow
 def test_images_show_material_points_where_the_motion_puts_them(scene: SceneData):
     """Those that do not fit lie at the edge of a thing. Wrong axes or the wrong time fit half as well, by chance."""
     frames = [*scene.splits["train"], *scene.splits["test"]]
@@ -116,6 +117,7 @@ def test_images_show_material_points_where_the_motion_puts_them(scene: SceneData
         assert share_that_fits(errors) < 0.55, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1])
 def test_images_are_not_shifted_by_part_of_a_pixel(scene: SceneData, axis: int):
     shifts = np.linspace(-1, 1, 5)

@@ -16,27 +16,20 @@ from playwright.sync_api import Browser, Page
 
 from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
+from msdgs_train.viewer.scene_view import view_of_data
 from msdgs_train.viewer.snapshot import Snapshot
-from msdgs_train.viewer.stage import view_of_data
 from msdgs_train.viewer.viewer import Viewer
-from tests.support.browser import WEBGL, chromium
 from tests.support.images import decode
 from tests.support.models import random_model
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, WEBGL, chromium
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import write_scene
-from tests.support.viewer_page import wait_for
+from tests.train.engine.viewer_page import wait_for
 
 pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
 pytestmark = pytest.mark.slow
 
-SMALL = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--model.width=16", "--model.depth=2"]
+SMALL = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--layers", *["mlp:width=16,depth=2"] * 2]
 MILLISECONDS = 60_000
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +89,7 @@ def test_a_run_is_seen_paused_and_stopped(data: Path, tmp_path: Path, page: Page
         page.wait_for_timeout(1500)
         assert _step(page) == paused
         process.send_signal(signal.SIGINT)
-        output = process.communicate(timeout=60)[0]
+        output = process.communicate(timeout=600)[0]
     assert process.returncode == cli.EXIT_INTERRUPTED, output
     assert "interrupted at step" in output
     assert (tmp_path / "run" / "checkpoint.pt").exists()
@@ -110,7 +103,7 @@ def test_the_page_stays_until_ctrl_c(data: Path, tmp_path: Path, page: Page) -> 
         assert any("Ctrl-C ends it" in line for line in process.stdout)
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+        assert process.wait(600) == 0
 
 
 @pytest.mark.parametrize("opened_early", [True, False])

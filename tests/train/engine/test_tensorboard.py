@@ -11,13 +11,14 @@ import pytest
 from PIL import Image
 
 from msdgs_train.cli import main as cli
-from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.engine.run import RENDERS_PER_EVAL, Observer, fit
 from msdgs_train.engine.tensorboard_events import EVAL_SCALARS, FOLDER, TRAIN_SCALARS
 from msdgs_train.engine.trainer import StepResult
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SIZE, small_config, write_scene
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
 
 accumulator = pytest.importorskip(
     "tensorboard.backend.event_processing.event_accumulator",
@@ -28,12 +29,6 @@ accumulator = pytest.importorskip(
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("data") / "scene", test=RENDERS_PER_EVAL + 1)
-
-
-@pytest.fixture(autouse=True)
-def _no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
 
 
 def _events(run: Path) -> Any:
@@ -75,7 +70,7 @@ def test_a_run_that_broke_off_is_seen_once(data: Path, tmp_path: Path) -> None:
     assert [event.step for event in _events(run).Scalars("train/loss")][-1] == 14
     fit(config, data, run, resume=True, tensorboard=True)
     _assert_as_in_metrics(run)
-    assert len(_events(run).Scalars("train/loss")) == config.steps
+    assert len(_events(run).Scalars("train/loss")) == config.run.steps
 
 
 def test_asked_for_when_resumed_the_past_is_there_too(data: Path, tmp_path: Path) -> None:

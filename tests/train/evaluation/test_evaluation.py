@@ -36,10 +36,7 @@ from tests.support.scenes import front_camera, gaussians_of
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import SIZE, small_config, write_scene
 
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -122,17 +119,17 @@ def test_the_best_model_is_that_of_the_highest_psnr_on_val(run: Path) -> None:
     assert by_name["last"].mean.psnr <= highest["psnr"]
 
 
-def test_without_val_the_best_is_chosen_on_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+@pytest.mark.usefixtures("no_curve")
+def test_without_val_the_best_is_chosen_on_test(tmp_path: Path) -> None:
     data = write_scene(tmp_path / "scene")
     (data / "transforms_val.json").unlink()
     outcome = fit(small_config(steps=4, eval_every=2), data, tmp_path / "run")
     assert outcome.best is not None
-    assert (outcome.best.split, outcome.best.psnr >= outcome.qualities["test"].psnr) == ("test", True)
+    assert (outcome.best.split, outcome.best.psnr >= outcome.metrics["test"].psnr) == ("test", True)
 
 
-def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+@pytest.mark.usefixtures("no_curve")
+def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = fit(small_config(steps=3), data, run).best
     assert first is not None
@@ -290,7 +287,7 @@ def test_sheet_shows_image_rendering_and_error(run: Path) -> None:
     assert {path.name for path in (run / "eval").iterdir()} == {"test.json", "test.md", "test.png"}
     sheet = _read(run / "eval" / "test.png")
     worst = min(range(2), key=lambda index: evaluation.models[0].images[index].psnr)
-    times = -(-evaluation_report.SMALLEST_PANEL // SIZE)
+    times = -(-evaluation_report.MIN_PANEL // SIZE)
     for picture in (_read(evaluation.frames[worst].image_path), _render(run / "model.pt", evaluation.frames[worst])):
         assert _contains(to_bytes(sheet), to_bytes(picture).repeat(times, axis=0).repeat(times, axis=1))
 
@@ -349,7 +346,7 @@ def test_a_run_from_before_there_was_a_best_model(data: Path, run: Path, tmp_pat
     for name in ("config.json", "model.pt"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
     assert cli.main(["eval", str(tmp_path), "--data", str(data), "--split", "val"]) == 0
-    assert "this run has kept no best.pt" in (tmp_path / "eval" / "val.md").read_text()
+    assert "this run has no best.pt" in (tmp_path / "eval" / "val.md").read_text()
     assert set(json.loads((tmp_path / "eval" / "val.json").read_text())["models"]) == {"last"}
 
 
@@ -360,13 +357,13 @@ def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: 
     assert cli.main(["eval", str(run), str(other), "--sheet", str(path)]) == 0
     assert f"wrote {path}" in capsys.readouterr().out.replace("\n", "")
     frame, sheet = evaluate_run(run).frames[0], to_bytes(_read(path))
-    times = -(-evaluation_report.SMALLEST_PANEL // SIZE)
+    times = -(-evaluation_report.MIN_PANEL // SIZE)
     for image in (_read(frame.image_path), *(_render(each / "model.pt", frame) for each in (run, other))):
         assert _contains(sheet, to_bytes(image).repeat(times, axis=0).repeat(times, axis=1))
     assert cli.main(["eval"]) == cli.EXIT_INVALID
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         cli.main(["eval", "--help"])
     assert exit_info.value.code == 0

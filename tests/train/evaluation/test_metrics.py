@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
-from msdgs_train.evaluation.metrics import MAX_PSNR, ImageMetrics, mean_metrics, psnr, quality
+from msdgs_train.evaluation.metrics import MAX_PSNR, ImageMetrics, image_metrics, mean_metrics, psnr
 from tests.support.tolerances import assert_close
 
 
@@ -27,9 +27,9 @@ def test_equal_images_get_the_cap_and_nan_stays() -> None:
     assert math.isnan(psnr(picture * math.nan, picture))
 
 
-def test_quality_is_of_what_a_screen_shows() -> None:
+def test_renderings_are_clamped_first() -> None:
     white = torch.ones(12, 12, 3)
-    assert quality(white + 0.5, white) == pytest.approx((MAX_PSNR, 1.0))
+    assert image_metrics(white + 0.5, white) == pytest.approx((MAX_PSNR, 1.0))
 
 
 def test_mean_is_of_psnrs() -> None:

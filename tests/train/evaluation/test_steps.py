@@ -16,6 +16,8 @@ from msdgs_train.evaluation.sheets import Panel, draw_sheet, panel_corners, shee
 from msdgs_train.gaussians.model_file import CheckpointInvalid, save_model
 from tests.support.models import CAMERA, SCENE, random_model
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 320, 240
 
 
@@ -25,8 +27,8 @@ def model(tmp_path: Path) -> Path:
     return tmp_path / "model.pt"
 
 
-def _render(t: float, steps: int | None) -> np.ndarray:
-    posed = random_model(noise=0.2).pose(t, steps=steps)
+def _render(t: float, num_layers: int | None) -> np.ndarray:
+    posed = random_model(noise=0.2).pose(t, num_layers=num_layers)
     gaussians = Gaussians(*(tensor.detach().numpy() for tensor in posed))
     matrix = np.array(CAMERA["camera_to_world"])
     camera = Camera(**{**CAMERA, "camera_to_world": matrix}).resized(WIDTH, HEIGHT)
@@ -70,7 +72,7 @@ def test_time_and_camera_unless_given(tmp_path: Path) -> None:
     [
         ({"t": 1.5}, r"time range, \[0, 1\]"),
         ({"t": float("nan")}, "time range"),
-        ({"camera": "nobody"}, "r_000, r_001"),
+        ({"camera": "missing"}, "r_000, r_001"),
         ({"size": 0}, "`size`"),
         ({"size": 40_000}, "width"),
         ({"out": Path("steps.jpeg")}, "`out`"),
@@ -96,7 +98,7 @@ def test_a_missing_or_broken_model_is_named(tmp_path: Path, capsys: pytest.Captu
         write_steps(tmp_path / "broken.pt", tmp_path / "steps.png")
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         cli.main(["steps", "--help"])
     assert exit_info.value.code == 0

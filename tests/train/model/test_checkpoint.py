@@ -3,13 +3,17 @@
 import pickle
 import re
 import zipfile
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from msdgs_train.gaussians.model_file import CheckpointInvalid, load, load_model, save_atomic, save_model
-from tests.support.models import SCENE, random_model
+from msdgs_train.gaussians.model_file import load_model, save_model
+from msdgs_train.gaussians.safe_load import CheckpointInvalid, load, save_atomic
+from msdgs_train.supports.nodes import NodesConfig
+from tests.support.models import MLP, NODES, SCENE, random_model
 
 
 @pytest.fixture
@@ -23,8 +27,19 @@ def rewritten(path: Path, **changes: object) -> Path:
     return path
 
 
-@pytest.mark.parametrize("changes", [{}, {"layers": ()}, {"embedding_dim": 0}, {"sh_degree": 0}])
-def test_what_is_saved_comes_back(tmp_path: Path, changes: dict[str, int]):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"layers": ()},
+        {"embedding_dim": 0},
+        {"sh_degree": 0},
+        {"layers": ("plane", "mlp")},
+        {"layers": ("spline", "plane", "mlp"), "support": NODES},
+        {"layers": ("mlp",), "support": NodesConfig(num_nodes=1, k_nearest=3)},
+    ],
+)
+def test_what_is_saved_comes_back(tmp_path: Path, changes: dict[str, Any]):
     model = random_model(**changes)
     save_model(tmp_path / "model.pt", model, SCENE, 42)
     loaded = load_model(tmp_path / "model.pt")
@@ -55,7 +70,7 @@ def test_files_of_others_are_refused(tmp_path: Path):
     with pytest.raises(CheckpointInvalid, match="isn't a torch checkpoint"):
         load_model(path)
     torch.save({"weights": torch.zeros(3)}, path)
-    with pytest.raises(CheckpointInvalid, match=r"format msdgs-model/1 \(found None"):
+    with pytest.raises(CheckpointInvalid, match=r"format msdgs-model/2 \(found None"):
         load_model(path)
     torch.save([1, 2], path)
     with pytest.raises(CheckpointInvalid, match="found 'list'"):
@@ -129,21 +144,33 @@ def test_tensors_missing_or_of_another_shape_are_named(model_file: Path, name: s
         load_model(model_file)
 
 
-@pytest.mark.parametrize("config", [{"unheard_of": 1}, {"layers": -1}])
-def test_configurations_of_others_are_refused(model_file: Path, config: dict[str, int]):
+@pytest.mark.parametrize(
+    "config", [{"unheard_of": 1}, {"layers": -1}, {"layers": ["hash"]}, {"support": {"kind": "cage"}}]
+)
+def test_configurations_of_others_are_refused(model_file: Path, config: dict[str, Any]):
     rewritten(model_file, config=config)
     with pytest.raises(CheckpointInvalid, match=next(iter(config))):
         load_model(model_file)
 
 
 @pytest.mark.parametrize(
-    ("config", "message"),
-    [({"width": 10_000_000}, r"size mismatch"), ({"depth": 10_000_000}, r"`model.depth` must be at most \d+")],
+    ("part", "message"),
+    [
+        ({"layers": (replace(MLP, width=10_000_000),)}, r"size mismatch"),
+        ({"layers": (replace(MLP, depth=10_000_000),)}, r"`depth` must be at most \d+"),
+        ({"support": NodesConfig(num_nodes=10**12)}, r"size mismatch|must be of shape"),
+    ],
 )
-def test_sizes_that_are_not_stored_take_no_memory(model_file: Path, config: dict[str, int], message: str):
-    contents = torch.load(model_file, weights_only=True)
-    rewritten(model_file, config=contents["config"] | config)
+def test_sizes_that_are_not_stored_take_no_memory(tmp_path: Path, part: dict[str, Any], message: str):
+    model = random_model(layers=("mlp",), support=NODES)
+    save_model(tmp_path / "model.pt", model, SCENE, 42, replace(model.config, **part))
     with pytest.raises(CheckpointInvalid, match=message):
+        load_model(tmp_path / "model.pt")
+
+
+def test_a_model_of_before_is_refused_in_one_sentence(model_file: Path):
+    rewritten(model_file, format="msdgs-model/1")
+    with pytest.raises(CheckpointInvalid, match=r"found 'msdgs-model/1'\): train or import it again"):
         load_model(model_file)
 
 

@@ -2,14 +2,14 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from msdgs_train.gaussians.modulation import Modulation
+from msdgs_train.layers.base import Heads
 from msdgs_train.layers.chain import MultiStepDeformation
-from msdgs_train.layers.heads import Heads
-from msdgs_train.layers.mlp import MLPLayer, PositionalEncoding, frequency_matrix
+from msdgs_train.layers.mlp import MLPConfig, MLPLayer, PositionalEncoding, frequency_matrix
+from tests.support.reference_deformation import plain_chain, plain_encoding, plain_step
 from tests.support.tolerances import assert_close, tolerance
 
 PAPER_LAYER_PARAMETERS = 235_561
@@ -23,36 +23,11 @@ def parameters(module: torch.nn.Module) -> int:
 def random_layer(seed: int, **sizes: Any) -> MLPLayer:
     torch.manual_seed(seed)
     defaults: dict[str, Any] = {"width": 16, "depth": 3, "time_width": 8, "time_features": 5}
-    layer = MLPLayer(**(defaults | sizes)).double()
+    layer = MLPLayer(MLPConfig(**(defaults | sizes))).double()
     with torch.no_grad():
         for parameter in layer.parameters():
             parameter.normal_(std=0.2)
     return layer
-
-
-def plain_encoding(x: np.ndarray, frequencies: int) -> np.ndarray:
-    phases = [x * 2.0**k for k in range(frequencies)]
-    return np.concatenate([x, *(np.sin(p) for p in phases), *(np.cos(p) for p in phases)], axis=-1)
-
-
-def plain_step(layer: MLPLayer, means: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Equations 7 and 10 with the time features repeated for every Gaussian: deltas [N, 10] and weights [N, 1]."""
-
-    def linear(module: torch.nn.Module, value: np.ndarray) -> np.ndarray:
-        assert isinstance(module, torch.nn.Linear)
-        return value @ module.weight.detach().numpy().T + module.bias.detach().numpy()
-
-    time = np.maximum(
-        linear(layer.time_hidden, plain_encoding(np.array([[t]]), layer.time_frequency_matrix.shape[1])), 0
-    )
-    features = np.repeat(linear(layer.time_output, time), len(means), axis=0)
-    inputs = np.concatenate([plain_encoding(means, layer.xyz_frequency_matrix.shape[1] // 3), features], axis=1)
-    hidden = np.maximum(linear(layer.first, inputs), 0)
-    for i, module in enumerate(layer.trunk, start=1):
-        read = np.concatenate([inputs, hidden], axis=1) if i == layer.skip else hidden
-        hidden = np.maximum(linear(module, read), 0)
-    heads = linear(layer.heads, hidden)
-    return heads[:, :10], 1 / (1 + np.exp(-heads[:, 10:]))
 
 
 def test_a_layer_has_the_papers_number_of_parameters():
@@ -78,7 +53,7 @@ def test_the_modulation_stays_bounded():
 
 def test_a_new_layer_moves_nothing_but_has_weights():
     torch.manual_seed(0)
-    step = MLPLayer(depth=2)(torch.randn(9, 3), torch.tensor(0.3))
+    step = MLPLayer(MLPConfig(depth=2))(torch.randn(9, 3), torch.tensor(0.3))
     for delta in (step.delta_means, step.delta_scales, step.delta_quats):
         assert not delta.any()
     assert step.weight.shape == (9, 1)
@@ -120,17 +95,15 @@ def test_layer_agrees_with_a_plain_reading(sizes: dict[str, int]):
     layer = random_layer(1, **sizes)
     means = torch.randn(20, 3, dtype=torch.float64)
     step = layer(means, torch.tensor(0.7, dtype=torch.float64))
-    deltas, weight = plain_step(layer, means.numpy(), 0.7)
-    got = torch.cat([step.delta_means, step.delta_scales, step.delta_quats], dim=1)
-    assert_close(got.detach(), deltas, "network.float64")
-    assert_close(step.weight.detach(), weight, "network.float64")
+    for got, want in zip(step[:4], plain_step(layer, means.numpy(), 0.7), strict=True):
+        assert_close(got.detach(), want, "network.float64")
 
 
 def test_without_a_weight_every_step_counts_in_full():
     """Under a wrong wiring (a weight that is 1 but still learned, or a step that is halved) these would differ."""
     torch.manual_seed(3)
-    weighted = MLPLayer(width=16, depth=2).double()
-    full = MLPLayer(width=16, depth=2, outputs=Heads(weight=False)).double()
+    weighted = MLPLayer(MLPConfig(width=16, depth=2)).double()
+    full = MLPLayer(MLPConfig(width=16, depth=2), Heads(weight=False)).double()
     with torch.no_grad():
         weighted.heads.weight.normal_()
         full.load_state_dict(weighted.state_dict() | {
@@ -152,7 +125,7 @@ def test_without_a_weight_every_step_counts_in_full():
 
 def test_heads_of_opacity_and_sh_change_only_these():
     torch.manual_seed(4)
-    layer = MLPLayer(width=16, depth=2, outputs=Heads(opacity=True, sh=4)).double()
+    layer = MLPLayer(MLPConfig(width=16, depth=2), Heads(opacity=True, sh=4)).double()
     assert layer.heads.out_features == 10 + 1 + 12 + 1
     with torch.no_grad():
         layer.heads.bias[10] = 0.5
@@ -175,22 +148,19 @@ def test_layer_gradients():
     assert torch.autograd.gradcheck(lambda *x: tuple(layer(*x[:2])[:4]), (means, t, *layer.parameters()))
 
 
-@pytest.mark.parametrize("steps", [None, 0, 1, 2, 3])
-def test_steps_are_weighted_and_summed(steps: int | None):
+@pytest.mark.parametrize("num_layers", [None, 0, 1, 2, 3])
+def test_steps_are_weighted_and_summed(num_layers: int | None):
     layers = [random_layer(seed) for seed in range(3)]
     means = torch.randn(20, 3, dtype=torch.float64)
-    deltas = MultiStepDeformation(layers)(means, torch.tensor(0.2, dtype=torch.float64), steps)
-    moved, total = means.numpy(), np.zeros((20, 10))
-    for layer in layers[:steps]:
-        step, weight = plain_step(layer, moved, 0.2)  # equation 7
-        moved = moved + weight * step[:, :3]  # equation 8
-        total = total + weight * step  # equation 9
-    assert_close(torch.cat(deltas[:3], dim=1).detach(), total, "network.float64")
-    assert np.abs(moved - means.numpy() - total[:, :3]).max() < tolerance("network.float64")
+    deltas = MultiStepDeformation(layers)(means, torch.tensor(0.2, dtype=torch.float64), num_layers)
+    want = plain_chain(layers[:num_layers], means.numpy(), 0.2)
+    assert_close(deltas.means.detach(), want.means, "network.float64")
+    assert_close(deltas.scales.detach(), want.scales[:, :3], "network.float64")
+    assert_close(deltas.quats.detach(), want.quats, "network.float64")
 
 
 def test_no_layers_and_no_gaussians():
-    for deformation in (MultiStepDeformation([]), MultiStepDeformation([MLPLayer(width=8)])):
+    for deformation in (MultiStepDeformation([]), MultiStepDeformation([MLPLayer(MLPConfig(width=8))])):
         deltas = deformation(torch.empty(0, 3), torch.tensor(0.0))
         assert [tuple(d.shape) for d in deltas[:3]] == [(0, 3), (0, 3), (0, 4)]
 
@@ -210,7 +180,7 @@ def last_features(layer: MLPLayer, places: torch.Tensor, t: float) -> torch.Tens
 def test_some_last_unit_answers_everywhere(sizes: dict[str, Any]):
     places = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 2.6 - 1.3
     torch.manual_seed(0)
-    layer = MLPLayer(**sizes)
+    layer = MLPLayer(MLPConfig(**sizes))
     for t in (0.0, 0.3, 1.0):
         silent = (last_features(layer, places, t) == 0).all(dim=1)
         assert silent.float().mean() < tolerance("silent_places")
@@ -229,7 +199,7 @@ def mean_cosines(layer: MLPLayer) -> tuple[float, float]:
 def test_a_new_layer_is_local_in_time_and_space():
     def small_layer(seed: int) -> MLPLayer:
         torch.manual_seed(seed)
-        return MLPLayer(width=96, depth=2, xyz_frequencies=4, time_width=64)
+        return MLPLayer(MLPConfig(width=96, depth=2, xyz_frequencies=4, time_width=64))
 
     ours = torch.tensor([mean_cosines(small_layer(seed)) for seed in range(8)]).mean(dim=0)
     torchs_own = []

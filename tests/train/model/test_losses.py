@@ -8,7 +8,8 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from msdgs_serve.scene import InvalidInput
-from msdgs_train.losses.photometric import MSE_SCALE, RADIUS, masked_l1, photometric_loss, pooled_l1, ssim
+from msdgs_train.losses.photometric import MSE_SCALE, masked_l1, photometric_loss, pooled_l1
+from msdgs_train.losses.ssim import RADIUS, ssim
 from tests.support.tolerances import assert_close, tolerance
 
 

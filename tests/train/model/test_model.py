@@ -1,14 +1,24 @@
 """Canonical Gaussians and the posed ones that a model makes of them."""
 
+import json
 from typing import Any
 
 import pytest
 import torch
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbour_distances
-from msdgs_train.gaussians.model import MIN_SCALE, DynamicGaussians, ModelConfig, unit_quats
-from tests.support.models import random_model, small_config
+from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbor_distances
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.modulation import EMBEDDINGS
+from msdgs_train.gaussians.scale_space import MIN_SCALE
+from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.mlp import MLPConfig
+from msdgs_train.layers.parts import to_text
+from msdgs_train.layers.plane import PlaneConfig
+from msdgs_train.layers.quaternions import unit_or_identity
+from msdgs_train.supports.gaussians import GaussiansConfig
+from tests.support.models import NODES, random_model, small_config
 from tests.support.tolerances import assert_close
 
 
@@ -19,7 +29,7 @@ def test_canonical_gaussians_are_activated_only():
     assert torch.equal(posed.scales, g.log_scales.exp())
     assert torch.equal(posed.opacities, g.raw_opacities.sigmoid())
     assert torch.equal(posed.sh, torch.cat([g.sh_dc, g.sh_rest], dim=1))
-    for got, same in zip(model.pose(0.9, steps=0), posed, strict=True):
+    for got, same in zip(model.pose(0.9, num_layers=0), posed, strict=True):
         assert torch.equal(got, same)
 
 
@@ -29,7 +39,7 @@ def test_deltas_are_added_before_activation():
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     quats = g.raw_quats / g.raw_quats.norm(dim=1, keepdim=True) + deltas.quats
     assert model.modulation is not None
-    log_scales = g.log_scales + model.modulation(g.embeddings).scales * deltas.scales  # equation 12
+    log_scales = g.log_scales + model.modulation(g.attributes[EMBEDDINGS]).scales * deltas.scales  # equation 12
     for got, want in (
         (posed.means, g.means + deltas.means),
         (posed.scales, log_scales.exp()),
@@ -43,8 +53,7 @@ def changed(config: dict[str, Any]) -> set[str]:
     model = random_model(**config)
     before = model.pose(0.3)
     with torch.no_grad():
-        assert model.gaussians.embeddings is not None
-        model.gaussians.embeddings.add_(1.0)
+        model.gaussians.attributes[EMBEDDINGS].add_(1.0)
     after = model.pose(0.3)
     return {name for name in before._fields if not torch.equal(getattr(before, name), getattr(after, name))}
 
@@ -52,9 +61,9 @@ def changed(config: dict[str, Any]) -> set[str]:
 @pytest.mark.parametrize(
     "targets", [("means",), ("scales",), ("quats",), ("means", "quats"), ("quats", "scales", "means")]
 )
-@pytest.mark.parametrize("delta_space", ["raw", "activated"])
-def test_modulation_changes_its_targets_only(targets: tuple[str, ...], delta_space: str):
-    assert changed({"modulation_targets": targets, "delta_space": delta_space}) == set(targets)
+@pytest.mark.parametrize("scale_space", ["log", "linear"])
+def test_modulation_changes_its_targets_only(targets: tuple[str, ...], scale_space: str):
+    assert changed({"modulation_targets": targets, "scale_space": scale_space}) == set(targets)
 
 
 @pytest.mark.parametrize("targets", [("means",), ("scales",), ("quats",), ("means", "scales", "quats")])
@@ -63,26 +72,28 @@ def test_modulation_multiplies_the_sums_once(targets: tuple[Any, ...]):
     g, posed = model.gaussians, model.pose(0.3)
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     assert model.modulation is not None
-    factors = model.modulation(g.embeddings).present()
+    factors = model.modulation(g.attributes[EMBEDDINGS]).present()
     assert list(factors) == [name for name in ("means", "scales", "quats") if name in targets]
     assert all((f - 1).abs().max() > 1e-3 for f in factors.values())
     means, scales, quats = (factors.get(name, 1.0) * getattr(deltas, name) for name in ("means", "scales", "quats"))
     assert_close(posed.means.detach(), (g.means + means).detach(), "network.float64")
     assert_close(posed.scales.detach(), (g.log_scales + scales).exp().detach(), "network.float64")
-    assert_close(posed.quats.detach(), unit_quats(unit_quats(g.raw_quats) + quats).detach(), "network.float64")
+    assert_close(
+        posed.quats.detach(), unit_or_identity(unit_or_identity(g.raw_quats) + quats).detach(), "network.float64"
+    )
 
 
 def test_deltas_may_be_added_to_scales_themselves():
-    model = random_model(delta_space="activated", noise=0.2).double()
+    model = random_model(scale_space="linear", noise=0.2).double()
     g, posed = model.gaussians, model.pose(0.3)
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     assert model.modulation is not None
-    wanted = g.log_scales.exp() + model.modulation(g.embeddings).scales * deltas.scales
-    clamped_scales = wanted < MIN_SCALE
-    assert 0 < clamped_scales.sum() < clamped_scales.numel() / 2
-    assert_close(posed.scales[~clamped_scales].detach(), wanted[~clamped_scales].detach(), "network.float64")
-    assert (posed.scales[clamped_scales] == MIN_SCALE).all()
-    assert (random_model(delta_space="raw", noise=0.2).pose(0.3).scales.double() - posed.scales).abs().max() > 0.1
+    wanted = g.log_scales.exp() + model.modulation(g.attributes[EMBEDDINGS]).scales * deltas.scales
+    clamped = wanted < MIN_SCALE
+    assert 0 < clamped.sum() < clamped.numel() / 2
+    assert_close(posed.scales[~clamped].detach(), wanted[~clamped].detach(), "network.float64")
+    assert (posed.scales[clamped] == MIN_SCALE).all()
+    assert (random_model(scale_space="log", noise=0.2).pose(0.3).scales.double() - posed.scales).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("heads", [{"opacity_head": True}, {"sh_head": True}, {"opacity_head": True, "sh_head": True}])
@@ -117,7 +128,7 @@ def test_any_number_of_layers(count: int):
 def test_stopping_after_a_step_is_a_model_of_fewer_layers():
     model, shorter = random_model(layers=("mlp",) * 3), random_model(layers=("mlp",))
     shorter.load_state_dict(model.state_dict(), strict=False)
-    for got, want in zip(model.pose(0.6, steps=1), shorter.pose(0.6), strict=True):
+    for got, want in zip(model.pose(0.6, num_layers=1), shorter.pose(0.6), strict=True):
         assert torch.equal(got, want)
 
 
@@ -147,7 +158,7 @@ def test_ids_pose_only_these():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_sh_bands_above_a_degree_are_left_out(degree: int):
+def test_sh_bands_above_a_degree_are_omitted(degree: int):
     model = random_model()
     assert torch.equal(model.pose(0.5, sh_degree=degree).sh, model.pose(0.5).sh[:, : (degree + 1) ** 2])
     assert random_model(sh_degree=degree).pose(0.5).sh.shape == (300, (degree + 1) ** 2, 3)
@@ -171,14 +182,14 @@ def test_every_parameter_is_reached_by_gradients():
 
 def test_detached_means_get_the_gradient_of_a_shift():
     for detach in (True, False):
-        model = random_model(detach_deform_input=detach)
+        model = random_model(support=GaussiansConfig(detach_deform_input=detach))
         gradient = torch.autograd.grad(model.pose(0.3).means.sum(), model.gaussians.means)[0]
         assert torch.equal(gradient, torch.ones(300, 3)) == detach
 
 
 def test_quaternions_without_direction_become_identity():
     raw = torch.tensor([[0.0, 0, 0, 0], [1e-9, 0, 0, 0], [0, 3.0, 0, -4.0]], requires_grad=True)
-    quats = unit_quats(raw)
+    quats = unit_or_identity(raw)
     assert torch.equal(quats, torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0], [0, 0.6, 0, -0.8]]))
     quats[:, 1].sum().backward()
     assert raw.grad is not None
@@ -192,28 +203,70 @@ def test_quaternions_without_direction_become_identity():
         ("sh_degree", -1),
         ("layers", -1),
         ("layers", 1.5),
-        ("width", 0),
-        ("depth", 0),
-        ("time_width", 0),
-        ("embedding_dim", -1),
         ("layers", True),
-        ("layers", ("mlp", "grid")),
         ("layers", "mlp"),
-        ("plane_resolution", 1),
-        ("plane_features_dim", 0),
-        ("delta_space", "linear"),
-        ("skip", 4),
+        ("support", "nodes"),
+        ("embedding_dim", -1),
+        ("scale_space", "activated"),
         ("weights", 1),
+        ("eps2d", -0.1),
+        ("modulation_lr_init", 0.0),
         ("modulation_targets", ()),
         ("modulation_targets", ("scales", "scales")),
         ("modulation_targets", ("opacities",)),
-        ("multires", ()),
-        ("multires", (1, 0)),
     ],
 )
-def test_impossible_sizes_are_refused_by_name(field: str, value: Any):
+def test_impossible_settings_are_refused_by_name(field: str, value: Any):
     with pytest.raises(InvalidInput, match=f"model.{field}"):
         ModelConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("setting", "layer"),
+    [
+        ("width", MLPConfig(width=0)),
+        ("depth", MLPConfig(depth=0)),
+        ("time_width", MLPConfig(time_width=0)),
+        ("xyz_frequencies", MLPConfig(xyz_frequencies=-1)),
+        ("skip", MLPConfig(skip=4)),
+        ("resolution", PlaneConfig(resolution=1)),
+        ("features", PlaneConfig(features=0)),
+        ("multires", PlaneConfig(multires=())),
+        ("multires", PlaneConfig(multires=(1, 0))),
+    ],
+)
+def test_impossible_sizes_are_refused_by_layer_and_name(setting: str, layer: LayerConfig):
+    with pytest.raises(InvalidInput, match=rf"model\.layers\.1\.{setting}"):
+        ModelConfig(layers=(MLPConfig(), layer))
+
+
+@pytest.mark.parametrize(
+    ("layers", "message"),
+    [
+        (["grid"], r"model\.layers\.0.*\(mlp, plane, spline.*--plugin"),
+        (["mlp:width=96", "mlp:hight=3"], r"model\.layers\.1.*width.*`hight`"),
+        (["mlp:width=wide"], r"model\.layers\.0"),
+        (["mlp:96"], r"model\.layers\.0"),
+        (["mlp:width=9.5"], r"model\.layers\.0\.width"),
+        ([{"kind": "mlp", "width": "wide"}], r"model\.layers\.0\.width"),
+        ([{"width": 3}], r"model\.layers\.0"),
+        ([3], r"model\.layers\.0"),
+    ],
+)
+def test_parts_that_cannot_be_read_are_named(layers: list[Any], message: str):
+    with pytest.raises(InvalidInput, match=message):
+        ModelConfig.from_dict({"layers": layers})
+
+
+def test_parts_as_text_as_values_and_as_settings_are_the_same():
+    layer = PlaneConfig(features=4, multires=(1, 2), lr_init=1.0)
+    text = "plane:features=4,multires=(1, 2),lr_init=1.0"
+    values = {"kind": "plane", "features": 4, "multires": [1, 2], "lr_init": 1}
+    assert to_text(layer) == text
+    assert ModelConfig.from_dict({"layers": [text, values, layer]}).layers == (layer, layer, layer)
+    config = small_config(layers=(layer, "mlp"))
+    assert ModelConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert to_text(MLPConfig()) == "mlp"
 
 
 @pytest.mark.parametrize(
@@ -221,21 +274,22 @@ def test_impossible_sizes_are_refused_by_name(field: str, value: Any):
     [
         ("log_scales", {"count": 4}),
         ("sh_rest", {"sh_degree": 2}),
-        ("embeddings", {"embedding_dim": 0}),
-        ("embeddings", {"embedding_dim": 9}),
+        ("embeddings", {"attributes": small_config(embedding_dim=9).attributes()}),
+        ("embeddings", {"attributes": {}}),
+        ("node_ids", {"attributes": small_config(support=NODES).attributes()}),
     ],
 )
-def test_tensors_that_disagree_are_refused_by_name(field: str, change: dict[str, int]):
-    sizes = {"count": 5, "scene_half_size": 1.0, "sh_degree": 3, "embedding_dim": 8, "seed": 0}
-    gaussians = CanonicalGaussians.random_in_cube(**sizes)
-    other = CanonicalGaussians.random_in_cube(**(sizes | change))
-    setattr(gaussians, field, getattr(other, field))
+def test_tensors_that_disagree_are_refused_by_name(field: str, change: dict[str, Any]):
+    sizes = {"count": 5, "scene_half_size": 1.0, "sh_degree": 3, "seed": 0, "attributes": small_config().attributes()}
+    gaussians, other = (dict(CanonicalGaussians.random_in_cube(**sizes | c).named_parameters()) for c in ({}, change))
+    gaussians.pop(field, None)
+    mixed = CanonicalGaussians(**gaussians | {name: other[name] for name in [field] if name in other})
     with pytest.raises(InvalidInput, match=f"gaussians.{field}"):
-        DynamicGaussians(small_config(), gaussians)
+        DynamicGaussians(small_config(), mixed)
 
 
 def test_random_start_fills_the_cube_and_repeats():
-    a, b, c = (CanonicalGaussians.random_in_cube(500, 1.3, 3, 8, seed) for seed in (1, 1, 2))
+    a, b, c = (CanonicalGaussians.random_in_cube(500, 1.3, 3, seed) for seed in (1, 1, 2))
     assert torch.equal(a.means, b.means)
     assert not torch.equal(a.means, c.means)
     assert 1.2 < a.means.abs().max() <= 1.3
@@ -245,7 +299,7 @@ def test_random_start_fills_the_cube_and_repeats():
 
 @pytest.mark.parametrize("spread", ["uniform", "clustered", "plane", "line"])
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 300])
-def test_neighbour_distances_against_all_pairs(spread: str, count: int):
+def test_neighbor_distances_against_all_pairs(spread: str, count: int):
     generator = torch.Generator().manual_seed(count)
     points = torch.rand(count, 3, generator=generator)
     points = {
@@ -256,9 +310,9 @@ def test_neighbour_distances_against_all_pairs(spread: str, count: int):
     }[spread]
     pairs = (points[:, None] - points[None]).double().norm(dim=2).sort(dim=1).values
     want = pairs[:, 1 : min(count, 4)].mean(dim=1)
-    assert_close(neighbour_distances(points), want.float(), "neighbour_distances")
+    assert_close(neighbor_distances(points), want.float(), "neighbor_distances")
 
 
 def test_points_in_one_place_have_a_scale():
-    gaussians = CanonicalGaussians.from_points(torch.zeros(5, 3), torch.rand(5, 3), 0, 0, torch.Generator())
+    gaussians = CanonicalGaussians.from_points(torch.zeros(5, 3), torch.rand(5, 3), 0, torch.Generator())
     assert gaussians.log_scales.isfinite().all()

@@ -1,19 +1,19 @@
 """The plane layer against a slow one in float64, and its gradients against finite differences."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from msdgs_train.layers.heads import Heads
-from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
+from msdgs_train.layers.base import Heads, SceneBounds
+from msdgs_train.layers.plane import PlaneConfig, PlaneGrid, PlaneLayer
+from tests.support.reference_deformation import plain_features
 
 
-def layer(dtype: torch.dtype = torch.float64, scales: tuple[int, ...] = (1,)) -> PlaneLayer:
+def layer(dtype: torch.dtype = torch.float64, multires: tuple[int, ...] = (1,)) -> PlaneLayer:
     torch.manual_seed(0)
-    made = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8, scene_half_size=1.3, scales=scales)
+    config = PlaneConfig(features=5, resolution=6, time_resolution=7, width=8, multires=multires)
+    made = PlaneLayer(config, SceneBounds(1.3))
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
@@ -27,42 +27,25 @@ def places(n: int = 40) -> Tensor:
     return means
 
 
-def slow_features(planes: PlaneGrid, means: Tensor, t: float) -> np.ndarray:
-    space, time = (p.detach().double().numpy() for p in (planes.space, planes.time))
-    s, nodes = space.shape[1], time.shape[1]
-    out = np.ones((len(means), space.shape[3]))
-    for n, mean in enumerate(means.double().numpy()):
-        across = mean * planes.cells.numpy() + (s - 1) / 2
-        places = [*np.clip(across, 0, s - 1), np.clip(t * (nodes - 1), 0, nodes - 1)]
-        hats = [
-            [max(0.0, 1 - abs(p - k)) for k in range(count)] for p, count in zip(places, [s, s, s, nodes], strict=True)
-        ]
-        for plane, (a, b) in enumerate([(0, 1), (0, 2), (1, 2)]):
-            out[n] *= np.einsum("i,j,ijc->c", hats[a], hats[b], space[plane])
-        for axis in range(3):
-            out[n] *= np.einsum("t,j,tjc->c", hats[3], hats[axis], time[axis])
-    return out
-
-
 def test_parameters_at_the_papers_sizes() -> None:
     assert sum(p.numel() for p in PlaneLayer().parameters()) == 131_083
 
 
 def test_parameters_of_4dgs() -> None:
     """3.38 M in table 4, which counts the heads of opacity and SH that 4DGS leaves out unless asked for."""
-    sizes: dict[str, Any] = {"channels": 32, "space_nodes": 64, "time_nodes": 75, "width": 64, "scales": (1, 2)}
+    config = PlaneConfig(features=32, resolution=64, time_resolution=75, width=64, multires=(1, 2))
     for outputs, count in ((Heads(weight=False), 3_365_770), (Heads(False, True, 16), 3_377_275)):
-        assert sum(p.numel() for p in PlaneLayer(**sizes, outputs=outputs).parameters()) == count
+        assert sum(p.numel() for p in PlaneLayer(config, outputs=outputs).parameters()) == count
 
 
-@pytest.mark.parametrize("scales", [(1,), (1, 2), (2, 1, 3)])
+@pytest.mark.parametrize("multires", [(1,), (1, 2), (2, 1, 3)])
 @pytest.mark.parametrize("t", [0.0, 0.37, 0.5, 1.0, -0.2, 1.7])
-def test_features_are_products_of_interpolated_planes(t: float, scales: tuple[int, ...]) -> None:
-    planes, seen = layer(scales=scales), {}
+def test_features_are_products_of_interpolated_planes(t: float, multires: tuple[int, ...]) -> None:
+    planes, seen = layer(multires=multires), {}
     planes.features.register_forward_pre_hook(lambda _, inputs: seen.update(features=inputs[0]))
     planes(places(), torch.tensor(t, dtype=torch.float64))
-    slow = np.concatenate([slow_features(grid, places(), t) for grid in planes.plane_grids()], axis=1)
-    assert [grid.space.shape[1] for grid in planes.plane_grids()] == [6 * scale for scale in scales]
+    slow = np.concatenate([plain_features(grid, places().numpy(), t) for grid in planes.plane_grids()], axis=1)
+    assert [grid.space.shape[1] for grid in planes.plane_grids()] == [6 * factor for factor in multires]
     np.testing.assert_allclose(seen["features"].detach().numpy(), slow, rtol=1e-12)
 
 
@@ -74,8 +57,9 @@ def test_the_whole_time_range_is_used() -> None:
         torch.testing.assert_close(planes.lines(torch.tensor(t)), torch.full((3, 32, 16), expected))
 
 
+@pytest.mark.slow
 def test_gradients_match_finite_differences() -> None:
-    planes = layer(scales=(1, 2))
+    planes = layer(multires=(1, 2))
     means = places(6).requires_grad_(True)
     t = torch.tensor(0.43, dtype=torch.float64)
 
@@ -143,15 +127,3 @@ def test_flat_grids_and_straight_lines_in_time_are_smooth() -> None:
         assert float(planes.l1_time_planes()) == pytest.approx(2 + 1 / 9)
         assert float(planes.plane_tv()) == pytest.approx(2 / 31)
         assert float(planes.plane_smoothness()) == pytest.approx((1 + 4 + 1) / 30)
-
-
-def test_grids_of_before_there_were_several_or_boxes_are_read() -> None:
-    planes = layer()
-    old = {name.replace("grids.0.", ""): value for name, value in planes.state_dict().items()}
-    old["cells"] = old["cells"][0]
-    del old["origin"]
-    read = PlaneLayer(channels=5, space_nodes=6, time_nodes=7, width=8)
-    read.load_state_dict(old)
-    t = torch.tensor(0.2)
-    for got, want in zip(read.double()(places(), t)[:4], planes(places(), t)[:4], strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-6, atol=1e-6)

@@ -1,6 +1,5 @@
-"""The mean of the last steps: what it is the mean of, and that it is what is judged, shown, saved and resumed."""
+"""The average of the last steps: of which steps, and that it is evaluated, shown, saved and resumed."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,38 +7,34 @@ import pytest
 import torch
 
 from msdgs_train.datasets import load_scene
-from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.run import fit
+from msdgs_train.engine.schedule import Schedule
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.viewer.snapshot import snapshot_of_training
 from tests.support.training_scene import (
-    SHARED_MOTIONS,
+    MOTION_BASES,
     StopAfter,
     assert_same_bits,
     small_config,
     state_of,
-    write_scene,
 )
+
+pytestmark = pytest.mark.slow
 
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
-    model=SHARED_MOTIONS,
+    model=MOTION_BASES,
     window_full_fraction=0.5,
     refine_stop_fraction=BEGINS / STEPS,
     ema_steps=KEPT,
     eval_every=0,
 )
-AS_THE_PRESET = replace(
-    CONFIG, batch_size=2, window_full_fraction=BEGINS / STEPS, refine_stop_fraction=0.5, eps2d_init=0.4
+AS_THE_PRESET = CONFIG.updated(
+    batch_size=2, window_full_fraction=BEGINS / STEPS, refine_stop_fraction=0.5, eps2d_init=0.4
 )
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def _parameters(model: torch.nn.Module) -> list[np.ndarray]:
@@ -52,26 +47,26 @@ def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
     for step in range(1, STEPS + 1):
         trainer.step()
         if step <= BEGINS:
-            assert trainer.eval_model is trainer.model
+            assert trainer.system.eval_model is trainer.system.model
             continue
-        seen.append(_parameters(trainer.model))
+        seen.append(_parameters(trainer.system.model))
         if len(seen) <= KEPT:
             expected = [np.mean(values, axis=0) for values in zip(*seen, strict=True)]
         else:
             expected = [(1 - 1 / KEPT) * old + last / KEPT for old, last in zip(expected, seen[-1], strict=True)]
-        for mean, value in zip(_parameters(trainer.eval_model), expected, strict=True):
+        for mean, value in zip(_parameters(trainer.system.eval_model), expected, strict=True):
             np.testing.assert_allclose(mean, value, rtol=1e-5, atol=1e-6)
-    moved = zip(_parameters(trainer.eval_model), seen[-1], strict=True)
+    moved = zip(_parameters(trainer.system.eval_model), seen[-1], strict=True)
     assert sum(not np.array_equal(mean, last) for mean, last in moved) > 5
 
 
-def test_it_is_judged_shown_and_saved(data: Path, tmp_path: Path) -> None:
+def test_it_is_evaluated_shown_and_saved(data: Path, tmp_path: Path) -> None:
     trainer = Trainer(CONFIG, load_scene(data))
     for _ in range(STEPS):
         trainer.step()
-    trainer.save_model(tmp_path / "model.pt")
+    trainer.system.save(tmp_path / "model.pt", STEPS)
     saved = load_model(tmp_path / "model.pt")
-    last = LoadedModel(trainer.model, saved.scene, STEPS)
+    last = LoadedModel(trainer.system.model, saved.scene, STEPS)
     for evaluated in trainer.evaluate("test"):
         view = (evaluated.frame.camera, evaluated.frame.t)
         np.testing.assert_array_equal(saved.render(*view).clamp(0, 1), evaluated.rgb)
@@ -80,18 +75,16 @@ def test_it_is_judged_shown_and_saved(data: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(shown, to_bytes(evaluated.rgb.numpy()))
 
 
+@pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize("config", [CONFIG, AS_THE_PRESET], ids=["density control last", "windows last"])
 @pytest.mark.parametrize("stop", [BEGINS, BEGINS + 1, BEGINS + 5])
-def test_resuming_changes_no_bit_of_it(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, config: TrainConfig
-) -> None:
-    monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
+def test_resuming_changes_no_bit_of_it(data: Path, tmp_path: Path, stop: int, config: TrainConfig) -> None:
     fit(config, data, tmp_path / "whole")
     fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
-    assert (state_of(tmp_path / "parts")["/mean/count"] if stop > BEGINS else 0) == min(stop - BEGINS, KEPT)
+    assert (state_of(tmp_path / "parts")["/system/average/count"] if stop > BEGINS else 0) == min(stop - BEGINS, KEPT)
     fit(config, data, tmp_path / "parts", resume=True)
     assert_same_bits(*(state_of(tmp_path / name) for name in ("whole", "parts")))
-    kept = torch.load(tmp_path / "whole/checkpoint.pt", weights_only=True)["mean"]["model"]
+    kept = torch.load(tmp_path / "whole/checkpoint.pt", weights_only=True)["system"]["average"]["model"]
     for file in ("model.pt", "best.pt"):
         saved = load_model(tmp_path / "parts" / file)
         assert saved.step == STEPS
@@ -106,49 +99,38 @@ def _saved(data: Path, path: Path, steps: int) -> Trainer:
     return trainer
 
 
-def test_with_more_steps_it_begins_anew(data: Path, tmp_path: Path) -> None:
-    """Density control goes on then, and the Gaussians are other ones."""
+def test_with_more_steps_it_begins_again(data: Path, tmp_path: Path) -> None:
+    """Density control continues then, and changes the Gaussians."""
     before = _saved(data, tmp_path / "checkpoint.pt", STEPS)
-    longer = Trainer(replace(CONFIG, steps=2 * STEPS), before.scene)
+    longer = Trainer(CONFIG.updated(steps=2 * STEPS), before.scene)
     longer.load_checkpoint(tmp_path / "checkpoint.pt")
-    assert longer.eval_model is longer.model
+    assert longer.system.eval_model is longer.system.model
     longer.step()
-    assert longer.eval_model is longer.model
+    assert longer.system.eval_model is longer.system.model
 
 
 def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_path: Path) -> None:
     before = _saved(data, tmp_path / "checkpoint.pt", 12)
-    shorter = Trainer(replace(CONFIG, steps=14), before.scene)
+    shorter = Trainer(CONFIG.updated(steps=14), before.scene)
     shorter.load_checkpoint(tmp_path / "checkpoint.pt")
     seen = []
     for _ in range(2):
         shorter.step()
-        seen.append(_parameters(shorter.model))
-    for mean, *values in zip(_parameters(shorter.eval_model), *seen, strict=True):
+        seen.append(_parameters(shorter.system.model))
+    for mean, *values in zip(_parameters(shorter.system.eval_model), *seen, strict=True):
         np.testing.assert_allclose(mean, np.mean(values, axis=0), rtol=1e-5, atol=1e-6)
 
 
-def test_a_run_from_before_there_were_means_goes_on(data: Path, tmp_path: Path) -> None:
-    before = _saved(data, tmp_path / "checkpoint.pt", BEGINS + 2)
-    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    del state["mean"]
-    torch.save(state, tmp_path / "checkpoint.pt")
-    trainer = Trainer(CONFIG, before.scene)
-    trainer.load_checkpoint(tmp_path / "checkpoint.pt")
-    assert trainer.eval_model is trainer.model
-    trainer.step()
-    for mean, last in zip(_parameters(trainer.eval_model), _parameters(trainer.model), strict=True):
-        np.testing.assert_array_equal(mean, last)
-
-
-@pytest.mark.parametrize("last", ["still", "windows", "density control"])
+@pytest.mark.parametrize("last", ["static", "windows", "density control"])
 def test_it_begins_when_gaussians_and_motions_stay_what_they_are(last: str) -> None:
-    ends = {"still": 0.25, "windows": 0.25, "density control": 0.25, last: 0.5}
-    config = replace(
-        CONFIG,
-        static_fraction=ends["still"],
+    ends = {"static": 0.25, "windows": 0.25, "density control": 0.25, last: 0.5}
+    config = CONFIG.updated(
+        static_fraction=ends["static"],
         window_full_fraction=ends["windows"],
         refine_stop_fraction=ends["density control"],
     )
-    assert [step for step in range(1, STEPS + 1) if config.averages_at(step)] == list(range(13, STEPS + 1))
-    assert not any(replace(config, ema_steps=0).averages_at(step) for step in range(1, STEPS + 1))
+    assert [step for step in range(1, STEPS + 1) if Schedule.from_config(config).averages_at(step)] == list(
+        range(13, STEPS + 1)
+    )
+    off = Schedule.from_config(config.updated(ema_steps=0))
+    assert not any(off.averages_at(step) for step in range(1, STEPS + 1))

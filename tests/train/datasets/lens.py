@@ -43,7 +43,9 @@ class Lens(NamedTuple):
 
     def grid(self) -> np.ndarray:
         """[12, 3] points in OpenCV camera axes that are spread over the image, each at another depth."""
-        columns, rows = np.meshgrid(np.linspace(40, self.width - 40, 4), np.linspace(40, self.height - 40, 3))
+        columns, rows = np.meshgrid(
+            np.linspace(0.125, 0.875, 4) * self.width, np.linspace(0.125, 0.875, 3) * self.height
+        )
         depths = np.linspace(2.0, 6.0, columns.size)
         x, y = (columns.ravel() - self.cx) / self.fx, (rows.ravel() - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], axis=1) * depths[:, None]

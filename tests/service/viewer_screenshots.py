@@ -1,10 +1,10 @@
-"""Take the screenshots of docs/viewer.md: `python -m tests.support.viewer_screenshots docs/images`."""
+"""Take the screenshots of docs/viewer.md: `python -m tests.service.viewer_screenshots docs/images`."""
 
 import sys
 from pathlib import Path
 from typing import Any
 
-from tests.support.browser import chromium, wait_until_still
+from tests.support.processes import chromium, wait_until_still
 from tests.support.service import serving
 
 SCENE = Path("examples/toybench.onnx")

@@ -1,0 +1,54 @@
+"""Numbers and names from outside: each has its limits here, before anything computes with it."""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
+
+MAX_NAME_BYTES = 200
+"""In UTF-8: with a suffix and a prefix of the service's own still a file name on any file system."""
+
+# Bounds far beyond any sensible value, within which single precision neither overflows nor underflows
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
+Distance = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-6, le=1e9)]
+Focal = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e8)]
+FieldOfView = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.01, le=179.0)]
+Elevation = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-89.9, le=89.9)]
+FramesPerSecond = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=240)]
+Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_PIXELS_PER_SIDE)]
+Index = Annotated[int, Field(strict=True, ge=0, le=1_000_000)]
+Samples = Annotated[int, Field(strict=True, ge=1, le=10_000)]
+Quality = Annotated[int, Field(strict=True, ge=1, le=100)]
+Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
+Decibels = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=200)]
+Steps = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1000)]
+
+# of links, where all is text
+LaxNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+LaxPixels = Annotated[int, Field(ge=1, le=MAX_PIXELS_PER_SIDE)]
+LaxIndex = Annotated[int, Field(ge=0, le=1_000_000)]
+LaxQuality = Annotated[int, Field(ge=1, le=100)]
+LaxDecibels = Annotated[float, Field(allow_inf_nan=False, ge=0, le=200)]
+LaxSteps = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1000)]
+List = Annotated[str, Field(max_length=100)]
+
+Vector = tuple[Number, Number, Number]
+Row = tuple[Number, Number, Number, Number]
+Color = tuple[Unit, Unit, Unit]
+
+
+def _not_tiny(vector: Vector) -> Vector:
+    if sum(x * x for x in vector) < 1e-12:
+        raise ValueError("must be longer than 1e-6")
+    return vector
+
+
+def _fits_a_file_name(name: str) -> str:
+    if len(name.encode()) > MAX_NAME_BYTES:
+        raise ValueError(f"must be at most {MAX_NAME_BYTES} bytes in UTF-8")
+    return name
+
+
+Direction = Annotated[Vector, AfterValidator(_not_tiny)]
+Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME_BYTES), AfterValidator(_fits_a_file_name)]

@@ -1,0 +1,16 @@
+"""What a run of the tests says of those that it skipped."""
+
+from tests.support.skips import ALLOWED_SKIPS, LACKS, not_tested, unexpected
+
+
+def test_only_listed_reasons_are_expected():
+    assert unexpected([f"{reason}: more" for reason in ALLOWED_SKIPS]) == []
+    assert unexpected(["I felt like it", "I felt like it", *ALLOWED_SKIPS]) == ["I felt like it"]
+    assert unexpected([lack.reason for lack in LACKS]) == sorted(lack.reason for lack in LACKS)
+
+
+def test_one_line_says_what_was_not_tested_and_what_brings_it():
+    assert not_tested(list(ALLOWED_SKIPS)) == ""
+    line = not_tested([lack.reason for lack in (*LACKS, LACKS[0])])
+    assert "the page in a browser (2), " in line
+    assert line.endswith("apt-get install chromium prometheus && pip install kubernetes-validate")

@@ -1,0 +1,271 @@
+"""Who has how many places in the queue, and whose work is done next."""
+
+import asyncio
+import gc
+import threading
+import weakref
+from collections.abc import AsyncGenerator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, aclosing
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from msdgs_serve.api.app import create_app
+from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.routes import batch, video
+from msdgs_serve.api.schemas import VideoRequest
+from msdgs_serve.api.server import Server
+from msdgs_serve.api.service import Service
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.api.turns import PART_TURN, Turns
+from msdgs_serve.api.work import WorkQueue
+from msdgs_serve.imaging import Image
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.store import SceneStore
+from msdgs_serve.watch import Watch
+from tests.support.scene_files import write_scene
+from tests.support.service import in_this_process, serving
+
+ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
+FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
+MANY = 40
+
+
+def order(turns: Turns[str]) -> list[str]:
+    return list(iter(turns.next, None))
+
+
+def test_clients_take_turns():
+    turns: Turns[str] = Turns()
+    for item in ("a1", "a2", "a3", "b1", "c1", "b2"):
+        turns.add(item, item[0], part=False)
+    assert order(turns) == ["a1", "b1", "c1", "a2", "b2", "a3"]
+    assert turns.next() is None
+
+
+def test_single_frames_come_in_between_parts_which_have_their_turns_too():
+    turns: Turns[str] = Turns()
+    for number in range(3):
+        turns.add(f"part of {number}", str(number), part=True)
+    for _ in range(2 * PART_TURN):
+        turns.add("single", "x", part=False)
+    done = order(turns)
+    assert done[: 2 * PART_TURN] == ["single"] * (PART_TURN - 1) + ["part of 0"] + ["single"] * (PART_TURN - 1) + [
+        "part of 1"
+    ]
+    assert done[2 * PART_TURN :] == ["single", "single", "part of 2"]
+
+
+def test_who_leaves_the_line_is_in_nobodys_way():
+    turns: Turns[str] = Turns()
+    for item in ("a1", "a2", "b1"):
+        turns.add(item, item[0], part=item[0] == "b")
+    for item in ("a1", "b1", "b1"):
+        turns.remove(item)
+    assert order(turns) == ["a2"]
+
+
+@pytest.fixture
+def queue() -> Iterator[WorkQueue]:
+    queue = WorkQueue(workers=2, waiting=6, seconds=20)
+    yield queue
+    queue.shut_down()
+
+
+def places(queue: WorkQueue, calls: ExitStack, client: str, *, streamed: bool = False) -> int:
+    """How many a client gets, before it is refused."""
+    before = queue.waiting
+
+    def take_all() -> None:
+        while True:
+            calls.enter_context(queue.admitted(client, streamed=streamed))
+
+    with pytest.raises(Refused, match="places") as refused:
+        take_all()
+    assert (refused.value.status, refused.value.headers["Retry-After"].isdecimal()) == (503, True)
+    return queue.waiting - before
+
+
+def test_a_client_has_as_many_places_as_it_leaves(queue: WorkQueue):
+    with ExitStack() as calls:
+        assert [places(queue, calls, client) for client in ("one", "two", "three", "four")] == [4, 2, 1, 1]
+        assert queue.waiting == 8
+    assert queue.waiting == 0
+    with ExitStack() as calls:
+        assert places(queue, calls, "four") == 4
+
+
+def test_batches_and_films_have_half_of_all_places(queue: WorkQueue):
+    with ExitStack() as calls:
+        assert [places(queue, calls, client, streamed=True) for client in ("one", "two", "three")] == [4, 0, 0]
+        assert places(queue, calls, "two") == 2
+    with ExitStack() as calls:
+        for client in ("one", "two", "three"):
+            calls.enter_context(queue.admitted(client, streamed=True))
+        assert places(queue, calls, "four", streamed=True) == 1
+
+
+def test_parts_keep_their_place_until_the_call_and_its_work_have_ended(queue: WorkQueue):
+    begun, go_on = threading.Event(), threading.Event()
+
+    async def call() -> None:
+        with queue.admitted("one", streamed=True):
+            await queue.run(lambda: None, Watch(), part=True)
+            assert queue.waiting == 1
+            last = asyncio.ensure_future(queue.run(lambda: begun.set() or go_on.wait(20), Watch(), part=True))
+            assert await asyncio.to_thread(begun.wait, 20)
+        last.cancel()
+        assert queue.running == 1
+        with ExitStack() as calls:
+            assert places(queue, calls, "one") == 3, "one of four is taken as long as the thread is"
+        go_on.set()
+
+    asyncio.run(call())
+    queue.shut_down()
+    queue._executor.shutdown(wait=True)
+    assert queue.waiting == queue.running == 0
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
+
+
+@in_this_process
+def test_one_client_cant_take_the_places_of_another(scene: Path):
+    """Addresses are those that a proxy on this machine names."""
+    renderer, entered, go_on = Renderer(), threading.Semaphore(0), threading.Event()
+    original = renderer.render
+
+    def render(*arguments: Any) -> Image:
+        if arguments[2] == 0.5:
+            entered.release()
+            assert go_on.wait(20)
+        return original(*arguments)
+
+    renderer.render = render  # pyright: ignore[reportAttributeAccessIssue]
+    servers: list[Server] = []
+    with (
+        serving(scene, renderer=renderer, server=servers, concurrent_renders=1, queued_renders=3) as client,
+        ThreadPoolExecutor(4) as pool,
+    ):
+
+        def ask(address: str, path: str = "/render", body: Any = FRAME) -> httpx.Response:
+            return client.post(path, json=body, headers={"X-Forwarded-For": address})
+
+        frames = [pool.submit(ask, "10.0.0.1") for _ in range(2)]
+        assert entered.acquire(timeout=20)
+        while servers[0].service.queue.waiting != 1:
+            threading.Event().wait(0.005)
+        refused = ask("10.0.0.1")
+        assert (refused.status_code, refused.headers["Retry-After"].isdecimal()) == (503, True)
+        assert "2 places" in refused.json()["detail"]
+        assert ask("10.0.0.1", "/render/batch", {"frames": [FRAME]}).status_code == 503
+        frames.append(pool.submit(ask, "10.0.0.2"))
+        while servers[0].service.queue.waiting != 2:
+            threading.Event().wait(0.005)
+        go_on.set()
+        assert [frame.result(20).status_code for frame in frames] == [200] * 3
+
+
+@pytest.fixture
+def service(scene: Path) -> Iterator[Service]:
+    app = create_app(SceneStore([scene]), Renderer(), Settings(scenes=[scene], max_batch=MANY))
+    yield app.state.service
+    app.state.service.queue.shut_down()
+
+
+@pytest.fixture
+def images(service: Service, monkeypatch: pytest.MonkeyPatch) -> list[weakref.ref[Image]]:
+    """Every image that was drawn."""
+    drawn: list[weakref.ref[Image]] = []
+    original = service.renderer.render
+
+    def render(*arguments: Any) -> Image:
+        image = original(*arguments)
+        drawn.append(weakref.ref(image))
+        return image
+
+    monkeypatch.setattr(service.renderer, "render", render)
+    return drawn
+
+
+def times(count: int) -> list[float]:
+    return [number / count for number in range(count)]
+
+
+def film(service: Service) -> AsyncGenerator[bytes]:
+    frames = [{"camera": ORBIT, "t": t} for t in times(MANY)]
+    body = VideoRequest.model_validate({"frames": frames, "width": 32, "height": 32})
+    return video._film(service, body, *video._path(service, body))
+
+
+def lines(service: Service) -> AsyncGenerator[Any]:
+    return batch._items(service, [{**FRAME, "t": t} for t in times(MANY)], multipart=False)
+
+
+@pytest.mark.parametrize("made", [film, lines])
+def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images: list[weakref.ref[Image]], made: Any):
+    """A film and a batch have one frame at a time in memory, and none is drawn before the last was taken."""
+
+    async def take() -> None:
+        taken = 0
+        async with aclosing(made(service)) as pieces:
+            async for _ in pieces:
+                taken += 1
+                gc.collect()
+                assert len(images) == min(taken, MANY)
+                assert sum(image() is not None for image in images) <= 1
+
+    asyncio.run(take())
+    assert len(images) == MANY
+
+
+def test_a_film_fails_in_time_to_say_so_or_is_cut_off(scene: Path):
+    renderer = Renderer()
+    original, broken = renderer.render, list[float]()
+
+    def render(*arguments: Any) -> Image:
+        if arguments[2] in broken:
+            raise RuntimeError("secret")
+        return original(*arguments)
+
+    renderer.render = render  # pyright: ignore[reportAttributeAccessIssue]
+    frames = [{"camera": ORBIT, "t": t} for t in (0.0, 0.5, 1.0)]
+    with serving(scene, renderer=renderer) as client:
+        body = {"frames": frames, "width": 16, "height": 16}
+        broken[:] = [0.0]
+        broken_at_once = client.post("/render/video", json=body)
+        assert broken_at_once.status_code == 500
+        assert "secret" not in broken_at_once.text
+        broken[:] = [1.0]
+        with pytest.raises(httpx.RemoteProtocolError):
+            client.post("/render/video", json=body)
+        broken[:] = []
+        assert client.post("/render/video", json=body).status_code == 200
+
+
+def test_a_list_of_times_is_drawn_in_parts(service: Service, scene: Path):
+    """So that it can't keep a thread for all of its frames."""
+    parts = []
+    original = service.queue.run
+
+    async def run(work: Any, watch: Watch, *, part: bool = False) -> Any:
+        parts.append(part)
+        return await original(work, watch, part=part)
+
+    service.queue.run = run  # pyright: ignore[reportAttributeAccessIssue]
+    app_frames = [{**FRAME, "t": [0.0, 0.5, 1.0], "format": name} for name in ("png", "npy")]
+
+    async def ask() -> list[int]:
+        app = create_app(SceneStore([scene]), service.renderer, service.settings)
+        app.state.service = service
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return [(await client.post("/render", json=frame)).status_code for frame in app_frames]
+
+    assert asyncio.run(ask()) == [200, 200]
+    assert parts == [True] * 8

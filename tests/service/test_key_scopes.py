@@ -1,0 +1,108 @@
+"""What a key opens, and which files of keys are taken."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from msdgs_serve.api.keys import SCOPES, read_keys, scope_of
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.scene import InvalidInput
+from tests.service.test_api_poison import check_problem
+from tests.support.scene_files import write_scene
+from tests.support.service import serving
+
+KEYS = {scope: f"{scope}-0123456789abcdef" for scope in SCOPES}
+FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
+# one call for each scope that changes nothing where it is let through
+CALLS = [("POST", "/render", "read"), ("DELETE", "/scenes/nothing", "write"), ("GET", "/metrics", "operate")]
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("keys") / "keys"
+    path.write_text("# by scope\n\n" + "".join(f"{scope} {key}\n" for scope, key in KEYS.items()))
+    return path
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory, keys: Path) -> Iterator[httpx.Client]:
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scene(folder / "balls.onnx")
+    with serving(folder, uploads=True, api_keys_file=keys) as client:
+        yield client
+
+
+@pytest.mark.parametrize(("method", "path", "scope"), CALLS)
+def test_a_key_opens_its_scope_and_nothing_else(client: httpx.Client, method: str, path: str, scope: str):
+    body = FRAME if method == "POST" else None
+    for owned, key in KEYS.items():
+        response = client.request(method, path, json=body, headers={"Authorization": f"Bearer {key}"})
+        if owned == scope:
+            assert response.status_code == (404 if method == "DELETE" else 200)
+        else:
+            assert response.status_code == 403
+            check_problem(response)
+            assert f"`{scope}`" in response.json()["detail"]
+    for headers in ({}, {"X-API-Key": "wrong-0123456789abcdef"}):
+        response = client.request(method, path, json=body, headers=headers)
+        assert response.status_code == 401
+        check_problem(response)
+
+
+def test_uploads_need_the_scope_write(client: httpx.Client, tmp_path: Path):
+    file = write_scene(tmp_path / "walk.onnx").read_bytes()
+    for scope, status in (("read", 403), ("operate", 403), ("write", 201)):
+        headers = {"X-API-Key": KEYS[scope]}
+        assert client.post("/scenes?name=walk", content=file, headers=headers).status_code == status
+    for scope, status in (("read", 403), ("operate", 403), ("write", 204)):
+        assert client.delete("/scenes/walk", headers={"X-API-Key": KEYS[scope]}).status_code == status
+
+
+def test_every_call_of_the_document_says_which_scope_it_needs(client: httpx.Client):
+    document = client.get("/openapi.json", headers={"X-API-Key": KEYS["read"]}).json()
+    for path, calls in document["paths"].items():
+        for method, call in calls.items():
+            scope = scope_of(method.upper(), path)
+            assert list(call.get("security", ())) == ([] if scope is None else [{"bearer": [scope]}, {"key": [scope]}])
+            assert scope is None or {"401", "403"} <= call["responses"].keys()
+
+
+def test_a_key_may_have_several_scopes(tmp_path: Path):
+    (tmp_path / "keys").write_text("read,write  0123456789abcdef\noperate\tfedcba9876543210\n")
+    assert [key.scopes for key in read_keys(tmp_path / "keys")] == [{"read", "write"}, {"operate"}]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0123456789abcdef", "line 1` must be `scopes key`, as in `read,write,operate .*, got a key without scopes"),
+        ("# ours\nread 0123456789abcdef\nfedcba9876543210\n", "line 3"),
+        ("admin 0123456789abcdef", "line 1"),
+        ("read,,write 0123456789abcdef", "line 1"),
+        ("read 0123456789abcde", "16 or more letters"),
+        ("read 0123456789abcdef extra", "line 1"),
+        ("read 0123456789abcdef\nwrite 0123456789abcdef", "different keys"),
+        ("", "0 keys"),
+        ("\n# nothing\n", "0 keys"),
+    ],
+)
+def test_a_file_that_says_no_scopes_is_refused_with_the_line_that_it_needs(tmp_path: Path, text: str, message: str):
+    (tmp_path / "keys").write_text(text)
+    with pytest.raises(InvalidInput, match=message) as error:
+        read_keys(tmp_path / "keys")
+    assert "0123456789" not in str(error.value)
+
+
+def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
+    (tmp_path / "keys").write_bytes(b"\xff\xfe")
+    for path in (tmp_path / "keys", tmp_path / "missing", tmp_path):
+        with pytest.raises(InvalidInput, match="a text file"):
+            read_keys(path)
+
+
+def test_a_variable_that_is_empty_is_as_if_it_were_not_there(monkeypatch: pytest.MonkeyPatch):
+    """A composition sets it whether or not there are keys."""
+    monkeypatch.setenv("MSDGS_API_KEYS_FILE", "")
+    assert Settings().api_keys_file is None

@@ -1,0 +1,220 @@
+"""Bodies and links made from the OpenAPI document, with a value at one leaf that nobody should send.
+
+The answer is what the document allows: never a 5xx but 501, 503, 504 and 507, and a 422 names the leaf. A few hundred
+cases, drawn with a seed; `MSDGS_FUZZ=all pytest -n 0 tests/service/test_openapi_poison.py` tries every one.
+"""
+
+import json
+import os
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.service.test_api_poison import check_problem
+from tests.support.scene_files import write_scene
+from tests.support.service import serving
+
+EVERY_DAY = 400
+ALLOWED = {501, 503, 504, 507}
+HUGE, DEEP, DEEPER = "@huge@", "@deep@", "@deeper@"  # stand for what Python itself can't write as JSON
+WRITTEN = {HUGE: "1e999", DEEP: "[" * 400 + "]" * 400, DEEPER: "[" * 3000 + "]" * 3000}
+# fields that have a meaning only beside others
+PARTNERS: dict[str, dict[str, Any]] = {
+    "dt": {"channels": ["motion"]}, "depth_range": {"channels": ["depth"]}, "quality": {"format": "jpeg"},
+    "distortion": {"fx": 16.0, "model": "fisheye"}, "fy": {"fx": 16.0}, "cx": {"fx": 16.0},
+    "cy": {"fx": 16.0}, "axes": {"fx": 16.0}, "model": {"fx": 16.0},
+}  # fmt: skip
+SIZE = {"width": 16, "height": 16}
+ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
+
+Document = dict[str, Any]
+Leaf = tuple[str | int, ...]
+
+
+POISON: list[Any] = [
+    10**400, -(10**400), 10**4000, 1e308, 5e-324, -0.0, float("nan"), float("inf"), HUGE, 2**63, 1.5,
+    True, None, "", "1", "x" * 10_000, "\ud800", "\0", "\U0001f600" * 200, "../x", [], {}, [1] * 2000, {"a": {"b": 1}},
+    DEEP, DEEPER,
+]  # fmt: skip
+QUERY_POISON = [
+    "", "1" * 400, "-" + "1" * 5000, "1e999", "nan", "-inf", "1e-400", "0x10", "1,2", "1,2," + "9" * 90, "\0", "../x",
+    "\U0001f600" * 200, "x" * 10_000, "[1]", "{}", "true",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scene(folder / "balls.onnx", steps=True, measured_error={"rendered": {"psnr_worst": 45.0}})
+    with serving(folder, uploads=True, max_pixels=64 * 64, max_samples=8, max_batch=4, max_video_frames=4) as client:
+        yield client
+
+
+def resolved(schema: Document, document: Document) -> Document:
+    while "$ref" in schema:
+        schema = document["components"]["schemas"][schema["$ref"].rsplit("/", 1)[1]]
+    return schema
+
+
+def instances(schema: Document, document: Document) -> Iterator[Any]:
+    """Good values of a schema: every branch, and every field that may be left out alone beside those that may not."""
+    schema = resolved(schema, document)
+    yield from schema.get("examples", [])[:1]
+    for union in ("anyOf", "oneOf"):
+        for branch in schema.get(union, ()):
+            yield from instances(branch, document)
+    if "const" in schema or "enum" in schema:
+        yield schema["const"] if "const" in schema else schema["enum"][0]
+    elif schema.get("type") == "object":
+        fields = {name: list(instances(part, document)) for name, part in schema.get("properties", {}).items()}
+        least = {name: fields[name][0] for name in schema.get("required", ())}
+        for name, values in fields.items():
+            yield from ({**least, **PARTNERS.get(name, {}), name: value} for value in values)
+    elif schema.get("type") == "array":
+        parts = schema.get("prefixItems") or [schema["items"]] * schema.get("minItems", 1)
+        lists = [list(instances(part, document)) for part in parts]
+        for number in range(max(map(len, lists))):
+            yield [values[number % len(values)] for values in lists]
+    elif schema.get("type") in ("number", "integer"):
+        yield int(max(schema.get("minimum", 0), min(1, schema.get("maximum", 1))))
+    elif schema.get("type") == "string":
+        yield "balls"
+
+
+def leaves(value: Any, at: Leaf = ()) -> Iterator[Leaf]:
+    """Of a value, and everything that holds them."""
+    if at:
+        yield at
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, part in parts:
+        yield from leaves(part, (*at, key))
+
+
+def replaced(value: Any, at: Leaf, new: Any) -> Any:
+    if not at:
+        return new
+    copy: Any = dict(value) if isinstance(value, dict) else list(value)
+    copy[at[0]] = replaced(value[at[0]], at[1:], new)
+    return copy
+
+
+def bodies(document: Document) -> list[tuple[str, Any, Leaf]]:
+    """Of every call that takes JSON: path, body and each of its leaves. Frames of a batch are those of single calls."""
+    found = []
+    for path, calls in document["paths"].items():
+        content = calls.get("post", {}).get("requestBody", {}).get("content", {})
+        if "application/json" in content:
+            whole = list(instances(content["application/json"]["schema"], document))
+            if path == "/render/batch":
+                frames = instances({"$ref": "#/components/schemas/RenderRequest"}, document)
+                whole = [{"frames": [{**SIZE, **frame}]} for frame in frames]
+            if path == "/render/video":
+                film = {"frames": [{"camera": ORBIT, "t": 0.5}], **SIZE}
+                whole = [{**(SIZE if {"frames", "path"} & set(body) else film), **body} for body in whole]
+            elif path == "/render":
+                whole = [{**SIZE, **body} for body in whole]
+            found += [(path, body, leaf) for body in whole for leaf in leaves(body)]
+    return found
+
+
+def chosen(cases: list[Any]) -> list[Any]:
+    if os.environ.get("MSDGS_FUZZ") == "all":
+        return cases
+    return random.Random(0).sample(cases, min(EVERY_DAY, len(cases)))
+
+
+def text_of(body: Any, *, twice: bool) -> bytes:
+    text = json.dumps(body)
+    for placeholder, written in WRITTEN.items():
+        text = text.replace(f'"{placeholder}"', written)
+    return (f"{text[:-1]}, {text[1:]}" if twice else text).encode()
+
+
+def named(field: str, leaf: Leaf) -> bool:
+    """Whether an error's field is the leaf, what holds it, or lies within it."""
+    given, wanted = field.split("."), [str(part) for part in leaf]
+    length = min(len(given), len(wanted))
+    return given[:length] == wanted[:length]
+
+
+def problems(response: httpx.Response, path: str) -> list[dict[str, Any]]:
+    """Of an answer; of a batch, those of its frames."""
+    if response.status_code != 200:
+        check_problem(response)
+        return [response.json()]
+    if path != "/render/batch":
+        return []
+    found = [json.loads(line).get("problem") for line in response.content.splitlines()]
+    return [problem for problem in found if problem is not None]
+
+
+def test_no_value_at_any_leaf_of_a_body_breaks_the_service(client: httpx.Client):
+    cases = [(*case, value) for case in bodies(client.get("/openapi.json").json()) for value in POISON]
+    assert len(cases) > 5000
+    headers = {"Content-Type": "application/json"}
+    for number, (path, body, leaf, value) in enumerate(chosen(cases)):
+        content = text_of(replaced(body, leaf, value), twice=number % 8 == 0)
+        response = client.post(path, content=content, headers=headers)
+        where = (path, leaf, repr(value)[:60], response.text[:300])
+        assert response.status_code < 500 or response.status_code in ALLOWED, where
+        for problem in problems(response, path):
+            assert problem["status"] < 500 or problem["status"] in ALLOWED, where
+            if problem["status"] == 422:
+                assert problem["errors"], where
+
+
+def test_a_leaf_that_no_float_holds_is_named(client: httpx.Client):
+    """Whole numbers of 400 digits, and what is no finite number, at every leaf that is a number."""
+    cases = []
+    for path, body, leaf in bodies(client.get("/openapi.json").json()):
+        value = body
+        for part in leaf:
+            value = value[part]
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            cases += [(path, body, leaf, poison) for poison in (10**400, -(10**400), float("nan"), HUGE)]
+    assert len(cases) > 500
+    for path, body, leaf, value in chosen(cases):
+        content = text_of(replaced(body, leaf, value), twice=False)
+        response = client.post(path, content=content, headers={"Content-Type": "application/json"})
+        where = (path, leaf, repr(value)[:60], response.text[:300])
+        found = problems(response, path)
+        assert [problem["status"] for problem in found] == [422], where
+        within = leaf[2:] if path == "/render/batch" else leaf
+        assert any(named(error["field"], within) for error in found[0]["errors"]), where
+
+
+def test_no_value_in_a_link_breaks_the_service(client: httpx.Client):
+    document, cases = client.get("/openapi.json").json(), []
+    for path, calls in document["paths"].items():
+        for method, call in calls.items():
+            for parameter in call.get("parameters", ()):
+                if parameter["in"] in ("query", "path"):
+                    cases += [(method, path, parameter, value) for value in QUERY_POISON]
+    assert len(cases) > 300
+    for number, (method, path, parameter, value) in enumerate(chosen(cases)):
+        name = parameter["name"]
+        query = [(name, value)] * (1 + number % 2) if parameter["in"] == "query" else []
+        if path == "/scenes" and name != "name":
+            query.append(("name", "other"))
+        where = path.replace(f"{{{name}}}", str(httpx.URL(params={"v": value}).query.decode().removeprefix("v=")))
+        response = client.request(method, where, params=query)
+        assert response.status_code < 500 or response.status_code in ALLOWED, (method, path, name, value[:60])
+        if response.status_code >= 400:
+            check_problem(response)
+
+
+@pytest.mark.parametrize("text", [b'{"t": %s}' % (b"1" * 5000), b"[" * 100_000, b'{"t":' * 50_000, b'{"t": 1e99999}'])
+@pytest.mark.parametrize("path", ["/render", "/render/batch", "/render/video"])
+def test_what_python_itself_refuses_to_read_is_no_5xx(client: httpx.Client, path: str, text: bytes):
+    response = client.post(path, content=text, headers={"Content-Type": "application/json"})
+    assert response.status_code in (400, 422)
+    check_problem(response)
+
+
+def test_good_frames_are_still_drawn(client: httpx.Client, tmp_path: Path):
+    frame = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
+    assert client.post("/render", json={**frame, "scene": "balls"}).status_code == 200

@@ -1,0 +1,72 @@
+"""The page's modules by themselves: the camera is the service's, and frames are as large as there is time for."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page
+
+from msdgs_serve.scene.camera import orbit
+from tests.support.processes import chromium
+from tests.support.scene_files import metadata
+from tests.support.service import serving
+from tests.support.tolerances import tolerance
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def modules(scene: Path) -> Iterator[Page]:
+    """A page whose modules can be imported by scripts."""
+    with serving(scene) as client, chromium() as browser, browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"{client.base_url}/viewer/icon.svg")
+        yield page
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, 0.2, 0.9)])
+def test_the_camera_is_the_services_own(modules: Page, up: tuple[float, float, float]):
+    view = {"target": [0.5, 1, -2], "distance": 3, "up": up, "fov_y": 40, "width": 4, "height": 3}
+    script = """async (view) => {
+        const { Camera } = await import("/viewer/camera.js");
+        const camera = new Camera(view);
+        camera.orbit(-75, 15);
+        const { right, above, forward } = camera.axes;
+        return [right, above.map((x) => -x), forward, camera.eye]; }"""
+    columns = np.array(modules.evaluate(script, view)).T
+    wanted = orbit(np.array(view["target"]), 3, 30 - 75, 20 + 15, np.array(up))
+    assert np.abs(columns - wanted[:3]).max() < tolerance("rotation")
+
+
+def test_a_pose_that_is_taken_over_stays_where_it_is(modules: Page):
+    stored = metadata().cameras[1]
+    script = """async ([view, stored]) => {
+        const { Camera } = await import("/viewer/camera.js");
+        const camera = new Camera(view);
+        camera.take(stored, 1);
+        const { right, above, forward } = camera.axes;
+        return [right, above.map((x) => -x), forward, camera.eye]; }"""
+    view = {"target": [0.5, 0, 0.25], "distance": 3, "up": [0, 0, 1], "fov_y": 40, "width": 4, "height": 3}
+    columns = np.array(modules.evaluate(script, [view, stored.to_plain()])).T
+    assert np.abs(columns - stored.camera.camera_to_world[:3]).max() < tolerance("rotation")
+
+
+@pytest.mark.parametrize(("pose", "nanoseconds_a_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
+def test_moving_frames_come_15_times_a_second(modules: Page, pose: float, nanoseconds_a_pixel: float):
+    script = """async ([pose, aPixel]) => {
+        const { Pace } = await import("/viewer/pace.js");
+        const pace = new Pace();
+        const taken = [];
+        for (let i = 0; i < 20; i += 1) {
+          const { width, height } = pace.size({ width: 1600, height: 1200 });
+          const drawing = width * height * aPixel;
+          taken.push([width * height, pose + drawing]);
+          pace.measured(width * height, pose + drawing, drawing);
+        }
+        return taken; }"""
+    taken = modules.evaluate(script, [pose, nanoseconds_a_pixel * 1e-9])
+    pixels, seconds = taken[-1]
+    assert seconds < 1 / 15
+    affordable = (1 / 15 - pose) / (nanoseconds_a_pixel * 1e-9)
+    assert pixels > 0.5 * min(affordable, 1600 * 1200), "fewer pixels than there is time for"

@@ -1,0 +1,20 @@
+"""What the tests of training share."""
+
+from pathlib import Path
+
+import pytest
+
+from msdgs_train.engine import run as run_module
+from tests.support.training_scene import write_scene
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a tiny scene; it is only read."""
+    return write_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture
+def no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than all the rest of a tiny run."""
+    monkeypatch.setattr(run_module, "draw_curve", lambda run: None)

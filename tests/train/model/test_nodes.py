@@ -1,0 +1,202 @@
+"""Control nodes: against a slow linear blend skinning, where they begin, and local rigidity."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.quaternions import multiply, rotation_matrices
+from msdgs_train.layers.spline import SplineConfig, SplineLayer
+from msdgs_train.supports.nodes import NodesConfig, NodesSupport
+from msdgs_train.supports.skinning import skin
+from msdgs_train.supports.skinning_kernels import LEAST_STRETCH, MAX_NEAREST
+from tests.support.models import MLP, NODES, PLANE, SPLINE, random_model
+from tests.support.reference_deformation import MIN_STRETCH, plain_pose, rotation
+from tests.support.tolerances import assert_close, tolerance
+
+EXACT = tolerance("rotation")
+CHAINS = {
+    "mlp": (MLP, MLP),
+    "no weight": (MLP, MLP),
+    "spline": (SPLINE,),
+    "rigid": (replace(SPLINE, affine=False),),
+    "plane": (PLANE,),
+    "spline, plane, mlp": (SPLINE, PLANE, MLP),
+    "mlp, spline": (MLP, SPLINE),
+}
+
+
+def model_on_nodes(chain: str, count: int = 25) -> DynamicGaussians:
+    """In float64, without modulation."""
+    model = random_model(
+        count, noise=0.1, support=NODES, layers=CHAINS[chain], embedding_dim=0, weights=chain != "no weight"
+    )
+    return model.double()
+
+
+def time(t: float) -> Tensor:
+    return torch.tensor(t, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+def test_a_chain_on_nodes_is_linear_blend_skinning(chain: str) -> None:
+    model = model_on_nodes(chain)
+    posed, want = model.pose(0.37), plain_pose(model, 0.37)
+    assert MIN_STRETCH == LEAST_STRETCH
+    assert_close(posed.means.detach(), want.means, "network.float64")
+    assert_close(posed.scales.detach(), want.scales, "network.float64")
+    assert_close(posed.quats.detach(), want.quats, "network.float64")
+    assert np.abs(want.means - model.gaussians.means.detach().numpy()).max() > 1e-2
+
+
+@pytest.mark.parametrize("layers", [(PLANE, MLP), (MLP, PLANE, MLP)])
+def test_mixed_layers_on_gaussians(layers: tuple[Any, ...]) -> None:
+    model = random_model(25, noise=0.1, layers=layers, embedding_dim=0).double()
+    posed, want = model.pose(0.37), plain_pose(model, 0.37)
+    assert_close(posed.means.detach(), want.means, "network.float64")
+    assert_close(posed.scales.detach(), want.scales, "network.float64")
+    assert_close(posed.quats.detach(), want.quats, "network.float64")
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+def test_gradients_are_those_of_the_slow_pose(chain: str) -> None:
+    """Along a random direction of each parameter that moves something, by central differences of the slow pose."""
+    model, generator = model_on_nodes(chain, 6), torch.Generator().manual_seed(5)
+    factors = [torch.randn(6, columns, generator=generator, dtype=torch.float64) for columns in (3, 3, 4)]
+
+    def slow() -> float:
+        posed = plain_pose(model, 0.37)
+        return sum(float((f.numpy() * v).sum()) for f, v in zip(factors, posed, strict=True))
+
+    posed = model.pose(0.37)
+    fast = sum((f * v).sum() for f, v in zip(factors, (posed.means, posed.scales, posed.quats), strict=True))
+    names = [n for n, p in model.named_parameters() if p.requires_grad and not n.endswith(("opacities", "dc", "rest"))]
+    assert {"gaussians.means", "gaussians.raw_quats", "gaussians.skinning_logits"} < set(names)
+    parameters = [model.get_parameter(name) for name in names]
+    gradients = torch.autograd.grad(fast, parameters)
+    with torch.no_grad():
+        for name, parameter, gradient in zip(names, parameters, gradients, strict=True):
+            direction = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+            direction /= direction.norm()
+            values = []
+            for step in (1e-6, -2e-6):
+                parameter += step * direction
+                values.append(slow())
+            parameter += 1e-6 * direction
+            want = (values[0] - values[1]) / 2e-6
+            got = float((gradient * direction).sum())
+            assert abs(got - want) <= tolerance("skinning_gradient") * max(1.0, abs(want)), name
+
+
+def test_modulation_multiplies_the_growth_of_scales() -> None:
+    model = random_model(25, noise=0.3, support=NODES).double()
+    modulated, modulation = model.pose(0.6), model.modulation
+    assert modulation is not None
+    factors = modulation(model.gaussians.attributes["embeddings"]).scales
+    model.modulation = None
+    plain, log_scales = model.pose(0.6), model.gaussians.log_scales
+    assert_close((modulated.scales.log() - log_scales).detach(), (factors * (plain.scales.log() - log_scales)).detach(),
+                 "network.float64")  # fmt: skip
+    assert torch.equal(modulated.means, plain.means)
+    assert float((factors - 1).abs().max().detach()) > 1e-2
+
+
+def test_scales_grow_along_a_gaussians_own_axes() -> None:
+    half = 0.5**0.5
+    quats = torch.tensor([[half, 0.0, 0.0, half]], dtype=torch.float64)  # its second axis is -x
+    stretch = torch.eye(3, dtype=torch.float64)
+    stretch[0, 0] = 2.0  # twice as long along x
+    motion = torch.cat([stretch.flatten(), torch.zeros(3), torch.tensor([1.0, 0, 0, 0])]).double()[None]
+    one = torch.ones(1, 1, dtype=torch.float64)
+    deltas = skin(torch.zeros(1, 3, dtype=torch.float64), quats, one, torch.tensor([[0]]), motion)
+    assert np.abs(deltas[0, 3:6].exp().numpy() - [1, 2, 1]).max() <= EXACT
+
+
+def test_a_gaussian_that_is_squeezed_to_nothing_keeps_a_scale_and_a_finite_gradient() -> None:
+    generator = torch.Generator().manual_seed(2)
+    means, quats, weights, motions = (
+        torch.randn(4, columns, generator=generator, dtype=torch.float64) for columns in (3, 4, 1, 16)
+    )
+    motions[:, :9] = 0.0
+    tensors = [means, quats / quats.norm(dim=1, keepdim=True), torch.ones_like(weights)]
+    motions.requires_grad_()
+    deltas = skin(*tensors, torch.arange(4)[:, None], motions)
+    assert_close(deltas[:, 3:6].exp().detach(), np.full((4, 3), LEAST_STRETCH), "rotation")
+    (gradient,) = torch.autograd.grad(deltas.sum(), [motions])
+    assert torch.isfinite(gradient).all()
+
+
+def test_quaternions_as_scipy_has_them() -> None:
+    a, b = torch.nn.functional.normalize(torch.randn(2, 6, 4, dtype=torch.float64), dim=2)
+    ours, scipys = rotation(multiply(a, b).numpy()), rotation(a.numpy()) * rotation(b.numpy())
+    assert ((ours * scipys.inv()).magnitude() <= EXACT).all()
+    assert np.abs(rotation_matrices(a).numpy() - rotation(a.numpy()).as_matrix()).max() <= EXACT
+
+
+def test_nodes_are_spread_among_opaque_gaussians() -> None:
+    generator = torch.Generator().manual_seed(3)
+    means = torch.rand(400, 3, generator=generator)
+    opacities = torch.where(means[:, 0] < 0.5, 0.9, 0.01)
+    support = NodesSupport(NodesConfig(num_nodes=20))
+    logits, ids = support.initialize_nodes(means, opacities)
+    assert bool((support.nodes[:, 0] < 0.5).all())
+    assert len(support.nodes.unique(dim=0)) == 20
+    nearest = torch.cdist(means, support.nodes).topk(MAX_NEAREST, largest=False).indices
+    assert torch.equal(ids.sort(dim=1).values, nearest.sort(dim=1).values)
+    assert torch.equal(ids.gather(1, logits.argmax(dim=1, keepdim=True)), nearest[:, :1])
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_fewer_gaussians_than_nodes(count: int) -> None:
+    support = NodesSupport(NodesConfig(num_nodes=12))
+    logits, ids = support.initialize_nodes(torch.rand(count, 3), torch.full((count,), 0.1))
+    assert bool(torch.isfinite(logits).all())
+    assert ids.shape == (count, MAX_NEAREST)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_gaussians_and_a_single_node(count: int) -> None:
+    posed = random_model(count, support=NodesConfig(num_nodes=1)).pose(0.5)
+    assert [len(tensor) for tensor in posed] == [count] * 5
+    assert all(tensor.isfinite().all() for tensor in posed)
+
+
+def test_a_body_that_moves_as_one_is_rigid() -> None:
+    support = NodesSupport(NodesConfig(num_nodes=6)).double()
+    layer = SplineLayer(SplineConfig(num_knots=4), 6, (0.0, 1.0)).double()
+    chain = MultiStepDeformation([layer])
+    with torch.no_grad():
+        means = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+        support.initialize_nodes(means, torch.ones(6))
+        turn = torch.tensor([0.8, 0.6, 0.0, 0.0], dtype=torch.float64)
+        layer.rots[:] = turn
+        turned = torch.from_numpy(rotation(turn.numpy()).apply(support.nodes.numpy()))
+        layer.transls[:] = turned - support.nodes + torch.tensor([1.0, 2.0, 3.0])
+        assert float(support.local_rigidity(chain, time(0.4))) <= EXACT
+        layer.transls[:, 2, 0] += 0.5
+        distances = torch.cdist(support.nodes, support.nodes)
+        near = distances.topk(5, largest=False).indices[:, 1:]
+        touched = (near == 2) | (torch.arange(6)[:, None] == 2)
+        expected = torch.where(touched, 0.5 / (distances.gather(1, near) + 0.01), 0.0).mean()
+        assert float(support.local_rigidity(chain, time(0.4))) == pytest.approx(float(expected))
+        weighted = support.regularizers(chain, time(0.4))
+        assert {name: float(term) for name, term in weighted.items()} == {"arap": pytest.approx(0.1 * float(expected))}
+
+
+@pytest.mark.parametrize("changes", [{"scale_space": "linear"}, {"opacity_head": True}, {"sh_head": True}])
+def test_what_nodes_cannot_change_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInput, match=f"model.{next(iter(changes))}"):
+        ModelConfig(support=NODES, **changes)
+
+
+@pytest.mark.parametrize("changes", [{"num_nodes": 0}, {"k_nearest": 0}, {"k_nearest": 9}, {"num_nodes": 2.0}])
+def test_impossible_sizes_are_refused_by_name(changes: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInput, match=f"model.support.{next(iter(changes))}"):
+        ModelConfig(support=NodesConfig(**changes))

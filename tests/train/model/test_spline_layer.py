@@ -1,0 +1,102 @@
+"""Spline layers: curves, where they begin, how they extrapolate beyond the time window, and temporal smoothness."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.layers.spline import SplineConfig, SplineLayer, cubic_weights
+from tests.support.models import NODES, SPLINE, random_model
+from tests.support.reference_deformation import plain_step
+from tests.support.tolerances import assert_close, tolerance
+
+EXACT = tolerance("rotation")
+
+
+def layer_of(count: int = 3, knots: int = 5, time_range: tuple[float, float] = (0.0, 1.0)) -> SplineLayer:
+    layer = SplineLayer(SplineConfig(num_knots=knots), count, time_range).double()
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter.add_(0.3 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+    return layer
+
+
+def time(t: float) -> torch.Tensor:
+    return torch.tensor(t, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("t", [2.0, 2.013, 3.1, 4.49, 4.5, 1.0, 7.0])
+def test_motions_are_on_splines(t: float) -> None:
+    layer, nodes = layer_of(time_range=(2.0, 4.5)), torch.randn(3, 3, dtype=torch.float64)
+    step, want = layer(nodes, time(t)), plain_step(layer, nodes.numpy(), t)
+    assert_close(step.delta_means.detach(), want.means, "rotation")
+    assert_close(step.delta_scales.detach(), want.scales, "rotation")
+    assert_close(step.delta_quats.detach(), want.quats, "rotation")
+    assert torch.equal(step.weight, torch.ones(3, 1, dtype=torch.float64))
+
+
+def test_gradients() -> None:
+    layer = layer_of(2, 3)
+    curves = dict(layer.named_parameters())
+
+    def step(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        replaced = dict(zip(curves, values, strict=True))
+        return torch.func.functional_call(layer, replaced, (torch.zeros(2, 3).double(), time(0.41)))[:3]
+
+    assert torch.autograd.gradcheck(step, [curve.detach().requires_grad_() for curve in curves.values()])
+
+
+def test_weights_of_knots_sum_to_one() -> None:
+    assert float(cubic_weights(time(0.37)).sum()) == pytest.approx(1)
+
+
+def test_a_new_layer_moves_nothing() -> None:
+    step = SplineLayer(SplineConfig(num_knots=4), 5, (0.0, 1.0)).double()(torch.zeros(5, 3).double(), time(0.7))
+    for delta in (step.delta_means, step.delta_scales, step.delta_quats):
+        assert float(delta.abs().max().detach()) <= EXACT
+
+
+def test_beyond_the_window_translations_stay_and_rotations_continue() -> None:
+    layer = SplineLayer(SplineConfig(num_knots=40), 1, (0.0, 1.0))
+    angles = 0.1 * torch.arange(43)
+    with torch.no_grad():
+        layer.transls[:, 0, 0] = torch.arange(43.0)
+        layer.rots[:, 0] = torch.stack([(angles / 2).cos(), 0 * angles, 0 * angles, (angles / 2).sin()], dim=1)
+    known = layer.rots.detach().clone()
+    layer.on_window(0.1, 0.2)
+    inside = [k for k in range(43) if abs((k - 1) / 40 - 0.5) <= 0.2 + 0.5 / 40]
+    assert torch.equal(layer.transls[inside, 0, 0].detach(), torch.tensor(inside, dtype=torch.float32))
+    assert (layer.transls[: inside[0], 0, 0] == inside[0]).all()
+    assert (layer.transls[inside[-1] :, 0, 0] == inside[-1]).all()
+    near = slice(inside[0] - 3, inside[-1] + 4)
+    assert float((layer.rots.detach()[near] - known[near]).abs().max()) <= tolerance("float32.relative")
+
+
+def test_straight_motion_is_smooth() -> None:
+    layer = SplineLayer(SplineConfig(num_knots=6), 2, (0.0, 1.0)).double()
+    with torch.no_grad():
+        layer.transls[:] = torch.arange(9.0)[:, None, None]
+        assert float(layer.temporal_smoothness(time(0.5))) <= EXACT
+        layer.transls[5, 0, 1] += 0.6
+        assert float(layer.temporal_smoothness(time(0.5))) == pytest.approx((0.6 + 1.2) / (2 * 2 * 3))
+        assert float(layer.temporal_smoothness(time(0.1))) <= EXACT
+        weighted = layer.regularizers(time(0.5), is_new_frame=False)
+        assert float(weighted["motion_smoothness"]) == pytest.approx(0.2 * (0.6 + 1.2) / (2 * 2 * 3))
+        assert layer.regularizers(time(0.5), is_new_frame=True) == {}, "a bounce needs a kink"
+
+
+def test_rigid_motions_stay_rigid() -> None:
+    model = random_model(20, layers=(replace(SPLINE, affine=False),), support=NODES, embedding_dim=0).double()
+    assert not any("stretches" in name for name, _ in model.named_parameters())
+    matrices = model.support.motions(model.deformation, time(0.3))[:, :9].view(-1, 3, 3).detach()
+    assert float((matrices @ matrices.transpose(1, 2) - torch.eye(3)).abs().max()) <= EXACT
+
+
+def test_curves_are_of_nodes() -> None:
+    with pytest.raises(InvalidInput, match=r"`model\.layers\.0` must be of another kind"):
+        ModelConfig(layers=(SPLINE,))
+    with pytest.raises(InvalidInput, match=r"model\.layers\.0\.num_knots"):
+        ModelConfig(support=NODES, layers=(SplineConfig(num_knots=0),))
