@@ -40,8 +40,8 @@ class MovingRegion(NamedTuple):
 
 
 def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -> MovingRegion:
-    """From the images if each camera of the split has images at `FIXED_TIMES` times or more, of any split; else from the
-    models."""
+    """From the images if each camera of the split has images at `FIXED_TIMES` times or more, of any split; else
+    from the models."""
     groups: dict[bytes, list[Frame]] = defaultdict(list)
     for frame in (frame for frames in scene.splits.values() for frame in frames):
         groups[_identity(frame.camera)].append(frame)
