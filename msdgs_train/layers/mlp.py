@@ -119,14 +119,16 @@ class MLPLayer(DeformationLayer):
     def _initialize(self, trunk: list[nn.Linear]) -> None:
         """He's initialization with a negative bias: a hidden unit is active at some positions and times only.
 
-        The paper doesn't specify any. With torch's default the last features of a small layer (width 96, depth 2) have a cosine
-        similarity of 0.98 for times 0.1 apart and 0.81 for positions one unit apart, so that a gradient of one part
-        of the scene moves all others at all times. Here it is 0.57 and 0.39.
+        The paper doesn't specify any. With torch's default the last features of a small layer (width 96, depth 2) have
+        a cosine similarity of 0.98 for times 0.1 apart and 0.81 for positions one unit apart, so that a gradient of one
+        part of the scene moves all others at all times. Here it is 0.57 and 0.39.
         """
         for linear in (self.time_hidden, self.first, *trunk):
             nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
             nn.init.constant_(linear.bias, HIDDEN_BIAS)
-        for linear in trunk[1:]:  # negative biases add up over the depth: at 4 no unit of the last layer would be active
+        for linear in trunk[
+            1:
+        ]:  # negative biases add up over the depth: at 4 no unit of the last layer would be active
             nn.init.zeros_(linear.bias)
         nn.init.kaiming_normal_(self.time_output.weight, nonlinearity="linear")
         nn.init.zeros_(self.time_output.bias)

@@ -1,8 +1,8 @@
 """One step of deformation by splines: each node has its own translation, rotation and stretch over time.
 
 A gradient at one time changes only nearby knots, while an MLP shares its weights over all positions and times. On
-control nodes this is Shape of Motion's motion bases (Wang et al. 2024) on splines, with a stretch: a soft body needs few
-of them, where rigid ones must be many.
+control nodes these are Shape of Motion's motion bases (Wang et al. 2024) on splines, with a stretch: a soft body needs
+few of them, where rigid ones must be many.
 """
 
 from collections.abc import Iterable

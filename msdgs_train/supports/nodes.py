@@ -141,8 +141,8 @@ class NodesSupport(Support):
         return {"arap": self.config.arap_weight * self.local_rigidity(chain, t)}
 
     def local_rigidity(self, chain: MultiStepDeformation, t: Tensor) -> Tensor:
-        """Mean over pairs of neighbors: distance between the position of one as moved by itself and as moved by the other,
-        relative to their canonical distance."""
+        """Mean over pairs of neighbors: distance between one as moved by itself and as moved by the other, relative to
+        their canonical distance."""
         matrices, offsets, _ = self.motions(chain, t).split((9, 3, 4), dim=1)
         near = self.neighbors
         own = torch.einsum("bij,bj->bi", matrices.view(-1, 3, 3), self.nodes) + offsets

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,11 +13,12 @@ import torch
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.renderer import Renderer
+from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.layers.base import PAPER_HEADS, SceneBounds
 from msdgs_train.layers.chain import MultiStepDeformation
 from tests.support.plugin_example import FourierConfig
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, run_python
 from tests.support.tolerances import assert_close, tolerance
 from tests.support.training_scene import assert_same_bits, state_of
 
@@ -101,7 +103,7 @@ def test_a_fourier_layer_has_the_period_of_its_time_range() -> None:
         layer.matrices.normal_()
         layer.offsets.normal_()
         first, last, middle = (layer(means, torch.tensor(t).double()) for t in (2.0, 6.0, 4.0))
-    assert_close(first.delta_means, last.delta_means, "network.float64")
+    assert_close(first.delta_means, last.delta_means, "encoding.float32")
     assert float((first.delta_means - middle.delta_means).abs().max()) > 0.1
     assert MultiStepDeformation([layer]).operations() == 2 * 3 * 11
 
@@ -109,11 +111,24 @@ def test_a_fourier_layer_has_the_period_of_its_time_range() -> None:
 def test_it_is_exported_and_served(trained: Path, tmp_path: Path) -> None:
     """The scene file needs neither the plugin nor torch, and holds the poses of the model."""
     scene = tmp_path / "scene.onnx"
-    run("export.to_onnx", trained / "model.pt", scene, "--plugin", PLUGIN)
-    loaded, drawn = load_model(trained / "model.pt"), DeformationSession(scene).gaussians(0.37)
+    export = "import sys; from export.to_onnx import *; sys.exit(main(tyro.cli(ExportOptions)))"
+    run_python(export, trained / "model.pt", scene, MSDGS_PLUGINS=str(PLUGIN))
+    loaded, session = load_model(trained / "model.pt"), DeformationSession(scene)
+    drawn = session.gaussians(0.37)
     with torch.no_grad():
         posed = loaded.model.pose(0.37)
     for field in ("means", "quats", "scales"):
         want = getattr(posed, field).numpy()
         np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))
-    assert Renderer is not None
+    entry = loaded.scene.cameras[0]
+    image = Renderer().render(session, camera_of(entry, entry["width"]), 0.37)
+    want = loaded.render(camera_of(entry, entry["width"]), 0.37).clamp(0, 1)
+    assert_close(image.rgb, want.numpy(), "served_frame")
+
+
+def test_the_documented_code_is_the_example() -> None:
+    """All of it, in the order layer, export, system; the other tests of this file run it."""
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)\n```", page, re.DOTALL)
+    head, layer, export, system = blocks
+    assert "\n\n\n".join((head, layer, system)) + f"\n\n{export}\n" == PLUGIN.read_text(encoding="utf-8")
