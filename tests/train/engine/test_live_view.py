@@ -283,7 +283,7 @@ def test_the_page_stays_after_the_run(
     assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
     printed = capsys.readouterr().out
     assert "viewer: http://localhost:8080" in printed
-    assert "Ctrl-C ends it" in printed
+    assert "Ctrl-C closes it" in printed
 
 
 def test_a_model_file_is_viewed(
@@ -313,9 +313,14 @@ def test_without_viser_the_extra_is_named_before_anything_is_done(
 
 
 def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
-    for command, words in (("fit", ["--viewer", "--viewer-port", "after each"]), ("view", ["MODEL", "--port"])):
+    commands = (
+        (["fit", "--help"], ["--viewer", "while it trains"]),
+        (["fit", "--help-all"], ["--viewer-port", "--viewer-host"]),
+        (["view", "--help"], ["MODEL", "--port", "after each layer"]),
+    )
+    for command, words in commands:
         with pytest.raises(SystemExit):
-            cli.main([command, "--help"])
+            cli.main(command)
         text = " ".join(capsys.readouterr().out.split())
         for word in [*words, "msdgs[viewer]"]:
             assert word in text
