@@ -15,7 +15,7 @@ from export.precision.formats import FLOAT32, in_format
 from export.precision.report import StabilityReport
 from msdgs_train.gaussians.model import DynamicGaussians
 from tests.export.stability_rows import Row, measured, refused
-from tests.support.models import MLP, PLANE, SCENE, SMALL_LAYERS, random_model
+from tests.support.models import MLP, NODES, PLANE, SCENE, SMALL_LAYERS, random_model
 from tests.support.tolerances import tolerance
 
 COUNT = 100
@@ -108,6 +108,8 @@ CASES: dict[str, Callable[[], DynamicGaussians]] = {
     "K = 2, planes": lambda: stiff(**layers(2, "plane")),
     "K = 8, planes": lambda: stiff(**layers(8, "plane")),
     "K = 8, planes, steps × 64": lambda: stiff(steps_times(64), **layers(8, "plane")),
+    **{f"K = 2 on nodes, steps × {s}": lambda s=s: stiff(steps_times(s), support=NODES) for s in (1, 16)},
+    "K = 8, planes on nodes": lambda: stiff(support=NODES, **layers(8, "plane")),
 }
 
 

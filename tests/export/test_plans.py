@@ -253,13 +253,12 @@ class DriftExport:
     scale_columns = 3
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
-        speed = np.zeros((1, sum(HEAD_COLUMNS[head].stop - HEAD_COLUMNS[head].start for head in used)), np.float32)
-        speed[0, 0] = 2
+        columns = sum(HEAD_COLUMNS[head].stop - HEAD_COLUMNS[head].start for head in used)
+        speed = np.eye(1, columns, dtype=np.float32) * 2
         step = graph.node("Mul", [inputs.time, graph.constant(f"{inputs.name}.speed", speed)], "drift.now")
-        none = graph.node("Sub", [inputs.means, inputs.means], "drift.none")
-        axis = graph.constant("drift.axis", np.array([1], np.int64))
-        rows = graph.node("ReduceSum", [none, axis], "drift.rows")
-        return graph.node("Add", [rows, graph.node("Mul", [step, inputs.gate], "drift.step")], "drift.deltas")
+        zeros = graph.constant("drift.zeros", np.zeros((3, columns), np.float32))
+        still = graph.node("MatMul", [inputs.means, zeros], "drift.still")
+        return graph.node("Add", [still, graph.node("Mul", [step, inputs.gate], "drift.step")], "drift.deltas")
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         return frozenset({"scales", "quats"})
