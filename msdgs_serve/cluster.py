@@ -65,7 +65,8 @@ def _service(settings: "Settings", cores: int) -> Any:
     from msdgs_serve.store import SceneStore
 
     os.environ[THREADS_VARIABLE] = str(cores)
-    app = create_app(SceneStore(settings.scenes), Renderer(settings.cache_megabytes << 20), settings)
+    store = SceneStore(settings.scenes, settings.open_scene)
+    app = create_app(store, Renderer(settings.cache_megabytes << 20), settings)
     service, begin = app.state.service, app.router.lifespan_context
 
     @asynccontextmanager

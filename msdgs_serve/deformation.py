@@ -1,29 +1,23 @@
 """A scene file in onnxruntime: time and ids in, posed Gaussians out."""
 
+import hashlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from msdgs_serve.scene.baked import (
-    CONSTANT_OUTPUTS,
-    INPUTS,
-    MOVING_OUTPUTS,
-    OPTIONAL_INPUT,
-    BakedScene,
-    SceneMetadata,
-)
+from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT, BakedScene
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
-from msdgs_serve.scene.onnx_constants import Malformed, read_constants
+from msdgs_serve.scene.onnx import GraphLimits
+from msdgs_serve.scene.scene_file import CHUNK, SceneFile, read_scene_file
 from msdgs_serve.threads import run_parallel, sharing_cores, thread_count
 
-CHUNK = 2048
-"""Gaussians a call where layers run. The widest activation of a call is CHUNK × width, whatever the scene's size."""
-
 _SIZES = {"means": 3, "quats": 4, "scales": 3}
-_INPUT_TYPES = {"t": "tensor(float)", "ids": "tensor(int64)", OPTIONAL_INPUT: "tensor(float)"}
+_MAX_DETAILS = 500
 
 
 class DeformationSession:
@@ -34,11 +28,20 @@ class DeformationSession:
     don't depend on the number of threads, so neither do the results. Other graphs blend what is stored of all Gaussians
     whatever they are asked for, and are called once, on threads of onnxruntime's own: 1.6 times as fast on two cores,
     the same bits.
+
+    onnxruntime never gets the file: `read_scene_file` checks it and writes the graph again.
     """
 
-    def __init__(self, path: str | Path, *, chunk: int | None = None, contents: bytes | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        chunk: int | None = None,
+        contents: bytes | None = None,
+        limits: GraphLimits | None = None,
+    ) -> None:
         """`contents` are the file's, where they came by another way and `path` is but its name. `chunk` is how many
-        Gaussians a call takes, by default what suits the file's graph.
+        Gaussians a call takes, by default what suits the file's graph. `limits` are those of the graph's cost.
 
         Raises `SceneFileInvalid` naming the field where the file isn't a whole, finite `msdgs/1` scene.
         """
@@ -48,22 +51,20 @@ class DeformationSession:
         self._chunk = chunk
         self._file = self.path.name
         contents = self._read() if contents is None else contents
-        default_ids, runs_layers = self._check_constants(contents)
-        self._session = self._open(contents, 1 if runs_layers else thread_count())
-        try:
-            properties = self._session.get_modelmeta().custom_metadata_map
-            metadata = SceneMetadata.from_properties(properties, self._file)
-            self._check_interface()
-        except UnicodeDecodeError as error:
-            raise SceneFileInvalid(self._file, "file", f"has text that isn't UTF-8: {error}") from error
-        self.scene = self._read_scene(metadata, default_ids)
-        for t in metadata.time_range:
+        self.sha256 = hashlib.sha256(contents).hexdigest()
+        scene_file = read_scene_file(contents, self._file, limits or GraphLimits())
+        del contents  # a copy of all that is large is in `scene_file`
+        self.cost = scene_file.cost
+        self._steps = scene_file.steps
+        self.scene = self._read_scene(scene_file)
+        self._session = self._open(scene_file.graph, thread_count() if self._steps is None else 1)
+        for t in self.scene.metadata.time_range:
             self._check_sample(t)
 
     @property
     def most_steps(self) -> int:
         """How many deformation layers can be applied one after the other; 0 where the scene's plan doesn't run them."""
-        return len(self.scene.metadata.layers) if self._has_steps else 0
+        return 0 if self._steps is None else len(self.scene.metadata.layers)
 
     def check_steps(self, steps: float | None) -> None:
         """Raise `InvalidInput` where the scene can't be posed after so many layers."""
@@ -91,14 +92,14 @@ class DeformationSession:
         posed = {name: np.empty((len(every), _SIZES[name]), np.float32) for name in MOVING_OUTPUTS}
 
         def run(start: int, stop: int) -> None:
-            outputs = self._run(MOVING_OUTPUTS, t, every[start:stop], steps)
+            outputs = self._run(t, every[start:stop], steps)
             for name, output in zip(MOVING_OUTPUTS, outputs, strict=True):
                 expected = posed[name][start:stop]
                 if output.shape != expected.shape:
                     raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
                 expected[:] = output
 
-        chunk = self._chunk or (CHUNK if self._has_steps else max(len(every), 1))
+        chunk = self._chunk or (max(len(every), 1) if self._steps is None else CHUNK)
         with sharing_cores():
             run_parallel(run, [(i, min(i + chunk, len(every))) for i in range(0, len(every), chunk)])
         self._check_finite(t, posed)
@@ -107,6 +108,18 @@ class DeformationSession:
     def gaussians(self, t: float, steps: float | None = None) -> Gaussians:
         """All Gaussians at time `t`, moving and static, ready to draw; moving ones as `pose` has them."""
         return self.scene.gaussians(*self.pose(t, steps=steps))
+
+    @contextmanager
+    def answering_for(self, t: float) -> Iterator[None]:
+        """Turn `InvalidInput` about this scene's Gaussians at `t` into `SceneFileInvalid`: only the first and the last
+        time are looked at when a file is loaded."""
+        try:
+            yield
+        except InvalidInput as error:
+            if not error.field.startswith("gaussians."):
+                raise
+            name = error.field.removeprefix("gaussians.")
+            raise SceneFileInvalid(self._file, name, f"can't be used at t = {t}: {error}") from error
 
     def _checked_time(self, t: float) -> float:
         t0, t1 = self.scene.metadata.time_range
@@ -131,92 +144,49 @@ class DeformationSession:
 
     def _read(self) -> bytes:
         try:
-            contents = self.path.read_bytes()
+            return self.path.read_bytes()
         except OSError as error:
             raise SceneFileInvalid(self._file, "file", f"can't be read: {error.strerror or error}") from error
-        if not contents:
-            raise SceneFileInvalid(self._file, "file", "is empty")
-        return contents
 
-    def _check_constants(self, contents: bytes) -> tuple[int, bool]:
-        """Check every constant in the file; returns the number of ids in the default of `ids`, and whether `steps` has
-        one."""
-        try:
-            constants = read_constants(contents)
-        except Malformed as error:
-            raise SceneFileInvalid(self._file, "file", f"isn't a whole ONNX model: {error}") from error
-        default_ids, has_steps = None, False
-        for constant in constants:
-            if constant.external:
-                raise SceneFileInvalid(self._file, constant.name, "lies in another file; a scene must be one file")
-            if constant.bad_values:
-                problem = f"holds {constant.bad_values:,} values that are NaN or infinite"
-                raise SceneFileInvalid(self._file, constant.name, problem)
-            has_steps |= constant.name == OPTIONAL_INPUT
-            if constant.name == "ids" and len(constant.shape) == 1:
-                default_ids = constant.shape[0]
-        if default_ids is None:
-            raise SceneFileInvalid(self._file, "ids", "has no default of all moving Gaussians")
-        return default_ids, has_steps
+    def _read_scene(self, scene_file: SceneFile) -> BakedScene:
+        arrays = dict(scene_file.constants)
+        if scene_file.constant_graph is not None:
+            session = self._open(scene_file.constant_graph, 1)
+            arrays |= zip(scene_file.computed, self._call(session, scene_file.computed, {}), strict=True)
+        ordered = [arrays[name] for name in CONSTANT_OUTPUTS]
+        return BakedScene(scene_file.metadata, scene_file.moving_count, *ordered).validate(self._file)
 
-    def _open(self, contents: bytes, threads: int) -> ort.InferenceSession:
+    def _open(self, model: bytes, threads: int) -> ort.InferenceSession:
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3  # its warnings are about how graphs are written, not about scenes
+        options.log_severity_level = 4  # its errors are raised as well, its warnings are about how graphs are written
         try:
-            return ort.InferenceSession(contents, options, providers=["CPUExecutionProvider"])
+            return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors share no base below it
-            raise SceneFileInvalid(self._file, "file", f"is refused by onnxruntime: {error}") from error
-
-    def _check_interface(self) -> None:
-        inputs = {i.name: i for i in [*self._session.get_inputs(), *self._session.get_overridable_initializers()]}
-        for name in INPUTS:
-            if name not in inputs:
-                raise SceneFileInvalid(self._file, name, "is missing from the inputs")
-            if inputs[name].type != _INPUT_TYPES[name]:
-                raise SceneFileInvalid(self._file, name, f"is {inputs[name].type}, not {_INPUT_TYPES[name]}")
-        self._has_steps = OPTIONAL_INPUT in inputs
-        if self._has_steps:
-            self._check_steps_input(inputs[OPTIONAL_INPUT])
-        unknown = sorted(set(inputs) - {*INPUTS, OPTIONAL_INPUT})
-        if unknown:
-            raise SceneFileInvalid(self._file, unknown[0], "isn't an input of this contract")
-        outputs = {o.name: o for o in self._session.get_outputs()}
-        for name in (*MOVING_OUTPUTS, *CONSTANT_OUTPUTS):
-            if name not in outputs:
-                raise SceneFileInvalid(self._file, name, "is missing from the outputs")
-            if outputs[name].type != "tensor(float)":
-                raise SceneFileInvalid(self._file, name, f"is {outputs[name].type}, not tensor(float)")
-
-    def _check_steps_input(self, steps: ort.NodeArg) -> None:
-        if steps.type != _INPUT_TYPES[OPTIONAL_INPUT]:
-            raise SceneFileInvalid(self._file, OPTIONAL_INPUT, f"is {steps.type}, not {_INPUT_TYPES[OPTIONAL_INPUT]}")
-        if OPTIONAL_INPUT in [i.name for i in self._session.get_inputs()]:
-            raise SceneFileInvalid(self._file, OPTIONAL_INPUT, "has no default of all layers")
-
-    def _read_scene(self, metadata: SceneMetadata, moving_count: int) -> BakedScene:
-        arrays = self._run(CONSTANT_OUTPUTS, metadata.time_range[0], np.empty(0, np.int64))
-        return BakedScene(metadata, moving_count, *arrays).validate(self._file)
+            raise self._refused("is refused", error) from error
 
     def _check_sample(self, t: float) -> None:
         sample = slice(min(self.scene.moving_count, 64))
         posed = self.pose(t, np.arange(sample.stop))
-        try:
+        with self.answering_for(t):
             Gaussians(*posed, self.scene.opacities[sample], self.scene.sh[sample]).validate()
-        except InvalidInput as error:
-            name = error.field.removeprefix("gaussians.")
-            raise SceneFileInvalid(self._file, name, f"can't be used at t = {t}: {error}") from error
 
-    def _run(
-        self, outputs: tuple[str, ...], t: float, ids: npt.NDArray[np.int64], steps: float | None = None
-    ) -> list[FloatArray]:
+    def _run(self, t: float, ids: npt.NDArray[np.int64], steps: float | None = None) -> list[FloatArray]:
         inputs = {"t": np.array([t], np.float32), "ids": ids}
-        if steps is not None:
-            inputs[OPTIONAL_INPUT] = np.array([steps], np.float32)
+        if self._steps is not None:
+            inputs[OPTIONAL_INPUT] = np.array([self._steps if steps is None else steps], np.float32)
+        return self._call(self._session, MOVING_OUTPUTS, inputs)
+
+    def _call(
+        self, session: ort.InferenceSession, outputs: Sequence[str], inputs: dict[str, np.ndarray]
+    ) -> list[FloatArray]:
         try:
-            arrays = self._session.run(outputs, inputs)
+            arrays = session.run(list(outputs), inputs)
         except Exception as error:
-            raise SceneFileInvalid(self._file, "file", f"can't be run by onnxruntime: {error}") from error
+            raise self._refused("can't be run", error) from error
         return [np.asarray(array) for array in arrays]
+
+    def _refused(self, what: str, error: Exception) -> SceneFileInvalid:
+        return SceneFileInvalid(self._file, "file", f"{what} by onnxruntime", str(error)[:_MAX_DETAILS])

@@ -80,6 +80,7 @@ class Renderer:
             InvalidInput: if `t` or a moment of the shutter is outside of the scene's time range, or it has no such
                 steps.
             Interrupted: if the watch was stopped.
+            SceneFileInvalid: if the scene's Gaussians at such a moment are none that can be drawn.
         """
         watch = watch or Watch()
         check_times(session, t, options.shutter, options.motion_dt)
@@ -100,7 +101,7 @@ class Renderer:
         gaussians, later = self.posed(session, moment, watch, options.steps), None
         if options.motion_dt is not None:
             later = self.posed(session, moment + options.motion_dt, watch, options.steps)
-        with watch.stage("draw"):
+        with watch.stage("draw"), session.answering_for(moment):
             background = resolve_background(session, options.background)
             constants = as_trained(session.scene.metadata, options.rasterizer)
             extra = None if later is None else displacements(gaussians, later, camera)

@@ -1,10 +1,10 @@
 """The report that the exporter leaves beside a scene file: error against run time of the ways to store the scene."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from msdgs_serve.scene import SceneFileInvalid
+from msdgs_serve.scene.plain_json import parse
 
 SUFFIX = ".report.json"
 FORMAT = "msdgs-report/1"
@@ -30,13 +30,9 @@ def read_report(scene_file: Path, checkpoint_sha256: str) -> dict[str, Any] | No
     except OSError as error:
         raise SceneFileInvalid(path.name, "report", f"can't be read: {error.strerror}") from None
     try:
-        report = json.loads(text, parse_constant=_refuse) if len(text) <= MAX_BYTES else None
-    except (ValueError, RecursionError):
+        report = parse(text.decode(), MAX_BYTES)
+    except ValueError:
         report = None
     if not isinstance(report, dict) or report.get("format") != FORMAT:
         raise SceneFileInvalid(path.name, "report", f"must be a report, {FORMAT}, of at most {MAX_BYTES} bytes")
     return report if report.get("checkpoint_sha256") == checkpoint_sha256 else None
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number of JSON")

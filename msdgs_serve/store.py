@@ -1,6 +1,6 @@
 """The scenes on disk: found by name, opened when first asked for, swapped when their file changes."""
 
-import hashlib
+import logging
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -17,6 +17,8 @@ INCOMING_PREFIX = ".incoming-"
 MAX_NAME_LENGTH = 200
 OPEN_TRIES = 5
 
+logger = logging.getLogger("msdgs_serve")
+
 Signature = tuple[Path, int, int, int]
 
 
@@ -30,7 +32,11 @@ class ServedScene:
 
     name: str
     session: DeformationSession
-    sha256: str  # of its file
+
+    @property
+    def sha256(self) -> str:
+        """Of its file."""
+        return self.session.sha256
 
     @cached_property
     def framing(self) -> Framing:
@@ -44,7 +50,7 @@ class SceneStatus:
 
     name: str
     loaded: bool  # whether some version of it is being served
-    problem: str | None  # why the file as it is now can't be loaded; None before the first try
+    problem: SceneFileInvalid | None  # why the file as it is now can't be loaded; None before the first try
 
 
 @dataclass
@@ -110,7 +116,7 @@ class SceneStore:
         if entry.served is None:
             self._update(entry, file)
         if entry.served is None:
-            raise entry.problem or SceneNotFound(name, [])
+            raise entry.problem.again() if entry.problem else SceneNotFound(name, [])
         return entry.served
 
     def refresh(self) -> None:
@@ -145,13 +151,13 @@ class SceneStore:
             present = self._files().get(name, target)
             if present != target or (present.exists() and not replace):
                 raise SceneExists(f"there is a scene `{name}` already")
-            session, sha256 = self._open(incoming)
+            session = self._open(incoming)
             _write_through(incoming)
             entry = self._entry(name)
             with entry.lock:
                 os.replace(incoming, target)
                 _write_through(target.parent)
-                entry.served, entry.problem = ServedScene(name, session, sha256), None
+                entry.served, entry.problem = ServedScene(name, session), None
                 entry.tried = _signature(target)
             return entry.served
 
@@ -170,7 +176,7 @@ class SceneStore:
 
     def _status(self, name: str) -> SceneStatus:
         entry = self._entry(name)
-        return SceneStatus(name, entry.served is not None, str(entry.problem) if entry.problem else None)
+        return SceneStatus(name, entry.served is not None, entry.problem)
 
     def _writable_folder(self) -> Path:
         if self.folder is None:
@@ -204,23 +210,23 @@ class SceneStore:
 
     def _load(self, entry: _Entry, file: Path, signature: Signature) -> None:
         try:
-            session, sha256 = self._open(file)
-            entry.served, entry.problem = ServedScene(file.stem, session, sha256), None
+            entry.served, entry.problem = ServedScene(file.stem, self._open(file)), None
         except SceneFileInvalid as error:
-            entry.problem = error
+            entry.problem = error.again()
         except OSError as error:
-            entry.problem = SceneFileInvalid(str(file), "file", f"can't be read: {error.strerror}")
+            entry.problem = SceneFileInvalid(file.name, "file", f"can't be read: {error.strerror}")
+        except Exception as error:  # one file, whatever is in it, doesn't stop the others from being served
+            logger.exception("%s can't be opened", file)
+            entry.problem = SceneFileInvalid(file.name, "file", f"can't be opened: {type(error).__name__}")
         entry.tried = signature
 
-    def _open(self, file: Path) -> tuple[DeformationSession, str]:
-        """The scene in a file and the file's SHA-256; both of one version, though the file may change meanwhile."""
+    def _open(self, file: Path) -> DeformationSession:
+        """The scene in a file; of one version, though the file may change meanwhile."""
         for _ in range(OPEN_TRIES):
             before = _signature(file)
-            with file.open("rb") as stream:
-                sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
             session = self._open_scene(file)
             if _signature(file) == before:
-                return session, sha256
+                return session
         raise SceneFileInvalid(file.name, "file", "changes while it is read")
 
     def _entry(self, name: str) -> _Entry:

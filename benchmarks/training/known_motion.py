@@ -25,7 +25,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.base import SceneBounds
 
 MOVING = OBJECTS[2:]
-HALF_EXTENT = 1.3  # scene units
+SCENE_HALF_SIZE = 1.3  # scene units
 EVALUATED_TIMES = 61
 
 
@@ -99,7 +99,7 @@ def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicG
     for name in ("means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"):
         gaussians.get_parameter(name).requires_grad = False
     torch.manual_seed(seed)
-    return DynamicGaussians(sizes, gaussians, SceneBounds(HALF_EXTENT))
+    return DynamicGaussians(sizes, gaussians, SceneBounds(SCENE_HALF_SIZE))
 
 
 def _places(local: list[np.ndarray], t: float) -> Tensor:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import onnx
 import onnxruntime
+from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
 from export.jobs.bake import Baked
@@ -46,7 +47,14 @@ def int8(baked: Baked) -> onnx.ModelProto:
             calibrate_method=CalibrationMethod.MinMax,
         )
         quantised = onnx.load(path)
-    return quantised
+    return _plain(quantised)
+
+
+def _plain(model: onnx.ModelProto) -> onnx.ModelProto:
+    """All constants as raw bytes, as scene files have them; the quantiser writes its own as lists of numbers."""
+    for constant in model.graph.initializer:
+        constant.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(constant), constant.name))
+    return model
 
 
 @contextmanager

@@ -59,7 +59,7 @@ def activated(graph: GraphBuilder, pose: str) -> None:
 
 
 def unit_quats(graph: GraphBuilder, raw: str) -> None:
-    """The output `quats`: unit length; identity where the norm is under 1e-8, as the trainer's `unit_quats`.
+    """The output `quats`: unit length; identity where the norm is under 1e-8, as the trainer's `unit_or_identity`.
 
     Sums of squares and the identity are products with constants: of 106,500 rows in 1 ms, where ReduceL2 takes 7 and
     Where 3.

@@ -305,6 +305,7 @@ class SceneEntry(BaseModel):
     name: str
     loaded: bool = Field(description="whether it is in memory; a scene is loaded by the first request for it")
     problem: bool = Field(description="whether its file, as it is now, is broken; an earlier version may be served")
+    reason: str | None = Field(description="why it is broken")
 
 
 class SceneList(BaseModel):
@@ -339,6 +340,23 @@ class SceneView(BaseModel):
     height: int = Field(description="pixels")
 
 
+class GraphLimit(BaseModel):
+    """What a scene may take at most."""
+
+    gaussians: int
+    memory_bytes: int
+    operations: float
+
+
+class GraphCost(BaseModel):
+    """What posing takes at most, known from the file before anything runs and the same at all times."""
+
+    memory_bytes: int = Field(description="of the values of one call of the graph and of all poses")
+    operations: int = Field(description="of posing all moving Gaussians once")
+    calls: int = Field(description="of the graph, that this takes")
+    limits: GraphLimit
+
+
 class SceneDetail(SceneEntry):
     """A scene, from what its file says of itself."""
 
@@ -362,6 +380,7 @@ class SceneDetail(SceneEntry):
     package_version: str
     checkpoint_sha256: str
     sha256: str = Field(description="of the scene's file")
+    cost: GraphCost
 
 
 class Live(BaseModel):

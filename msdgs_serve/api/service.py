@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from enum import Enum
 from http import HTTPStatus
+from pathlib import Path
 from typing import Annotated
 
 import anyio.to_thread
@@ -24,6 +25,7 @@ from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.store import SceneStore, ServedScene
 from msdgs_serve.threads import give_way
+from msdgs_serve.trial import try_scene
 
 LAST_LOOK_SECONDS = 2.0
 """That the end waits for the thread that looks after files: cut off amid a call, libraries complain on the terminal."""
@@ -54,7 +56,7 @@ class Service:
         self.failure: MsdgsError | None = None
         self.start_seconds = 0.0
         self._stopped = threading.Event()
-        self._reported: dict[str, str | None] = {}
+        self._reported: dict[str, str] = {}
 
     @asynccontextmanager
     async def lifespan(self, _: FastAPI) -> AsyncIterator[None]:
@@ -81,6 +83,14 @@ class Service:
                 raise InvalidInput("scene", f"given, as {len(names)} scenes are served", "nothing")
             name = names[0]
         return self.store.get(name)
+
+    def add_scene(self, name: str, incoming: Path, *, replace: bool) -> ServedScene:
+        """A file that clients sent becomes a scene, once a process of its own could pose it.
+
+        Raises `SceneFileInvalid`, and what `SceneStore.add` raises.
+        """
+        try_scene(incoming, self.settings.graph_limits, self.settings.trial_seconds)
+        return self.store.add(name, incoming, replace=replace)
 
     def check_uploads(self) -> None:
         """Raises `Refused` where clients may not add and delete scenes."""
@@ -131,9 +141,9 @@ class Service:
     def _refresh(self) -> None:
         try:
             self.store.refresh()
-            problems = {status.name: status.problem for status in self.store.statuses()}
+            problems = {each.name: str(each.problem) for each in self.store.statuses() if each.problem}
             for name, problem in problems.items():
-                if problem is not None and self._reported.get(name) != problem:
+                if self._reported.get(name) != problem:
                     logger.error("%s", problem)
             self._reported = problems
         except Exception:

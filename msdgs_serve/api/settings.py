@@ -15,6 +15,8 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.threads import thread_count
 
 PROGRAM = "msdgs-serve"
@@ -73,6 +75,16 @@ class Settings(BaseSettings):
     max_key_scenes: int = Field(default=100, ge=1, description="most scenes there of one key")
     max_key_megabytes: int = Field(default=1 << 13, ge=1, description="most that they take together")
     min_free_megabytes: int = Field(default=1024, ge=0, description="of the disk, what uploads leave free")
+    max_scene_memory_megabytes: int = Field(
+        default=2048, ge=1, description="most memory for the values of one call of a scene's graph and for all poses"
+    )
+    max_scene_gaussians: int = Field(default=40_000_000, ge=1, description="most Gaussians of a scene")
+    max_scene_operations: float = Field(
+        default=1e13, gt=0, description="most operations of a scene's graph for one frame"
+    )
+    trial_seconds: float = Field(
+        default=60.0, gt=0, le=3600, description="time limit for opening and posing an uploaded scene once"
+    )
     uploads: CliImplicitFlag[bool] = Field(
         default=False, description="let clients add and delete scenes, in the first folder given"
     )
@@ -99,6 +111,15 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="warning", description="`info` logs every request"
     )
+
+    @property
+    def graph_limits(self) -> GraphLimits:
+        """What the graph of a scene may take."""
+        return GraphLimits(self.max_scene_gaussians, self.max_scene_memory_megabytes << 20, self.max_scene_operations)
+
+    def open_scene(self, path: Path) -> DeformationSession:
+        """A scene file within these limits. Raises `SceneFileInvalid`."""
+        return DeformationSession(path, limits=self.graph_limits)
 
     @classmethod
     def settings_customise_sources(

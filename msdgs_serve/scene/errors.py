@@ -33,7 +33,14 @@ class SceneNotFound(MsdgsError, KeyError):
 class SceneFileInvalid(MsdgsError):
     """A scene file lacks something of contract `msdgs/1`, or says what can't be true."""
 
-    def __init__(self, file: str, field: str, problem: str) -> None:
-        super().__init__(f"{file}: `{field}` {problem}")
+    def __init__(self, file: str, field: str, problem: str, details: str = "") -> None:
+        """`details` are for logs alone, such as a library's own words."""
+        super().__init__(f"{file}: `{field}` {problem}{': ' if details else ''}{details}")
         self.file = file
         self.field = field
+        self.problem = problem
+        self.details = details
+
+    def again(self) -> "SceneFileInvalid":
+        """The same without its traceback, which holds on to all that was being read."""
+        return SceneFileInvalid(self.file, self.field, self.problem, self.details)

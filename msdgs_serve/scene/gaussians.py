@@ -51,7 +51,8 @@ class Gaussians:
             raise InvalidInput("gaussians.scales", "above 0", float(self.scales.min()))
         if n and not ((self.opacities >= 0) & (self.opacities <= 1)).all():
             raise InvalidInput("gaussians.opacities", "in [0, 1]", f"[{self.opacities.min()}, {self.opacities.max()}]")
-        norms = np.linalg.norm(self.quats, axis=1)
+        with np.errstate(over="ignore"):
+            norms = np.linalg.norm(self.quats, axis=1)
         if n and not (np.abs(norms - 1) < 1e-3).all():
             raise InvalidInput("gaussians.quats", "unit quaternions", f"norms in [{norms.min()}, {norms.max()}]")
         return self

@@ -1,7 +1,6 @@
 """What a scene file says about itself, contract `msdgs/1`: its `metadata_props`, each checked on reading."""
 
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields
@@ -11,8 +10,15 @@ import numpy as np
 
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import SceneFileInvalid
+from msdgs_serve.scene.plain_json import parse
 
 CONTRACT = "msdgs/1"
+MAX_NUMBER = 1e9
+"""Of times, coordinates, pixels and so on: far beyond any sensible value, and within single precision."""
+MAX_LIST = 1000
+"""Layers, cameras and entries of other lists."""
+MAX_WORD = 100
+"""Characters of a text that may become an HTTP header."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +38,14 @@ class SceneCamera:
     @classmethod
     def from_plain(cls, value: Mapping[str, Any]) -> "SceneCamera":
         """The inverse of `to_plain`. Raises ValueError (`InvalidInput` is one) or KeyError."""
+        rows = _list(value["camera_to_world"])
         camera = Camera(
-            *(_finite(value[key]) for key in ("fx", "fy", "cx", "cy")),
+            *(_number(value[key]) for key in ("fx", "fy", "cx", "cy")),
             width=value["width"],
             height=value["height"],
-            camera_to_world=np.asarray(value["camera_to_world"], dtype=np.float64),
+            camera_to_world=np.array([_numbers(row, 4) for row in rows]),
         )
-        return cls(_text(value["name"]), _finite(value["t"]), camera)
+        return cls(_text(value["name"]), _number(value["t"]), camera)
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,7 @@ class SceneMetadata:
                     continue
                 raise SceneFileInvalid(file, name, "is missing from the metadata")
             try:
-                values[name] = reader(json.loads(properties[name], parse_constant=_refuse_constant))
+                values[name] = reader(parse(properties[name]))
             except KeyError as error:
                 raise SceneFileInvalid(file, name, f"lacks {error}") from error
             except (ValueError, TypeError) as error:
@@ -87,48 +94,59 @@ class SceneMetadata:
         return cls(**values)
 
 
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} isn't a finite number")
-
-
-def _finite(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{value!r} isn't a finite number")
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{_shown(value)} isn't a number")
+    if abs(value) > MAX_NUMBER:
+        raise ValueError(f"{value} isn't within ±{MAX_NUMBER:g}")
     return float(value)
 
 
 def _numbers(value: Any, count: int) -> tuple[float, ...]:
     if not isinstance(value, list) or len(value) != count:
-        raise ValueError(f"{value!r} isn't a list of {count} numbers")
-    return tuple(_finite(v) for v in value)
+        raise ValueError(f"{_shown(value)} isn't a list of {count} numbers")
+    return tuple(_number(v) for v in value)
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, str) or not value:
-        raise ValueError(f"{value!r} isn't a text")
+        raise ValueError(f"{_shown(value)} isn't a text")
     return value
 
 
-def _texts(value: Any) -> tuple[str, ...]:
-    return tuple(_text(v) for v in _list(value))
+def _word(value: Any) -> str:
+    """Text that may be a header's value."""
+    if not (_text(value).isascii() and len(value) <= MAX_WORD):
+        raise ValueError(f"{_shown(value)} isn't at most {MAX_WORD} printable ASCII characters")
+    return value
+
+
+def _words(value: Any) -> tuple[str, ...]:
+    return tuple(_word(v) for v in _list(value))
 
 
 def _list(value: Any) -> tuple[Any, ...]:
-    if not isinstance(value, list):
-        raise ValueError(f"{value!r} isn't a list")
+    if not isinstance(value, list) or len(value) > MAX_LIST:
+        raise ValueError(f"{_shown(value)} isn't a list of at most {MAX_LIST:,}")
     return tuple(value)
 
 
 def _mapping(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{value!r} isn't an object")
+        raise ValueError(f"{_shown(value)} isn't an object")
     return value
+
+
+def _shown(value: Any) -> str:
+    """For a message: its beginning."""
+    text = repr(value)
+    return text if len(text) <= MAX_WORD else f"{text[:MAX_WORD]}…"
 
 
 def _one_of(*known: str) -> Callable[[Any], str]:
     def read(value: Any) -> str:
         if value not in known:
-            raise ValueError(f"{value!r} isn't known to this reader, which knows {', '.join(known)}")
+            raise ValueError(f"{_shown(value)} isn't known to this reader, which knows {', '.join(known)}")
         return value
 
     return read
@@ -142,16 +160,19 @@ def _time_range(value: Any) -> tuple[float, ...]:
 
 
 def _bounds(value: Any) -> tuple[tuple[float, ...], ...]:
-    low, high = (_numbers(corner, 3) for corner in _list(value))
+    corners = _list(value)
+    if len(corners) != 2:
+        raise ValueError(f"{_shown(value)} isn't two corners")
+    low, high = (_numbers(corner, 3) for corner in corners)
     if any(a > b for a, b in zip(low, high, strict=True)):
         raise ValueError(f"the corner {low} isn't below {high}")
     return low, high
 
 
 def _sh_degree(value: Any) -> int:
-    if isinstance(value, bool) or value not in (0, 1, 2, 3):
-        raise ValueError(f"{value!r} isn't 0, 1, 2 or 3")
-    return int(value)
+    if type(value) is not int or not 0 <= value <= 3:
+        raise ValueError(f"{_shown(value)} isn't 0, 1, 2 or 3")
+    return value
 
 
 def _background(value: Any) -> tuple[float, ...]:
@@ -166,31 +187,31 @@ def _cameras(value: Any) -> tuple[SceneCamera, ...]:
 
 
 def _eps2d(value: Any) -> float:
-    if (number := _finite(value)) < 0:
-        raise ValueError(f"{value!r} is below 0")
+    if (number := _number(value)) < 0:
+        raise ValueError(f"{value} is below 0")
     return number
 
 
 def _sha256(value: Any) -> str:
     if not re.fullmatch("[0-9a-f]{64}", _text(value)):
-        raise ValueError(f"{value!r} isn't a SHA-256 in lower-case hexadecimal")
+        raise ValueError(f"{_shown(value)} isn't a SHA-256 in lower-case hexadecimal")
     return value
 
 
 _READERS: dict[str, Callable[[Any], Any]] = {
     "contract": _one_of(CONTRACT),
-    "layers": _texts,
-    "plan": _text,
+    "layers": _words,
+    "plan": _word,
     "time_range": _time_range,
     "bounds": _bounds,
     "sh_degree": _sh_degree,
-    "delta_space": _text,
+    "delta_space": _word,
     "background": _background,
     "antialiasing": _one_of("dilate", "mip"),
     "cameras": _cameras,
     "left_out": _list,
     "measured_error": _mapping,
-    "package_version": _text,
+    "package_version": _word,
     "checkpoint_sha256": _sha256,
     "eps2d": _eps2d,
 }

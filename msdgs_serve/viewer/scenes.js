@@ -37,6 +37,7 @@ export class SceneList {
       this.list.append(item);
       item.classList.toggle("broken", scene.problem);
       item.querySelector(".note").textContent = scene.problem ? "file is broken" : "";
+      item.title = scene.reason ?? "";
     }
   }
 

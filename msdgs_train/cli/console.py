@@ -1,9 +1,11 @@
-"""What all commands print with, and how they end."""
+"""The console, exit codes, tables and progress bars that commands share."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 EXIT_INVALID = 2
@@ -13,20 +15,28 @@ console = Console()
 
 
 class Command(Protocol):
-    """The options of one command, and what it does."""
+    """The options of one command."""
 
     def execute(self) -> int:
-        """Do it; returns the exit code."""
+        """Run the command; returns the exit code."""
         ...
 
 
 def rich_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], *, names: int, title: str | None = None
 ) -> Table:
-    """Numbers are right-aligned, the first `names` columns left-aligned."""
+    """The first `names` columns are left-aligned, the others right-aligned."""
     shown = Table(title=title)
     for i, heading in enumerate(headings):
         shown.add_column(heading, justify="left" if i < names else "right")
     for row in rows:
         shown.add_row(*row)
     return shown
+
+
+@contextlib.contextmanager
+def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
+    """A bar over frames; yields a function of (done, total)."""
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("frames", total=total)
+        yield lambda done, of: bar.update(task, completed=done, total=of)

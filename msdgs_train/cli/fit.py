@@ -5,10 +5,10 @@ import contextlib
 import inspect
 import io
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterator, Sequence
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import tyro
 
@@ -16,64 +16,67 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.console import EXIT_INTERRUPTED, console
 from msdgs_train.cli.parts import PARTS
 from msdgs_train.cli.view import open_viewer
-from msdgs_train.datasets.config import DataConfig
-from msdgs_train.density.config import DensityConfig
-from msdgs_train.engine.config import LoggingConfig, OptimizerConfig, RunConfig, TrainConfig
-from msdgs_train.engine.curriculum_config import CurriculumConfig
-from msdgs_train.gaussians.config import ModelConfig
-from msdgs_train.losses.config import LossConfig
+from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
 if TYPE_CHECKING:
     from msdgs_train.viewer.training_view import TrainingView
 
 HELP_ALL = "--help-all"
+COMMON = {
+    "run": ("steps", "batch_size", "threads", "max_minutes", "seed"),
+    "data": ("size", "background"),
+    "density": ("init_num_pts", "max_gaussians"),
+    "model": ("layers", "support", "sh_degree", "embedding_dim"),
+}
+"""Settings that --help shows, by group; --help-all shows all."""
+RARE = ("viewer_port", "viewer_host")
+"""Options of the command that only --help-all shows."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Train on a folder of images; RUN gets config.json, run.json, metrics.jsonl, curve.png, renders/, checkpoint.pt,
-    model.pt (the last) and best.pt (of the highest PSNR on held-out images).
+    """Train on a folder of images. RUN gets config.json, metrics.jsonl, curve.png, renders/, checkpoint.pt, model.pt
+    (last step) and best.pt (highest PSNR on held-out images).
 
-    Ctrl-C finishes the step, saves a checkpoint and stops. The same command with --resume continues from there, with
-    the same bits as if it had never stopped; more --steps, another --max-minutes and the like may be given then.
+    Ctrl-C saves a checkpoint and stops; --resume continues from it bit by bit, then also with other --steps.
 
-    A first look, in a few minutes:  msdgs-train fit data/scene runs/first --size 200 --steps 3000
+    A first result in minutes:  msdgs-train fit data/scene runs/first --size 200 --steps 3000
 
-    The paper's system with two layers:  msdgs-train fit data/scene runs/paper --preset msdgs-mlp --layers mlp mlp
+    The paper's MLP system:  msdgs-train fit data/scene runs/paper --preset msdgs-mlp
 
-    All settings, with the values of a preset:  msdgs-train fit --preset deformgs --help-all
+    All settings of a preset:  msdgs-train fit --preset deformgs --help-all
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """A dataset folder in the layout of D-NeRF, nerfstudio, COLMAP, Neu3D or HyperNeRF, detected by its files."""
+    """A dataset in the layout of D-NeRF, nerfstudio, COLMAP, Neu3D or HyperNeRF."""
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The folder of this run; new, or one to --resume."""
+    """The folder of the run: new, or one to --resume."""
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = DEFAULT
-    """A system and its settings; other options change them."""
+    """System and settings; other options change them."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Continue the run in RUN, with the settings it was begun with."""
+    """Continue the run in RUN with its own settings."""
     tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Also write metrics and held-out renderings to RUN/tensorboard. Needs: pip install 'msdgs[tensorboard]'"""
+    """Also write events to RUN/tensorboard; needs msdgs[tensorboard]."""
     viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Open a page that shows the model while it is trained, from all around, at any time, after each layer; it stays
-    when the run is over, until Ctrl-C. Needs: pip install 'msdgs[viewer]'"""
+    """Show the model in a browser while it trains, and afterwards until Ctrl-C; needs msdgs[viewer]."""
     viewer_port: int = 8080
-    """Port of that page; one of the next if it is taken. 0 takes a free one."""
+    """Port of the viewer; the next free one if it is taken, any free one if 0."""
     viewer_host: str = "127.0.0.1"
-    """Address that it listens on; 0.0.0.0 for all networks, from which anyone may then pause the run."""
+    """Address of the viewer; 0.0.0.0: all networks, from which anyone may then pause the run."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def execute(self) -> int:
-        """Train, with a progress bar."""
-        from msdgs_train.cli.progress import FitProgress, print_outcome
-        from msdgs_train.engine.run import Observer, Observers, fit
+        """Train with a progress bar; returns the exit code."""
+        from msdgs_train.cli.fit_progress import FitProgress, print_result
+        from msdgs_train.engine.observer import Observer, Observers
+        from msdgs_train.engine.run import fit
 
         with contextlib.ExitStack() as stack:
             view = stack.enter_context(_training_view(self)) if self.viewer else None
             with FitProgress(console, self.config.run.steps) as progress:
                 observers: list[Observer] = [progress, view] if view else [progress]
-                outcome = fit(
+                result = fit(
                     self.config,
                     self.data,
                     self.run,
@@ -81,64 +84,42 @@ class Fit:
                     observer=Observers(*observers),
                     tensorboard=self.tensorboard,
                 )
-            print_outcome(console, outcome, self.data, self.run)
-            if view is not None and outcome.status != "interrupted":
+            print_result(console, result, self.data, self.run)
+            if view is not None and result.status != "interrupted":
                 with contextlib.suppress(KeyboardInterrupt):
-                    console.print("the page stays, with the last model; Ctrl-C ends it")
+                    console.print("the viewer shows the last model; Ctrl-C closes it")
                     view.wait_for_interrupt()
-        return EXIT_INTERRUPTED if outcome.status == "interrupted" else 0
-
-
-@dataclass(frozen=True)
-class _CommonSettings:
-    """The groups of settings that the short help shows."""
-
-    run: RunConfig
-    data: DataConfig
-    model: ModelConfig
-    curriculum: tyro.conf.Suppress[CurriculumConfig]
-    density: tyro.conf.Suppress[DensityConfig]
-    loss: tyro.conf.Suppress[LossConfig]
-    optimizer: tyro.conf.Suppress[OptimizerConfig]
-    logging: tyro.conf.Suppress[LoggingConfig]
-
-
-@dataclass(frozen=True)
-class _ShortHelp(Fit):
-    config: Annotated[_CommonSettings, tyro.conf.arg(name="")] = tyro.MISSING  # type: ignore[assignment]
+        return EXIT_INTERRUPTED if result.status == "interrupted" else 0
 
 
 def parse_fit(arguments: Sequence[str]) -> Fit:
-    """Options change the settings of the preset, or of the run that is resumed, and those are what --help shows."""
+    """Options change the settings of the preset, or of the run that is resumed; --help shows those settings."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset")
     name = early.parse_known_args(arguments)[0].preset
-    config = preset(name or DEFAULT)
+    default = Fit(tyro.MISSING, tyro.MISSING, preset=name or DEFAULT, config=preset(name or DEFAULT))
     if {"-h", "--help"} & set(arguments):
-        shown = _CommonSettings(**{group: getattr(config, group) for group in _CommonSettings.__dataclass_fields__})
-        _cli(_ShortHelp, ["--help"], _ShortHelp(tyro.MISSING, tyro.MISSING, preset=name or DEFAULT, config=shown))  # type: ignore[arg-type]
+        _cli(["--help"], _short_help(default))
     arguments = ["--help" if argument == HELP_ALL else argument for argument in arguments]
-    command = _cli(Fit, arguments, Fit(tyro.MISSING, tyro.MISSING, preset=name or DEFAULT, config=config))
+    command = _cli(arguments, default)
     if command.resume:
         if name is not None:
-            raise InvalidInput("preset", "not given: a resumed run keeps the settings that it began with", name)
-        from msdgs_train.engine.run import stored_config
+            raise InvalidInput("preset", "not given: a resumed run keeps its settings", name)
+        from msdgs_train.engine.run_record import stored_config
 
-        # parsed again with the run's own settings as defaults, so that only what is given now differs from them
-        command = _cli(Fit, arguments, Fit(command.data, command.run, config=stored_config(command.run)))
+        # parsed again with the run's own settings as defaults, so that only the given options change them
+        command = _cli(arguments, Fit(command.data, command.run, config=stored_config(command.run)))
     return command
 
 
-def _cli(kind: type[Fit], arguments: Sequence[str], default: Fit) -> Fit:
+def _cli(arguments: Sequence[str], default: Fit) -> Fit:
     names = "\n".join(f"  {entry.name}: {entry.description}" for entry in systems().values())
-    description = (
-        f"{inspect.cleandoc(Fit.__doc__ or '')}\n\nPresets:\n{names}\n\n{HELP_ALL} shows the settings of all groups."
-    )
+    description = f"{inspect.cleandoc(Fit.__doc__ or '')}\n\nPresets:\n{names}"
     errors = io.StringIO()
     try:
         with PARTS, contextlib.redirect_stderr(errors):
             return tyro.cli(
-                kind,
+                type(default),
                 args=arguments,
                 prog="msdgs-train fit",
                 default=default,
@@ -146,18 +127,44 @@ def _cli(kind: type[Fit], arguments: Sequence[str], default: Fit) -> Fit:
                 config=(tyro.conf.OmitArgPrefixes,),
             )
     except SystemExit as end:
-        if (refused := _refused_setting(end)) is not None:  # tyro has drawn a box; every command prints one line
-            raise refused from None
+        invalid = _invalid_setting(end)
+        if invalid is not None:  # reported in one line, as by the other commands, instead of tyro's box
+            raise invalid from None
         sys.stderr.write(errors.getvalue())
         raise
 
 
-def _refused_setting(end: SystemExit) -> InvalidInput | None:
-    """The error of a setting for which tyro ends the program; None if it is another reason."""
+def _invalid_setting(end: SystemExit) -> InvalidInput | None:
+    """The error of a setting for which tyro exits; None if it exits for another reason."""
     cause: BaseException | None = end
     while cause is not None and not isinstance(cause, InvalidInput):
         cause = cause.__context__
     return cause
+
+
+def _short_help(command: Fit) -> Any:
+    """The same command, of a type that hides rarely used options in its help."""
+    config = command.config
+    groups = {item.name: _hiding(getattr(config, item.name), COMMON.get(item.name, ())) for item in fields(config)}
+    kinds = [(name, type(group)) for name, group in groups.items()]
+    settings = make_dataclass("Settings", kinds, frozen=True)(**groups)
+    own = [item.name for item in fields(command) if item.name not in RARE]
+    return _hiding(command, own, config=settings)
+
+
+def _hiding(options: Any, shown: Container[str], **replaced: Any) -> Any:
+    """A copy of a dataclass, of a type whose other fields aren't in the help; fields in `replaced` change their type
+    and value."""
+    kind = type(options)
+    values = {item.name: getattr(options, item.name) for item in fields(kind)} | replaced
+    changed = [(name, Annotated[type(value), tyro.conf.arg(name="")], tyro.MISSING) for name, value in replaced.items()]
+    changed += [
+        (name, tyro.conf.Suppress[hint], tyro.MISSING)
+        for name, hint in get_type_hints(kind, include_extras=True).items()
+        if name in values and name not in shown
+    ]
+    short = make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True, namespace={"__doc__": kind.__doc__})
+    return short(**values)
 
 
 @contextlib.contextmanager

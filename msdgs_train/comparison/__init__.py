@@ -1,1 +1,1 @@
-"""Systems compared: every one on every scene with every seed, under one budget, to one table and two plots."""
+"""Comparison of systems: each on each scene with each seed under one budget, as a table and two plots."""

@@ -1,4 +1,4 @@
-"""Trains the runs of a comparison, several side by side; goes on where it was stopped."""
+"""Training of the runs of a comparison, several in parallel, resumed after an interruption."""
 
 import json
 import signal
@@ -10,13 +10,14 @@ from typing import Any
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import Pool, RunEnd
-from msdgs_train.engine.run import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
+from msdgs_train.engine.config import differences
+from msdgs_train.engine.run_record import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
 
 
 def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, RunEnd], None]) -> bool:
-    """Train what isn't finished yet; False where Ctrl-C has stopped it, with all checkpoints saved.
+    """Train the unfinished runs; returns False if Ctrl-C has stopped it, with all checkpoints saved.
 
-    Raises `InvalidInput` before anything is trained where a folder holds a run with other settings.
+    Raises `InvalidInput` before training if a folder holds a run with other settings.
     """
     for run in runs:
         _check_settings(run)
@@ -30,7 +31,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
         return True
     interrupted = threading.Event()
     with pool as trainers:
-        # after Ray, which has a handler of its own
+        # after Ray, which installs a handler of its own
         old = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
         try:
             while waiting or len(trainers):
@@ -39,8 +40,8 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
                     waiting.clear()
                 while waiting and len(trainers) < trainers.jobs:
                     trainers.submit(waiting.pop(0))
-                for run, how in trainers.ended():
-                    on_end(run, how)
+                for run, end in trainers.ended():
+                    on_end(run, end)
         finally:
             signal.signal(signal.SIGINT, old)
     return not interrupted.is_set()
@@ -56,7 +57,7 @@ def is_finished(run: Run) -> bool:
 
 
 def final_metrics(run: Run) -> dict[str, Any] | None:
-    """What `fit` has written at its end; None where it hasn't come to it."""
+    """The metrics that `fit` writes at its end; None if it hasn't ended."""
     try:
         return json.loads((run.folder / FINAL_METRICS).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -68,9 +69,7 @@ def final_metrics(run: Run) -> dict[str, Any] | None:
 def _check_settings(run: Run) -> None:
     if not (run.folder / CONFIG).exists() or not (run.folder / CHECKPOINT).exists():
         return
-    stored, wanted = (config.updated(threads=1).to_dict() for config in (stored_config(run.folder), run.config))
-    for name, value in ((name, value) for group in stored.values() for name, value in group.items()):
-        if value != {name: v for group in wanted.values() for name, v in group.items()}[name]:
-            raise InvalidInput(
-                "out", "a new folder, or one of the same comparison", f"{run.folder} with other settings: {name}"
-            )
+    changed = [name for name, *_ in differences(stored_config(run.folder), run.config) if name != "threads"]
+    if changed:
+        problem = f"{run.folder} with other settings: {', '.join(changed)}"
+        raise InvalidInput("out", "a new folder, or one of the same comparison", problem)

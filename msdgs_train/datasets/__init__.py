@@ -1,4 +1,4 @@
-"""Images with cameras and times, read from the layouts in which other people publish them. One file a format."""
+"""Images with cameras and times, read from published dataset layouts: one file per format."""
 
 from pathlib import Path
 
@@ -18,15 +18,15 @@ LAYOUTS = (
     ("HyperNeRF", DATASET_FILE, load_hypernerf),
     ("Neu3D", CAMERAS, load_neu3d),
 )
-"""The name of each, what tells it, and who reads it; COLMAP's comes after them, since others are made from it."""
+"""Name, marker file and reader of each; COLMAP is tried last, since other layouts contain its files too."""
 
 
 def load_scene(path: Path | str, size: int | None = None, time_pattern: str | None = TRAILING_NUMBER) -> SceneData:
-    """Read the dataset in folder `path`, whatever its layout.
+    """Read the dataset in folder `path`, detecting its layout.
 
     `size` is the width in pixels that images are reduced to, height in proportion. Pixels are read later, by
     `Frame.load_rgba`. `time_pattern` is for COLMAP's layout, which has no times: see `load_colmap`. Raises
-    `DatasetInvalid` naming file and field, and `InvalidInput` where `size` or `time_pattern` can't be.
+    `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size` or `time_pattern`.
     """
     folder = Path(path)
     if not folder.is_dir():

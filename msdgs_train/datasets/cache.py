@@ -1,4 +1,4 @@
-"""Images in memory, so that each is decoded once."""
+"""A cache of decoded images."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ MAX_BYTES = 2 << 30
 
 
 class ImageCache:
-    """Keeps pixels as uint8 RGBA, read when first needed, up to `MAX_BYTES`."""
+    """Keeps pixels as uint8 RGBA from their first use on, up to `MAX_BYTES`."""
 
     def __init__(self) -> None:
         self._pixels: dict[Path, np.ndarray] = {}

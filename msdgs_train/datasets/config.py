@@ -10,15 +10,14 @@ BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 @dataclass(frozen=True)
 class DataConfig(Checked):
-    """How images are read."""
+    """Images and background."""
 
     size: int | None = None
-    """Width in pixels to train at, the height in proportion; the images' own if not given."""
+    """Width of the images in pixels, height in proportion; their own if not given."""
     background: Literal["white", "black", "random"] = "white"
-    """What is behind the scene. With random every step draws a color, and evaluation is on white."""
+    """Color behind the scene; random: another one each step, white in evaluation."""
     scene_half_size: float | None = None
-    """Half the side of the cube around the origin that holds the scene, scene units; what the dataset suggests if not
-    given."""
+    """Half the side of the cube around the origin that holds the scene, in scene units; the dataset's if not given."""
 
     def __post_init__(self) -> None:
         self.require_positive_or_none("size", "scene_half_size")
@@ -26,5 +25,5 @@ class DataConfig(Checked):
 
     @property
     def evaluation_background(self) -> tuple[float, float, float]:
-        """RGB in [0, 1] that held-out images are evaluated on, and that the model is saved with."""
+        """RGB in [0, 1] behind held-out images; stored in the model."""
         return BACKGROUNDS.get(self.background, BACKGROUNDS["white"])

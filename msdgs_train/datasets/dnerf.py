@@ -2,8 +2,8 @@
 
 Each JSON has `camera_angle_x` (horizontal field of view, radians) and `frames`; each frame has `file_path` (with or
 without extension, relative to the folder), `transform_matrix` (camera to world, OpenGL axes) and `time`. A scene whose
-frames have no `time` is static, t = 0. Where a frame, or the file, has `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in pixels,
-they are used instead of the angle. The time range of the scene runs from the first to the last frame of all splits.
+frames have no `time` is static, t = 0. If a frame, or the file, has `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in pixels,
+these are used instead of the angle. The time range of the scene runs from the first to the last frame of all splits.
 """
 
 from pathlib import Path
@@ -12,8 +12,9 @@ from msdgs_train.datasets.common.scene_data import SPLITS, Frame, SceneData
 from msdgs_train.datasets.common.transforms import Entry, check_times, read_entries, read_frame
 
 TRAIN_FILE = "transforms_train.json"
-HALF_EXTENT = 1.3
-"""Of the cube that all D-NeRF scenes fit in; Deformable-3D-Gaussians and 4DGaussians begin with points in it."""
+SCENE_HALF_SIZE = 1.3
+"""Half the side of the cube that holds all D-NeRF scenes; Deformable-3D-Gaussians and 4DGaussians start with points
+in it."""
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
@@ -21,13 +22,13 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 def load_dnerf(folder: Path | str, size: int | None = None) -> SceneData:
     """Read the cameras, times and image sizes of a D-NeRF scene; val and test may be missing.
 
-    `size` is the width in pixels that images are reduced to. Raises `DatasetInvalid` naming file and field.
+    `size` is the width of the images in pixels. Raises `DatasetInvalid` naming file and field.
     """
     entries = {split: _read_split(Path(folder), split) for split in SPLITS}
     check_times([entry for split in SPLITS for entry in entries[split]])
     splits = {split: [_frame(entry, size) for entry in entries[split]] for split in SPLITS}
     times = [frame.t for frames in splits.values() for frame in frames]
-    return SceneData(splits, (min(times), max(times)), HALF_EXTENT)
+    return SceneData(splits, (min(times), max(times)), SCENE_HALF_SIZE)
 
 
 def _read_split(folder: Path, split: str) -> list[Entry]:
@@ -40,5 +41,5 @@ def _read_split(folder: Path, split: str) -> list[Entry]:
 def _frame(entry: Entry, size: int | None) -> Frame:
     for key in DISTORTION:
         if entry.get(key):
-            raise entry.invalid(key, "must be 0: images have to be undistorted first")
+            raise entry.invalid(key, "must be 0: undistort the images first")
     return read_frame(entry, size)

@@ -1,21 +1,21 @@
-"""HyperNeRF layout, which is nerfies' with other scenes: one JSON a camera, images in several sizes.
+"""HyperNeRF layout, the same as that of nerfies: one JSON file per camera, images in several sizes.
 
 - `dataset.json`: `train_ids` and `val_ids`; the latter are the test split.
 - `metadata.json`: for each id its `time_id` or, without one, its `warp_id`; t is that divided by the largest of all
   frames in use.
-- `scene.json`: `scale` and `center`. The scene's axes are the file's, its origin is the centre and its unit is
+- `scene.json`: `scale` and `center`. The scene's axes are the file's, its origin is the center and its unit is
   1 / scale of the file's: x becomes (x - center) · scale, for cameras and points alike. `near` and `far` are not used.
 - `camera/ID.json`: below.
-- `rgb/Nx/ID.png`: images, reduced to a 1/N of the size that cameras speak of.
-- `points.npy`, which may be missing: sparse points [M, 3], without colors.
+- `rgb/Nx/ID.png`: images, downscaled to 1/N of the size in the cameras.
+- `points.npy`, optional: sparse points [M, 3], without colors.
 
 A camera is nerfies' `Camera`. `orientation` maps world to camera: its rows are the camera's axes right, down, forward.
-`position` is where it stands; pixel centres are at half-integers, and fy = `focal_length` · `pixel_aspect_ratio`. As in
+`position` is in world axes; pixel centers are at half-integers, and fy = `focal_length` · `pixel_aspect_ratio`. As in
 `Camera.project` of nerfies, x / z and y / z are distorted before focal length and principal point: by
 `radial_distortion` (k1, k2, k3) with the factor 1 + k1 r² + k2 r⁴ + k3 r⁶, and by `tangential_distortion` (p1, p2;
 `tangential` in nerfies) with + 2 p1 x y + p2 (r² + 2 x²) in x and + p1 (r² + 2 y²) + 2 p2 x y in y. That is OpenCV's
-model, where k3 stands behind p2. `Frame.load_rgba` takes the distortion out; the camera is a pinhole with the same
-intrinsics. `skew` has to be 0.
+model, where k3 follows p2. `Frame.load_rgba` removes the distortion; the camera is a pinhole with the same intrinsics.
+`skew` must be 0.
 """
 
 import re
@@ -28,8 +28,7 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.distortion import Distortion
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import ImageSize
-from msdgs_train.datasets.common.json_file import read_json
-from msdgs_train.datasets.common.npy import read_table
+from msdgs_train.datasets.common.readers import read_json, read_table
 from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, image_size, reduced
 
 DATASET_FILE = "dataset.json"
@@ -41,9 +40,8 @@ POINTS_FILE = "points.npy"
 def load_hypernerf(folder: Path | str, size: int | None = None) -> SceneData:
     """Read the cameras, times, splits and sparse points of a HyperNeRF scene.
 
-    `size` is the width in pixels that images are reduced to: from the smallest copy that is wide enough, or with
-    None the largest copy as it is. Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't
-    be.
+    `size` is the width of the images in pixels: the smallest copy that is wide enough is downscaled, or with None the
+    largest copy is used. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
     """
     folder = Path(folder)
     ids = _read_ids(folder / DATASET_FILE)
@@ -63,7 +61,7 @@ def load_hypernerf(folder: Path | str, size: int | None = None) -> SceneData:
 
 
 class _World(NamedTuple):
-    """What turns the file's world into the scene's."""
+    """The transform from the file's world to the scene's."""
 
     center: np.ndarray  # [3]
     scale: float
@@ -88,7 +86,7 @@ def _id_list(file: Path, content: dict[str, Any], key: str) -> list[str]:
 
 
 def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
-    """In [0, 1]; all are 0 where the largest time_id is."""
+    """In [0, 1]; all are 0 if the largest time_id is 0."""
     content = read_json(file)
     numbers = {}
     for id_ in ids:
@@ -115,10 +113,10 @@ def _read_world(file: Path) -> _World:
 
 
 def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
-    """The folder of the smallest copies that are `size` pixels wide or more, or of the largest."""
+    """The folder of the smallest copies at least `size` pixels wide, or of the largest copies."""
     copies = [path for path in folder.glob("*x") if re.fullmatch(r"\d+x", path.name) and path.is_dir()]
     if not copies:
-        raise DatasetInvalid(folder, "folder", "must have the images in 1x, 2x or the like, and has none")
+        raise DatasetInvalid(folder, "folder", "must have the images in 1x, 2x or the like, found none")
     copies.sort(key=lambda path: int(path.name[:-1]))
     if size is None:
         return copies[0]
@@ -131,12 +129,14 @@ def _frame(file: Path, image_path: Path, t: float, world: _World, size: int | No
     camera = _camera(file, content, world, image_size(image_path))
     distortion = _distortion(file, content)
     if distortion is not None and distortion.folds(camera):
-        raise DatasetInvalid(file, "radial_distortion", f"{distortion} would show places twice: undistort the images")
+        raise DatasetInvalid(
+            file, "radial_distortion", f"{distortion} maps two points to one: undistort the images first"
+        )
     return Frame(image_path.stem, reduced(camera, size, image_path), t, image_path, distortion)
 
 
 def _camera(file: Path, content: dict[str, Any], world: _World, image: ImageSize) -> Camera:
-    """In pixels of the image as it is stored."""
+    """In pixels of the stored image."""
     if _numbers(file, content, "skew", ()) != 0:
         raise DatasetInvalid(file, "skew", f"must be 0, got {content['skew']}")
     width, height = _numbers(file, content, "image_size", (2,))
@@ -152,7 +152,7 @@ def _camera(file: Path, content: dict[str, Any], world: _World, image: ImageSize
     try:
         return Camera(focal, focal * aspect, cx, cy, *stated, pose).resized(*image)
     except InvalidInput as error:
-        raise DatasetInvalid(file, _KEYS.get(error.field, "orientation"), f"is no camera's: {error}") from None
+        raise DatasetInvalid(file, _KEYS.get(error.field, "orientation"), f"is not a valid camera's: {error}") from None
 
 
 _KEYS = {"camera.fx": "focal_length", "camera.fy": "pixel_aspect_ratio", "camera.width": "image_size"}
@@ -182,7 +182,7 @@ def _get(file: Path, content: dict[str, Any], key: str) -> Any:
 def _numbers(
     file: Path, content: dict[str, Any], key: str, shape: tuple[int, ...], name: str | None = None
 ) -> np.ndarray:
-    """Finite float64 of that shape; `name` is what errors call the field."""
+    """Finite float64 of that shape; errors call the field `name`, if given."""
     value = _get(file, content, key)
     wanted = f"{'×'.join(map(str, shape))} finite numbers" if shape else "a finite number"
     try:

@@ -2,14 +2,14 @@
 
 The JSON has `frames`; each has `file_path` (relative to the folder), `transform_matrix` (camera to world, OpenGL axes)
 and maybe `time`, which may be outside [0, 1]. A scene whose frames have no `time` is static, t = 0. `fl_x`, `fl_y`,
-`cx`, `cy`, `w`, `h` in pixels, or else `camera_angle_x` in radians, stand in the frame or for all frames; pixel centres
-are at half-integers, as in `Camera`. `camera_model` and the distortion `k1`, `k2`, `p1`, `p2`, `k3` likewise: they are
-OpenCV's, and `Frame.load_rgba` takes the distortion out by bilinear interpolation, to a pinhole camera with the same
-intrinsics. `mask_path`, depths, `applied_transform` and nerfstudio's own centring and scaling are passed over: the
-world is the one that `transform_matrix` and the points in `ply_file_path` share.
+`cx`, `cy`, `w`, `h` in pixels, or else `camera_angle_x` in radians, are given per frame or for all; pixel centers are
+at half-integers, as in `Camera`. `camera_model` and the distortion `k1`, `k2`, `p1`, `p2`, `k3` likewise: they are
+OpenCV's, and `Frame.load_rgba` removes the distortion by bilinear interpolation, to a pinhole camera with the same
+intrinsics. `mask_path`, depths, `applied_transform` and nerfstudio's own centering and scaling are ignored: the world
+is the one that `transform_matrix` and the points in `ply_file_path` share.
 
-`train_filenames`, `val_filenames` and `test_filenames` say what the splits are, and a frame in none of them is left
-out. Without them the first of the frames, in the order of their names, and every 8th after it are for testing.
+`train_filenames`, `val_filenames` and `test_filenames` name the splits; a frame in none of them is ignored.
+Without them the first frame, in the order of names, and every 8th after it are test frames.
 """
 
 from dataclasses import replace
@@ -31,8 +31,8 @@ CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV
 def load_nerfstudio(folder: Path | str, size: int | None = None) -> SceneData:
     """Read the cameras, times, splits and sparse points of a nerfstudio scene.
 
-    `size` is the width in pixels that images are reduced to. Raises `DatasetInvalid` naming file and field, and
-    `InvalidInput` where `size` can't be.
+    `size` is the width of the images in pixels. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for
+    an unusable `size`.
     """
     file = Path(folder) / TRANSFORMS_FILE
     entries = sorted(read_entries(file), key=Entry.file_path)
@@ -51,7 +51,7 @@ def _frame(entry: Entry, size: int | None) -> Frame:
     distortion = _distortion(entry)
     frame = read_frame(entry, size)
     if distortion is not None and distortion.folds(frame.camera):
-        raise entry.invalid("k1", f"and the rest of {distortion} would show places twice: undistort the images")
+        raise entry.invalid("k1", f"and the rest of {distortion} map two points to one: undistort the images first")
     name = "_".join(PurePosixPath(entry.file_path()).with_suffix("").parts)
     return replace(frame, name=name, distortion=distortion)
 
@@ -61,9 +61,9 @@ def _distortion(entry: Entry) -> Distortion | None:
     if model not in CAMERA_MODELS:
         raise entry.invalid("camera_model", f"must be one of {', '.join(CAMERA_MODELS)}, got {model!r}")
     if entry.get("is_fisheye"):
-        raise entry.invalid("is_fisheye", "must be false: fisheye images have to be undistorted first")
+        raise entry.invalid("is_fisheye", "must be false: undistort fisheye images first")
     if entry.has("k4") and entry.number("k4") != 0:
-        raise entry.invalid("k4", "must be 0: images have to be undistorted first")
+        raise entry.invalid("k4", "must be 0: undistort the images first")
     distortion = Distortion(*(entry.number(key) if entry.has(key) else 0.0 for key in Distortion._fields))
     return distortion if any(distortion) else None
 
@@ -78,7 +78,7 @@ def _splits(
         names = _names(file, shared, f"{split}_filenames", set(paths))
         splits[split] = [frame for path, frame in zip(paths, frames, strict=True) if path in names]
     if not splits["train"]:
-        raise DatasetInvalid(file, "train_filenames", "must name one frame or more, as other splits are listed")
+        raise DatasetInvalid(file, "train_filenames", "must name one frame or more if other splits are listed")
     return splits
 
 

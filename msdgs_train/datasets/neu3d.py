@@ -2,11 +2,11 @@
 
 `poses_bounds.npy` is LLFF's: a row of 17 numbers for each camera, in the order of the cameras' names. Those are a 3×5
 matrix, row by row, and the nearest and furthest depth. The matrix's columns are the camera's axes in world space (down,
-right, back), its position, and height, width and focal length in pixels; the principal point is the image's centre.
-World axes stay what they are in the file. Images may be a reduced copy of the size that the matrix states.
+right, back), its position, and height, width and focal length in pixels; the principal point is the image's center.
+World axes are those of the file. Images may be downscaled copies of the size in the matrix.
 
 A camera is `cam07.mp4`, or a folder `cam07/` or `cam07/images/`, which is preferred as it needs no decoding. Cameras
-run in step: all have F frames, frame i is at t = i / (F - 1). The first camera, cam00, is the test view.
+are synchronized: all have F frames, and frame i is at t = i / (F - 1). The first camera, cam00, is the test view.
 """
 
 import re
@@ -18,26 +18,26 @@ import numpy as np
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize
-from msdgs_train.datasets.common.npy import read_table
 from msdgs_train.datasets.common.ply_points import read_ply_points
+from msdgs_train.datasets.common.readers import read_table
 from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, image_size, reduced
 from msdgs_train.datasets.common.video import VideoFrame, read_info
 
 POSES_FILE = "poses_bounds.npy"
 CAMERAS = "cam0*"
-"""The files or folders that tell this layout: static scenes of LLFF have a `poses_bounds.npy` too."""
+"""The marker of this layout, since static LLFF scenes have a `poses_bounds.npy` too."""
 
 POINTS_FILES = ("points3D_downsample*.ply", "points3d.ply", "points3D.ply")
-"""The first of these that there is; of several downsampled ones the last by name, which is the smallest."""
+"""The first that exists is read; of several downsampled ones the last by name, which is the smallest."""
 
 CAMERA_NAME = re.compile(r"cam\d+")
 
 
 def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras of a Neu3D scene and, where there is a `.ply` file, its sparse points.
+    """Read the cameras of a Neu3D scene and, from a `.ply` file if there is one, its sparse points.
 
-    `size` is the width in pixels that images are reduced to. Videos are decoded later, by `Frame.load_rgba`.
-    Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't be.
+    `size` is the width of the images in pixels. Videos are decoded later, by `Frame.load_rgba`. Raises `DatasetInvalid`
+    naming file and field, and `InvalidInput` for an unusable `size`.
     """
     folder = Path(folder)
     sources = _find_sources(folder)
@@ -49,7 +49,7 @@ def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
                 view[0].image_path.parent,
                 "frames",
                 f"are {len(view)}, but {views[0][0].image_path.parent} has {len(views[0])}: "
-                f"cut all cameras to the frames that they have in common",
+                f"cut all cameras to the same frames",
             )
     points, colors = _read_points(folder)
     extent = scene_half_size(points, [view[0].camera for view in views])
@@ -58,7 +58,7 @@ def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
 
 
 class _Source(NamedTuple):
-    """Where a camera's images come from: a video, or files in the order of time."""
+    """The images of a camera: a video, or files in the order of time."""
 
     name: str
     video: Path | None
@@ -93,19 +93,19 @@ def _source(folder: Path, name: str) -> _Source:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Numbers in order of their value, also where they are not filled up with zeros."""
+    """A sorting key that orders numbers by value, with or without leading zeros."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _read_poses(file: Path, sources: list[_Source]) -> np.ndarray:
-    """[M, 17] float64, finite, with as many rows as there are cameras."""
+    """[M, 17] float64, finite, one row per camera."""
     poses = read_table(file, 17)
     if len(poses) != len(sources):
         raise DatasetInvalid(
             file,
             "rows",
             f"are {len(poses)}, but there are {len(sources)} cameras: {' '.join(source.name for source in sources)}. "
-            f"Each camera has its row, in the order of their names",
+            f"There must be one row per camera, in the order of their names",
         )
     return poses
 
@@ -159,7 +159,7 @@ def _camera(file: Path, row: int, values: np.ndarray, image: ImageSize) -> Camer
     try:
         return Camera(focal, focal, width / 2, height / 2, *stated, pose).resized(*image)
     except InvalidInput as error:
-        raise _invalid_row(file, row, f"is no camera: {error}") from None
+        raise _invalid_row(file, row, f"is not a valid camera: {error}") from None
 
 
 def _invalid_row(file: Path, row: int, problem: str) -> DatasetInvalid:

@@ -1,1 +1,1 @@
-"""Density."""
+"""Density control: strategies that add, remove and relocate Gaussians during training."""

@@ -1,6 +1,7 @@
-"""Training configuration: groups of settings, each beside the code that reads it, and a system with its model."""
+"""Training configuration: groups of settings, each defined beside the code that reads it."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -21,21 +22,20 @@ SMALL_MODEL = ModelConfig(sh_degree=2, layers=(SMALL_LAYER, SMALL_LAYER))
 
 @dataclass(frozen=True)
 class RunConfig(Checked):
-    """Which system a run trains, and how long."""
+    """System and length of a run."""
 
     system: tyro.conf.Suppress[str] = "msdgs-small"
     """The registered system that builds and trains the model."""
     steps: int = 16_000
     """Optimizer steps."""
     batch_size: int = 1
-    """Images per step, rendered side by side on `threads`; gradients are averaged over them."""
+    """Images per step, rendered in parallel; gradients are averaged over them."""
     seed: int = 0
-    """Of the initial Gaussians, the order of the images, random backgrounds and density control."""
+    """Seed of all random numbers of the run."""
     threads: int = 2
-    """Threads that the images of a step are shared among; with one image a step, threads of torch. The same seed and
-    threads give the same bits."""
+    """CPU threads. The same seed and threads give the same bits."""
     max_minutes: float | None = None
-    """Stop, evaluate and save after so many minutes in all, resumed parts included."""
+    """Stop, evaluate and save after this time, resumed parts included."""
 
     def __post_init__(self) -> None:
         self.require_counts("steps", "batch_size", "threads")
@@ -78,7 +78,7 @@ class OptimizerConfig(Checked):
 
 @dataclass(frozen=True)
 class LoggingConfig(Checked):
-    """How often a run writes down what it does."""
+    """Intervals of logging, evaluation and checkpoints."""
 
     log_every: int = 20
     """Steps between lines in metrics.jsonl."""
@@ -147,13 +147,20 @@ def _group_of(name: str) -> str:
 
 
 RESUMABLE_CHANGES = frozenset({"steps", "threads", "max_minutes", "log_every", "eval_every", "checkpoint_every"})
-"""Settings that may change when a run is resumed. All others shape what has been trained already."""
+"""Settings that may change when a run is resumed. All others have shaped what is trained already."""
 
 
 def check_resumable(stored: TrainConfig, wanted: TrainConfig) -> None:
     """Raise `InvalidInput` naming the first setting that a resumed run may not change."""
-    for group, settings in stored.to_dict().items():
-        other = wanted.to_dict()[group]
+    for name, before, now in differences(stored, wanted):
+        if name not in RESUMABLE_CHANGES:
+            raise InvalidInput(f"config.{name}", f"{before}, as when the run was started", now)
+
+
+def differences(one: TrainConfig, other: TrainConfig) -> Iterator[tuple[str, Any, Any]]:
+    """Name and both plain values of each setting in which two configurations differ."""
+    groups = other.to_dict()
+    for group, settings in one.to_dict().items():
         for name, value in settings.items():
-            if name not in RESUMABLE_CHANGES and other[name] != value:
-                raise InvalidInput(f"config.{name}", f"{value}, as when the run began", other[name])
+            if value != groups[group][name]:
+                yield name, value, groups[group][name]

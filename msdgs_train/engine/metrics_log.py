@@ -1,4 +1,4 @@
-"""What a run leaves to look at: metrics as JSON lines, a curve, and renderings beside their images."""
+"""Metrics of a run as JSON lines and as a plot, and renderings beside their images."""
 
 import json
 from pathlib import Path
@@ -24,44 +24,51 @@ class MetricsLog:
     """
 
     def __init__(self, run: Path, *, keep_until: int = 0, tensorboard: bool = False) -> None:
-        """Goes on after the lines up to step `keep_until`; those of steps after the last checkpoint are dropped."""
-        self.path = run / METRICS
-        kept = [line for line in read_metrics(run) if line["step"] <= keep_until]
-        self.path.write_text("".join(json.dumps(line) + "\n" for line in kept))
-        self._events = TensorBoardEvents(run / FOLDER, kept, keep_until) if tensorboard else None
+        """Appends to the lines up to step `keep_until`; later ones are dropped."""
+        self._run, self._tensorboard = run, tensorboard
+        self._events: TensorBoardEvents | None = None
+        self.rewind(keep_until)
+
+    def rewind(self, step: int) -> None:
+        """Drop the lines of steps after `step`."""
+        kept = [line for line in read_metrics(self._run) if line["step"] <= step]
+        (self._run / METRICS).write_text("".join(json.dumps(line) + "\n" for line in kept))
+        self.close()
+        if self._tensorboard:
+            self._events = TensorBoardEvents(self._run / FOLDER, kept, step)
 
     def train(self, result: StepResult, seconds: float) -> None:
-        """One line about the steps so far."""
+        """Add a line of training metrics."""
         self._append({"kind": "train", **result._asdict(), "seconds": round(seconds, 3)})
 
     def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
-        """One line about a split of held-out images."""
+        """Add a line of held-out metrics."""
         self._append({"kind": "eval", "step": step, "split": split, **metrics._asdict()})
 
     def image(self, step: int, split: str, evaluated: EvaluatedFrame) -> None:
-        """A held-out image at the left and its rendering at the right, for TensorBoard only."""
+        """Add a held-out image and its rendering, side by side; to TensorBoard only."""
         if self._events is not None:
             self._events.image(step, f"{split}/{_stem(evaluated)}", side_by_side(evaluated))
 
     def flush(self) -> None:
-        """What was logged outlives this process."""
+        """Write buffered events to disk."""
         if self._events is not None:
             self._events.flush()
 
     def close(self) -> None:
-        """Nothing is logged after this."""
+        """Close the event files."""
         if self._events is not None:
             self._events.close()
 
     def _append(self, line: dict[str, Any]) -> None:
-        with self.path.open("a") as file:
+        with (self._run / METRICS).open("a") as file:
             file.write(json.dumps(line) + "\n")
         if self._events is not None:
             self._events.add(line)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`, without a last one that was cut off; none if there is no such file."""
+    """The lines of a run's `metrics.jsonl`, without an incomplete last one; none if there is no such file."""
     path = run / METRICS
     lines = []
     for text in path.read_text().splitlines() if path.exists() else ():
@@ -73,7 +80,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 
 def draw_curve(run: Path) -> None:
-    """Loss, PSNR in training and on held-out images, and the number of Gaussians, over the steps."""
+    """Plot loss, PSNR on training and held-out images, and the number of Gaussians against steps, into `curve.png`."""
     lines = read_metrics(run)
     train = [line for line in lines if line["kind"] == "train"]
     figure = Figure(figsize=(9, 9))
@@ -81,7 +88,7 @@ def draw_curve(run: Path) -> None:
     loss, psnr, count = figure.subplots(3, 1, sharex=True)
     steps = [line["step"] for line in train]
     loss.semilogy(steps, [line["loss"] for line in train])
-    psnr.plot(steps, [line["psnr"] for line in train], label="train, last images")
+    psnr.plot(steps, [line["psnr"] for line in train], label="train, moving average")
     for split in sorted({line["split"] for line in lines if line["kind"] == "eval"}):
         points = [(line["step"], line["psnr"]) for line in lines if line["kind"] == "eval" and line["split"] == split]
         psnr.plot(*zip(*points, strict=True), marker="o", label=f"{split}, last {points[-1][1]:.2f} dB")
@@ -95,7 +102,7 @@ def draw_curve(run: Path) -> None:
 
 
 def write_side_by_side(run: Path, split: str, evaluated: EvaluatedFrame) -> Path:
-    """The image at the left, the rendering at the right, in `renders/`; returns the PNG's path."""
+    """Write image and rendering, side by side, to `renders/`; returns the PNG's path."""
     folder = run / RENDERS
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{split}_{_stem(evaluated)}.png"
@@ -104,7 +111,7 @@ def write_side_by_side(run: Path, split: str, evaluated: EvaluatedFrame) -> Path
 
 
 def side_by_side(evaluated: EvaluatedFrame) -> np.ndarray:
-    """The image at the left, the rendering at the right, [H, 2 W, 3] uint8."""
+    """Image (left) and rendering (right), [H, 2 W, 3] uint8."""
     return to_bytes(np.concatenate([evaluated.target.numpy(), evaluated.rgb.numpy()], axis=1))
 
 
@@ -113,5 +120,5 @@ def _stem(evaluated: EvaluatedFrame) -> str:
 
 
 def to_bytes(rgb: np.ndarray) -> np.ndarray:
-    """uint8 of display-referred values in [0, 1], rounded."""
+    """uint8 of sRGB values in [0, 1], rounded."""
     return np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)

@@ -1,17 +1,23 @@
-"""`run.json`: what a run has to remember besides its settings, where its images are and which model was best."""
+"""The folder of a run: the names of its files, its settings, and `run.json`, which names its dataset and best model."""
 
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.datasets.common.files import write_text
+from msdgs_train.engine.config import TrainConfig
 
+CONFIG = "config.json"
 RECORD = "run.json"
+CHECKPOINT = "checkpoint.pt"
+MODEL = "model.pt"
+BEST = "best.pt"
+FINAL_METRICS = "metrics.json"
 
 
 class RunInvalid(MsdgsError):
-    """The folder of a run lacks something, or holds what can't be read; the message names the file."""
+    """A file of a run is missing or can't be read; the message names it."""
 
     def __init__(self, file: Path, problem: str) -> None:
         super().__init__(f"{file}: {problem}")
@@ -19,9 +25,9 @@ class RunInvalid(MsdgsError):
 
 @dataclass(frozen=True)
 class Best:
-    """Which model `best.pt` is: that of the highest mean PSNR so far."""
+    """The model in `best.pt`: the one of the highest mean PSNR so far."""
 
-    split: str  # the held-out images that it was chosen by
+    split: str  # the held-out images that it was selected on
     step: int
     psnr: float  # dB
 
@@ -31,11 +37,11 @@ class RunRecord:
     """The contents of `run.json`."""
 
     data: Path  # absolute
-    best: Best | None = None
+    best: Best | None = None  # None until a split has been evaluated
 
 
 def read_record(run: Path) -> RunRecord | None:
-    """What a run remembers; None for a run from before there was a `run.json`. Raises `RunInvalid`."""
+    """The contents of `run.json`, None if there is no such file. Raises `RunInvalid`."""
     path = run / RECORD
     if not path.exists():
         return None
@@ -47,6 +53,25 @@ def read_record(run: Path) -> RunRecord | None:
 
 
 def write_record(run: Path, record: RunRecord) -> None:
-    """Atomically."""
+    """Write `run.json`, atomically."""
     values = {"data": str(record.data), "best": asdict(record.best) if record.best else None}
     write_text(run / RECORD, json.dumps(values, indent=2) + "\n")
+
+
+def stored_config(run: Path) -> TrainConfig:
+    """The settings that a run was started with.
+
+    Raises `InvalidInput` if the folder holds no run, `RunInvalid` if its settings are those of another version.
+    """
+    path = run / CONFIG
+    if not path.exists() or not (run / CHECKPOINT).exists():
+        raise InvalidInput("run", "the folder of a run with a checkpoint, to resume it", run)
+    try:
+        return TrainConfig.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except (InvalidInput, ValueError, AttributeError, TypeError) as error:
+        raise RunInvalid(path, f"can't be resumed, train again in a new folder: {error}") from error
+
+
+def write_config(run: Path, config: TrainConfig) -> None:
+    """Write `config.json`, atomically."""
+    write_text(run / CONFIG, json.dumps(config.to_dict(), indent=2) + "\n")

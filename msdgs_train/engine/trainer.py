@@ -1,4 +1,4 @@
-"""One training run in memory: do a step, evaluate the model, save everything and continue from there."""
+"""The training of one model in memory: take a step, evaluate, save and restore a checkpoint."""
 
 import functools
 from collections.abc import Iterator
@@ -28,8 +28,8 @@ FORMAT = "msdgs-checkpoint/2"
 MAX_SKIPPED_IN_A_ROW = 20
 ROLLBACK_LR = 0.5  # factor of the learning rates, each time that training returns to a checkpoint
 ROLLBACK_SEED = 1_000_003  # added to the seed of the images' order
-MAX_GRADIENT_NORM = 1.0  # of networks and grids; 0.05 to 0.6 is usual
-SMOOTHING = 0.98  # of the loss and PSNR that are shown: an average over about 50 steps
+MAX_GRADIENT_NORM = 1.0  # of networks and grids; typical norms are 0.05 to 0.6
+SMOOTHING = 0.98  # of the reported loss and PSNR: a moving average over about 50 steps
 
 
 class TrainingDiverged(MsdgsError):
@@ -37,18 +37,18 @@ class TrainingDiverged(MsdgsError):
 
 
 class StepResult(NamedTuple):
-    """What one step has shown, averaged over the last steps, and what it has cost."""
+    """Metrics after one step."""
 
     step: int  # counted from 1
-    loss: float
-    psnr: float  # dB, on training images
+    loss: float  # moving average
+    psnr: float  # dB, on training images, of the moving average of squared errors
     gaussians: int
     skipped: int  # steps of the whole run whose loss or gradient was not finite
-    clamped_scales: int  # Gaussians a scale of which came out at 0 or below in this step, and was set to e^-20
+    clamped_scales: int  # Gaussians with a scale of 0 or below in this step, which was set to e^-20
 
 
 class EvaluatedFrame(NamedTuple):
-    """A held-out frame: as captured and as rendered, [H, W, 3] in [0, 1]."""
+    """A held-out frame: its image and its rendering, [H, W, 3] in [0, 1]."""
 
     frame: Frame
     target: Tensor
@@ -63,13 +63,17 @@ class Trainer:
         torch.set_num_threads(config.run.threads if config.run.batch_size == 1 else 1)
         self.config, self.scene = config, scene
         self.schedule = Schedule.from_config(config)
-        self.step_count = self.skipped = self.rollbacks = 0
-        self._skipped_in_a_row = 0
-        self._averages: tuple[float, float] | None = None  # loss, squared error
-        self._generator = torch.Generator().manual_seed(config.run.seed)
-        self._curriculum = WindowCurriculum(self.schedule, scene.splits["train"], scene.time_range)
+        self.skipped = self.rollbacks = 0
         self._images = ImageCache()
-        self.system: System = system_of(self.schedule, scene)
+        self._reset()
+
+    def _reset(self) -> None:
+        """The state before the first step."""
+        self.step_count = self._skipped_in_a_row = 0
+        self._averages: tuple[float, float] | None = None  # loss, squared error
+        self._generator = torch.Generator().manual_seed(self.config.run.seed)
+        self._curriculum = WindowCurriculum(self.schedule, self.scene.splits["train"], self.scene.time_range)
+        self.system: System = system_of(self.schedule, self.scene)
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
 
     def step(self) -> StepResult:
@@ -83,7 +87,7 @@ class Trainer:
         self.step_count += 1
         is_finite = self._is_finite(loss)
         if is_finite:
-            # one outlier would stay in Adam's second moment, and slow a network down, for a thousand steps
+            # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
             clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], MAX_GRADIENT_NORM)
             new_times = [view.sample.t for view in views if view.sample.update == "motion"]
             rows = self.system.new_frame_rows(new_times) if new_times else []
@@ -100,7 +104,7 @@ class Trainer:
 
     @torch.no_grad()
     def evaluate(self, split: str) -> Iterator[EvaluatedFrame]:
-        """Render and score each frame of a split, one after the other."""
+        """Render each frame of a split and compute its metrics."""
         background = torch.tensor(self.config.data.evaluation_background)
         for frame in self.scene.splits[split]:
             target = self._images.image(frame, background)
@@ -108,7 +112,7 @@ class Trainer:
             yield EvaluatedFrame(frame, target, rgb, image_metrics(rgb, target))
 
     def save_checkpoint(self, path: Path, seconds: float) -> None:
-        """Write all that a bit-exact continuation needs; `seconds` is the time trained so far. Atomic."""
+        """Write the complete state, from which training continues bit by bit; `seconds` of training so far. Atomic."""
         state = {
             "format": FORMAT,
             "step_count": self.step_count,
@@ -124,10 +128,13 @@ class Trainer:
         safe_load.save_atomic(path, state)
 
     def load_checkpoint(self, path: Path) -> float:
-        """Continue from a checkpoint, of a run with the same settings; returns the seconds trained before."""
+        """Continue from a checkpoint of a run with the same settings; returns the seconds trained before.
+
+        Raises `CheckpointInvalid`.
+        """
         state: dict[str, Any] = safe_load.load(path)
         if not isinstance(state, dict) or state.get("format") != FORMAT:
-            raise safe_load.CheckpointInvalid(path, f"isn't of format {FORMAT}: train again, with a new run folder")
+            raise safe_load.CheckpointInvalid(path, f"isn't of format {FORMAT}: train again in a new folder")
         self.step_count, self._averages = state["step_count"], state["averages"]
         self.system.load_state(state["system"], self.step_count)
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
@@ -139,11 +146,15 @@ class Trainer:
             generator.set_state(stored)
         return float(state["seconds"])
 
-    def retry_after(self, diverged: "Trainer") -> None:
-        """Take another way than a trainer that has diverged from here: half its rates, another order of images."""
-        self.skipped, self._skipped_in_a_row = diverged.skipped, 0
-        self.rollbacks = diverged.rollbacks + 1
-        self._generator.manual_seed(self.config.run.seed + ROLLBACK_SEED * self.rollbacks)
+    def roll_back(self, checkpoint: Path) -> None:
+        """Return to a checkpoint, or to the start if there is no such file, after training has diverged: with half the
+        learning rates and another order of the images."""
+        skipped, rollbacks = self.skipped, self.rollbacks + 1
+        self._reset()
+        if checkpoint.exists():
+            self.load_checkpoint(checkpoint)
+        self.skipped, self.rollbacks, self._skipped_in_a_row = skipped, rollbacks, 0
+        self._generator.manual_seed(self.config.run.seed + ROLLBACK_SEED * rollbacks)
         self._curriculum.load_state(torch.empty(0, dtype=torch.int64))
 
     @property
@@ -153,14 +164,14 @@ class Trainer:
 
     @property
     def lr_factor(self) -> float:
-        """What the learning rates of the settings are multiplied by."""
+        """Factor of all learning rates."""
         return ROLLBACK_LR**self.rollbacks
 
     def _generators(self) -> list[torch.Generator]:
         return [self._generator, *self.system.generators()]
 
     def _render_and_backward(self) -> list[ViewGradients]:
-        """Render the next batch and differentiate the loss of each image, side by side."""
+        """Render the next batch and differentiate the loss of each image, in parallel."""
         size = self.config.run.batch_size
         first = self.step_count * size
         drawn = [
@@ -173,7 +184,7 @@ class Trainer:
 
     @functools.cached_property
     def _workers(self) -> ThreadPoolExecutor:
-        """Each runs torch on one core: small matrices shared among cores leave most of them waiting."""
+        """Each runs torch on one thread: splitting small matrix products over cores is slower."""
         return ThreadPoolExecutor(self.config.run.threads, "image", torch.set_num_threads, (1,))
 
     @sharing_cores()
@@ -202,7 +213,7 @@ class Trainer:
         return False
 
     def _average(self, views: list[ViewGradients]) -> None:
-        """Of samples that update everything; the others' images are chosen for what is wrong in them."""
+        """Add samples that update all parameters; the others are drawn from images with large errors."""
         if not views:
             return
         loss, error = (sum(getattr(v, name) for v in views) / len(views) for name in ("loss", "squared_error"))

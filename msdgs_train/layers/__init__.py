@@ -1,1 +1,1 @@
-"""Layers."""
+"""Deformation layers, one kind per file; each predicts deltas from canonical positions and time."""

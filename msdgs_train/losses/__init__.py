@@ -1,1 +1,1 @@
-"""Losses."""
+"""Photometric losses and regularizers."""

@@ -1,1 +1,1 @@
-"""Rendering."""
+"""Differentiable rasterization for training, on the CPU or on CUDA."""

@@ -1,1 +1,1 @@
-"""Supports."""
+"""What deformation layers move: the Gaussians themselves, or control nodes that carry them."""

@@ -1,1 +1,1 @@
-"""Viewer."""
+"""Browser viewer of a model, trained or in training."""

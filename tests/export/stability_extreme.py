@@ -22,24 +22,27 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.gaussians.model import DynamicGaussians, SceneBounds
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
-from msdgs_train.layers.mlp import PositionalEncoding, frequency_matrix
+from msdgs_train.layers.base import SceneBounds
+from msdgs_train.layers.mlp import MLPConfig, PositionalEncoding, frequency_matrix
+from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.rendering.rasterize import rasterize as rasterize_for_training
 from tests.export.stability_rows import Row, measured, refused, relative
-from tests.support.models import CAMERA, SCENE, export_scene, random_model
+from tests.support.models import CAMERA, MLP, PLANE, SCENE, export_scene, random_model
 from tests.support.scene_files import write_scene
 from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of
 
 COUNT = 60
 Change = Callable[[DynamicGaussians], object]
+SMOOTH = replace(MLP, xyz_frequencies=6)
 BACKGROUND = (0.2, 0.6, 0.9)
 MOVES, SCALES, IMAGE = "pose from the scene file", "scales from the file, relative", "float32 image"
 
 
 def changed(change: Change = lambda model: None, count: int = COUNT, **config: Any) -> DynamicGaussians:
     """A random model of one layer, changed."""
-    model = random_model(count, **{"sh_degree": 0, "layers": ("mlp",), "xyz_frequencies": 6, **config})
+    model = random_model(count, **{"sh_degree": 0, "layers": (SMOOTH,), **config})
     with torch.no_grad():
         change(model)
     return model
@@ -92,7 +95,7 @@ def traps() -> Iterator[Row]:
             float(np.abs(exported(model).scene.static_quats - identity).max()),
             "float32.relative",
         )
-    shrinking = changed(_head_bias(slice(3, 6), -10.0), delta_space="activated")
+    shrinking = changed(_head_bias(slice(3, 6), -10.0), scale_space="linear")
     yield measured("activated ΔS of −5 on scales of 0.1", MOVES, file_error(shrinking), "export.relative")
     for logit in (1e4, -1e4):
         model = changed(lambda m, v=logit: m.get_parameter("modulation.output.bias").fill_(v))
@@ -167,15 +170,15 @@ def _opened(**metadata: Any) -> DeformationSession:
 
 def counts() -> Iterator[Row]:
     """None, one, and a million."""
-    for count, layers in ((0, ("mlp",)), (0, ()), (1, ("mlp",)), (1, ("plane",))):
+    for count, layers in ((0, (SMOOTH,)), (0, ()), (1, (SMOOTH,)), (1, (PLANE,))):
         model = changed(count=count, layers=layers)
         yield measured(f"N = {count}, K = {len(layers)}", MOVES, file_error(model), "export.relative")
 
 
 def a_million() -> Iterator[Row]:
     """A million moving Gaussians, few of which are compared."""
-    small = {"width": 4, "depth": 1, "xyz_frequencies": 1, "time_width": 4, "time_features": 2, "embedding_dim": 0}
-    model = changed(_many, count=2, **small)
+    small = MLPConfig(width=4, depth=1, xyz_frequencies=1, time_width=4, time_features=2)
+    model = changed(_many, count=2, layers=(small,), embedding_dim=0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.onnx"
         path.write_bytes(_network(model))
@@ -230,7 +233,7 @@ def frames_error(model: DynamicGaussians, scene: SceneInfo, session: Deformation
 
 def _scaled(kind: str, factor: float) -> tuple[DynamicGaussians, SceneInfo]:
     """A scene, its cameras and all of its motion, `factor` times as large."""
-    like = changed(layers=(kind, kind), xyz_frequencies=10)
+    like = changed(layers=(kind, kind))
     model = DynamicGaussians(like.config, like.gaussians, SceneBounds(1.3 * factor))
     own = ("cells", "first_time", "time_cells")
     model.load_state_dict({n: v for n, v in like.state_dict().items() if n.split(".")[-1] not in own}, strict=False)
@@ -315,7 +318,7 @@ def broken_files() -> Iterator[Row]:
 
 
 def _contents() -> dict[str, Any]:
-    model = changed(count=3, layers=("mlp", "plane"), width=4, plane_resolution=2, plane_time_resolution=2)
+    model = changed(count=3, layers=(replace(MLP, width=4), PlaneConfig(resolution=2, time_resolution=2, width=4)))
     buffer = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder:
         save_model(Path(folder) / "model.pt", model, SCENE, 1)

@@ -1,6 +1,7 @@
 """Made models whose layers amplify round-off: a little, a lot, and beyond what any number can hold."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from export.precision.formats import FLOAT32, in_format
 from export.precision.report import StabilityReport
 from msdgs_train.gaussians.model import DynamicGaussians
 from tests.export.stability_rows import Row, measured, refused
-from tests.support.models import SCENE, random_model
+from tests.support.models import MLP, PLANE, SCENE, SMALL_LAYERS, random_model
 from tests.support.tolerances import tolerance
 
 COUNT = 100
@@ -85,8 +86,8 @@ def saturated(logit: float) -> Change:
 
 def layers(count: int, kind: str = "mlp") -> dict[str, Any]:
     """Many layers are small ones: their number is what matters here."""
-    small = {"depth": 1, "plane_resolution": 6, "plane_time_resolution": 6} if count > 4 else {}
-    return {"layers": (kind,) * count, **small}
+    small = {"mlp": replace(MLP, depth=1), "plane": replace(PLANE, resolution=6, time_resolution=6)}
+    return {"layers": ((small if count > 4 else SMALL_LAYERS)[kind],) * count}
 
 
 CASES: dict[str, Callable[[], DynamicGaussians]] = {
@@ -97,8 +98,10 @@ CASES: dict[str, Callable[[], DynamicGaussians]] = {
     "K = 64, small steps": lambda: stiff(steps_times(0.02), **layers(64)),
     "K = 64, steps × 64": lambda: stiff(steps_times(64), **layers(64)),
     "K = 64, all weights × 64": lambda: stiff(all_times(64), **layers(64)),
-    "K = 2, frequencies to 2^12": lambda: stiff(xyz_frequencies=13, time_frequencies=13),
-    "K = 2, frequencies to 2^12, steps × 16": lambda: stiff(steps_times(16), xyz_frequencies=13),
+    "K = 2, frequencies to 2^12": lambda: stiff(layers=(replace(MLP, xyz_frequencies=13, time_frequencies=13),) * 2),
+    "K = 2, frequencies to 2^12, steps × 16": lambda: stiff(
+        steps_times(16), layers=(replace(MLP, xyz_frequencies=13),) * 2
+    ),
     "K = 4, all weights w = 0": lambda: stiff(saturated(-200), **layers(4)),
     "K = 2, all weights w = 1": lambda: stiff(saturated(200)),
     "K = 2, no weights": lambda: stiff(weights=False),
@@ -146,8 +149,8 @@ def _unseen(model: DynamicGaussians) -> tuple[int, float]:
 
 def jacobian_rows() -> Iterator[Row]:
     """The products of Jacobians against central differences through the whole chain."""
-    for kind in ("mlp", "plane"):
-        model = stiff(**layers(3, kind), xyz_frequencies=4).double()
+    for layer in (replace(MLP, xyz_frequencies=4), PLANE):
+        model = stiff(layers=(layer,) * 3).double()
         means = model.gaussians.means.detach()
         found = growth(model.deformation, in_format(model, FLOAT32).deformation, means, 0.3)
         step, columns, t = 1e-7, [], torch.tensor(0.3, dtype=torch.double)
@@ -157,7 +160,9 @@ def jacobian_rows() -> Iterator[Row]:
                 columns.append((ends[0] - ends[1]) / (2 * step))
         norms = torch.linalg.matrix_norm(torch.stack(columns, dim=2), ord=2).numpy()
         smooth = np.median(np.abs(found.after[-1] - norms) / norms)  # kinks of ReLU and of grids lie in a few steps
-        yield measured(f"K = 3, {kind}", "‖J₃J₂J₁‖ against differences, median", float(smooth), "stability.jacobian")
+        yield measured(
+            f"K = 3, {layer.kind}", "‖J₃J₂J₁‖ against differences, median", float(smooth), "stability.jacobian"
+        )
 
 
 def all_rows() -> Iterator[Row]:

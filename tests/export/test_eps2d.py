@@ -23,11 +23,12 @@ from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
 from msdgs_train.viewer.snapshot import snapshot_of_file
 from tests.support.models import CAMERA, SCENE, export_scene, random_model, small_config
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import SHARED_MOTIONS, write_scene
+from tests.support.training_scene import MOTION_BASES, write_scene
 from tests.support.training_scene import small_config as training_config
 
 pytestmark = pytest.mark.slow
@@ -111,20 +112,22 @@ def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
 
 def test_training_may_begin_with_more(tmp_path: Path):
     """What is saved says what it was trained with, early and late, and going on knows it too."""
-    sizes = replace(SHARED_MOTIONS, eps2d=EPS2D)
+    sizes = replace(MOTION_BASES, eps2d=EPS2D)
     config = training_config(model=sizes, window_full_fraction=0.5, eps2d_init=0.4)
     trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))
-    assert trainer.model.config.eps2d == 0.4
+    assert isinstance(model := trainer.system.model, DynamicGaussians)
+    assert model.config.eps2d == 0.4
     seen = []
     for _ in range(14):
         trainer.step()
-        trainer.save_model(tmp_path / "model.pt")
+        trainer.system.save(tmp_path / "model.pt", trainer.step_count)
         seen.append(load_model(tmp_path / "model.pt").model.config.eps2d)
         if trainer.step_count == 12:
             trainer.save_checkpoint(tmp_path / "checkpoint.pt", 0.0)
     assert seen == [0.4] * 12 + [EPS2D] * 2
     trainer.load_checkpoint(tmp_path / "checkpoint.pt")
-    assert trainer.model.config.eps2d == 0.4
+    assert isinstance(model := trainer.system.model, DynamicGaussians)
+    assert model.config.eps2d == 0.4
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])

@@ -4,6 +4,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,11 @@ from export.to_onnx import main
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.gaussians.model import LOG_SCALE_LIMIT, DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
-from tests.support.models import SCENE, export_scene, random_model
+from msdgs_train.gaussians.modulation import EMBEDDINGS
+from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
+from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
 
@@ -50,20 +53,25 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
     ("count", "changes", "moving"),
     [
         (300, {}, 300),
-        (300, {"layers": ("mlp",), "depth": 1}, 300),
+        (300, {"layers": (replace(MLP, depth=1),)}, 300),
         (300, {"layers": ("mlp",) * 4, "embedding_dim": 0, "noise": 0.01}, 300),
         (300, {"layers": ("plane",)}, 300),
-        (300, {"layers": ("mlp", "plane", "plane"), "plane_time_resolution": 2, "plane_resolution": 2}, 300),
+        (300, {"layers": ("mlp", *[replace(PLANE, time_resolution=2, resolution=2)] * 2)}, 300),
         (1, {"layers": ("plane", "mlp")}, 1),
         (300, {"weights": False, "layers": ("mlp", "plane")}, 300),
         (300, {"modulation_targets": ("means",)}, 300),
         (300, {"modulation_targets": ("quats", "means", "scales"), "layers": ("plane", "mlp")}, 300),
-        (300, {"delta_space": "activated", "noise": 0.03}, 300),
-        (300, {"depth": 4, "skip": 3}, 300),
-        (300, {"layers": ("plane", "plane"), "multires": (1, 2), "plane_resolution": 6}, 300),
+        (300, {"scale_space": "linear", "noise": 0.03}, 300),
+        (300, {"layers": (replace(MLP, depth=4, skip=3),) * 2}, 300),
+        (300, {"layers": (replace(PLANE, multires=(1, 2), resolution=6),) * 2}, 300),
         (300, {"sh_degree": 0}, 300),
-        (300, {"layers": ("bases",), "num_nodes": 12, "num_knots": 5}, 300),
-        (300, {"layers": ("bases", "plane", "mlp"), "num_nodes": 3, "embedding_dim": 0}, 300),
+        (300, {"support": replace(NODES, num_nodes=12), "layers": (replace(SPLINE, num_knots=5),)}, 300),
+        (300, {"support": replace(NODES, num_nodes=3), "layers": ("spline", "plane", "mlp"), "embedding_dim": 0}, 300),
+        (300, {"support": NODES, "layers": ("mlp", "mlp"), "modulation_targets": ("quats", "means")}, 300),
+        (300, {"support": replace(NODES, num_nodes=9, k_nearest=2), "layers": ("plane",), "weights": False}, 300),
+        (300, {"support": replace(NODES, num_nodes=300), "layers": (replace(SPLINE, affine=False), "mlp")}, 300),
+        (1, {"support": NODES, "layers": ("mlp",)}, 1),
+        (0, {"support": NODES, "layers": ("spline",)}, 0),
         (300, {"layers": ()}, 0),
         (1, {}, 1),
         (1, {"layers": ()}, 0),
@@ -113,11 +121,11 @@ def test_embeddings_and_their_network_are_gone(scene_file: Path, model: DynamicG
         return tensor.detach().numpy().tobytes() in contents
 
     assert model.modulation is not None
-    assert model.gaussians.embeddings is not None
-    assert not any(stored(row) for row in model.gaussians.embeddings[:20])
+    embeddings = model.gaussians.get_parameter(EMBEDDINGS)
+    assert not any(stored(row) for row in embeddings[:20])
     assert not any(stored(parameter) for parameter in model.modulation.parameters())
     assert stored(model.gaussians.means)
-    scales = model.modulation(model.gaussians.embeddings).scales
+    scales = model.modulation(embeddings).scales
     assert scales is not None
     assert stored(scales)
     names = [tensor.name for tensor in onnx.load(scene_file).graph.initializer]

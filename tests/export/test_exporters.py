@@ -29,8 +29,8 @@ from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
-from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.models import SCENE, random_model
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)

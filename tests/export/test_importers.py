@@ -23,7 +23,8 @@ from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.spherical_harmonics import sh_basis
-from tests.export.splat_files import (
+from tests.support.images import psnr
+from tests.support.splat_files import (
     compressed_ply_bytes,
     inria_columns,
     ksplat_bytes,
@@ -35,7 +36,6 @@ from tests.export.splat_files import (
     write_sog,
     zipped,
 )
-from tests.support.images import psnr
 from tests.support.tolerances import tolerance
 
 REAL = os.environ.get("MSDGS_SPLATS")

@@ -22,8 +22,9 @@ from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.camera import orbit
 from msdgs_train.gaussians.model_file import load_model
+from msdgs_train.layers.plane import PlaneConfig
 from tests.export import test_importers_runs
-from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
@@ -105,8 +106,10 @@ def test_the_network_is_theirs(tmp_path: Path, scales: tuple[int, ...], lengths:
     assert detect_format(run) == "4dgs"
     assert write_model(run, "4dgs", tmp_path / "model.pt", QUIET) == []
     model, info, step = load_model(tmp_path / "model.pt")
-    assert (step, info.background, model.config.delta_space) == (20_000, (1.0, 1.0, 1.0), "raw")
-    assert model.config.plane_time_resolution == TIME - (TIME - 1) // 2
+    assert (step, info.background, model.config.scale_space) == (20_000, (1.0, 1.0, 1.0), "log")
+    (layer,) = model.config.layers
+    assert isinstance(layer, PlaneConfig)
+    assert layer.time_resolution == TIME - (TIME - 1) // 2
     g = some_gaussians(COUNT, 3)
     means, quats, scales_then = (torch.from_numpy(a).double() for a in (g.means, g.quats, g.scales))
     raw_quats = quats * torch.linspace(1 - lengths, 1 + lengths, COUNT, dtype=torch.float64)[:, None]

@@ -3,14 +3,13 @@
 `MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` takes so many of each kind, and larger ones.
 """
 
-import ctypes
 import gzip
 import os
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -30,7 +29,9 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model_file import CheckpointInvalid, load_model, save_model
 from tests.export import test_importers_4dgs, test_importers_runs
-from tests.export.splat_files import (
+from tests.support.memory import measured
+from tests.support.models import SCENE, random_model
+from tests.support.splat_files import (
     compressed_ply_bytes,
     inria_columns,
     ksplat_bytes,
@@ -42,12 +43,9 @@ from tests.export.splat_files import (
     write_sog,
     zipped,
 )
-from tests.support.models import SCENE, random_model
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
-
-T = TypeVar("T")
 QUIET = Console(quiet=True)
 DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "30"))
 """Files of each kind."""
@@ -60,8 +58,6 @@ PALETTE = 64
 
 ENDS = 1024
 """Bytes at both ends, where headers and tables are and half of the damage is done."""
-
-STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Kind(NamedTuple):
@@ -213,20 +209,6 @@ def refused_or_drawn(kind: Kind, folder: Path, files: list[Path]) -> Taken:
 def drawn(g: Gaussians) -> np.ndarray:
     camera = Camera.from_fov(orbit(np.zeros(3), 3.0, 30, 20, np.array([0.0, -1.0, 0.0])), 64, 48, 50)
     return rasterize(g, camera).rgb
-
-
-def measured(work: Callable[[], T]) -> tuple[T, float]:
-    """What the work returns, and by how many MB it raised the process's memory at its highest."""
-    ctypes.CDLL(None).malloc_trim(0)  # what earlier work left free would hide this work's
-    FORGET.write_text("5")  # the highest mark begins anew
-    before = _memory("VmRSS")
-    result = work()
-    return result, _memory("VmHWM") - before
-
-
-def _memory(name: str) -> float:
-    line = next(line for line in STATUS.read_text().splitlines() if line.startswith(name))
-    return int(line.split()[1]) / 1024
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:

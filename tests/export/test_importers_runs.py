@@ -20,7 +20,7 @@ from export.measure.poses import posed
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import load_model
-from tests.export.splat_files import inria_columns, ply_bytes, some_gaussians
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
@@ -96,7 +96,7 @@ def test_the_network_is_theirs(tmp_path: Path, blender: bool, depth: int):
     assert 10 < lost["worst_frame_db"] < 100
     model, info, step = load_model(tmp_path / "model.pt")
     g = some_gaussians(COUNT, 3, seed=40_000)
-    assert (step, info.background, model.config.delta_space) == (40_000, (1.0, 1.0, 1.0), "activated")
+    assert (step, info.background, model.config.scale_space) == (40_000, (1.0, 1.0, 1.0), "linear")
     means, quats, scales = (torch.from_numpy(a).double() for a in (g.means, g.quats, g.scales))
     for t in (0.0, 0.37, 1.0):
         d_means, d_quats, d_scales = their_deltas(state, means, t)

@@ -12,26 +12,38 @@ import pytest
 import torch
 
 from export.jobs.bake import Baked, bake
-from export.layers import LAYERS, LayerInputs, ModelNotExportable
+from export.layers import HEAD_COLUMNS, LAYERS, LayerInputs, ModelNotExportable
+from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder
 from export.measure.verify import VerificationFailed, times_to_verify, verify
 from export.plans.base import Plan
 from export.plans.network import network
 from export.plans.registry import PLANS, build, parse
+from export.supports import SUPPORTS, SupportInputs
 from export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
-from tests.support.models import SCENE, random_model
+from msdgs_train.layers.base import Heads, LayerConfig, SceneBounds
+from msdgs_train.layers.chain import Deltas, MultiStepDeformation
+from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
+from msdgs_train.supports.gaussians import GaussiansConfig
+from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, random_model
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
 
+SLOW, COARSE = replace(MLP, time_frequencies=2), replace(PLANE, time_resolution=9)
+ON_NODES = {"support": NODES, "noise": 0.02}
 FORMATS: dict[str, dict[str, Any]] = {
-    "mlp": {"noise": 0.02, "time_frequencies": 2},
-    "plane": {"layers": ("plane",), "plane_time_resolution": 9},
-    "mixed": {"layers": ("mlp", "plane"), "noise": 0.02, "time_frequencies": 2, "plane_time_resolution": 9},
+    "mlp": {"layers": (SLOW, SLOW), "noise": 0.02},
+    "plane": {"layers": (COARSE,)},
+    "mixed": {"layers": (SLOW, COARSE), "noise": 0.02},
+    "splines on nodes": {"layers": (SPLINE,), **ON_NODES},
+    "mlp on nodes": {"layers": (SLOW, SLOW), **ON_NODES},
+    "plane on nodes": {"layers": (COARSE,), **ON_NODES},
+    "mixed on nodes": {"layers": (SPLINE, COARSE, SLOW), **ON_NODES},
 }
 FITTED = ("lowrank:1", "lowrank:8", "lowrank", "keyframes:4", "keyframes:12", "keyframes")
 
@@ -46,6 +58,14 @@ def made(kind: str, count: int = 60) -> tuple[DynamicGaussians, Baked, Trajector
 def opened(path: Path, contents: onnx.ModelProto) -> DeformationSession:
     path.write_bytes(contents.SerializeToString())
     return DeformationSession(path)
+
+
+def check_against_model(session: DeformationSession, model: DynamicGaussians, num_layers: int | None = None) -> None:
+    for t in (0.0, 0.4):
+        with torch.no_grad():
+            expected = model.pose(t, num_layers)
+        for got, name in zip(session.pose(t), ("means", "quats", "scales"), strict=True):
+            assert np.abs(got - getattr(expected, name).numpy()).max() <= tolerance("export.relative")
 
 
 @pytest.mark.parametrize(
@@ -143,21 +163,23 @@ def test_rows_are_those_asked_for(tmp_path: Path, plan: str, ids: list[int]):
         assert np.abs(some - every[ids]).max(initial=0) <= tolerance("export.relative")
 
 
-def test_prefix_is_the_model_stopped_early(tmp_path: Path):
-    model, baked, _ = made("mlp")
-    for k in (1, 2):
-        session = opened(tmp_path / "scene.onnx", build(f"prefix:{k}", baked))
-        assert session.scene.metadata.plan == f"prefix:{k}"
-        expected = model.pose(0.4, steps=k).means.detach().numpy()
-        assert np.abs(session.pose(0.4)[0] - expected).max() <= tolerance("export.relative")
+@pytest.mark.parametrize("kind", FORMATS)
+def test_prefix_is_the_model_stopped_early_and_network_the_whole_of_it(tmp_path: Path, kind: str):
+    model, baked, _ = made(kind)
+    plans = {f"prefix:{k}": k for k in range(1, len(baked.layers) + 1)} | {"network": None}
+    for plan, num_layers in plans.items():
+        session = opened(tmp_path / "scene.onnx", build(plan, baked))
+        assert session.scene.metadata.plan == plan
+        check_against_model(session, model, num_layers)
 
 
-def test_int8_rounds_wide_products_and_nothing_before_them(tmp_path: Path):
-    model, baked, _ = made("mlp")
+@pytest.mark.parametrize("kind", ["mlp", "mixed", "mlp on nodes", "mixed on nodes"])
+def test_int8_rounds_wide_products_and_nothing_before_them(tmp_path: Path, kind: str):
+    model, baked, _ = made(kind)
     contents = build("int8", baked)
     eight_bits = [c.name for c in contents.graph.initializer if c.data_type == onnx.TensorProto.INT8 and c.dims]
     assert sorted(n.split("_quantized")[0] for n in eight_bits if "zero" not in n) == [
-        f"layer{k}.trunk{i}.weight" for k in (1, 2) for i in (0, 1)
+        f"layer{k}.trunk{i}.weight" for k, layer in enumerate(baked.layers, 1) if layer.kind == "mlp" for i in (0, 1)
     ]
     exact = opened(tmp_path / "exact.onnx", build("network", baked))
     session = opened(tmp_path / "scene.onnx", contents)
@@ -207,44 +229,98 @@ def test_plan_knows_whether_it_is_fitted():
     assert [name for name, plan in PLANS.items() if plan.fitted] == ["lowrank", "keyframes"]
 
 
-class Drift(torch.nn.Module):
-    """A layer of a kind that the package doesn't know: all Gaussians drift along x."""
+class DriftConfig(LayerConfig):
+    """Of a kind that the package doesn't know."""
 
     kind = "drift"
+
+    def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "Drift":
+        return Drift()
+
+
+class Drift(DeformationLayer):
+    """All points drift along x."""
+
+    kind = "drift"
+
+    def forward(self, means: torch.Tensor, t: torch.Tensor) -> LayerStep:
+        step = torch.stack([2 * t, 0 * t, 0 * t]).expand(len(means), 3)
+        return LayerStep(step, 0 * step, means.new_zeros(len(means), 4), means.new_ones(len(means), 1))
 
 
 class DriftExport:
     removable_heads: frozenset[str] = frozenset()
-    parameters: frozenset[str] = frozenset()
-    bytes_per_gaussian = 0
-
-    def attributes(self, gaussians: CanonicalGaussians) -> dict[str, np.ndarray]:
-        return {}
+    scale_columns = 3
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
-        assert used == ["means"]
-        speed = graph.constant(f"{inputs.name}.speed", np.array([[2, 0, 0]], np.float32))
-        step = graph.node("Mul", [graph.node("Mul", [inputs.time, speed], "drift.now"), inputs.gate], "drift.step")
-        zeros = graph.node("Sub", [inputs.means, inputs.means], "drift.zeros")
-        return graph.node("Add", [zeros, step], "drift.deltas")
+        speed = np.zeros((1, sum(HEAD_COLUMNS[head].stop - HEAD_COLUMNS[head].start for head in used)), np.float32)
+        speed[0, 0] = 2
+        step = graph.node("Mul", [inputs.time, graph.constant(f"{inputs.name}.speed", speed)], "drift.now")
+        none = graph.node("Sub", [inputs.means, inputs.means], "drift.none")
+        axis = graph.constant("drift.axis", np.array([1], np.int64))
+        rows = graph.node("ReduceSum", [none, axis], "drift.rows")
+        return graph.node("Add", [rows, graph.node("Mul", [step, inputs.gate], "drift.step")], "drift.deltas")
 
-    def inert_heads(self, layer: torch.nn.Module) -> frozenset[str]:
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         return frozenset({"scales", "quats"})
 
-    def without_heads(self, layer: torch.nn.Module, names: frozenset[str]) -> torch.nn.Module:
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
         return layer
 
 
-def test_a_kind_of_layer_from_elsewhere_is_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    _, baked, _ = made("mlp")
-    drifting = replace(baked, layers=(Drift(),))
+@pytest.mark.parametrize("support", [GaussiansConfig(), NODES], ids=lambda support: support.kind)
+def test_a_kind_of_layer_from_elsewhere_is_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, support: SupportConfig
+):
+    model = random_model(60, layers=(DriftConfig(), SLOW), support=support, noise=0.02)
+    baked = bake(model, SCENE, "0" * 64)
     with pytest.raises(ModelNotExportable, match="'drift' can't be exported; those that can: mlp"):
-        build("network", drifting)
+        build("network", baked)
     monkeypatch.setitem(LAYERS, "drift", DriftExport())
-    session = opened(tmp_path / "scene.onnx", build("network", drifting))
-    for t in (0.0, 0.5):
-        means = session.pose(t, np.arange(len(baked.moving)))[0]
-        assert np.abs(means - baked.moving.means - [2 * t, 0, 0]).max() <= tolerance("export.relative")
+    check_against_model(opened(tmp_path / "scene.onnx", build("network", baked)), model)
+
+
+class RigidConfig(SupportConfig):
+    """Of a kind that the package doesn't know."""
+
+    kind = "rigid"
+
+    def build(self) -> "Rigid":
+        return Rigid()
+
+
+class Rigid(Support):
+    """All Gaussians move as the origin does."""
+
+    kind = "rigid"
+    num_points = 1
+
+    def forward(
+        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: torch.Tensor, num_layers: int | None
+    ) -> Deltas:
+        deltas = chain(self.points(gaussians), t, num_layers)
+        return Deltas(*(part.expand(len(gaussians.means), -1) for part in (deltas.means, deltas.scales, deltas.quats)))
+
+    def points(self, gaussians: CanonicalPoints) -> torch.Tensor:
+        return gaussians.means.new_zeros(1, 3)
+
+
+class RigidExport:
+    heads_are_removable = True
+    bytes_per_gaussian = 0
+
+    def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
+        origin = graph.constant("rigid.origin", np.zeros((1, 3), np.float32))
+        return summed_deltas(graph, inputs.layers, origin, inputs.time, inputs.steps, list(HEAD_COLUMNS))
+
+
+def test_a_kind_of_support_from_elsewhere_is_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    model = random_model(60, layers=(SLOW, COARSE), support=RigidConfig(), noise=0.02)
+    baked = bake(model, SCENE, "0" * 64)
+    with pytest.raises(ModelNotExportable, match="'rigid' can't be exported; those that can: gaussians, nodes"):
+        build("network", baked)
+    monkeypatch.setitem(SUPPORTS, "rigid", RigidExport())
+    check_against_model(opened(tmp_path / "scene.onnx", build("network", baked)), model)
 
 
 def test_a_plan_from_elsewhere_is_parsed_and_built(monkeypatch: pytest.MonkeyPatch):

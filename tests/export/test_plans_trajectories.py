@@ -1,6 +1,7 @@
 """What fitted plans are fitted to: samples as dense as the motion needs, and a motion too fast for them is found."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from export.trajectories.sampling import SomeTrajectories, Trajectories
 from export.trajectories.splines import design, fitting, samples_for
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
-from tests.support.models import SCENE, random_model
+from tests.support.models import PLANE, SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance
 
 pytestmark = pytest.mark.slow
@@ -150,7 +151,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
 
 
 def test_a_scene_is_sampled_once_for_all_plans():
-    model = random_model(5, layers=("plane",), plane_time_resolution=5)
+    model = random_model(5, layers=(replace(PLANE, time_resolution=5),))
     kept = module.trajectories_of(bake(model, SCENE, "0" * 64))
     assert module.trajectories_of(bake(model, SCENE, "1" * 64)) is kept
     with torch.no_grad():

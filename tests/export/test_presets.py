@@ -8,6 +8,7 @@ import pytest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.trainer import Trainer
+from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.systems.registry import preset, systems
 from tests.support.models import export_scene
 from tests.support.tolerances import tolerance
@@ -26,7 +27,7 @@ def test_each_preset_exports(name: str, data: Path, tmp_path: Path) -> None:
         trainer.step()
     trainer.system.save(tmp_path / "model.pt", 12)
     exported = export_scene(tmp_path / "model.pt", tmp_path / "scene.onnx", times=5)
-    drawn, posed = DeformationSession(exported.path).gaussians(0.37), trainer.system.eval_model.pose(0.37)
+    drawn, posed = DeformationSession(exported.path).gaussians(0.37), load_model(tmp_path / "model.pt").model.pose(0.37)
     for field in ("means", "quats", "scales"):
         want = getattr(posed, field).detach().numpy()
         np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))

@@ -19,7 +19,7 @@ from msdgs_serve.scene.camera import Camera
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
 from tests.support.images import psnr
-from tests.support.models import CAMERA, GROUND, OBJECT, SCENE, moving_object, random_model
+from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -195,10 +195,11 @@ def test_cameras_are_added_where_too_few_are_stored(count: int):
         (5, {"layers": ()}, SCENE),
         (5, {"layers": (), "embedding_dim": 0}, SCENE),
         (40, {"layers": ("plane", "mlp")}, SCENE),
-        (40, {"layers": ("bases",), "num_nodes": 5}, SCENE),
-        (40, {"layers": ("bases", "mlp"), "num_nodes": 5}, SCENE),
+        (40, {"support": NODES, "layers": ("spline",)}, SCENE),
+        (40, {"support": NODES, "layers": ("spline", "mlp")}, SCENE),
+        (40, {"support": NODES, "layers": ("mlp", "plane")}, SCENE),
         (40, {"weights": False, "modulation_targets": ("means", "scales", "quats")}, SCENE),
-        (40, {"delta_space": "activated"}, SCENE),
+        (40, {"scale_space": "linear"}, SCENE),
         (40, {}, SceneInfo(bounds=SCENE.bounds)),
         (40, {}, SceneInfo(time_range=(0.5, 0.5), bounds=SCENE.bounds, cameras=SCENE.cameras[:2])),
     ],
@@ -214,8 +215,10 @@ def test_unusual_scenes_are_trimmed_and_written(tmp_path: Path, count: int, chan
     assert exported.moving_count + exported.static_count == len(candidate.pruned.ids)
 
 
-def test_shared_motions_have_no_heads_to_leave_out(tmp_path: Path):
-    candidate = job_of(tmp_path, random_model(40, layers=("bases",), num_nodes=5), SCENE).candidate("network", 50.0)
+@pytest.mark.parametrize("kind", ["spline", "mlp"])
+def test_layers_on_nodes_keep_all_heads(tmp_path: Path, kind: str):
+    model = random_model(40, support=NODES, layers=(kind,))
+    candidate = job_of(tmp_path, model).candidate("network", 50.0)
     assert "heads" not in {entry["rule"] for entry in candidate.pruned.left_out}
 
 

@@ -20,7 +20,7 @@ from export.stability import UNSTABLE, main
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import save_model
 from msdgs_train.layers.chain import MultiStepDeformation
-from msdgs_train.layers.mlp import LayerStep
+from msdgs_train.layers.deformation import DeformationLayer, LayerStep
 from tests.export import stability_extreme, stability_stiff
 from tests.export.stability_rows import FAILS, Row
 from tests.export.stability_suite import TABLE
@@ -50,7 +50,7 @@ def test_products_of_jacobians_are_those_of_differences():
     assert_none_fails([*stability_stiff.jacobian_rows()])
 
 
-class Linear(torch.nn.Module):
+class Linear(DeformationLayer):
     """x → x + w A x."""
 
     def __init__(self, matrix: torch.Tensor, weight: float) -> None:
@@ -176,7 +176,7 @@ def test_what_does_not_move_is_steady(count: int, layers: tuple[str, ...]):
 
 
 def test_bounds_that_hold_a_gaussian_back_are_counted():
-    model = random_model(9, layers=("mlp",), delta_space="activated")
+    model = random_model(9, layers=("mlp",), scale_space="linear")
     with torch.no_grad():
         model.gaussians.log_scales[:2] = 30.0
         model.gaussians.raw_quats[0] = 0

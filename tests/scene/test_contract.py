@@ -175,7 +175,7 @@ def test_steps_need_a_default_of_their_type(tmp_path: Path):
         model.graph.node.insert(0, helper.make_node("Cast", ["steps"], ["as_before"], to=TensorProto.FLOAT))
 
     assert "has no default" in str(refusal(tmp_path / "scene.onnx", remove))
-    assert "is tensor(int64), not tensor(float)" in str(refusal(tmp_path / "scene.onnx", whole_numbers))
+    assert "is int64, not float32" in str(refusal(tmp_path / "scene.onnx", whole_numbers))
 
 
 def test_another_input_is_refused(tmp_path: Path):
@@ -242,26 +242,18 @@ def test_a_deformation_that_overflows_is_refused(tmp_path: Path, names: list[str
     assert refusal(tmp_path / "scene.onnx", change).field == output
 
 
-def test_a_graph_that_cannot_run_is_refused(tmp_path: Path):
+def test_a_graph_whose_shapes_disagree_is_refused_by_its_node(tmp_path: Path):
     def change(model: onnx.ModelProto) -> None:
         replace_constant(model, "layer1.trunk0.weight", lambda v: v[:, 1:])
 
-    assert refusal(tmp_path / "scene.onnx", change).field == "file"
-
-
-def test_constants_in_another_file_are_refused(tmp_path: Path):
-    path = tmp_path / "scene.onnx"
-    model = onnx.load_from_string(SCENE_BYTES)
-    onnx.save(model, path, save_as_external_data=True, location="weights.bin", size_threshold=100)
-    with pytest.raises(SceneFileInvalid, match="in another file"):
-        DeformationSession(path)
+    assert refusal(tmp_path / "scene.onnx", change).field == "layer1.trunk0.out"
 
 
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.1, 0.5, 0.99, 0.9999])
 def test_cut_off_files_are_refused(tmp_path: Path, part: float):
     path = tmp_path / "scene.onnx"
     path.write_bytes(SCENE_BYTES[: int(part * len(SCENE_BYTES))])
-    with pytest.raises(SceneFileInvalid, match=r"`file` is(n't a whole ONNX model| empty)"):
+    with pytest.raises(SceneFileInvalid, match=r"`file` (can't be read as a scene|is empty)"):
         DeformationSession(path)
 
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
-from tests.support.models import random_model
+from tests.support.models import MLP, random_model
 from tests.support.scene_files import write_scene
 from tests.support.tolerances import tolerance
 
@@ -78,7 +79,7 @@ def test_layers_may_be_applied_one_after_the_other(tmp_path: Path):
     assert session.most_steps == 3
     for steps in range(4):
         with torch.no_grad():
-            want = model.pose(0.37, steps=steps)
+            want = model.pose(0.37, num_layers=steps)
         got = dict(zip(("means", "quats", "scales"), session.pose(0.37, steps=steps), strict=True))
         for part, values in got.items():
             assert np.abs(values - getattr(want, part).detach().numpy()).max() <= tolerance("export.relative")
@@ -156,7 +157,7 @@ assert "torch" not in sys.modules and "onnx" not in sys.modules
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from Linux's /proc")
 def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
     count, width = 60_000, 256
-    model = random_model(1, layers=("mlp",), width=width, sh_degree=0, embedding_dim=0)
+    model = random_model(1, layers=(replace(MLP, width=width),), sh_degree=0, embedding_dim=0)
     for name, parameter in list(model.gaussians.named_parameters()):
         setattr(
             model.gaussians, name, torch.nn.Parameter(parameter.detach().repeat(count, *[1] * (parameter.ndim - 1)))

@@ -194,7 +194,9 @@ def test_a_long_render_does_not_hold_up_other_calls(scene: Path, monkeypatch: py
 
 
 def test_scenes_are_listed_and_described(client: httpx.Client):
-    assert client.get("/scenes").json() == {"scenes": [{"name": "balls", "loaded": True, "problem": False}]}
+    assert client.get("/scenes").json() == {
+        "scenes": [{"name": "balls", "loaded": True, "problem": False, "reason": None}]
+    }
     described = client.get("/scenes/balls").json()
     assert described["gaussians"] == {"moving": 1, "static": 1, "total": 2}
     assert described["time_range"] == [0, 1]
@@ -228,7 +230,9 @@ def test_a_scene_that_breaks_is_reported_and_goes_on(tmp_path: Path):
         np.testing.assert_array_equal(render(client), before)
         write_scene(path, static_color=(0, 0, 1))
         eventually(lambda: render(client)[SIZE // 2, SIZE // 2].argmax() == 2)
-        assert client.get("/scenes").json()["scenes"] == [{"name": "balls", "loaded": True, "problem": False}]
+        assert client.get("/scenes").json()["scenes"] == [
+            {"name": "balls", "loaded": True, "problem": False, "reason": None}
+        ]
 
 
 def test_a_scene_broken_from_the_start_is_unavailable_without_saying_where_it_lies(tmp_path: Path):

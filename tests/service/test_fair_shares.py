@@ -1,7 +1,6 @@
 """Who has how many places in the queue, and whose work is done next."""
 
 import asyncio
-import gc
 import threading
 import weakref
 from collections.abc import AsyncGenerator, Iterator
@@ -216,7 +215,6 @@ def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images
         async with aclosing(made(service)) as pieces:
             async for _ in pieces:
                 taken += 1
-                gc.collect()
                 assert len(images) == min(taken, MANY)
                 assert sum(image() is not None for image in images) <= 1
 
@@ -226,7 +224,7 @@ def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images
 
 def test_a_film_fails_in_time_to_say_so_or_is_cut_off(scene: Path):
     renderer = Renderer()
-    original, broken = renderer.render, [0.0]
+    original, broken = renderer.render, list[float]()
 
     def render(*arguments: Any) -> Image:
         if arguments[2] in broken:

@@ -8,7 +8,6 @@ from typing import Any
 
 import httpx
 import numpy as np
-import onnx
 import pytest
 
 from tests.service.test_api import eventually
@@ -77,29 +76,6 @@ def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, fo
     assert response.json()["errors"][0]["field"] == "name"
     assert files(folder) == []
     assert not (folder.parent / "scenes.onnx").exists()
-
-
-def with_external_data(path: Path, location: str) -> bytes:
-    """A scene whose constants lie in another file."""
-    model = onnx.load(path)
-    tensor = next(each for each in model.graph.initializer if each.name == "all_sh")
-    tensor.ClearField("raw_data")
-    tensor.data_location = onnx.TensorProto.EXTERNAL
-    for key, value in {"location": location, "length": "24"}.items():
-        entry = tensor.external_data.add()
-        entry.key, entry.value = key, value
-    return model.SerializeToString()
-
-
-@pytest.mark.parametrize("location", ["/etc/passwd", "../secret", "walk.data", "a/../../secret"])
-def test_files_that_need_other_files_are_refused(client: httpx.Client, tmp_path: Path, folder: Path, location: str):
-    content = with_external_data(write_scene(tmp_path / "external.onnx"), location)
-    (tmp_path / "secret").write_bytes(b"s" * 24)
-    response = add(client, content)
-    assert response.status_code == 422
-    check_problem(response)
-    assert str(tmp_path) not in response.text
-    assert files(folder) == []
 
 
 @pytest.mark.parametrize("content", [b"", b"no scene", b"\x08\x0a"], ids=["empty", "text", "beginning"])

@@ -39,7 +39,7 @@ def serving(
         with serving_on_ray(chosen) as client:
             yield client
         return
-    app = create_app(SceneStore(scenes), renderer or Renderer(), chosen)
+    app = create_app(SceneStore(scenes, chosen.open_scene), renderer or Renderer(), chosen)
     listener = bind("127.0.0.1", chosen.port)
     running = Server(app, chosen)
     if server is not None:

@@ -1,7 +1,7 @@
 """What a test may lack: where that is meant to be so, and what brings the rest.
 
-In CI (`CI` or `MSDGS_CI` is set) a run fails if it skips a test for a reason that isn't in `ALLOWED_SKIPS`. Others end in a line
-that says what was not tested, and the command that would bring it.
+In CI (`CI` or `MSDGS_CI` is set) a run fails if it skips a test for a reason that isn't in `ALLOWED_SKIPS`. Others end
+in a line that says what was not tested, and the command that would bring it.
 """
 
 from typing import NamedTuple

@@ -20,13 +20,25 @@ from msdgs_serve.api.errors import ClientGone, Refused
 from msdgs_serve.api.keys import CLIENT
 from msdgs_serve.api.numbers import Name
 from msdgs_serve.api.openapi import SCENE_BODY, problems
-from msdgs_serve.api.schemas import GaussianCounts, SceneAdded, SceneDetail, SceneEntry, SceneList, SceneView
+from msdgs_serve.api.schemas import (
+    GaussianCounts,
+    GraphCost,
+    GraphLimit,
+    SceneAdded,
+    SceneDetail,
+    SceneEntry,
+    SceneList,
+    SceneView,
+)
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.uploads import Stored
 from msdgs_serve.framing import Framing
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.scene.scene_file import SceneCost
 from msdgs_serve.scene_report import read_report, report_path
-from msdgs_serve.store import SceneStore
+from msdgs_serve.store import SceneStatus, SceneStore
+
+MAX_REASON = 300
 
 SceneName = Annotated[Name, Path(description="as in `GET /scenes`", examples=["toybench"])]
 NewName = Annotated[Name, Query(description="plain text, no separators", examples=["walk"])]
@@ -39,9 +51,7 @@ router = APIRouter(tags=["scenes"])
 def list_scenes(service: SharedService) -> SceneList:
     """Names, without loading anything."""
     statuses = service.store.statuses()
-    return SceneList(
-        scenes=[SceneEntry(name=each.name, loaded=each.loaded, problem=each.problem is not None) for each in statuses]
-    )
+    return SceneList(scenes=[SceneEntry(name=each.name, loaded=each.loaded, **_problem(each)) for each in statuses])
 
 
 @router.get(
@@ -92,8 +102,8 @@ async def add_scene(
     replace: Annotated[bool, Query(description="whether a scene of this name may be replaced")] = False,
     sha256: Sha256 = None,
 ) -> SceneAdded:
-    """Takes a scene file as the body. It is opened and checked before it takes its place; who draws the scene that it
-    replaces is not disturbed. Only where the service was started with `--uploads`."""
+    """Takes a scene file as the body. It is checked, and posed in a process of its own, before it takes its place;
+    who draws the scene that it replaces is not disturbed. Only where the service was started with `--uploads`."""
     service.check_uploads()
     incoming, uploads = service.store.incoming(uuid.uuid4().hex), service.uploads
     await anyio.to_thread.run_sync(uploads.scan)
@@ -102,12 +112,12 @@ async def add_scene(
             digest = await _receive(request, incoming, service, upload)
             if sha256 is not None and not hmac.compare_digest(digest, sha256):
                 raise InvalidInput("sha256", "that of the file", "another")
-            add = partial(service.store.add, name, incoming, replace=replace)
+            add = partial(service.add_scene, name, incoming, replace=replace)
             added = await anyio.to_thread.run_sync(add, limiter=uploads.opening)
             uploads.added(upload)
     except SceneFileInvalid as error:
         service.log_problem(error)
-        detail = f"The file breaks the contract msdgs/1 at `{error.field}`; docs/contract.md says what belongs there."
+        detail = f"The file breaks the contract msdgs/1: `{error.field}` {error.problem}"
         raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
@@ -165,7 +175,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
     return SceneDetail(
         name=name,
         loaded=status.loaded,
-        problem=status.problem is not None,
+        **_problem(status),
         contract=metadata.contract,
         plan=metadata.plan,
         layers=list(metadata.layers),
@@ -186,7 +196,19 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         package_version=metadata.package_version,
         checkpoint_sha256=metadata.checkpoint_sha256,
         sha256=served.sha256,
+        cost=_cost(served.session.cost),
     )
+
+
+def _problem(status: SceneStatus) -> dict[str, Any]:
+    reason = None if status.problem is None else f"`{status.problem.field}` {status.problem.problem}"
+    return {"problem": reason is not None, "reason": reason and reason[:MAX_REASON]}
+
+
+def _cost(cost: SceneCost) -> GraphCost:
+    allowed = cost.limits
+    limits = GraphLimit(gaussians=allowed.gaussians, memory_bytes=allowed.memory_bytes, operations=allowed.operations)
+    return GraphCost(memory_bytes=cost.memory_bytes, operations=cost.operations, calls=cost.calls, limits=limits)
 
 
 def _view(seen: Framing) -> SceneView:

@@ -1,4 +1,4 @@
-"""COLMAP's `cameras.bin`, `images.bin` and `points3D.bin`: little-endian records behind a count."""
+"""COLMAP's `cameras.bin`, `images.bin` and `points3D.bin`: a count followed by little-endian records."""
 
 import struct
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from msdgs_train.datasets.common.scene_data import DatasetInvalid
 
 
 class _Bytes:
-    """A little-endian file, read from front to back."""
+    """A little-endian file, read sequentially."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -36,7 +36,7 @@ class _Bytes:
         return values
 
     def text(self, field: str) -> str:
-        """Up to the next zero byte."""
+        """The string up to the next zero byte."""
         end = self.content.find(b"\0", self.offset)
         self._require(end if end >= 0 else len(self.content) + 1, field)
         text = self.content[self.offset : end].decode("utf-8", errors="replace")

@@ -1,11 +1,11 @@
 """COLMAP layout: a sparse model in `sparse/0` or `sparse`, binary or text, and the images in `images`.
 
-Poses map world to camera in OpenCV axes and pixel centres are at half-integers, both as in `Camera`. Images of
+Poses map world to camera in OpenCV axes and pixel centers are at half-integers, both as in `Camera`. Images of
 the models SIMPLE_RADIAL, RADIAL and OPENCV are undistorted by `Frame.load_rgba`, bilinearly, to a pinhole camera with
-the same intrinsics. Where `images` holds reduced copies, intrinsics are scaled to them.
+the same intrinsics. If `images` holds downscaled copies, intrinsics are scaled to them.
 
-COLMAP knows no time: it is the number that a pattern finds in an image's name, scaled so that the images of the model
-run from 0 to 1. The first image, in the order of names, and every 8th after it are for testing.
+COLMAP stores no times: a frame's time is the number that a pattern finds in the image's name, scaled to [0, 1] over the
+images of the model. The first image, in the order of names, and every 8th after it are test frames.
 """
 
 import math
@@ -26,16 +26,16 @@ from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneD
 
 SPARSE = "sparse"
 TRAILING_NUMBER = r"(\d+)[^\d/]*$"
-"""The last run of digits in the name of the file itself."""
+"""The last run of digits in the name of the file, folders excluded."""
 
 
 def load_colmap(folder: Path | str, size: int | None = None, time_pattern: str | None = TRAILING_NUMBER) -> SceneData:
     """Read the cameras, times and sparse points of a COLMAP scene.
 
-    `size` is the width in pixels that images are reduced to. `time_pattern` is a regular expression with one
-    group, which is the time in any unit; it is searched in the image's name, folders in `images` included and the
-    extension left out. With None the scene is static, t = 0, as it is where all numbers are equal. Raises
-    `DatasetInvalid` naming file and field, and `InvalidInput` where `size` or `time_pattern` can't be.
+    `size` is the width of the images in pixels. `time_pattern` is a regular expression with one group, the time in any
+    unit; it is searched in the image's path below `images`, without the extension. With None, or if all numbers are
+    equal, the scene is static, t = 0. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable
+    `size` or `time_pattern`.
     """
     folder = Path(folder)
     files = _model_files(folder)
@@ -55,7 +55,7 @@ def load_colmap(folder: Path | str, size: int | None = None, time_pattern: str |
 
 
 def _model_files(folder: Path) -> list[Path]:
-    """`cameras`, `images` and `points3D`, which are all there."""
+    """The existing files `cameras`, `images` and `points3D`."""
     for place in (folder / SPARSE / "0", folder / SPARSE):
         for ending in (".bin", ".txt"):
             files = [place / f"{part}{ending}" for part in ("cameras", "images", "points3D")]
@@ -76,27 +76,27 @@ def _frame(
     image_path = folder / "images" / image.name
     if not image_path.is_file():
         raise DatasetInvalid(files[1], field, f"is in the model, but there is no file {image_path}")
-    photograph, stated = image_size(image_path), ImageSize(camera.width, camera.height)
-    if not stated.has_shape_of(photograph):
-        raise DatasetInvalid(files[1], field, f"has a camera for {stated}, but the image is {image}")
-    pinhole = _pinhole(files, image, camera).resized(*photograph)
+    stored, stated = image_size(image_path), ImageSize(camera.width, camera.height)
+    if not stated.has_shape_of(stored):
+        raise DatasetInvalid(files[1], field, f"has a camera for {stated}, but the image is {stored}")
+    pinhole = _pinhole(files, image, camera).resized(*stored)
     distortion = Distortion(**{key: camera.values.get(key, 0.0) for key in Distortion._fields})
     if distortion.folds(pinhole):
-        problem = f"is {distortion} and would show places twice: let COLMAP undistort the images"
+        problem = f"is {distortion} and maps two points to one: undistort the images with COLMAP"
         raise DatasetInvalid(files[0], f"cameras[{image.camera_id}]", problem)
     name = "_".join(PurePosixPath(image.name).with_suffix("").parts)
     return Frame(name, reduced(pinhole, size, image_path), t, image_path, distortion if any(distortion) else None)
 
 
 def _pinhole(files: list[Path], image: ModelImage, camera: ModelCamera) -> Camera:
-    """In pixels of the image that COLMAP saw."""
+    """In pixels of the image that COLMAP was run on."""
     values = camera.values
     fx, fy = (values.get(key, values.get("f", math.nan)) for key in ("fx", "fy"))
     pose = _camera_to_world(files[1], image)
     try:
         return Camera(fx, fy, values["cx"], values["cy"], camera.width, camera.height, pose)
     except InvalidInput as error:
-        raise DatasetInvalid(files[0], f"cameras[{image.camera_id}]", f"is no camera: {error}") from None
+        raise DatasetInvalid(files[0], f"cameras[{image.camera_id}]", f"is not a valid camera: {error}") from None
 
 
 def _camera_to_world(file: Path, image: ModelImage) -> np.ndarray:
@@ -106,7 +106,7 @@ def _camera_to_world(file: Path, image: ModelImage) -> np.ndarray:
     try:
         rotation = to_matrix(normalize(image.qvec))  # world to camera
     except InvalidInput as error:
-        raise DatasetInvalid(file, f"images[{image.name}].qvec", f"is no rotation: {error}") from None
+        raise DatasetInvalid(file, f"images[{image.name}].qvec", f"is not a rotation: {error}") from None
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ image.tvec
@@ -114,7 +114,7 @@ def _camera_to_world(file: Path, image: ModelImage) -> np.ndarray:
 
 
 def _times(file: Path, images: list[ModelImage], pattern: str | None) -> list[float]:
-    """Of every image, in [0, 1]."""
+    """The time of each image, in [0, 1]."""
     if pattern is None:
         return [0.0] * len(images)
     try:
@@ -135,13 +135,13 @@ def _number(file: Path, name: str, expression: re.Pattern[str]) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        problem = f"has no time: {expression.pattern} finds no number in it; choose another time_pattern, or none"
+        problem = f"has no time: {expression.pattern} finds no number in it; set another time_pattern, or None"
         raise DatasetInvalid(file, f"images[{name}].name", problem)
     return number
 
 
 def _points(file: Path, rows: list[tuple[float, ...]]) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """From x y z and 8-bit red green blue; None where there are none."""
+    """From x y z and 8-bit red green blue; None without points."""
     if not rows:
         return None, None
     values = np.array(rows, dtype=np.float64)

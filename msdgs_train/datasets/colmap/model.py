@@ -1,4 +1,4 @@
-"""What COLMAP's sparse models hold, whether they are binary or text."""
+"""The contents of COLMAP's sparse models, binary or text."""
 
 import math
 from pathlib import Path
@@ -15,7 +15,7 @@ PARAMETERS = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-"""The camera models that are understood, and what their parameters are, in the order of the file."""
+"""Supported camera models and their parameters, in the order of the file."""
 
 MODEL_NAMES = (
     *PARAMETERS,
@@ -23,7 +23,7 @@ MODEL_NAMES = (
     *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM"),
     "EQUIRECTANGULAR",
 )
-"""By the number that binary files give them."""
+"""Indexed by the model number in binary files."""
 
 
 class ModelCamera(NamedTuple):
@@ -37,16 +37,16 @@ class ModelCamera(NamedTuple):
 class ModelImage(NamedTuple):
     """An image and its pose: x_camera = R(qvec) · x_world + tvec, in OpenCV axes."""
 
-    name: str  # path below the folder of images
+    name: str  # path relative to the folder of images
     camera_id: int
-    qvec: np.ndarray  # [4] float64, wxyz, as it stands in the file
+    qvec: np.ndarray  # [4] float64, wxyz, not normalized
     tvec: np.ndarray  # [3] float64
 
 
 def make_camera(
     file: Path, field: str, model: str, width: int, height: int, parameters: tuple[float, ...]
 ) -> ModelCamera:
-    """Raises `DatasetInvalid` naming file and field where the parameters are not those of the camera model."""
+    """Raises `DatasetInvalid` naming file and field if the parameters don't fit the camera model."""
     keys = PARAMETERS[model]
     if len(parameters) != len(keys):
         raise DatasetInvalid(file, field, f"must have {len(keys)} parameters for {model}, got {len(parameters)}")
@@ -57,9 +57,9 @@ def make_camera(
 
 
 def check_model(file: Path, field: str, model: str) -> None:
-    """Raises `DatasetInvalid` naming a camera model that isn't understood."""
+    """Raise `DatasetInvalid` for an unsupported camera model."""
     if model not in PARAMETERS:
         known = ", ".join(PARAMETERS)
         raise DatasetInvalid(
-            file, field, f"is {model}, and only {known} are understood: let COLMAP undistort the images"
+            file, field, f"is {model}, and only {known} are supported: undistort the images with COLMAP"
         )

@@ -1,4 +1,4 @@
-"""COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`: lines of words, comments after `#`."""
+"""COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`: one record per line, comments after `#`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,13 +10,13 @@ from msdgs_train.datasets.common.scene_data import DatasetInvalid
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, comments left out; empty ones are kept, since an image may have no observations."""
+    """Lines with their numbers, without comments; empty lines are kept, since an image may have no observations."""
     try:
         text = file.read_text(encoding="utf-8")
     except OSError as error:
         raise DatasetInvalid(file, "file", f"can't be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
-        raise DatasetInvalid(file, "file", f"is no text: {error}") from None
+        raise DatasetInvalid(file, "file", f"is not text: {error}") from None
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.startswith("#"):
             yield number, line.strip()
@@ -49,7 +49,7 @@ def read_images(file: Path) -> Iterator[ModelImage]:
             pose = np.array([float(word) for word in words[1:8]])
             _, camera_id, name = int(words[0]), int(words[8]), words[9]
         except (ValueError, IndexError):
-            wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and the line after it what was seen in the image"
+            wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, followed by a line of its observations"
             raise DatasetInvalid(file, f"line {number}", f"must be {wanted}") from None
         next(lines, None)
         yield ModelImage(name, camera_id, pose[:4], pose[4:])

@@ -1,1 +1,1 @@
-"""Common."""
+"""Readers and data structures that several dataset formats share."""

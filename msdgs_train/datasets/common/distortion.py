@@ -1,4 +1,4 @@
-"""Lens distortion by the Brown–Conrady model, as OpenCV, COLMAP and nerfstudio number it, and how it is taken out."""
+"""Lens distortion by the Brown–Conrady model, coefficients as in OpenCV, COLMAP and nerfstudio, and its removal."""
 
 from typing import Any, NamedTuple
 
@@ -20,9 +20,9 @@ class Distortion(NamedTuple):
     k3: float = 0.0
 
     def folds(self, camera: Camera) -> bool:
-        """Whether two places in the image of the pinhole `camera` would be the same place in its image.
+        """Whether two points of the pinhole image of `camera` map to the same point of the distorted image.
 
-        No lens does so: the coefficients are wrong, or were fitted to less than the whole image.
+        No lens does so: the coefficients are wrong, or were fitted to a part of the image.
         """
         x = (np.linspace(0, camera.width, FOLD_GRID) - camera.cx) / camera.fx
         y = (np.linspace(0, camera.height, FOLD_GRID) - camera.cy) / camera.fy
@@ -34,10 +34,10 @@ class Distortion(NamedTuple):
 
 
 def undistort(rgba: np.ndarray, camera: Camera, distortion: Distortion) -> np.ndarray:
-    """What the pinhole `camera` would have captured: uint8 [H, W, 4], straight alpha, like `rgba`.
+    """Resample an image to the pinhole `camera`: uint8 [H, W, 4], straight alpha, like `rgba`.
 
     `camera` has the intrinsics of the distorted image and its size, H×W. Pixels are interpolated bilinearly,
-    colors weighted by alpha. A place that the image doesn't show gets the nearest one on its edge.
+    colors weighted by alpha. Points outside of the image take the nearest pixel of its border.
     """
     result = np.empty_like(rgba)
     _resample(np.ascontiguousarray(rgba), (camera.fx, camera.fy, camera.cx, camera.cy), distortion, result)

@@ -1,4 +1,4 @@
-"""How large a scene is, for datasets that don't say: by its sparse points, or else by where its cameras look."""
+"""Scene size for datasets that don't state it, from the sparse points or else from the cameras."""
 
 import numpy as np
 
@@ -6,14 +6,15 @@ from msdgs_serve.scene import Camera
 
 QUANTILE = 0.99
 PARALLEL = 1e-3
-"""Mean square of the sine between optical axes; below it, about 2°, the point nearest to all of them means nothing."""
+"""Smallest eigenvalue, a mean squared sine, below which optical axes are treated as parallel: about 2°."""
 
 
 def scene_half_size(points: np.ndarray | None, cameras: list[Camera]) -> float:
     """Half the side of the cube around the origin that holds 99 % of the sparse `points`, [M, 3], in scene units.
 
-    Without points, it holds a ball around the point nearest to all optical axes, as far as the median camera is from
-    it; where the axes are parallel, a ball around the middle of the cameras that holds them. At least one camera.
+    Without points, it holds a ball around the point nearest to all optical axes, whose radius is the median distance of
+    the cameras; if the axes are parallel, a ball around the mean position that holds all cameras. `cameras` has one or
+    more.
     """
     if points is not None and len(points):
         reach = float(np.quantile(np.abs(points).max(axis=1), QUANTILE))
@@ -25,7 +26,7 @@ def scene_half_size(points: np.ndarray | None, cameras: list[Camera]) -> float:
 def _reach_of_cameras(cameras: list[Camera]) -> float:
     positions = np.array([camera.position for camera in cameras])
     axes = np.array([camera.camera_to_world[:3, 2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3], takes out what lies along an axis
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3], projects onto the plane normal to an axis
     mean = across.mean(axis=0)
     if np.linalg.eigvalsh(mean)[0] < PARALLEL:
         center = positions.mean(axis=0)

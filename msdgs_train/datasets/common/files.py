@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside their place, flushed to the disk, then moved over it."""
+"""Atomic writes: into a temporary file in the same folder, flushed to disk, then moved over the old file."""
 
 import contextlib
 import os
@@ -9,12 +9,12 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write in the same folder, with the same ending; it takes the place of `path` at the end of the block.
+    """A temporary file in the same folder, with the same suffix; it replaces `path` at the end of the block.
 
-    Where the block is broken off, also by Ctrl-C, the file is removed and `path` stays as it was.
+    If the block raises, or is interrupted by Ctrl-C, the file is removed and `path` is unchanged.
     """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-    os.fchmod(handle, 0o644) if hasattr(os, "fchmod") else None  # mkstemp's own mode shuts out everybody else
+    os.fchmod(handle, 0o644) if hasattr(os, "fchmod") else None  # mkstemp's own mode is 0600
     os.close(handle)
     temporary = Path(name)
     try:

@@ -1,4 +1,4 @@
-"""Images as 8-bit RGBA with straight alpha: reading, reducing and laying over a background."""
+"""Images as 8-bit RGBA with straight alpha: reading, downscaling and compositing."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +10,7 @@ EXTENSIONS = (".png", ".jpg", ".jpeg")
 
 
 class ImageUnreadable(Exception):
-    """A file is no image that can be used; the message says why."""
+    """A file can't be used as an image; the message gives the reason."""
 
 
 class ImageSize(NamedTuple):
@@ -23,13 +23,13 @@ class ImageSize(NamedTuple):
         return f"{self.width}×{self.height}"
 
     def has_shape_of(self, other: "ImageSize") -> bool:
-        """Whether one is the other in another size; copies are rounded to whole pixels, so 1 % may be missing."""
+        """Whether the aspect ratios agree within 1 %, since sizes of copies are rounded to whole pixels."""
         across, down = self.width * other.height, self.height * other.width
         return min(*self, *other) > 0 and 100 * abs(across - down) <= down
 
 
 def read_size(path: Path) -> ImageSize:
-    """The size that an image's header states. Raises `ImageUnreadable`."""
+    """The size in an image's header. Raises `ImageUnreadable`."""
     reader = _open(path)
     spec = reader.spec()
     reader.close()
@@ -37,7 +37,7 @@ def read_size(path: Path) -> ImageSize:
 
 
 def read_rgba(path: Path) -> np.ndarray:
-    """[H, W, 4] uint8, straight alpha; grey becomes RGB, and what has no alpha is opaque. Raises `ImageUnreadable`."""
+    """[H, W, 4] uint8, straight alpha; gray becomes RGB, images without alpha are opaque. Raises `ImageUnreadable`."""
     reader = _open(path)
     pixels = reader.read_image("uint8")
     problem = reader.geterror()
@@ -53,10 +53,10 @@ def read_rgba(path: Path) -> np.ndarray:
 
 
 def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Reduce uint8 [H, W, 4] to [height, width, 4]: each new pixel is the mean over the area it covers.
+    """Downscale uint8 [H, W, 4] to [height, width, 4]: each new pixel is the mean over the area it covers.
 
-    Colors are weighted by alpha, so that what is behind transparent pixels does not bleed in; where nothing is
-    opaque, the color is black. For halves this is the exact 2×2 box.
+    Colors are weighted by alpha, so that colors of transparent pixels do not bleed in; fully transparent areas become
+    black. At half the size this is the exact 2×2 box filter.
     """
     if rgba.shape[:2] == (height, width):
         return rgba
@@ -69,7 +69,7 @@ def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def composite(rgba: np.ndarray, background: np.ndarray | tuple[float, float, float]) -> np.ndarray:
-    """Lay uint8 [H, W, 4] with straight alpha over an RGB background in [0, 1]; returns float32 [H, W, 3]."""
+    """Composite uint8 [H, W, 4] with straight alpha over an RGB background in [0, 1]; returns float32 [H, W, 3]."""
     scaled = rgba.astype(np.float32) * np.float32(1 / 255)
     rgb, alpha = scaled[..., :3], scaled[..., 3:]
     background = np.asarray(background, np.float32)
@@ -89,9 +89,9 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
-    """[count, …] means over `count` equal cells of float64 [length, …]; cells may cut rows.
+    """[count, …] means over `count` equal cells of float64 [length, …]; cell borders may split rows.
 
-    Differences of running sums, which cost the same whatever the size of a cell.
+    Computed as differences of cumulative sums, at a cost that doesn't depend on the cell size.
     """
     length = len(rows)
     sums = np.zeros((length + 1, *rows.shape[1:]))

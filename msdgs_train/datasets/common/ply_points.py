@@ -1,4 +1,4 @@
-"""Sparse points from `.ply` files: text or binary, the vertices first."""
+"""Sparse points from `.ply` files: text or binary, with the vertices as the first element."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -23,14 +23,14 @@ _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 
 class PlyPoints(NamedTuple):
-    """Points in the file's own axes and units, and what colors it gives them."""
+    """Points in the axes and units of the file."""
 
     points: np.ndarray  # [M, 3] float64, finite
-    colors: np.ndarray | None  # [M, 3] float64 in [0, 1]; None where the file has no red, green and blue
+    colors: np.ndarray | None  # [M, 3] float64 in [0, 1]; None if the file has no red, green and blue
 
 
 def read_ply_points(file: Path) -> PlyPoints:
-    """Read `x y z` and, where there are any, `red green blue` of the vertices; other properties are passed over.
+    """Read `x y z` and, if present, `red green blue` of the vertices; other properties are ignored.
 
     Integer colors are divided by the largest value of their type. Raises `DatasetInvalid` naming file and field.
     """
@@ -40,7 +40,7 @@ def read_ply_points(file: Path) -> PlyPoints:
         raise DatasetInvalid(file, "file", f"can't be read: {error.strerror}") from None
     header, end, body = content.partition(b"end_header")
     if not content.startswith(b"ply") or not end:
-        raise DatasetInvalid(file, "file", "is no PLY: it must begin with `ply` and have a line `end_header`")
+        raise DatasetInvalid(file, "file", "is not a PLY file: it must begin with `ply` and have a line `end_header`")
     encoding, count, row = _parse_header(file, header.decode("ascii", errors="replace"))
     body = body.partition(b"\n")[2]
     vertices = _from_text(file, body, count, row) if encoding == "ascii" else _from_bytes(file, body, count, row)
@@ -52,7 +52,7 @@ def read_ply_points(file: Path) -> PlyPoints:
 
 
 def _parse_header(file: Path, header: str) -> tuple[str, int, np.dtype]:
-    """The encoding, the number of vertices, and what each holds."""
+    """The encoding, the number of vertices and their type."""
     encoding, elements, fields = "", [], []
     for line in header.splitlines():
         match line.split():
@@ -70,7 +70,7 @@ def _parse_header(file: Path, header: str) -> tuple[str, int, np.dtype]:
         case [["vertex", number]] if number.isdecimal():
             count = int(number)
         case _:
-            raise DatasetInvalid(file, "element", f"must be vertex and a number at first, got {elements[:1]}")
+            raise DatasetInvalid(file, "element", f"must be vertex and a number first, got {elements[:1]}")
     names = [name for name, _ in fields]
     if len(set(names)) < len(names):
         raise DatasetInvalid(file, "property", f"names must differ, got {' '.join(names)}")
@@ -81,7 +81,7 @@ def _parse_header(file: Path, header: str) -> tuple[str, int, np.dtype]:
 
 
 def _from_text(file: Path, body: bytes, count: int, row: np.dtype) -> np.ndarray:
-    """Of the same fields as `row`, all float64: nothing is rounded or wrapped to an integer unseen."""
+    """The fields of `row`, all as float64, so that no value is rounded or wraps around."""
     names = row.names or ()
     words = body.split()[: count * len(names)]
     if len(words) < count * len(names):

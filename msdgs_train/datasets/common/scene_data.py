@@ -1,4 +1,4 @@
-"""What every dataset is turned into: frames with a camera and a time each, in splits."""
+"""The common form of all datasets: splits of frames, each with a camera and a time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +11,11 @@ from msdgs_train.datasets.common.images import ImageSize, ImageUnreadable, read_
 
 SPLITS = ("train", "val", "test")
 HELD_OUT = 8
-"""Where a dataset names no test frames, every 8th is one, as in Mip-NeRF 360 and 3D Gaussian Splatting."""
+"""Every 8th frame is a test frame if a dataset names none, as in Mip-NeRF 360 and 3D Gaussian Splatting."""
 
 
 class DatasetInvalid(MsdgsError):
-    """A dataset lacks something, or says what can't be true; `file` and `field` say where."""
+    """A dataset is incomplete or inconsistent; `file` and `field` name the place."""
 
     def __init__(self, file: Path | str, field: str, problem: str) -> None:
         super().__init__(f"{file}: `{field}` {problem}")
@@ -25,18 +25,18 @@ class DatasetInvalid(MsdgsError):
 
 @dataclass(frozen=True)
 class Frame:
-    """One image: where it was taken, when, and where its pixels are."""
+    """One image with its camera, its time and its file."""
 
     name: str
     camera: Camera  # a pinhole of the size that `load_rgba` returns
     t: float
     image_path: Path
-    distortion: Distortion | None = None  # of the lens, which the file still shows and `load_rgba` takes out
+    distortion: Distortion | None = None  # of the lens, in the file; `load_rgba` removes it
 
     def load_rgba(self) -> np.ndarray:
-        """[height, width, 4] uint8, sRGB with straight alpha, undistorted and reduced to the camera's size.
+        """[height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.
 
-        Raises `DatasetInvalid` where the file can't be read.
+        Raises `DatasetInvalid` if the file can't be read.
         """
         try:
             rgba = read_rgba(self.image_path)
@@ -50,17 +50,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class SceneData:
-    """A dataset ready for training. World axes are the dataset's own; cameras are OpenCV."""
+    """A dataset ready for training. World axes are those of the dataset; cameras are OpenCV."""
 
     splits: dict[str, list[Frame]]  # "train" has one frame or more; "val" and "test" may be empty
     time_range: tuple[float, float]  # first and last time of any frame of any split; equal in a static scene
-    scene_half_size: float  # half the side of the cube around the origin that the scene fills, in scene units
+    scene_half_size: float  # half the side of the cube around the origin that holds the scene, in scene units
     points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
-    point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None where `points` have no colors
+    point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None if `points` have no colors
 
 
 def image_size(path: Path) -> ImageSize:
-    """The size that an image's header states. Raises `DatasetInvalid` where it can't be read."""
+    """The size in an image's header. Raises `DatasetInvalid` if it can't be read."""
     try:
         return read_size(path)
     except ImageUnreadable as error:
@@ -68,9 +68,9 @@ def image_size(path: Path) -> ImageSize:
 
 
 def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
-    """`camera` for images `size` pixels wide, height in proportion; as it is if `size` is None.
+    """`camera` for images `size` pixels wide, height in proportion; unchanged if `size` is None.
 
-    Raises `InvalidInput` where `size` is not in [1, width of the image].
+    Raises `InvalidInput` if `size` is not in [1, width of the image].
     """
     if size is None or size == camera.width:
         return camera
@@ -82,7 +82,7 @@ def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
 
 
 def hold_out(frames: list[Frame]) -> dict[str, list[Frame]]:
-    """Splits in which the first and every 8th frame after it are for testing; a single frame is for training."""
+    """Splits with the first and every 8th frame after it as test frames; a single frame is a training frame."""
     test = frames[::HELD_OUT] if len(frames) > 1 else []
     train = [frame for index, frame in enumerate(frames) if index % HELD_OUT or not test]
     return {"train": train, "val": [], "test": test}

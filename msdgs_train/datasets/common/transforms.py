@@ -1,6 +1,6 @@
 """`transforms*.json`: images with poses in OpenGL axes and intrinsics, in the layouts that descend from NeRF.
 
-Pixels are those of the stored image: where it is a reduced copy of what `w` and `h` say, intrinsics are scaled.
+Cameras have the size of the stored image: if it is a downscaled copy of `w`×`h`, intrinsics are scaled.
 """
 
 import math
@@ -12,23 +12,23 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize
-from msdgs_train.datasets.common.json_file import read_json
+from msdgs_train.datasets.common.readers import read_json
 from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, image_size, reduced
 
 
 class Entry(NamedTuple):
-    """A frame as the JSON has it."""
+    """A frame as it is in the JSON file."""
 
     file: Path
     index: int
     values: dict[str, Any]
-    shared: dict[str, Any]  # what the file says for all frames
+    shared: dict[str, Any]  # top-level values, for all frames
 
     def invalid(self, key: str, problem: str) -> DatasetInvalid:
         return DatasetInvalid(self.file, f"frames[{self.index}].{key}", problem)
 
     def get(self, key: str) -> Any:
-        """The frame's own value, or else the file's; None where neither has one."""
+        """The frame's own value, or else the file's; None if neither has one."""
         return self.values.get(key, self.shared.get(key))
 
     def has(self, key: str) -> bool:
@@ -44,7 +44,7 @@ class Entry(NamedTuple):
         return float(value)
 
     def file_path(self) -> str:
-        """What the frame calls its image. Raises `DatasetInvalid`."""
+        """The frame's `file_path`. Raises `DatasetInvalid`."""
         name = self.values.get("file_path")
         if not isinstance(name, str) or not name:
             raise self.invalid("file_path", "is missing" if name is None else f"must be a file name, got {name!r}")
@@ -52,7 +52,7 @@ class Entry(NamedTuple):
 
 
 def read_entries(file: Path, may_be_empty: bool = False) -> list[Entry]:
-    """The frames of one JSON, unchecked but for being objects. Raises `DatasetInvalid` naming file and field."""
+    """The frames of one JSON file; only their type is checked. Raises `DatasetInvalid` naming file and field."""
     content = read_json(file)
     frames = content.get("frames")
     if not isinstance(frames, list) or not (frames or may_be_empty):
@@ -64,16 +64,16 @@ def read_entries(file: Path, may_be_empty: bool = False) -> list[Entry]:
 
 
 def check_times(entries: list[Entry]) -> None:
-    """Raise `DatasetInvalid` where some frames have a `time` and others none."""
+    """Raise `DatasetInvalid` if some frames have a `time` and others don't."""
     without = [entry for entry in entries if "time" not in entry.values]
     if without and len(without) < len(entries):
         raise without[0].invalid("time", "is missing, though other frames have one")
 
 
 def read_frame(entry: Entry, size: int | None) -> Frame:
-    """The frame without its distortion, reduced to a width of `size` pixels; t = 0 where it has no `time`.
+    """The frame, distortion ignored, for images `size` pixels wide; t = 0 if it has no `time`.
 
-    Raises `DatasetInvalid` naming file and field, and `InvalidInput` where `size` can't be.
+    Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
     """
     image_path = _image_path(entry)
     camera = reduced(_camera(entry, image_size(image_path)), size, image_path)
@@ -102,14 +102,14 @@ def _camera(entry: Entry, image: ImageSize) -> Camera:
     try:
         return Camera.from_opengl(_matrix(entry), width, height, fx=fx, fy=fy, cx=cx, cy=cy).resized(*image)
     except InvalidInput as error:
-        raise entry.invalid(_KEYS.get(error.field, "transform_matrix"), f"is no camera: {error}") from None
+        raise entry.invalid(_KEYS.get(error.field, "transform_matrix"), f"is not a valid camera: {error}") from None
 
 
 _KEYS = {"camera.fx": "fl_x", "camera.fy": "fl_y", "camera.width": "w", "camera.height": "h"}
 
 
 def _stated_size(entry: Entry, image: ImageSize) -> ImageSize:
-    """The size that the intrinsics are about: `w` and `h`, or else the image's own."""
+    """The size that the intrinsics belong to: `w` and `h`, or else the image's own."""
     if not (entry.has("w") or entry.has("h")):
         return image
     stated = ImageSize(round(entry.number("w")), round(entry.number("h")))
@@ -119,7 +119,7 @@ def _stated_size(entry: Entry, image: ImageSize) -> ImageSize:
 
 
 def _focal_length(entry: Entry, key: str, length: int) -> float:
-    """In pixels, from the angle that `length` pixels are seen under."""
+    """In pixels, from the field of view of `length` pixels."""
     angle = entry.get(key)
     if angle is None:
         raise DatasetInvalid(entry.file, key, f"is missing, and frames[{entry.index}] has no fl_x")

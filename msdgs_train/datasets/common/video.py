@@ -1,12 +1,12 @@
-"""Videos whose frames are images: one file a camera, of which training wants any frame at any time.
+"""Videos as training images: one file per camera, whose frames are read in random order.
 
-H.264 gives no random access: the way to a frame begins at the keyframe before it, 0.8 s for the 20th frame at 2704×2028
-on two busy cores, against milliseconds from pixels that lie ready. So the first frame that is wanted of a video decodes
-all of it, frame by frame and reduced to the size of training, into one uint8 `.npy` file [F, H, W, 3], which is
-memory-mapped from then on and used again by later runs. No more than one frame is held as an array at a time.
+H.264 has no random access: a frame is decoded from the keyframe before it, 0.8 s for the 20th frame at 2704×2028 on two
+busy cores, against milliseconds from stored pixels. Therefore the first access to a frame decodes the whole video,
+frame by frame and downscaled to the training size, into one uint8 `.npy` file [F, H, W, 3], which is memory-mapped from
+then on and reused by later runs. At most one frame is held as an array at a time.
 
-The files lie in `$XDG_CACHE_HOME/msdgs/videos`, or else `~/.cache/msdgs/videos`, and may be deleted whenever no
-training runs: 1.2 GB for 300 frames of 1352×1014. Their names hang on the video's path, size and time of change.
+The files are in `$XDG_CACHE_HOME/msdgs/videos`, or else `~/.cache/msdgs/videos`, and may be deleted if no training is
+running: 1.2 GB for 300 frames of 1352×1014. Their names depend on the video's path, size and modification time.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame
 
 
 class VideoInfo(NamedTuple):
-    """What a video's header says; sizes in pixels."""
+    """The header of a video; sizes in pixels."""
 
     count: int
     width: int
@@ -32,14 +32,14 @@ class VideoInfo(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class VideoFrame(Frame):
-    """A frame of a video. `image_path` is no file but the video's path with the frame's number behind it."""
+    """A frame of a video. `image_path` isn't a file: it is the video's path followed by the frame's number."""
 
     video: Path
     index: int
     count: int  # of the whole video
 
     def load_rgba(self) -> np.ndarray:
-        """[height, width, 4] uint8, sRGB, opaque, reduced to the camera's size. The first of a video decodes all."""
+        """[height, width, 4] uint8, sRGB, opaque, downscaled to the camera's size. The first call decodes it all."""
         width, height = self.camera.width, self.camera.height
         frames = open_frames(self.video, VideoInfo(self.count, width, height))
         rgba = np.full((height, width, 4), 255, np.uint8)
@@ -53,22 +53,22 @@ def read_info(video: Path) -> VideoInfo:
     try:
         with av.open(str(video)) as container:
             if not container.streams.video:
-                raise _invalid(video, "has no images in it")
+                raise _invalid(video, "has no video stream")
             stream = container.streams.video[0]
             width, height = stream.codec_context.width, stream.codec_context.height
             count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
     except av.FFmpegError as error:
         raise _invalid(video, f"can't be read: {error.strerror}") from None
     if count < 1:
-        raise _invalid(video, "has no frames in it")
+        raise _invalid(video, "has no frames")
     return VideoInfo(count, width, height)
 
 
 def open_frames(video: Path, wanted: VideoInfo) -> np.ndarray:
-    """[count, height, width, 3] uint8 RGB, read-only and memory-mapped, reduced to the wanted size.
+    """[count, height, width, 3] uint8 RGB, read-only and memory-mapped, downscaled to the wanted size.
 
-    Decodes the video unless an earlier call has. Raises `DatasetInvalid` where it has another number of frames, can't
-    be decoded, or its frames can't be kept.
+    Decodes the video unless it is cached. Raises `DatasetInvalid` if it has another number of frames, can't be decoded,
+    or its frames can't be stored.
     """
     cached = _cache_file(video, wanted)
     frames = _mapped(cached, wanted)
@@ -83,7 +83,7 @@ def open_frames(video: Path, wanted: VideoInfo) -> np.ndarray:
 def _mapped(file: Path, wanted: VideoInfo) -> np.ndarray | None:
     try:
         frames = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):  # not there, or cut off
+    except (OSError, ValueError, EOFError):  # missing or truncated
         return None
     shape = (wanted.count, wanted.height, wanted.width, 3)
     return frames if frames.shape == shape and frames.dtype == np.uint8 else None
@@ -108,13 +108,13 @@ def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
         gigabytes = 3e-9 * wanted.count * wanted.width * wanted.height
         raise _invalid(
             video,
-            f"can't be kept decoded in {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Name a folder "
-            f"with room in the environment variable XDG_CACHE_HOME, or train at a smaller size",
+            f"can't be stored decoded in {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the "
+            f"environment variable XDG_CACHE_HOME to a folder with space, or train at a smaller size",
         ) from None
 
 
 def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
-    """Plain writes, not through a map: a full disk is an error to the former and kills the process in the latter."""
+    """Written, not memory-mapped: a full disk raises an error in a write, and kills a process that writes to a map."""
     shape = (wanted.count, wanted.height, wanted.width, 3)
     np.lib.format.write_array_header_1_0(output, {"descr": "|u1", "fortran_order": False, "shape": shape})
     count = 0
@@ -123,14 +123,14 @@ def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
         if count <= wanted.count:
             output.write(pixels.data)
     if count != wanted.count:
-        raise _invalid(video, f"has {wanted.count} frames by its header, but {count} can be decoded: encode it anew")
+        raise _invalid(video, f"has {wanted.count} frames by its header, but {count} can be decoded: encode it again")
 
 
 def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
-    """Contiguous uint8 RGB [height, width, 3], by the color matrix that the video names, or else BT.601 as by FFmpeg.
+    """Contiguous uint8 RGB [height, width, 3], by the color matrix that the video names, or else BT.601 as in FFmpeg.
 
-    Each new pixel is the mean over the area it covers, within 0.5 of 255 of `resize_area` on average. FFmpeg's fast way
-    for the full size and its halves leaves out half of the chroma and is off by 1.4 to 5.
+    Each new pixel is the mean over the area it covers, within 0.5 of 255 of `resize_area` on average. FFmpeg's default
+    at the full size and at half of it skips half of the chroma and differs by 1.4 to 5.
     """
     av = _av(video)
     kinds = av.video.reformatter.Interpolation
@@ -149,7 +149,7 @@ def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
 
 def _av(video: Path) -> Any:
     try:
-        import av  # here, as only scenes with videos need it
+        import av  # an optional dependency
         import av.video.reformatter
     except ModuleNotFoundError as error:
         raise _invalid(video, f"needs {error.name} to be read: pip install 'msdgs[train]'") from None

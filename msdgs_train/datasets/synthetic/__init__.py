@@ -1,1 +1,1 @@
-"""Synthetic."""
+"""A synthetic moving scene with known motion, rendered by ray marching into D-NeRF layout."""

@@ -1,8 +1,8 @@
-"""A small moving scene of our own, captured by ray marching into D-NeRF layout, with its motion known exactly.
+"""A small synthetic moving scene, ray-marched into D-NeRF layout, with exactly known motion.
 
 A ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly squashes, twists and bends, a
-pendulum on a thin rod swings in a frame of thin bars, all on a still, tiled ground. As in D-NeRF there is one camera
-at a time and every frame is seen from somewhere else. The same arguments give the same bytes.
+pendulum on a thin rod swings in a frame of thin bars, all on a static, tiled ground. As in D-NeRF there is one
+image per time, each from another camera. The same arguments give the same bytes.
 """
 
 import json
@@ -27,7 +27,7 @@ CAMERA_DISTANCE = 4.0
 LOWEST, HIGHEST = 6.0, 75.0  # elevation of training cameras, degrees
 TEST_ELEVATION = 25.0
 R2_SEQUENCE = (0.7548776662466927, 0.5698402909980532)
-"""Two-dimensional golden ratio (M. Roberts, 2018): steps that spread azimuth and elevation evenly together."""
+"""Two-dimensional golden ratio (M. Roberts, 2018): steps that cover azimuth and elevation evenly."""
 
 MAX_SIZE = 4096
 TRAJECTORIES = "trajectories.json"
@@ -38,7 +38,7 @@ CONTACT_SIZE, CONTACT_COLUMNS, CONTACT_ROWS = 128, 6, 4
 
 
 class View(NamedTuple):
-    """An image to take."""
+    """A camera and a time to render."""
 
     name: str
     camera: Camera
@@ -56,14 +56,14 @@ def generate(
 ) -> None:
     """Make the dataset in folder `out`: images, transforms_{train,test}.json, trajectories.json, a contact sheet.
 
-    Everything is built beside `out` and moved there when complete; an interrupted call leaves `out` as it was. A
-    dataset that this function made there before is replaced, anything else is refused with `InvalidInput`.
+    The dataset is built beside `out` and moved there when complete; an interrupted call leaves `out` unchanged. An
+    earlier dataset of this function is replaced, any other content is refused with `InvalidInput`.
 
     Args:
         size: width and height of the images in pixels.
         train_frames: images at evenly spaced times in [0, 1], cameras spread over the upper hemisphere.
-        test_frames: images at times between, from one smooth turn around the scene.
-        seed: turns and shifts the cameras; the motion is always the same.
+        test_frames: images at intermediate times, from one smooth turn around the scene.
+        seed: of the camera positions; the motion is always the same.
         progress: called with (done, total) after every image.
     """
     for name, value, least in (("train_frames", train_frames, 1), ("test_frames", test_frames, 0)):
@@ -90,17 +90,17 @@ def generate(
 
 
 def training_views(count: int, size: int, seed: int) -> list[View]:
-    """One camera a time, over the upper hemisphere; neighbours in time are far apart, as in D-NeRF."""
+    """One camera per time, over the upper hemisphere; successive cameras are far apart, as in D-NeRF."""
     shift = np.random.default_rng(seed).uniform(size=2)
     across, up = ((shift + np.arange(count)[:, None] * R2_SEQUENCE) % 1).T
     low, high = math.sin(math.radians(LOWEST)), math.sin(math.radians(HIGHEST))
-    elevations = np.degrees(np.arcsin(low + up * (high - low)))  # even in area
+    elevations = np.degrees(np.arcsin(low + up * (high - low)))  # uniform in area
     times = np.linspace(0, 1, count)
     return _views(size, 360 * across, elevations, times)
 
 
 def held_out_views(count: int, size: int, seed: int) -> list[View]:
-    """One smooth turn around the scene, at times in the middle of `count` equal parts."""
+    """One smooth turn around the scene, at the centers of `count` equal intervals of time."""
     parts = (np.arange(count) + 0.5) / max(count, 1)
     shift = np.random.default_rng(seed).uniform()
     return _views(size, 360 * (shift + parts), np.full(count, TEST_ELEVATION), parts)
@@ -139,7 +139,7 @@ def _thumbnail(rgba: np.ndarray) -> np.ndarray:
 
 
 def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
-    """Up to 24 images, evenly taken, in rows."""
+    """Up to 24 evenly spaced images, in rows."""
     count = min(len(thumbnails), CONTACT_COLUMNS * CONTACT_ROWS)
     chosen = [thumbnails[index * len(thumbnails) // count] for index in range(count)]
     columns = min(count, CONTACT_COLUMNS)
@@ -149,7 +149,7 @@ def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
 
 @contextmanager
 def _replaced_when_complete(out: Path) -> Iterator[Path]:
-    """A folder to build in, beside `out`; on leaving without an exception it takes the place of `out`."""
+    """A folder beside `out`, which it replaces on leaving without an exception."""
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / TRAJECTORIES).exists())):
         raise InvalidInput("out", "a new or empty folder, or a dataset made by this command", out)
     out = out.absolute()

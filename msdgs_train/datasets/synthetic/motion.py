@@ -1,7 +1,7 @@
-"""What moves in the synthetic scene, and how: where every material point is at every time.
+"""The motion of the synthetic scene: the position of each material point at each time.
 
-World axes: z up, scene units, content within 1.25 of the origin. A point of an object at rest (`local`, [3]) is in the
-world at `offset + matrix · warp(local)`, where `warp` twists around z and bends along x and y, both growing with z.
+World axes: z up, scene units, content within 1.25 of the origin. A point of an object at rest (`local`, [3]) has the
+world position `offset + matrix · warp(local)`; `warp` twists around z and bends along x and y, both growing with z.
 """
 
 import math
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 OBJECTS = ("ground", "frame", "ball", "ring", "jelly", "pendulum")
-"""In the order of the rows of `Motion`. The ground and the frame stand still."""
+"""In the order of the rows of `Motion`. The ground and the frame are static."""
 
 GROUND_Z = -0.5
 GROUND_RADIUS, GROUND_THICKNESS = 1.1, 0.09
@@ -23,9 +23,9 @@ ROD_LENGTH, ROD_RADIUS, BOB_RADIUS = 0.74, 0.014, 0.12
 BOUNCES = 3
 BOUNCE_HEIGHT = 0.6
 CONTACT = 0.1
-"""Part of a bounce for which the ball touches the ground."""
+"""Fraction of a bounce during which the ball touches the ground."""
 SQUASH = 4 * BOUNCE_HEIGHT * CONTACT / ((1 - CONTACT) * math.pi * BALL_RADIUS)
-"""Depth of the squash, as part of the radius: the one that makes the velocity continuous at contact."""
+"""Depth of the squash as a fraction of the radius, so that the velocity is continuous at contact."""
 
 REST_BOXES = np.array(
     [
@@ -50,19 +50,19 @@ _BOUND_MARGIN = 1.03  # the grid does not hit the farthest point of a bent box e
 
 
 class Motion(NamedTuple):
-    """All objects at one time, a row each, float64. Crosses into the ray-marching kernels as it is."""
+    """All objects at one time, a row each, float64. Passed to the ray-marching kernels."""
 
     offsets: np.ndarray  # [objects, 3]
     matrices: np.ndarray  # [objects, 3, 3]
     inverses: np.ndarray  # [objects, 3, 3] of `matrices`
-    warps: np.ndarray  # [objects, 3]: twist in radians a unit of z, bend along x and along y in 1 / unit
-    shrinks: np.ndarray  # [objects] world distance to a surface is at least this, times that at rest
+    warps: np.ndarray  # [objects, 3]: twist in radians per unit of z, bend along x and along y in 1 / unit
+    shrinks: np.ndarray  # [objects] lower bound of the ratio of world distances to distances at rest
     centers: np.ndarray  # [objects, 3] of a sphere in the world that holds the object
     radii: np.ndarray  # [objects] of that sphere
 
 
 def motion_at(t: float) -> Motion:
-    """The whole scene at time t; one run of the scene is [0, 1]."""
+    """The whole scene at time t; the scene spans [0, 1]."""
     placements = _placements(t)
     boxes = REST_BOXES[:, :1] + _UNIT_GRID * (REST_BOXES[:, 1:] - REST_BOXES[:, :1])
     outlines = np.stack([_place(placement, box) for placement, box in zip(placements, boxes, strict=True)])
@@ -73,7 +73,7 @@ def motion_at(t: float) -> Motion:
 
 
 def world_positions(name: str, local: np.ndarray, t: float) -> np.ndarray:
-    """Where points of object `name`, [..., 3] at rest, are in the world at time t. The ground truth of the motion."""
+    """World positions at time t of points of object `name`, [..., 3] at rest. The ground truth of the motion."""
     return _place(_placements(t)[OBJECTS.index(name)], np.asarray(local, float))
 
 
@@ -85,12 +85,12 @@ class _Placement(NamedTuple):
 
 def _placements(t: float) -> tuple[_Placement, ...]:
     """One for each of `OBJECTS`."""
-    still = np.zeros(3)
-    ground = _Placement(np.array([0.0, 0.0, GROUND_Z]), np.eye(3), still)
+    no_warp = np.zeros(3)
+    ground = _Placement(np.array([0.0, 0.0, GROUND_Z]), np.eye(3), no_warp)
     jelly = _Placement(np.array([0.6, 0.34, GROUND_Z]), *_jelly(t))
     swing = _rotation(0, 0.72 * math.cos(3 * math.pi * t))
-    pendulum = _Placement(np.array([0.0, 0.0, PIVOT_Z]), swing, still)
-    return ground, ground, _Placement(*_ball(t), still), _Placement(*_ring(t), still), jelly, pendulum
+    pendulum = _Placement(np.array([0.0, 0.0, PIVOT_Z]), swing, no_warp)
+    return ground, ground, _Placement(*_ball(t), no_warp), _Placement(*_ring(t), no_warp), jelly, pendulum
 
 
 def _place(placement: _Placement, local: np.ndarray) -> np.ndarray:
@@ -102,7 +102,7 @@ def _place(placement: _Placement, local: np.ndarray) -> np.ndarray:
 
 
 def _ball(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounces along an arc in front, spinning; squashed, at constant volume, while it touches the ground."""
+    """Bounces along an arc, spinning; squashed, at constant volume, while it touches the ground."""
     phase = (t * BOUNCES + 0.5) % 1.0
     height, flat = BALL_RADIUS, 1.0
     if phase < CONTACT:
@@ -118,7 +118,7 @@ def _ball(t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ring(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Floats, tumbles around the vertical and turns in itself: rigid."""
+    """Floats, and rotates around the vertical and around its own axis: rigid."""
     offset = np.array([-0.6, 0.34, 0.06 + 0.06 * math.sin(2 * math.pi * t)])
     return offset, _rotation(2, 2 * math.pi * t) @ _rotation(0, 1.15) @ _rotation(2, -2 * math.pi * t)
 

@@ -1,6 +1,6 @@
 """Ray marching of the synthetic scene: sphere tracing, one soft-edged light, ambient occlusion.
 
-Every object is marched by itself, inside its bounding sphere, so that a ray pays only for what it passes.
+Each object is marched separately, inside its bounding sphere, so that a ray evaluates only the objects that it passes.
 """
 
 import math
@@ -22,9 +22,9 @@ from msdgs_train.datasets.synthetic.shapes import (
 SAMPLES = 2  # rays along each side of a pixel
 MAX_STEPS = 400
 HIT = 2e-4  # scene units; a pixel of an 800-pixel image is 20 times larger
-SURFACE_OFFSET = 4e-3  # where shadow rays begin
-PENUMBRA = 7.0  # the larger, the harder
-PENUMBRA_REACH = 0.25  # a shadow ray this far from an object is not dimmed by it
+SURFACE_OFFSET = 4e-3  # start of shadow rays
+PENUMBRA = 7.0  # larger values give harder shadows
+PENUMBRA_REACH = 0.25  # an object farther from a shadow ray doesn't dim it
 OCCLUSION_STEPS = (0.03, 0.08, 0.16, 0.28)
 NO_OBJECT = -1
 
@@ -39,7 +39,7 @@ _MISS = 1e9
 
 
 def render(camera: Camera, t: float) -> np.ndarray:
-    """The scene at time t: [H, W, 4] uint8, sRGB, straight alpha, color 0 where nothing is hit."""
+    """The scene at time t: [H, W, 4] uint8, sRGB, straight alpha, color 0 for rays that hit nothing."""
     motion = motion_at(t)
     linear = np.zeros((camera.height, camera.width, 4))
     view = np.ascontiguousarray(camera.camera_to_world)
@@ -91,7 +91,7 @@ def _first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: f
     nearest, shape = _MISS, NO_OBJECT
     top = (GROUND_Z - oz) / dz if dz < 0 else -1.0
     on_top = top > 0 and math.hypot(ox + top * dx, oy + top * dy) < GROUND_RADIUS - GROUND_ROUNDING
-    if on_top:  # the disc is flat here, and grazing rays are where marching takes longest
+    if on_top:  # the disc is flat here, and marching grazing rays takes longest
         nearest, shape = top, GROUND
     for index in range(len(OBJECTS)):
         if index == GROUND and on_top:
@@ -113,7 +113,7 @@ def _first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: f
 def _through_sphere(
     motion: Motion, index: int, margin: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float]:
-    """Where a ray enters and leaves the bounding sphere of an object, widened by a margin; start > end if it misses."""
+    """Entry and exit distance of a ray in the bounding sphere of an object plus a margin; start > end if it misses."""
     x = ox - motion.centers[index, 0]
     y = oy - motion.centers[index, 1]
     z = oz - motion.centers[index, 2]
@@ -128,7 +128,7 @@ def _through_sphere(
 
 @kernel
 def _to_rest(motion: Motion, index: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The inverse of `synthetic_motion.world_positions`."""
+    """The inverse of `motion.world_positions`."""
     x, y, z = x - motion.offsets[index, 0], y - motion.offsets[index, 1], z - motion.offsets[index, 2]
     m = motion.inverses[index]
     u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
@@ -162,7 +162,7 @@ def _normal(motion: Motion, index: int, x: float, y: float, z: float) -> tuple[f
 def _shade(
     motion: Motion, index: int, x: float, y: float, z: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float, float]:
-    """Linear RGB that leaves a surface point against the ray direction."""
+    """Linear RGB that a surface point sends back along the ray."""
     u, v, w = _to_rest(motion, index, x, y, z)
     albedo = _PALETTE_LINEAR[color_at_rest(index, u, v, w)]
     nx, ny, nz = _normal(motion, index, x, y, z)
@@ -185,10 +185,10 @@ def _shade(
 
 @kernel
 def _light_arriving(motion: Motion, x: float, y: float, z: float) -> float:
-    """1 in full light, 0 in full shadow: by the narrowest gap that the shadow ray passes, seen from its start."""
+    """1 in full light, 0 in full shadow: from the narrowest gap along the shadow ray relative to its distance."""
     arriving = 1.0
     for index in range(len(OBJECTS)):
-        if index == GROUND:  # the light is above it, and so is everything else
+        if index == GROUND:  # it is below the light and all other objects
             continue
         s, end = _through_sphere(motion, index, PENUMBRA_REACH, x, y, z, LIGHT[0], LIGHT[1], LIGHT[2])
         s = max(s, SURFACE_OFFSET)
@@ -203,7 +203,7 @@ def _light_arriving(motion: Motion, x: float, y: float, z: float) -> float:
 
 @kernel
 def _openness(motion: Motion, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> float:
-    """1 where the sky is free, less in corners: how much closer surfaces are than the way walked along the normal."""
+    """Ambient occlusion: 1 under the open sky, less in corners, from distances to surfaces along the normal."""
     closed, weight = 0.0, 1.0
     for step in OCCLUSION_STEPS:
         px, py, pz = x + step * nx, y + step * ny, z + step * nz

@@ -1,4 +1,4 @@
-"""What the objects of the synthetic scene are at rest: signed distances and colors, as scalar kernels."""
+"""Shapes of the synthetic scene at rest: signed distances and colors, as scalar kernels."""
 
 import math
 

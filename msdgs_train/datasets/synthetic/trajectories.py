@@ -1,4 +1,4 @@
-"""Known motion of the synthetic scene: material points on its surfaces, followed through time."""
+"""Known motion of the synthetic scene: trajectories of material points on its surfaces."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def surface_points(name: str, count: int, seed: int = 0) -> np.ndarray:
 
 
 def surface_colors(name: str, local: np.ndarray) -> np.ndarray:
-    """[N, 3] sRGB in [0, 1] of the surface itself, before light, at points of object `name` at rest."""
+    """[N, 3] sRGB albedo in [0, 1] at points of object `name` at rest."""
     return PALETTE[[color_at_rest(OBJECTS.index(name), *point) for point in local]]
 
 
@@ -42,7 +42,7 @@ def trajectories(points_per_object: int, times: np.ndarray, seed: int = 0) -> di
 
 @kernel
 def _onto_surface(shape: int, points: np.ndarray) -> None:
-    """Newton's way to the zero of the signed distance, along its gradient; moves [N, 3] points in place."""
+    """Move [N, 3] points onto the surface in place, by Newton's method along the gradient of the signed distance."""
     for point in points:
         for _ in range(ROUNDS):
             x, y, z = point

@@ -63,7 +63,7 @@ def test_static_scenes(tmp_path: Path):
 
 def test_names_without_a_time_are_named(tmp_path: Path):
     folder = write_colmap(tmp_path, names=("a_1.png", "cam07/front.png"), ending="txt")
-    with pytest.raises(DatasetInvalid, match=r"images\[cam07/front\.png\]\.name` has no time: .*; choose another"):
+    with pytest.raises(DatasetInvalid, match=r"images\[cam07/front\.png\]\.name` has no time: .* finds no number in it; set another"):
         load_scene(folder)
     with pytest.raises(DatasetInvalid, match=r"images\[a_1\.png\]\.name` has no time"):
         load_scene(folder, time_pattern="(a)")
@@ -98,7 +98,7 @@ def test_a_binary_file_that_is_cut_off_is_refused_wherever_the_cut_is(tmp_path: 
     [
         ((0.9, float("nan"), 0.1, 0.2, 0.3, -0.2, 4.0), "qvec` must be finite, got .*nan"),
         ((0.9, 0.1, -0.3, 0.2, float("inf"), 0.0, 0.0), "tvec` must be finite, got .*inf"),
-        ((0.0, 0.0, 0.0, 0.0, 0.3, -0.2, 4.0), "qvec` is no rotation"),
+        ((0.0, 0.0, 0.0, 0.0, 0.3, -0.2, 4.0), "qvec` is not a rotation"),
     ],
     ids=["nan", "inf", "zero"],
 )

@@ -16,11 +16,12 @@ from msdgs_serve.scene.camera import look_at
 from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.metrics_log import to_bytes
-from msdgs_train.engine.run import Observer, Observers, RunResult, fit
+from msdgs_train.engine.observer import Observer, Observers
+from msdgs_train.engine.run import RunResult, fit
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.gaussians.model_file import LoadedModel, SceneInfo, save_model
+from msdgs_train.viewer.scene_view import view_of_data, view_of_file
 from msdgs_train.viewer.snapshot import Snapshot, snapshot_of_training
-from msdgs_train.viewer.stage import view_of_data, view_of_file
 from msdgs_train.viewer.training_view import TrainingView
 from msdgs_train.viewer.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
 from tests.support.models import SCENE, random_model
@@ -281,7 +282,7 @@ def test_the_page_stays_after_the_run(
     options = ["--steps", "2", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--viewer"]
     assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
     printed = capsys.readouterr().out
-    assert "look at http://localhost:8080" in printed
+    assert "viewer: http://localhost:8080" in printed
     assert "Ctrl-C ends it" in printed
 
 

@@ -1,0 +1,158 @@
+"""What each operator makes of shapes, and how much it computes for each element of its results."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdgs_serve.scene.onnx.shapes import (
+    ONE,
+    Dim,
+    Shape,
+    ShapeInvalid,
+    added,
+    axes_of,
+    axis_of,
+    broadcast,
+    numbers,
+    reshaped,
+    text,
+)
+
+
+@dataclass(frozen=True)
+class Call:
+    """One node: shapes of its inputs, the values of those that are constants, its attributes and number of outputs."""
+
+    shapes: Sequence[Shape]
+    constants: Sequence[np.ndarray | None]
+    attributes: Mapping[str, int]
+    outputs: int
+
+    def constant(self, index: int) -> np.ndarray:
+        """The values of an input that the operator table says is a constant."""
+        values = self.constants[index]
+        assert values is not None  # `infer` has looked at the table
+        return values
+
+
+@dataclass(frozen=True)
+class Result:
+    """Shapes of the outputs; `inner` is what is summed or multiplied for each element of the first, and `products` how
+    many matrix products that are."""
+
+    shapes: Sequence[Shape]
+    inner: Shape = ()
+    products: Shape = ()
+
+
+def elementwise(call: Call) -> Result:
+    """Add and the like."""
+    return Result([broadcast(*call.shapes)])
+
+
+def alike(call: Call) -> Result:
+    """Operators of one array: further inputs are single numbers or, of quantisers, lists along an axis."""
+    return Result([call.shapes[0]])
+
+
+def clip(call: Call) -> Result:
+    """Limits are single numbers."""
+    if not {call.shapes[1], call.shapes[2]} <= {(), (ONE,)}:
+        raise ShapeInvalid(f"clips to limits of shapes {text(call.shapes[1])} and {text(call.shapes[2])}, not [1]")
+    return alike(call)
+
+
+def quantize(call: Call) -> Result:
+    """Scale and zero point are single numbers, or one for each index along an axis."""
+    shape, scale, zero = call.shapes
+    if scale != zero or (scale and scale != (shape[axis_of(call.attributes.get("axis", 1), len(shape))],)):
+        raise ShapeInvalid(f"quantises {text(shape)} with scales {text(scale)} and zero points {text(zero)}")
+    return alike(call)
+
+
+def gather(call: Call) -> Result:
+    """Rows, columns or the like by index."""
+    data, indices = call.shapes
+    axis = axis_of(call.attributes.get("axis", 0), len(data))
+    return Result([(*data[:axis], *indices, *data[axis + 1 :])])
+
+
+def scatter(call: Call) -> Result:
+    """Rows of an array replaced: indices [k, 1] are constant and within it."""
+    data, indices, updates = call.shapes
+    rows = call.constant(1)
+    if len(indices) != 2 or indices[1] != ONE or not data or updates != (indices[0], *data[1:]) or data[0].per_id:
+        raise ShapeInvalid(f"replaces rows {text(indices)} of {text(data)} by {text(updates)}")
+    if rows.size and not (rows.min() >= 0 and rows.max() < data[0].fixed):
+        raise ShapeInvalid(f"replaces rows {rows.min()} to {rows.max()} of {data[0]}")
+    return Result([data])
+
+
+def concat(call: Call) -> Result:
+    """Arrays side by side."""
+    first = call.shapes[0]
+    axis = axis_of(call.attributes.get("axis", 0), len(first))
+    if any(len(s) != len(first) or s[:axis] + s[axis + 1 :] != first[:axis] + first[axis + 1 :] for s in call.shapes):
+        raise ShapeInvalid(f"can't put {' and '.join(text(shape) for shape in call.shapes)} side by side")
+    return Result([(*first[:axis], added(shape[axis] for shape in call.shapes), *first[axis + 1 :])])
+
+
+def split(call: Call) -> Result:
+    """The reverse of `concat`, in parts of constant lengths."""
+    shape, parts = call.shapes[0], numbers(call.constant(1), "lengths")
+    axis = axis_of(call.attributes.get("axis", 0), len(shape))
+    if len(parts) != call.outputs or min(parts, default=-1) < 0 or shape[axis] != Dim(sum(parts)):
+        raise ShapeInvalid(f"splits {text(shape)} into {call.outputs} parts of {parts}")
+    return Result([(*shape[:axis], Dim(part), *shape[axis + 1 :]) for part in parts])
+
+
+def reshape(call: Call) -> Result:
+    """To a constant shape."""
+    return Result([reshaped(call.shapes[0], numbers(call.constant(1), "lengths"))])
+
+
+def unsqueeze(call: Call) -> Result:
+    """New axes of length 1."""
+    rest, axes = list(call.shapes[0]), numbers(call.constant(1), "axes")
+    rank = len(rest) + len(axes)
+    new = axes_of(axes, rank)
+    return Result([tuple(ONE if i in new else rest.pop(0) for i in range(rank))])
+
+
+def squeeze(call: Call) -> Result:
+    """Axes of length 1 less."""
+    shape = call.shapes[0]
+    gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
+    if any(shape[axis] != ONE for axis in gone):
+        raise ShapeInvalid(f"squeezes axes {sorted(gone)} of {text(shape)}")
+    return Result([tuple(dim for i, dim in enumerate(shape) if i not in gone)])
+
+
+def reduce(call: Call) -> Result:
+    """One value along some axes."""
+    shape, keep = call.shapes[0], call.attributes.get("keepdims", 1)
+    gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
+    left = tuple(ONE if i in gone else dim for i, dim in enumerate(shape) if keep or i not in gone)
+    return Result([left], inner=tuple(shape[axis] for axis in gone))
+
+
+def matmul(call: Call) -> Result:
+    """Products of matrices, or of stacks of them."""
+    left, right = call.shapes
+    if len(left) < 2 or len(right) < 2 or left[-1] != right[-2]:
+        raise ShapeInvalid(f"can't multiply {text(left)} by {text(right)}")
+    stack = broadcast(left[:-2], right[:-2]) if len(left) > 2 or len(right) > 2 else ()
+    return Result([(*stack, left[-2], right[-1])], inner=left[-1:], products=stack)
+
+
+def gemm(call: Call) -> Result:
+    """A product of two matrices and what is added to it."""
+    left, right, summand = call.shapes
+    right = right[::-1] if call.attributes.get("transB", 0) else right
+    if len(left) != 2 or len(right) != 2 or left[1] != right[0]:
+        raise ShapeInvalid(f"can't multiply {text(left)} by {text(right)}")
+    product = (left[0], right[1])
+    if broadcast(product, summand) != product:
+        raise ShapeInvalid(f"can't add {text(summand)} to {text(product)}")
+    return Result([product], inner=left[1:])

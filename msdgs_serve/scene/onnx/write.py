@@ -1,0 +1,131 @@
+"""A model in canonical form: what some outputs need of it, each value in the one way that this module writes it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from msdgs_serve.scene.onnx.infer import Value
+from msdgs_serve.scene.onnx.model import Model, Node, Tensor
+from msdgs_serve.scene.onnx.shapes import IDS
+
+IR_VERSION = 9
+_INT_ATTRIBUTE = 2
+_VARINT, _LENGTH = 0, 2
+
+Parts = list[bytes | memoryview]
+
+
+def write_model(
+    model: Model, outputs: Sequence[str], inputs: Mapping[str, Value], values: Mapping[str, Value]
+) -> bytes:
+    """The graph that computes `outputs` from `inputs`, none of which has a default. Large constants are copied once."""
+    nodes, names = _needed(model, outputs)
+    graph = _Message()
+    for node in nodes:
+        graph.message(1, _node(node))
+    graph.text(2, "msdgs")
+    for name in model.constants:
+        if name in names and name not in inputs:
+            graph.message(5, _tensor(model.constants[name]))
+    for name, value in inputs.items():
+        graph.message(11, _port(name, value))
+    for name in outputs:
+        graph.message(12, _port(name, values[name]))
+    opset = _Message()
+    opset.number(2, model.opset)
+    whole = _Message()
+    whole.number(1, IR_VERSION)
+    whole.message(7, graph)
+    whole.message(8, opset)
+    return b"".join(whole.parts)
+
+
+def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]:
+    """Nodes, in order, and names of values without which the outputs can't be computed."""
+    names, nodes = set(outputs), []
+    for node in reversed(model.nodes):
+        if names.intersection(node.outputs):
+            nodes.append(node)
+            names.update(node.inputs)
+    return nodes[::-1], names
+
+
+class _Message:
+    """Fields, one after the other."""
+
+    def __init__(self) -> None:
+        self.parts: Parts = []
+        self.length = 0
+
+    def number(self, field: int, value: int) -> None:
+        self._add(_varint(field << 3 | _VARINT), _varint(value % (1 << 64)))
+
+    def data(self, field: int, value: bytes | memoryview) -> None:
+        self._add(_varint(field << 3 | _LENGTH), _varint(len(value)), value)
+
+    def text(self, field: int, value: str) -> None:
+        self.data(field, value.encode())
+
+    def message(self, field: int, value: "_Message") -> None:
+        self._add(_varint(field << 3 | _LENGTH), _varint(value.length), *value.parts)
+
+    def _add(self, *parts: bytes | memoryview) -> None:
+        self.parts += parts
+        self.length += sum(len(part) for part in parts)
+
+
+def _node(node: Node) -> _Message:
+    message = _Message()
+    _texts(message, 1, node.inputs)
+    _texts(message, 2, node.outputs)
+    message.text(3, node.name)
+    message.text(4, node.operator)
+    for name, value in node.attributes.items():
+        attribute = _Message()
+        attribute.text(1, name)
+        attribute.number(3, value)
+        attribute.number(20, _INT_ATTRIBUTE)
+        message.message(5, attribute)
+    return message
+
+
+def _texts(message: _Message, field: int, values: Iterable[str]) -> None:
+    for value in values:
+        message.text(field, value)
+
+
+def _tensor(tensor: Tensor) -> _Message:
+    message = _Message()
+    for length in tensor.shape:
+        message.number(1, length)
+    message.number(2, tensor.element)
+    message.text(8, tensor.name)
+    message.data(9, tensor.data)
+    return message
+
+
+def _port(name: str, value: Value) -> _Message:
+    shape = _Message()
+    for dim in value.shape:
+        dimension = _Message()
+        if dim == IDS:
+            dimension.text(2, "M")
+        elif not dim.per_id:
+            dimension.number(1, dim.fixed)
+        shape.message(1, dimension)
+    tensor = _Message()
+    tensor.number(1, value.element)
+    tensor.message(2, shape)
+    kind = _Message()
+    kind.message(1, tensor)
+    port = _Message()
+    port.text(1, name)
+    port.message(2, kind)
+    return port
+
+
+def _varint(value: int) -> bytes:
+    digits = bytearray()
+    while value >= 0x80:
+        digits.append(value & 0x7F | 0x80)
+        value >>= 7
+    digits.append(value)
+    return bytes(digits)

@@ -1,0 +1,176 @@
+"""A scene file, contract `msdgs/1`, from its bytes: checked as a whole before anything in it runs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, INPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT
+from msdgs_serve.scene.errors import SceneFileInvalid
+from msdgs_serve.scene.metadata import SceneMetadata
+from msdgs_serve.scene.onnx import GraphLimits, Model, ModelInvalid, Tensor, Value, infer, read_model, write_model
+from msdgs_serve.scene.onnx.model import FLOAT, INT64, Port, element_name
+from msdgs_serve.scene.onnx.shapes import IDS, Shape, fixed, text
+
+CHUNK = 2048
+"""Gaussians a call where layers run. The widest activation of a call is CHUNK × width, whatever the scene's size."""
+
+_INPUTS: Mapping[str, tuple[int, Shape]] = {
+    "t": (FLOAT, fixed([1])),
+    "ids": (INT64, (IDS,)),
+    OPTIONAL_INPUT: (FLOAT, fixed([1])),
+}
+_COLUMNS = {"means": 3, "quats": 4, "scales": 3}
+_POSED_BYTES = 4 * sum(_COLUMNS.values())
+_AT_A_TIME = 1 << 22
+"""Values that are looked at at once, so that looking takes no memory to speak of."""
+
+
+@dataclass(frozen=True)
+class SceneCost:
+    """Upper bounds, known before anything runs and the same at all times, beside what is allowed."""
+
+    memory_bytes: int  # of the values of one call and of all poses
+    operations: int  # of posing all moving Gaussians once
+    calls: int  # that this takes
+    limits: GraphLimits
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What a file holds. `graph` and `constant_graph` are models that this package has written."""
+
+    metadata: SceneMetadata
+    moving_count: int
+    steps: float | None  # by default; None where the plan doesn't run layers
+    constants: Mapping[str, np.ndarray]  # those of CONSTANT_OUTPUTS that are stored as they are
+    graph: bytes  # inputs of the contract, without defaults, to MOVING_OUTPUTS
+    constant_graph: bytes | None  # no inputs, to the rest of CONSTANT_OUTPUTS
+    cost: SceneCost
+
+    @property
+    def computed(self) -> list[str]:
+        """Outputs of `constant_graph`."""
+        return [name for name in CONSTANT_OUTPUTS if name not in self.constants]
+
+
+def read_scene_file(contents: bytes, file: str, limits: GraphLimits) -> SceneFile:
+    """`file` is for messages. Raises `SceneFileInvalid` naming the field, the node or the constant."""
+    if not contents:
+        raise SceneFileInvalid(file, "file", "is empty")
+    try:
+        model = read_model(contents)
+        metadata = SceneMetadata.from_properties(model.properties, file)
+        return _read(model, metadata, limits)
+    except ModelInvalid as error:
+        raise SceneFileInvalid(file, error.field, error.problem) from None
+
+
+def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFile:
+    for tensor in model.constants.values():
+        _check_finite(tensor)
+    inputs = _inputs(model)
+    moving_count, steps = _default_ids(model), _default_steps(model)
+    ids = moving_count if steps is None else min(CHUNK, moving_count)
+    calls = -(-moving_count // max(ids, 1))
+    values, cost = infer(model, inputs, limits, ids, calls, moving_count * _POSED_BYTES)
+    _check_outputs(model, values, moving_count)
+    _check_count(moving_count + values["static_means"].shape[0].fixed, limits)
+    constants = {}
+    for name in CONSTANT_OUTPUTS:
+        stored = values[name].constant
+        if stored is not None:
+            constants[name] = stored.array().copy()  # aligned, and nothing holds on to the whole file
+    computed = [name for name in CONSTANT_OUTPUTS if name not in constants]
+    return SceneFile(
+        metadata,
+        moving_count,
+        steps,
+        constants,
+        write_model(model, MOVING_OUTPUTS, inputs, values),
+        write_model(model, computed, {}, values) if computed else None,
+        SceneCost(cost.memory_bytes, cost.operations * calls, calls, limits),
+    )
+
+
+def _check_finite(tensor: Tensor) -> None:
+    if tensor.element != FLOAT:
+        return
+    flat = tensor.array().reshape(-1)
+    parts = (flat[start : start + _AT_A_TIME] for start in range(0, flat.size, _AT_A_TIME))
+    bad = sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts)
+    if bad:
+        raise ModelInvalid(tensor.name, f"holds {bad:,} values that are NaN or infinite")
+
+
+def _inputs(model: Model) -> dict[str, Value]:
+    for name in INPUTS:
+        if name not in model.inputs:
+            raise ModelInvalid(name, "is missing from the inputs")
+    for name, port in model.inputs.items():
+        if name not in _INPUTS:
+            raise ModelInvalid(name, "isn't an input of this contract")
+        element, shape = _INPUTS[name]
+        if port.element != element:
+            raise ModelInvalid(name, f"is {element_name(port.element)}, not {element_name(element)}")
+        if not _is_of_shape(port, shape):
+            raise ModelInvalid(name, f"has shape {port.shape}, not {text(shape)}")
+    return {name: Value(*_INPUTS[name], varies=True) for name in _INPUTS if name in model.inputs}
+
+
+def _is_of_shape(port: Port, shape: Shape) -> bool:
+    """A dimension that is no number stands for any."""
+    if port.shape is None:
+        return True
+    if len(port.shape) != len(shape):
+        return False
+    return all(
+        isinstance(given, str) or (given == dim.fixed and not dim.per_id)
+        for given, dim in zip(port.shape, shape, strict=True)
+    )
+
+
+def _default_ids(model: Model) -> int:
+    if "t" in model.constants:
+        raise ModelInvalid("t", "has a default, which only `ids` and `steps` may have")
+    ids = model.constants.get("ids")
+    if ids is None:
+        raise ModelInvalid("ids", "has no default of all moving Gaussians")
+    if ids.element != INT64 or len(ids.shape) != 1 or not np.array_equal(ids.array(), np.arange(ids.shape[0])):
+        raise ModelInvalid("ids", "has a default that isn't all moving Gaussians in order")
+    return ids.shape[0]
+
+
+def _default_steps(model: Model) -> float | None:
+    if OPTIONAL_INPUT not in model.inputs:
+        return None
+    steps = model.constants.get(OPTIONAL_INPUT)
+    if steps is None:
+        raise ModelInvalid(OPTIONAL_INPUT, "has no default of all layers")
+    if steps.element != FLOAT or steps.shape != (1,):
+        raise ModelInvalid(OPTIONAL_INPUT, "has a default that isn't one float32")
+    return float(steps.array()[0])
+
+
+def _check_count(gaussians: int, limits: GraphLimits) -> None:
+    if gaussians > limits.gaussians:
+        raise ModelInvalid("ids", f"and `static_means` are {gaussians:,} Gaussians; allowed are {limits.gaussians:,}")
+
+
+def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int) -> None:
+    for name in (*MOVING_OUTPUTS, *CONSTANT_OUTPUTS):
+        if name not in model.outputs or name not in values:
+            raise ModelInvalid(name, "is missing from the outputs")
+        declared, element = model.outputs[name].element, values[name].element
+        if (declared, element) != (FLOAT, FLOAT):
+            wrong = declared if declared != FLOAT else element
+            raise ModelInvalid(name, f"is {element_name(wrong)}, not float32")
+    for name in CONSTANT_OUTPUTS:
+        if values[name].varies:
+            raise ModelInvalid(name, "depends on an input, where it has to be constant")
+        if not values[name].shape:
+            raise ModelInvalid(name, "is a single number")
+    for name, columns in _COLUMNS.items():
+        shapes = [(IDS, *fixed([columns]))] + ([] if moving_count else [fixed([0, columns])])
+        if values[name].shape not in shapes:
+            raise ModelInvalid(name, f"has shape {text(values[name].shape)}, not {text(shapes[0])}")

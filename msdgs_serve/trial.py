@@ -1,0 +1,85 @@
+"""A scene file opened and posed in a process of its own, with limits of memory and time, before a service opens it.
+
+`read_scene_file` lets nothing through that onnxruntime is known to fail at. What it fails at all the same costs that
+process, and not the service.
+"""
+
+import contextlib
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene import SceneFileInvalid
+from msdgs_serve.scene.onnx import GraphLimits
+from msdgs_serve.threads import THREADS_VARIABLE
+
+MEMORY, MEMORY_A_BYTE = 1 << 29, 6
+"""Bytes that the process may have: its own, and for each byte of the file, besides those of a call of the graph."""
+
+OPEN_FILES = 64
+NICENESS = 10
+
+
+def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
+    """Open `file` and pose its Gaussians in the middle of its time, in at most so many seconds.
+
+    Raises `SceneFileInvalid` with what that process says, or that it didn't end well.
+    """
+    memory = MEMORY + MEMORY_A_BYTE * file.stat().st_size + limits.memory_bytes
+    given = json.dumps({"file": str(file), "limits": vars(limits), "memory": memory, "seconds": seconds})
+    command = [sys.executable, "-P", "-m", "msdgs_serve.trial", given]
+    environment = {**os.environ, THREADS_VARIABLE: "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, check=False, env=environment
+        )
+    except subprocess.TimeoutExpired:
+        raise SceneFileInvalid(file.name, "file", f"isn't opened and posed within {seconds:g} s") from None
+    try:
+        answer = json.loads(done.stdout) if done.returncode == 0 else None
+    except ValueError:
+        answer = None
+    if answer is None:
+        problem = f"ends the process that tries it ({done.returncode}), which may have {memory >> 20:,} MiB"
+        raise SceneFileInvalid(file.name, "file", problem)
+    if answer:
+        raise SceneFileInvalid(file.name, **answer)
+
+
+def main(given: str) -> None:
+    """In the process: prints what is wrong with the file as an object, an empty one where nothing is."""
+    asked = json.loads(given)
+    _limit(asked["memory"], asked["seconds"])
+    answer = {}
+    try:
+        session = DeformationSession(asked["file"], limits=GraphLimits(**asked["limits"]))
+        session.pose(sum(session.scene.metadata.time_range) / 2)
+    except SceneFileInvalid as error:
+        answer = {"field": error.field, "problem": error.problem, "details": error.details}
+    print(json.dumps(answer))
+
+
+def _limit(memory: int, seconds: float) -> None:
+    os.nice(NICENESS)
+    with contextlib.suppress(OSError):  # where Linux runs out of memory, this is the process to end
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    limits = {
+        resource.RLIMIT_CPU: int(seconds) + 1,
+        resource.RLIMIT_FSIZE: 0,
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_NOFILE: OPEN_FILES,
+    }
+    if sys.platform == "linux":  # elsewhere the system doesn't keep to it
+        limits[resource.RLIMIT_DATA] = memory
+    for which, limit in limits.items():
+        _, most = resource.getrlimit(which)
+        limit = limit if most == resource.RLIM_INFINITY else min(limit, most)
+        resource.setrlimit(which, (limit, limit))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,66 @@
+"""Scene files of every plan and layer kind, changed at the level of the format: refused with a reason or drawn finite,
+in bounded memory, without opening a file.
+
+`MSDGS_HOSTILE=5000 pytest -n 0 -s tests/scene/test_structured_fuzz.py` takes so many in place of a few for every day.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.fuzz_scenes import DRAWN, LIMITS, hostile_file, outcome, outcomes
+from tests.support.memory import measured
+from tests.support.processes import ROOT
+from tests.support.scene_mutations import CANARY
+from tests.support.sound_scenes import sound_scenes
+
+FILES = int(os.environ.get("MSDGS_HOSTILE", "300"))
+MEMORY_MEGABYTES = 64.0
+"""Besides what the graph may take: a session of onnxruntime, the file, kernels' working memory."""
+
+OF_THE_SYSTEM = ("/proc/", "/sys/", "/dev/")
+"""What onnxruntime and Python's threads look at to know their processor."""
+
+
+def test_sound_files_are_drawn():
+    assert {name: outcome(contents) for name, contents in sound_scenes().items()} == dict.fromkeys(
+        sound_scenes(), DRAWN
+    )
+
+
+def test_a_seed_is_a_file():
+    assert hostile_file(7) == hostile_file(7)
+    assert len({hostile_file(seed) for seed in range(200)}) > 180
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the process's memory from /proc")
+def test_mutated_files_are_refused_or_drawn_in_bounded_memory():
+    for contents in sound_scenes().values():
+        outcome(contents)  # compiles
+    counted, megabytes = measured(lambda: outcomes(range(FILES)))
+    drawn = counted.pop(DRAWN)
+    print(f"\n{FILES:,} files, {drawn:,} drawn, the others refused for {len(counted):,} reasons; {megabytes:.0f} MB")
+    assert 0.02 * FILES < drawn < 0.6 * FILES  # the changes neither always break a file nor mostly do nothing
+    assert megabytes < LIMITS.memory_bytes / 2**20 + MEMORY_MEGABYTES
+
+
+@pytest.mark.skipif(shutil.which("strace") is None, reason="needs strace, which sees what native code opens")
+def test_mutated_files_make_no_code_open_a_file(tmp_path: Path):
+    marker, trace = tmp_path / "marker", tmp_path / "trace"
+    marker.touch()
+    program = [sys.executable, "-m", "tests.support.fuzz_scenes", str(FILES), str(marker)]
+    command = ["strace", "-f", "-qq", "-e", "trace=open,openat,openat2,creat", "-o", str(trace), *program]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=3600, check=False)
+    if "ptrace" in done.stderr and "not permitted" in done.stderr:
+        pytest.skip("strace may not trace here")
+    assert done.returncode == 0, done.stderr
+    opened = re.findall(r'open(?:at2?)?\([^"]*"([^"]*)"', trace.read_text())
+    after = opened[opened.index(str(marker)) + 1 :]
+    assert len(after) < len(opened)
+    assert [path for path in after if not path.startswith(OF_THE_SYSTEM)] == []
+    assert not any(str(CANARY) in path for path in opened)

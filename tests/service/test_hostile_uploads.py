@@ -1,0 +1,189 @@
+"""Hostile scene files at a running service: refused, or listed as broken, while the scene beside them is served."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import onnx
+import pytest
+
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.scene import SceneFileInvalid
+from msdgs_serve.scene.onnx import GraphLimits
+from msdgs_serve.trial import try_scene
+from tests.service.test_api import eventually
+from tests.service.test_api_poison import check_problem
+from tests.support.fuzz_scenes import hostile_file
+from tests.support.hostile_scenes import ATTACKS, POISON, poisoned
+from tests.support.processes import ROOT
+from tests.support.scene_files import write_scene
+from tests.support.service import in_this_process, serving
+
+MUTATED = 20
+FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 32, "height": 32}
+
+
+def frame(client: httpx.Client) -> bytes:
+    response = client.post("/render", json={**FRAME, "scene": "good"})
+    assert response.status_code == 200, response.text
+    return response.content
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scene(folder / "good.onnx")
+    with serving(folder, uploads=True) as client:
+        yield client
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_attacks_are_refused_while_another_scene_is_served(client: httpx.Client, tmp_path: Path, name: str):
+    (tmp_path / "secret").write_bytes(b"s" * 24)
+    contents = ATTACKS[name](onnx.load(write_scene(tmp_path / "scene.onnx")), tmp_path / "secret")
+    before = frame(client)
+    answers: list[httpx.Response] = []
+
+    def upload() -> None:
+        answers.append(client.post("/scenes", params={"name": "hostile"}, content=contents))
+
+    thread = threading.Thread(target=upload)
+    thread.start()
+    assert frame(client) == before
+    thread.join()
+    assert answers[0].status_code == 422, answers[0].text
+    check_problem(answers[0])
+    assert str(tmp_path) not in answers[0].text
+    assert [scene["name"] for scene in client.get("/scenes").json()["scenes"]] == ["good"]
+    assert frame(client) == before
+
+
+def test_refusals_say_which_node_what_it_takes_and_what_is_allowed(client: httpx.Client, tmp_path: Path):
+    model = onnx.load(write_scene(tmp_path / "scene.onnx"))
+    contents = ATTACKS["six_gigabytes_by_broadcasting"](model, tmp_path)
+    answer = client.post("/scenes", params={"name": "hostile"}, content=contents)
+    detail = answer.json()["detail"]
+    assert "`vast` (Add) takes a frame to 6,104 MiB of values; allowed are 2,048 MiB" in detail
+
+
+def test_what_a_scene_takes_is_shown(client: httpx.Client):
+    cost = client.get("/scenes/good").json()["cost"]
+    assert 0 < cost["memory_bytes"] < cost["limits"]["memory_bytes"] == 2 << 30
+    assert 0 < cost["operations"] < cost["limits"]["operations"] == 1e13
+    assert cost["calls"] == 1
+
+
+def test_limits_are_settings(tmp_path: Path):
+    write_scene(tmp_path / "good.onnx")
+    with serving(tmp_path, max_scene_operations=1) as client:
+        entry = client.get("/scenes").json()["scenes"][0]
+        assert (entry["problem"], entry["loaded"]) == (True, False)
+        assert entry["reason"].endswith("allowed are 1")
+
+
+@pytest.mark.parametrize("what", POISON)
+def test_a_poisoned_file_is_listed_as_broken_and_nothing_else_changes(tmp_path: Path, what: str):
+    good = write_scene(tmp_path / "good.onnx")
+    contents = poisoned(onnx.load(good), what)
+    (tmp_path / "bad.onnx").write_bytes(contents)
+    with serving(tmp_path) as client:
+        before = frame(client)
+        assert client.post("/render", json={**FRAME, "scene": "bad"}).status_code == 503
+        bad, fine = client.get("/scenes").json()["scenes"]
+        assert (bad["name"], bad["problem"], bad["loaded"]) == ("bad", True, False)
+        assert POISON[what][0] in bad["reason"]
+        assert bad["reason"].isprintable()
+        assert (fine["name"], fine["problem"], fine["reason"]) == ("good", False, None)
+        (tmp_path / "late.onnx").write_bytes(contents)  # what comes later is looked at by the reload
+        write_scene(good, static_color=(0, 0, 1))
+        eventually(lambda: frame(client) != before)
+
+
+def test_mutated_files_are_refused_or_served_without_a_server_error(tmp_path: Path):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    write_scene(folder / "good.onnx")
+    with serving(folder, uploads=True) as client:
+        before = frame(client)
+        for seed in range(MUTATED):
+            query = {"name": "mutated", "replace": "true"}
+            answer = client.post("/scenes", params=query, content=hostile_file(seed))
+            assert answer.status_code in (201, 422), (seed, answer.text)
+            for t in (0, 0.37, 1) if answer.status_code == 201 else ():
+                drawn = client.post("/render", json={**FRAME, "scene": "mutated", "t": t})
+                assert drawn.status_code in (200, 422, 503), (seed, drawn.text)
+        assert frame(client) == before
+
+
+def test_a_file_that_takes_too_long_is_refused(tmp_path: Path):
+    path = write_scene(tmp_path / "scene.onnx")
+    try_scene(path, GraphLimits(), 60)
+    with pytest.raises(SceneFileInvalid, match=r"isn't opened and posed within 0.01 s"):
+        try_scene(path, GraphLimits(), 0.01)
+
+
+@in_this_process
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems don't keep to a limit of memory")
+def test_a_file_that_ends_its_process_is_refused_at_upload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    contents = write_scene(tmp_path / "scene.onnx").read_bytes()
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    dying = GraphLimits(memory_bytes=-(1 << 29))  # leaves that process no memory at all
+    with serving(folder, uploads=True) as client:
+        monkeypatch.setattr(Settings, "graph_limits", dying)
+        answer = client.post("/scenes", params={"name": "walk"}, content=contents)
+        assert (answer.status_code, list(folder.iterdir())) == (422, [])
+        assert "ends the process that tries it" in answer.json()["detail"]
+        monkeypatch.undo()
+        assert client.post("/scenes", params={"name": "walk"}, content=contents).status_code == 201
+
+
+SERVICE = """
+import sys
+from pathlib import Path
+from tests.support.service import serving
+folder, contents, frame = Path(sys.argv[1]), Path(sys.argv[2]).read_bytes(), %r
+with serving(folder, uploads=True) as client:
+    assert client.post("/scenes", params={"name": "walk"}, content=contents).status_code == 201
+    assert client.post("/render", json=frame).status_code == 200
+"""
+
+
+def test_a_service_writes_no_file_besides_its_scenes(tmp_path: Path):
+    """onnxruntime keeps a database of telemetry in the home folder where it isn't told not to."""
+    contents = write_scene(tmp_path / "scene.onnx")
+    home, folder = tmp_path / "home", tmp_path / "scenes"
+    home.mkdir()
+    folder.mkdir()
+    kept = {"NUMBA_CACHE_DIR", "PATH", "MSDGS_THREADS", "PYTHONPATH", "LD_LIBRARY_PATH"}
+    environment = {name: value for name, value in os.environ.items() if name in kept}
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", SERVICE % FRAME, str(folder), str(contents)],
+        cwd=ROOT,
+        env={**environment, "HOME": str(home), "TMPDIR": str(home)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert list(home.rglob("*")) == []
+    assert [path.name for path in folder.rglob("*")] == ["walk.onnx"]
+
+
+@pytest.mark.parametrize("milliseconds", [f"1{'0' * 400}", "1e999", "[" * 100_000 + "]" * 100_000])
+def test_a_poisoned_report_beside_a_scene_is_as_none(tmp_path: Path, milliseconds: str):
+    measured = {"rendered": {"psnr_worst": 50.0}}
+    write_scene(tmp_path / "good.onnx", measured_error=measured)
+    point = {"plan": "network", "error": {"psnr_worst": 50.0}, "milliseconds": {"total": {"min": "MILLISECONDS"}}}
+    report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": [point]}
+    text = json.dumps(report).replace('"MILLISECONDS"', milliseconds)
+    (tmp_path / "good.report.json").write_text(text)
+    with serving(tmp_path) as client:
+        assert client.get("/scenes/good/report").status_code == 503
+        assert client.post("/render", json={**FRAME, "min_psnr": 40}).status_code == 200

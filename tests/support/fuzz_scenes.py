@@ -1,0 +1,77 @@
+"""Mutated scene files by seed, opened, posed and drawn. As a program: opens a marker, then handles so many of them.
+
+`python -m tests.support.fuzz_scenes COUNT MARKER`
+"""
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.scene import Camera, SceneFileInvalid
+from msdgs_serve.scene.camera import orbit
+from msdgs_serve.scene.onnx import GraphLimits
+from tests.support.scene_files import UP
+from tests.support.scene_mutations import mutated
+from tests.support.sound_scenes import sound_scenes
+
+LIMITS = GraphLimits(memory_bytes=64 << 20, operations=1e10, call_operations=1e10)
+CAMERA = Camera.from_fov(orbit(np.zeros(3), 5.0, 30, 20, UP), 16, 16, 40.0)
+DRAWN = "drawn"
+
+
+def hostile_file(seed: int) -> bytes:
+    """The file of a seed."""
+    rng = np.random.default_rng([33, seed])
+    scenes = sound_scenes()
+    names = sorted(scenes)
+    return mutated(scenes[names[seed % len(names)]], rng)
+
+
+def outcome(contents: bytes) -> str:
+    """`drawn`, where all that is drawn is finite, or the reason for which the file is refused."""
+    try:
+        session = DeformationSession("mutated.onnx", contents=contents, limits=LIMITS)
+        t0, t1 = session.scene.metadata.time_range
+        images = [Renderer(0).render(session, CAMERA, t0 + (t1 - t0) * part) for part in (0.0, 0.37, 1.0)]
+    except SceneFileInvalid as error:
+        return reason(error)
+    for image in images:
+        assert np.isfinite(image.rgb).all()
+        assert np.isfinite(image.alpha).all()
+    return DRAWN
+
+
+def reason(error: SceneFileInvalid) -> str:
+    """Why a file is refused; short text that may be shown."""
+    shown = f"{error.field} {error.problem}"
+    assert error.problem
+    assert shown.isprintable()
+    assert len(shown) < 1000
+    return error.problem
+
+
+def outcomes(seeds: range) -> Counter[str]:
+    """How many files have which; a failure says the seed."""
+    counted: Counter[str] = Counter()
+    for seed in seeds:
+        try:
+            counted[outcome(hostile_file(seed))] += 1
+        except Exception as error:
+            raise AssertionError(f"the file of seed {seed} is neither refused nor drawn") from error
+    return counted
+
+
+def main(count: str, marker: str) -> None:
+    """What is opened after the marker is opened because of the files."""
+    for contents in sound_scenes().values():
+        assert outcome(contents) == DRAWN
+    Path(marker).read_bytes()
+    print(f"{outcomes(range(int(count)))[DRAWN]} drawn")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
