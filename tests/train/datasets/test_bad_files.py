@@ -162,7 +162,12 @@ WRONG = [
     (CAMERA, put([240, 320], "image_size"), "image_size", "is 240×320, but the image is 320×240"),
     ("colmap/cameras.txt", swap("PINHOLE", "FOV"), "line 3", "is FOV, but only"),
     ("colmap/cameras.txt", swap("310.0", "nan"), "line 3.fy", "must be finite, got nan"),
-    ("colmap/cameras.txt", swap("310.0", "-1"), "cameras[7]", "is not a valid camera: `camera.fy` must be finite and above 0"),
+    (
+        "colmap/cameras.txt",
+        swap("310.0", "-1"),
+        "cameras[7]",
+        "is not a valid camera: `camera.fy` must be finite and above 0",
+    ),
     ("colmap/cameras.txt", swap(" 117.0", ""), "line 3", "must have 4 parameters for PINHOLE, got 3"),
     ("colmap/cameras.txt", swap("320", "wide"), "line 3", "must be CAMERA_ID MODEL WIDTH HEIGHT"),
     ("colmap/cameras.txt", swap(WHOLE, "PINHOLE"), "line 3", "must be CAMERA_ID MODEL"),
