@@ -166,11 +166,7 @@ WRONG = [
         "colmap/cameras.txt",
         swap("310.0", "-1"),
         "cameras[7]",
-<<<<<<< HEAD
         "is not a valid camera: `camera.fy` must be finite",
-=======
-        "is not a valid camera: `camera.fy` must be finite and above 0",
->>>>>>> wt/train-tests
     ),
     ("colmap/cameras.txt", swap(" 117.0", ""), "line 3", "must have 4 parameters for PINHOLE, got 3"),
     ("colmap/cameras.txt", swap("320", "wide"), "line 3", "must be CAMERA_ID MODEL WIDTH HEIGHT"),
