@@ -288,15 +288,15 @@ def test_sheet_shows_image_rendering_and_error(run: Path) -> None:
     sheet = _read(run / "eval" / "test.png")
     worst = min(range(2), key=lambda index: evaluation.models[0].images[index].psnr)
     times = -(-evaluation_report.MIN_PANEL // SIZE)
-    for picture in (_read(evaluation.frames[worst].image_path), _render(run / "model.pt", evaluation.frames[worst])):
-        assert _contains(to_bytes(sheet), to_bytes(picture).repeat(times, axis=0).repeat(times, axis=1))
+    for drawn in (_read(evaluation.frames[worst].image_path), _render(run / "model.pt", evaluation.frames[worst])):
+        assert _contains(to_bytes(sheet), to_bytes(drawn).repeat(times, axis=0).repeat(times, axis=1))
 
 
-def _contains(sheet: np.ndarray, picture: np.ndarray) -> bool:
+def _contains(sheet: np.ndarray, drawn: np.ndarray) -> bool:
     """Whether the image lies somewhere in the sheet, pixel for pixel, in the first row."""
-    height, width, _ = picture.shape
+    height, width, _ = drawn.shape
     rows = sheet[HEADER + CAPTION : HEADER + CAPTION + height]
-    return any(np.array_equal(rows[:, x : x + width], picture) for x in range(sheet.shape[1] - width + 1))
+    return any(np.array_equal(rows[:, x : x + width], drawn) for x in range(sheet.shape[1] - width + 1))
 
 
 @pytest.mark.usefixtures("_clean")
