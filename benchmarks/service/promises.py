@@ -1,4 +1,4 @@
-"""What the service promises where clients or operators do something unkind, each measured on a service of its own."""
+"""What the service promises where clients or operators misbehave, each measured on a service of its own."""
 
 import contextlib
 import http.client

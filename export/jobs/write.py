@@ -46,7 +46,7 @@ def write_scene(
     """Write a scene file beside `output`, compare it with the model of its moving part, and only then move it there.
 
     `rendered` is what is known of its frames, and goes into its metadata. With it, a plan that computes something
-    else than the model's own layers isn't held to `tolerance`: its frames have been judged.
+    else than the model's own layers isn't held to `tolerance`: its frames have been compared.
     """
     exact = rendered is None or properties(contents)["plan"] == BASELINE
     with replacing(output) as temporary:

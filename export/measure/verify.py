@@ -51,7 +51,7 @@ def verify(
     all others; they aren't compared. Errors of means are relative to the scene's half
     diagonal or, further out, to the largest coordinate; those of scales to the Gaussian's largest scale; those of
     quaternions are absolute. Raises `VerificationFailed` if one is above `tolerance` for a stable Gaussian, or an
-    error bound is exceeded. Unstable Gaussians are judged in rendered frames, before a file is written.
+    error bound is exceeded. Unstable Gaussians are evaluated in rendered frames, before a file is written.
     """
     stated = session.scene.metadata
     if stated.plan != BASELINE:

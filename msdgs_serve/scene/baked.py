@@ -23,6 +23,8 @@ __all__ = [
 INPUTS = ("t", "ids")
 OPTIONAL_INPUT = "steps"
 MOVING_OUTPUTS = ("means", "quats", "scales")
+MAX_SH = 1e30
+"""Sums of coefficients, and blends of what they give, stay finite in float32."""
 CONSTANT_OUTPUTS = ("static_means", "static_quats", "static_scales", "opacities", "sh")
 
 
@@ -63,6 +65,8 @@ class BakedScene:
                 raise SceneFileInvalid(file, name, f"has shape {array.shape}, {counts} need {shape}")
             if array.dtype != np.float32:
                 raise SceneFileInvalid(file, name, f"holds {array.dtype}, not float32")
+        if max(self.sh.max(initial=0), -self.sh.min(initial=0)) > MAX_SH:
+            raise SceneFileInvalid(file, "sh", f"holds values beyond ±{MAX_SH:g}, whose colors overflow")
         try:
             m = self.moving_count
             Gaussians(

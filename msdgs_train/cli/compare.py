@@ -12,17 +12,16 @@ from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, ric
 
 @dataclass(frozen=True)
 class Compare:
-    """Train every system on every scene with every seed under one budget, and put them side by side: a table
-    (comparison.md), all numbers (comparison.json), error against training time (time.png) and against the number of
-    layers (layers.png).
+    """Train every system on every scene with every seed under one budget, and compare them: a table (comparison.md),
+    all numbers (comparison.json), error against training time (time.png) and against the number of layers (layers.png).
 
-    A system is a preset, or a table of a TOML file: the settings of `fit`, changed from a `preset`. What Ctrl-C has
-    stopped goes on with the same command; finished runs aren't trained again.
+    A system is a preset, or a table of a TOML file: a `preset` and settings of `fit` that replace its own. The same
+    command continues after Ctrl-C; finished runs aren't trained again.
 
     Example:  msdgs-train compare deformgs 4dgs mine.toml --data data/a data/b --out runs/all --steps 3000 --size 200
     --init-num-pts 5000 --max-gaussians 10000
 
-    where mine.toml holds:  [k2]  preset = "msdgs-small"  [k4]  layers = ["mlp", "mlp:width=64", "mlp", "mlp"]
+    mine.toml:  [k2]  preset = "msdgs-small"  [k4]  layers = ["mlp", "mlp:width=64", "mlp", "mlp"]
     """
 
     systems: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG...")]
@@ -30,28 +29,28 @@ class Compare:
     data: tuple[Path, ...]
     """Dataset folders, one or more."""
     out: Path
-    """The folder for all runs and the results; new, or one of the same comparison."""
+    """The folder of all runs and results: new, or one of the same comparison."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Each is a run of its own; the table shows mean and spread."""
+    """One run per seed; the table shows mean and standard deviation."""
     steps: int = 3000
-    """The budget of each run in optimiser steps, whatever a preset says. Schedules that are parts of a run shrink with
-    it; those in steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
+    """Optimizer steps of each run, instead of the preset's. Schedules in fractions of a run scale with it; those in
+    steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
     minutes: float | None = None
-    """A run also ends after so many minutes. Learning rates fall over --steps, so choose these to be just reached."""
+    """Time limit of each run. Learning rates decay over --steps, which the limit should just allow."""
     size: int | None = None
-    """Width in pixels of all images."""
+    """Width of all images in pixels."""
     init_num_pts: int | None = None
-    """Gaussians at the start, for all systems; left out: each its own."""
+    """Initial Gaussians of all systems; their own settings if not given."""
     max_gaussians: int | None = None
-    """Gaussians at most, for all systems; left out: each its own."""
+    """Maximum Gaussians of all systems; their own settings if not given."""
     threads: int = 1
-    """Of each run."""
+    """CPU threads of each run."""
     jobs: int | None = None
-    """Runs side by side; left out: as many as have their threads' cores. Times of runs side by side disturb each other
-    somewhat; those of frames are taken at the end, one after the other."""
+    """Parallel runs; as many as the cores allow if not given. Parallel runs slow each other down somewhat; frame times
+    are measured at the end, one after the other."""
     ray: str | None = None
-    """Train on a Ray cluster: `auto`, that of this machine (one is started where there is none), or its address. DATA
-    and OUT must be seen by all its machines under the same names."""
+    """Train on a Ray cluster: its address, or `auto` for that of this machine, started if there is none. DATA and OUT
+    must be at the same paths on all its machines."""
 
     def execute(self) -> int:
         from msdgs_serve.threads import thread_count
@@ -77,10 +76,10 @@ class Compare:
             paths = write_comparison(self.out, results, len(runs) - len(results))
             if console.is_terminal:
                 console.print(rich_table(HEADINGS, table(results), names=2))
-            else:  # 80 columns would cut it
+            else:  # the table is wider than 80 columns
                 console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, markup=False, highlight=False)
             console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
         if not complete:
-            console.print("interrupted; the same command goes on", soft_wrap=True)
+            console.print("interrupted; the same command continues", soft_wrap=True)
             return EXIT_INTERRUPTED
         return 0 if len(results) == len(runs) else EXIT_INVALID

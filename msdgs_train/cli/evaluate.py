@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Evaluate the last and the best model of runs on held-out images: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR where
-    something moves, since a static background hides what is wrong with the motion.
+    """Evaluate the last and the best model of runs on held-out images: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR of the
+    moving region, since a static background hides errors of the motion.
 
     RUN/eval gets numbers for every image (<split>.json), a table (<split>.md) and a contact sheet of images, renderings
-    and errors (<split>.png). LPIPS and ꟻLIP are omitted if their packages or weights are not on this machine; nothing
-    is downloaded. Several runs are also drawn side by side.
+    and errors (<split>.png). LPIPS and ꟻLIP are omitted if their packages or weights are missing; nothing is
+    downloaded. Several runs are also drawn side by side.
 
     Example:  msdgs-train eval runs/first
 
@@ -32,11 +32,11 @@ class Evaluate:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """Folders of runs that `msdgs-train fit` has filled."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
-    """The dataset, if it is not any more where the runs found it."""
+    """The dataset, if it has moved since training."""
     split: Literal["test", "val", "train"] = "test"
-    """Which images."""
+    """The images to evaluate on."""
     sheet: Path = Path("side_by_side.png")
-    """With several runs, the PNG to write: a row for each of some images, then the rendering of each run."""
+    """With several runs, the PNG to write: one row per image, with the rendering of each run."""
 
     def execute(self) -> int:
         from msdgs_train.evaluation.evaluate import evaluate_run
@@ -62,6 +62,6 @@ class Evaluate:
 def _table(run: str, evaluation: "Evaluation") -> "Table":
     from msdgs_train.evaluation.report import HEADINGS, cells
 
-    rows = [[j.name, f"{j.loaded.step:,}", *cells(evaluation, j.mean)] for j in evaluation.models]
+    rows = [[model.name, f"{model.loaded.step:,}", *cells(evaluation, model.mean)] for model in evaluation.models]
     title = f"{run}: {evaluation.split}, mean of {len(evaluation.frames)} images"
     return rich_table(["model", "step", *HEADINGS.values()], rows, names=1, title=title)

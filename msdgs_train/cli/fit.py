@@ -127,14 +127,15 @@ def _cli(arguments: Sequence[str], default: Fit) -> Fit:
                 config=(tyro.conf.OmitArgPrefixes,),
             )
     except SystemExit as end:
-        if (refused := _refused_setting(end)) is not None:  # tyro has drawn a box; every command prints one line
-            raise refused from None
+        invalid = _invalid_setting(end)
+        if invalid is not None:  # reported in one line, as by the other commands, instead of tyro's box
+            raise invalid from None
         sys.stderr.write(errors.getvalue())
         raise
 
 
-def _refused_setting(end: SystemExit) -> InvalidInput | None:
-    """The error of a setting for which tyro ends the program; None if it is another reason."""
+def _invalid_setting(end: SystemExit) -> InvalidInput | None:
+    """The error of a setting for which tyro exits; None if it exits for another reason."""
     cause: BaseException | None = end
     while cause is not None and not isinstance(cause, InvalidInput):
         cause = cause.__context__

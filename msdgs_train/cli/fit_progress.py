@@ -71,13 +71,13 @@ class FitProgress(Observer):
             return
         self._next_update = now + (UPDATE_SECONDS if self._console.is_terminal else PLAIN_LINE_SECONDS)
         speed = (result.step - self._first[0]) / max(now - self._first[1], 1e-9)
-        state = (
-            f"loss {result.loss:.4f}  PSNR {result.psnr:.2f} dB  {result.gaussians:,} Gaussians  {speed:.1f} steps/s"
-            + (f"  {result.skipped} skipped" if result.skipped else "")
-        )
+        state = f"loss {result.loss:.4f}  PSNR {result.psnr:.2f} dB  {result.gaussians:,} Gaussians"
+        state += f"  {speed:.1f} steps/s" if speed else ""
+        state += f"  {result.skipped} skipped" if result.skipped else ""
         self._bar.update(self._task, completed=result.step, state=state)
         if not self._console.is_terminal:
-            left = f"  {(self._steps - result.step) / speed:.0f} s left" if speed else ""
+            steps_left = self._steps - result.step
+            left = f"  {steps_left / speed:.0f} s left" if speed and steps_left else ""
             self._print(f"step {result.step:,}/{self._steps:,}  {state}{left}")
 
     def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:

@@ -1,4 +1,4 @@
-"""`msdgs-train`: fit a moving scene to images, evaluate and look at the result, or make a scene to try it on."""
+"""`msdgs-train`: train dynamic Gaussians on images of a moving scene, evaluate and view them."""
 
 import argparse
 import sys
@@ -27,11 +27,11 @@ Commands = (
     | Annotated[Compare, tyro.conf.subcommand("compare")]
 )
 
-EPILOG = "--plugin MODULE, before the command: a module or Python file with layers or systems of your own (repeatable)."
+EPILOG = "--plugin MODULE, before the command: a module or Python file that registers layers or systems (repeatable)."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `msdgs-train`; returns the exit code: 0 done, 2 wrong input, 130 interrupted."""
+    """Entry point of `msdgs-train`; returns the exit code: 0 success, 2 invalid input, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         return _parse(_without_plugins(arguments)).execute()
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _without_plugins(arguments: Sequence[str]) -> list[str]:
-    """Imports the modules of `--plugin`, whose systems options depend on; returns the other arguments."""
+    """Import the modules of `--plugin`, before options that depend on their systems; returns the other arguments."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--plugin", action="append", default=[])
     known, rest = early.parse_known_args(arguments)

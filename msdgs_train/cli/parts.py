@@ -1,4 +1,4 @@
-"""Layers and supports as words of a command line: `mlp:width=96,depth=2`."""
+"""Layers and supports as command-line values: `mlp:width=96,depth=2`."""
 
 import inspect
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ from msdgs_train.supports.registry import SUPPORTS
 
 
 class PartInvalid(MsdgsError):
-    """An option names a layer or support that can't be used. No `ValueError`, which tyro would hide behind its own."""
+    """An invalid layer or support in an option. Not a `ValueError`, which tyro would replace by its own message."""
 
 
 PARTS = ConstructorRegistry()
-"""Tells tyro how to read them."""
+"""How tyro parses and prints them."""
 
 
 @PARTS.primitive_rule

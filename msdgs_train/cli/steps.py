@@ -11,7 +11,7 @@ from msdgs_train.cli.console import console
 
 @dataclass(frozen=True)
 class Steps:
-    """Draw the Gaussians after k = 0, 1, …, K layers of the deformation side by side: what each layer adds.
+    """Draw the Gaussians after k = 0, 1, …, K layers of the deformation side by side: the contribution of each layer.
 
     Example:  msdgs-train steps runs/first/model.pt --t 0.9
     """
@@ -19,13 +19,13 @@ class Steps:
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """The model.pt or best.pt of a run."""
     t: float | None = None
-    """Time, in the scene's range; left out: 0.3 of the way through it."""
+    """Time in the scene's range; 0.3 of the way through it if not given."""
     out: Path = Path("steps.png")
     """The PNG to write."""
     size: int = 400
-    """Width of each image in pixels, the height in proportion."""
+    """Width of each image in pixels, height in proportion."""
     camera: str | None = None
-    """Name of a camera that the model holds; left out: the one whose image is nearest in time."""
+    """Name of a camera in the model; the one whose image is nearest in time if not given."""
 
     def execute(self) -> int:
         from msdgs_train.evaluation.layer_strip import write_steps

@@ -11,21 +11,21 @@ from msdgs_train.cli.console import console, frame_progress
 
 @dataclass(frozen=True)
 class Synthetic:
-    """Make a small moving scene with known motion, ray-marched into D-NeRF layout. No downloads, a few seconds.
+    """Make a small moving scene with known motion in D-NeRF layout, by ray marching: no download, a few seconds.
 
     Example:  msdgs-train synthetic data/toy && msdgs-train fit data/toy runs/toy --steps 2000
     """
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """The folder to make."""
+    """The folder to create."""
     size: int = 128
     """Width and height of the images in pixels."""
     train_frames: int = 64
-    """At evenly spaced times, from all around."""
+    """Training images, at evenly spaced times, from all around."""
     test_frames: int = 12
-    """Held out: at times between, from one smooth turn around the scene."""
+    """Held-out images, at intermediate times, from one smooth turn around the scene."""
     seed: int = 0
-    """Of the cameras and times."""
+    """Seed of the camera positions."""
 
     def execute(self) -> int:
         from msdgs_train.datasets.synthetic.generate import generate

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """Open a page on which a trained model is seen from all around, at any time, after each layer of the deformation.
-    It stays until Ctrl-C. Needs: pip install 'msdgs[viewer]'
+    """View a trained model in a browser: any view and time, after each layer of the deformation. Ctrl-C ends it.
+    Needs: pip install 'msdgs[viewer]'
 
     Example:  msdgs-train view runs/first/model.pt
     """
@@ -24,7 +24,7 @@ class View:
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """The model.pt or best.pt of a run."""
     port: int = 8080
-    """Where it is taken, one of the next. 0 takes a free one."""
+    """The next free one if it is taken, any free one if 0."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 for all networks."""
 
@@ -43,5 +43,5 @@ def open_viewer(host: str, port: int) -> "Viewer":
     from msdgs_train.viewer.viewer import Viewer
 
     viewer = Viewer(host, port)
-    console.print(f"look at {viewer.url}", soft_wrap=True)
+    console.print(f"viewer: {viewer.url}", soft_wrap=True)
     return viewer

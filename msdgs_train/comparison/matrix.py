@@ -1,4 +1,4 @@
-"""What is to be trained: systems × scenes × seeds, each a run with its settings and its folder."""
+"""The runs of a comparison: systems × scenes × seeds, each with its settings and its folder."""
 
 import re
 import tomllib
@@ -11,13 +11,13 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
-EVALUATIONS = 10  # of the held-out images while training: points of a curve
+EVALUATIONS = 10  # of held-out images during training
 LOG_LINES = 100
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What is the same for all systems. None leaves it to the system's own settings."""
+    """Settings that all systems share. None: the system's own."""
 
     steps: int
     minutes: float | None = None
@@ -27,7 +27,7 @@ class Budget:
     max_gaussians: int | None = None
 
     def settings(self) -> dict[str, Any]:
-        """Fields of `TrainConfig`."""
+        """As settings of `TrainConfig`."""
         every = max(self.steps // EVALUATIONS, 1)
         given = {
             "steps": self.steps,
@@ -43,7 +43,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class ComparedSystem:
-    """Settings by name."""
+    """A system with a name and its settings."""
 
     name: str
     config: TrainConfig
@@ -66,9 +66,9 @@ class Run:
 
 
 def read_systems(sources: Sequence[str], budget: Budget) -> list[ComparedSystem]:
-    """Of names of presets and of TOML files, in which each table is a system: a `preset` and what differs from it.
+    """Systems from names of presets and from TOML files, where each table is one: a `preset` and changed settings.
 
-    Raises `InvalidInput` naming the file, the system and the setting that can't be used.
+    Raises `InvalidInput` naming the file, the system and the invalid setting.
     """
     tables = [pair for source in sources for pair in _tables(source)]
     systems = [ComparedSystem(name, _config(name, table, budget)) for name, table in tables]
@@ -77,7 +77,7 @@ def read_systems(sources: Sequence[str], budget: Budget) -> list[ComparedSystem]
 
 
 def make_runs(systems: Sequence[ComparedSystem], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
-    """Seed by seed, so that a comparison that is stopped early has something of every system."""
+    """Seed by seed, so that a comparison that is stopped early has results of every system."""
     _require_unique("scene", (scene.resolve().name for scene in scenes))
     _require_unique("seed", map(str, seeds))
     return [
@@ -104,7 +104,7 @@ def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
     try:
         contents = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InvalidInput("config", "a file that can be read", f"{path}: {error.strerror}") from error
+        raise InvalidInput("config", "a readable file", f"{path}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InvalidInput("config", "a TOML file", f"{path}: {error}") from error
     for name, table in contents.items():
@@ -118,7 +118,7 @@ def _config(name: str, table: Mapping[str, Any], budget: Budget) -> TrainConfig:
     try:
         return preset(table.get("preset", DEFAULT)).updated(**changes | budget.settings())
     except (InvalidInput, TypeError, ValueError) as error:
-        raise InvalidInput("config", "made of settings that can be used", f"system `{name}`: {error}") from error
+        raise InvalidInput("config", "made of valid settings", f"system `{name}`: {error}") from error
 
 
 def _require_unique(kind: str, given: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""Where the runs of a comparison are trained: processes of this machine, or tasks of a Ray cluster."""
+"""Workers that train the runs of a comparison: processes of this machine, or tasks of a Ray cluster."""
 
 import dataclasses
 import multiprocessing
@@ -37,25 +37,25 @@ class Pool(Protocol):
     jobs: int
 
     def __len__(self) -> int:
-        """Runs that haven't ended."""
+        """The number of runs that haven't ended."""
         ...
 
     def submit(self, run: Run) -> None:
-        """Begin, or go on with it."""
+        """Start a run, or continue it."""
         ...
 
     def ended(self) -> Iterator[tuple[Run, RunEnd]]:
-        """What has ended, after waiting a moment for it."""
+        """The runs that have ended; waits up to `POLL_SECONDS`."""
         ...
 
     def stop(self) -> None:
-        """Have all runs save their checkpoint and end."""
+        """Make all runs save their checkpoint and end."""
         ...
 
 
 @contextmanager
 def processes(jobs: int) -> Iterator[Pool]:
-    """A process of this machine for each."""
+    """One process of this machine per run."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     with ProcessPoolExecutor(jobs, context, _prepare, (stop,)) as executor:
@@ -64,10 +64,10 @@ def processes(jobs: int) -> Iterator[Pool]:
 
 @contextmanager
 def ray_tasks(address: str, threads: int, jobs: int | None) -> Iterator[Pool]:
-    """Tasks of a Ray cluster, `threads` cores each; as many as it has cores for where `jobs` says nothing.
+    """Tasks of a Ray cluster, `threads` cores each; as many as its cores allow if `jobs` is None.
 
-    Data and runs lie where all its machines see them, under the same names. A run whose machine is lost goes on
-    elsewhere from its last checkpoint.
+    Data and runs must be at the same paths on all its machines. A run whose machine is lost continues on another one
+    from its last checkpoint.
     """
     with ray_cluster(address) as cores:
         yield _RayPool(jobs or max(1, cores // threads), threads)
@@ -111,15 +111,15 @@ class _RayPool:
         self._tasks.submit(there)
 
     def ended(self) -> Iterator[tuple[Run, RunEnd]]:
-        for there, how in self._tasks.ended(POLL_SECONDS):
-            yield self._given.pop(there.folder), how
+        for there, end in self._tasks.ended(POLL_SECONDS):
+            yield self._given.pop(there.folder), end
 
     def stop(self) -> None:
         self._flag.set.remote()
 
 
 class _Flag:
-    """Lives on the cluster; the runs ask it whether they are to stop."""
+    """An actor on the cluster that runs poll for the request to stop."""
 
     def __init__(self) -> None:
         self._is_set = False
@@ -131,7 +131,7 @@ class _Flag:
         return self._is_set
 
 
-class _AskingFlag(Observer):
+class _FlagObserver(Observer):
     def __init__(self, flag: Any) -> None:
         self._flag = flag
         self._asked = 0.0
@@ -146,19 +146,19 @@ class _AskingFlag(Observer):
         return ray.get(self._flag.is_set.remote())
 
 
-class _AskingParent(Observer):
+class _ParentObserver(Observer):
     def should_stop(self) -> bool:
         return _is_orphan() or (_stop is not None and _stop.is_set())
 
 
 def _train_on_ray(flag: list[Any], run: Run) -> RunEnd:
-    return _train(run, _AskingFlag(flag[0]))
+    return _train(run, _FlagObserver(flag[0]))
 
 
 def _train_here(run: Run) -> RunEnd:
-    ended = _train(run, _AskingParent())
+    ended = _train(run, _ParentObserver())
     if _is_orphan():
-        os._exit(1)  # the executor would wait for more for ever
+        os._exit(1)  # the executor would wait for more work forever
     return ended
 
 
@@ -168,17 +168,17 @@ def _is_orphan() -> bool:
 
 
 def _train(run: Run, observer: Observer) -> RunEnd:
-    """One run, begun or gone on with."""
+    """Train one run, from its checkpoint if there is one."""
     os.environ[THREADS_VARIABLE] = str(run.config.run.threads)
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
-        outcome = fit(run.config, run.data, run.folder, resume=(run.folder / CHECKPOINT).exists(), observer=observer)
+        result = fit(run.config, run.data, run.folder, resume=(run.folder / CHECKPOINT).exists(), observer=observer)
     except MsdgsError as error:
         return RunEnd("failed", str(error))
-    return RunEnd(outcome.status)
+    return RunEnd(result.status)
 
 
 def _prepare(stop: Event) -> None:
     global _stop
     _stop = stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all; the parent passes it on
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the parent passes it on

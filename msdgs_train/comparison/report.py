@@ -25,14 +25,14 @@ HEADINGS = (
     "system", "scene", "seeds", "PSNR, dB", "SSIM", "deformation parameters", "with modulation", "Gaussians",
     "training, s", "frame, ms",
 )  # fmt: skip
-BESIDE = 0.04  # layers that bars of the same K stand apart
+BESIDE = 0.04  # horizontal offset between bars of the same K, in layers
 COLORS, DASHES = [f"C{i}" for i in range(10)], ["-", "--", ":", "-."]
 
 
 def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list[Path]:
     """Write the table, its numbers and the plots into the folder `out`, each atomically; returns their paths.
 
-    `missing`: runs that aren't finished.
+    `missing`: number of unfinished runs.
     """
     write_text(out / TABLE, as_markdown(results, missing))
     write_text(out / NUMBERS, json.dumps(as_json(results, missing), indent=2) + "\n")
@@ -42,7 +42,7 @@ def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list
 
 
 def table(results: Sequence[Result]) -> list[list[str]]:
-    """A row for each system and scene, in the order of `HEADINGS`; mean ± sample standard deviation over seeds."""
+    """One row per system and scene, in the order of `HEADINGS`: mean ± sample standard deviation over seeds."""
     return [_row(group) for group in _groups(results, lambda r: (r.run.system, r.run.scene))]
 
 
@@ -67,15 +67,15 @@ def _row(group: list[Result]) -> list[str]:
 
 
 def as_markdown(results: Sequence[Result], missing: int) -> str:
-    """The table, and under what it was measured."""
+    """The table and the conditions of the measurement."""
     lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
     lines += ["| " + " | ".join(row) + " |" for row in table(results)]
     budget = results[0].run.config
     limit = f", at most {budget.run.max_minutes:g} minutes a run" if budget.run.max_minutes is not None else ""
-    under = f"{budget.run.steps:,} steps{limit}; {budget.run.threads} thread(s) a run; held-out images of "
-    under += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
+    conditions = f"{budget.run.steps:,} steps{limit}; {budget.run.threads} thread(s) a run; held-out images of "
+    conditions += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
     machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
-    notes = [under, f"Measured on {date.today().isoformat()}: {machine}."]
+    notes = [conditions, f"Measured on {date.today().isoformat()}: {machine}."]
     skipped = sum(result.skipped for result in results)
     if skipped:
         notes.append(f"{skipped} steps were skipped because their loss was not finite.")
@@ -96,7 +96,7 @@ def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
 
 
 def draw_time(results: Sequence[Result]) -> Figure:
-    """Error on held-out images against training time: a panel a scene, a line a system, the mean of its seeds."""
+    """Error on held-out images against training time: one panel per scene, one line per system (mean over seeds)."""
     figure, panels = _panels(results, "seconds of training")
     styles = _styles(_names(results, lambda r: r.run.system))
     for axes, of_scene in panels:
@@ -115,8 +115,8 @@ def draw_time(results: Sequence[Result]) -> Figure:
 
 
 def draw_layers(results: Sequence[Result]) -> Figure:
-    """Error against K, a panel a scene. Systems that differ in nothing but their number of layers of a kind are joined
-    by a line; bars reach from the best seed to the worst, side by side."""
+    """Error against K, one panel per scene. Systems that differ only in their number of equal layers are joined by a
+    line; bars reach from the best seed to the worst."""
     figure, panels = _panels(results, "K, layers of the deformation")
     families = _names(results, _family)
     styles = _styles(families)
@@ -148,7 +148,7 @@ def _family(result: Result) -> str:
 
 
 def _panels(results: Sequence[Result], label: str) -> tuple[Figure, list[tuple[Axes, list[Result]]]]:
-    """A figure with a panel for each scene, and what is drawn there."""
+    """A figure with one panel per scene, and the results of each."""
     scenes = _groups(results, lambda r: r.run.scene)
     figure = Figure(figsize=(2.5 + 5.5 * len(scenes), 5.5), layout="constrained")
     panels: list[Axes] = list(np.ravel(figure.subplots(1, len(scenes), squeeze=False)))
@@ -167,8 +167,8 @@ def _finished(figure: Figure) -> Figure:
 
 
 def _styles(names: list[str]) -> dict[str, dict[str, Any]]:
-    looks = itertools.cycle({"color": color, "linestyle": dashes} for dashes in DASHES for color in COLORS)
-    return dict(zip(names, looks, strict=False))
+    styles = itertools.cycle({"color": color, "linestyle": dashes} for dashes in DASHES for color in COLORS)
+    return dict(zip(names, styles, strict=False))
 
 
 def _names(results: Sequence[Result], key: Callable[[Result], str]) -> list[str]:
@@ -176,7 +176,7 @@ def _names(results: Sequence[Result], key: Callable[[Result], str]) -> list[str]
 
 
 def _groups(results: Sequence[Result], key: Any) -> list[list[Result]]:
-    """In the order in which each first comes."""
+    """Groups in the order of their first result."""
     groups: dict[Any, list[Result]] = {}
     for result in results:
         groups.setdefault(key(result), []).append(result)

@@ -1,4 +1,4 @@
-"""What the runs of a comparison have come to: metrics, sizes, and the time that training and one frame take."""
+"""Results of the runs of a comparison: metrics, sizes, training time and frame time."""
 
 import statistics
 import time
@@ -24,7 +24,7 @@ FIRST_SPLIT = "test"
 
 
 class CurvePoint(NamedTuple):
-    """The metrics on held-out images at one moment of training."""
+    """PSNR on held-out images at one step of training."""
 
     step: int
     seconds: float
@@ -33,7 +33,7 @@ class CurvePoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Result:
-    """One finished run; qualities are those of the last model, which has had the whole budget."""
+    """One finished run; metrics are those of the last model, after the whole budget."""
 
     run: Run
     split: str
@@ -44,12 +44,12 @@ class Result:
     gaussians: int
     seconds: float  # of training, evaluations included
     skipped: int
-    frame_ms: float  # posing and drawing one held-out camera's view, median
+    frame_ms: float  # deforming and rendering one held-out view, median
     curve: list[CurvePoint]
 
 
 class Spread(NamedTuple):
-    """Mean and sample standard deviation; the latter is None of one value."""
+    """Mean and sample standard deviation; None for a single value."""
 
     mean: float
     deviation: float | None
@@ -59,12 +59,12 @@ class Spread(NamedTuple):
         return cls(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
 
     def shown(self, digits: int) -> str:
-        """As in a table: mean ± deviation."""
+        """As text: mean ± deviation."""
         return f"{self.mean:,.{digits}f}" + ("" if self.deviation is None else f" ± {self.deviation:,.{digits}f}")
 
 
 def collect(runs: Sequence[Run]) -> list[Result]:
-    """The finished ones, timed one after the other while nothing else of the comparison runs."""
+    """Results of the finished runs; frames are timed one after the other."""
     return [_result(run) for run in runs if is_finished(run)]
 
 
@@ -98,16 +98,16 @@ def _modulation_parameters(loaded: LoadedModel) -> int:
 
 
 def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
-    """Median over some of the model's cameras, each after one that doesn't count; `threads` of torch."""
+    """Median frame time over some of the model's cameras, after one untimed frame, with `threads` of torch."""
     torch.set_num_threads(threads)
-    took = []
+    times = []
     for i, entry in enumerate([loaded.scene.cameras[0], *loaded.scene.cameras[:TIMED_FRAMES]]):
         camera = camera_of(entry, entry["width"])
         start = time.perf_counter()
         loaded.render(camera, entry["t"])
         if i:
-            took.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(took)
+            times.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(times)
 
 
 def _curve(lines: list[dict[str, Any]], split: str) -> list[CurvePoint]:

@@ -1,4 +1,4 @@
-"""Trains the runs of a comparison, several side by side; goes on where it was stopped."""
+"""Training of the runs of a comparison, several in parallel, resumed after an interruption."""
 
 import json
 import signal
@@ -15,9 +15,9 @@ from msdgs_train.engine.run_record import CHECKPOINT, CONFIG, FINAL_METRICS, sto
 
 
 def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, RunEnd], None]) -> bool:
-    """Train what isn't finished yet; False where Ctrl-C has stopped it, with all checkpoints saved.
+    """Train the unfinished runs; returns False if Ctrl-C has stopped it, with all checkpoints saved.
 
-    Raises `InvalidInput` before anything is trained where a folder holds a run with other settings.
+    Raises `InvalidInput` before training if a folder holds a run with other settings.
     """
     for run in runs:
         _check_settings(run)
@@ -31,7 +31,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
         return True
     interrupted = threading.Event()
     with pool as trainers:
-        # after Ray, which has a handler of its own
+        # after Ray, which installs a handler of its own
         old = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
         try:
             while waiting or len(trainers):
@@ -40,8 +40,8 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
                     waiting.clear()
                 while waiting and len(trainers) < trainers.jobs:
                     trainers.submit(waiting.pop(0))
-                for run, how in trainers.ended():
-                    on_end(run, how)
+                for run, end in trainers.ended():
+                    on_end(run, end)
         finally:
             signal.signal(signal.SIGINT, old)
     return not interrupted.is_set()
@@ -57,7 +57,7 @@ def is_finished(run: Run) -> bool:
 
 
 def final_metrics(run: Run) -> dict[str, Any] | None:
-    """What `fit` has written at its end; None where it hasn't come to it."""
+    """The metrics that `fit` writes at its end; None if it hasn't ended."""
     try:
         return json.loads((run.folder / FINAL_METRICS).read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -8,17 +8,17 @@ from msdgs_train.settings import Checked
 
 @dataclass(frozen=True)
 class DensityConfig(Checked):
-    """How many Gaussians there are, and when and where they are added and removed."""
+    """The number of Gaussians, and when and where they are added and removed."""
 
     init_num_pts: int = 8_000
     """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
     max_gaussians: int = 10_000
-    """There are never more; the largest gradients come first."""
+    """Upper bound of the number of Gaussians; those with the largest gradients are densified first."""
     density_strategy: Literal["gradient", "mcmc"] = "gradient"
     """gradient clones and splits by gradients of the projected means, and prunes; mcmc relocates low-opacity Gaussians
     and grows by 5 % a round up to max_gaussians."""
     refine_start: int = 500
-    """The first step of density control."""
+    """First step of density control."""
     refine_every: int = 100
     """Steps between rounds of density control; 0 switches it off."""
     refine_stop_fraction: float = 0.7

@@ -1,7 +1,7 @@
 """Adaptive density control of 3D Gaussian Splatting (Kerbl et al. 2023, section 5.2), on the canonical Gaussians.
 
-Gradients are accumulated where the Gaussians are drawn, posed at the time of each image; their canonical attributes
-are cloned, split, reset and removed.
+Gradients are those of the projected means of posed Gaussians; the canonical attributes are cloned, split, reset and
+removed.
 """
 
 import math
@@ -20,12 +20,12 @@ from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.quaternions import rotate
 
 SPLIT_SHRINK = 1.6
-"""The two halves of a split Gaussian are smaller by this factor."""
+"""Scales of the two halves of a split Gaussian are divided by this factor."""
 RESET_OPACITY = 0.01
 
 
 class DensityChange(NamedTuple):
-    """How many Gaussians one round of density control has cloned, split in two and removed."""
+    """Numbers of Gaussians cloned, split in two and removed in one round."""
 
     cloned: int
     split: int
@@ -44,7 +44,7 @@ class GradientStrategy:
 
     @classmethod
     def start(cls, schedule: Schedule, scene_scale: float, count: int) -> "GradientStrategy":
-        """With nothing accumulated yet, for `count` Gaussians."""
+        """A new strategy for `count` Gaussians."""
         generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
         return cls(schedule, scene_scale, torch.zeros(count), torch.zeros(count), generator)
 
@@ -72,7 +72,7 @@ class GradientStrategy:
             self.reset_opacities(surgery)
 
     def state(self) -> tuple[Tensor, ...]:
-        """What has been accumulated."""
+        """The accumulated gradients."""
         return self.gradients, self.counts
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:
@@ -95,24 +95,24 @@ class GradientStrategy:
         return DensityChange(len(cloned), len(split), int(pruned.sum()))
 
     def reset_opacities(self, surgery: RowSurgery) -> None:
-        """Reset every opacity to 0.01 at most: what the images need comes back, the rest is pruned."""
+        """Clamp all opacities to 0.01: Gaussians that the images need recover, the rest is pruned."""
         ceiling = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
         surgery.replace_values("raw_opacities", surgery.gaussians.raw_opacities.detach().clamp(max=ceiling))
 
     def reset(self, count: int) -> None:
-        """Drop what was accumulated; there are `count` Gaussians now."""
+        """Drop the accumulated gradients; there are `count` Gaussians now."""
         self.gradients, self.counts = torch.zeros(count), torch.zeros(count)
 
     def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
         pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
         if 0 < self.config.reset_every < step:
             pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.scene_scale
-        if bool(pruned.all()):  # a scene of which all is transparent keeps its Gaussians and may recover
+        if bool(pruned.all()):  # a scene that is wholly transparent keeps its Gaussians and may recover
             return torch.zeros_like(pruned)
         return pruned
 
     def _to_densify(self, pruned: Tensor, step: int) -> Tensor:
-        """[N] bool: large gradients, the largest first while there is room."""
+        """[N] bool: large gradients, the largest first up to the maximum number."""
         mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
         chosen = mean >= self.config.grow_grad2d
         room = self.schedule.max_gaussians(step) - int((~pruned).sum())
@@ -122,7 +122,7 @@ class GradientStrategy:
         return chosen
 
     def _halves(self, gaussians: CanonicalGaussians, rows: Tensor) -> dict[str, Tensor]:
-        """Copies of the given rows, smaller, each moved to a random place inside the Gaussian it comes from."""
+        """Smaller copies of the given rows, at positions drawn from the Gaussian that is split."""
         values = {name: p[rows] for name, p in gaussians.named_parameters()}
         noise = torch.randn(len(rows), 3, generator=self.generator) * values["log_scales"].exp()
         values["means"] = values["means"] + rotate(functional.normalize(values["raw_quats"], dim=1), noise)

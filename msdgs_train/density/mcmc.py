@@ -1,7 +1,7 @@
 """Density control under a budget (3D Gaussian Splatting as Markov Chain Monte Carlo, Kheradmand et al. 2024).
 
-Low-opacity Gaussians are relocated to opaque ones, and new ones are added there until the budget is reached. A Gaussian
-and its copies share its opacity and footprint, so that the image stays. Noise is injected into low-opacity ones.
+Low-opacity Gaussians are relocated to opaque ones, and new ones are added there until the budget is reached. Opacity
+and scales of a Gaussian and its copies are reduced so that the image doesn't change. Noise is injected into the means.
 
 The formulas and constants are those of gsplat's `MCMCStrategy`, which itself runs on CUDA only.
 """
@@ -21,16 +21,16 @@ from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.quaternions import rotate
 
 GROWTH = 1.05
-"""How many there may be after a round for one before, as long as the budget allows it."""
+"""Factor by which the number of Gaussians grows per round, up to the budget."""
 MAX_COPIES = 51
-"""A Gaussian with more copies is divided as if by so many."""
+"""Upper bound of the number of copies in the formulas."""
 MAX_OPACITY = 1 - torch.finfo(torch.float32).eps
 NOISE_SLOPE = 100.0
-"""How sharply noise ends above `prune_opa`."""
+"""Slope of the sigmoid that gates noise by opacity, around `prune_opa`."""
 
 
 class Relocated(NamedTuple):
-    """How many low-opacity Gaussians one round has relocated, and how many it has added."""
+    """Numbers of Gaussians relocated and added in one round."""
 
     moved: int
     added: int
@@ -45,21 +45,21 @@ class MCMCStrategy:
 
     @classmethod
     def start(cls, schedule: Schedule) -> "MCMCStrategy":
-        """With its own randomness, of the settings' seed."""
+        """A new strategy, with a generator of its own."""
         return cls(schedule, torch.Generator().manual_seed(schedule.config.run.seed + 1))
 
     def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Gradients don't matter here."""
+        """Unused: relocation depends on opacities."""
 
     def reset(self, count: int) -> None:
-        """Nothing was accumulated."""
+        """Nothing to reset."""
 
     def state(self) -> tuple[Tensor, ...]:
-        """Nothing but the generator."""
+        """No state besides the generator."""
         return ()
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:
-        """Nothing."""
+        """No state to load."""
 
     @property
     def config(self) -> DensityConfig:
@@ -67,26 +67,26 @@ class MCMCStrategy:
         return self.schedule.config.density
 
     def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:
-        """Few and small Gaussians: what isn't needed becomes transparent and is relocated."""
+        """Opacity and scale regularizers: Gaussians that aren't needed become transparent and are relocated."""
         c = self.config
         return {"opacity": c.opacity_reg * posed.opacities.mean(), "scale": c.scale_reg * posed.scales.mean()}
 
     def after_step(self, surgery: RowSurgery, step: int) -> None:
-        """A round when one is due; and noise in proportion to the learning rate of the means."""
+        """Relocate if a round is due, then inject noise in proportion to the learning rate of means."""
         if self.schedule.refines_at(step):
             self.relocate(surgery, step)
         self.inject_noise(surgery.gaussians, surgery.learning_rate("means"))
 
     @torch.no_grad()
     def relocate(self, surgery: RowSurgery, step: int) -> Relocated:
-        """Put low-opacity Gaussians, and what the budget has room for, at others, drawn by their opacity."""
+        """Relocate low-opacity Gaussians, and add new ones within the budget, at others drawn by opacity."""
         gaussians = surgery.gaussians
         opacities = gaussians.raw_opacities.double().sigmoid()
         alive = torch.nonzero(opacities > self.config.prune_opa)[:, 0]
         count = len(opacities)
         added = max(0, min(self.schedule.max_gaussians(step), int(GROWTH * count)) - count)
         moved = count - len(alive)
-        if moved + added == 0 or len(alive) == 0:  # a scene of which all is transparent may recover
+        if moved + added == 0 or len(alive) == 0:  # a scene that is wholly transparent may recover
             return Relocated(0, 0)
         drawn = torch.multinomial(opacities[alive], moved + added, replacement=True, generator=self.generator)
         sources = alive[drawn]
@@ -102,7 +102,7 @@ class MCMCStrategy:
 
     @torch.no_grad()
     def inject_noise(self, gaussians: CanonicalGaussians, rate: float) -> None:
-        """Move each mean by noise of the shape of its covariance, more at lower opacity (equation 9 there)."""
+        """Add noise with the covariance of each Gaussian to its mean, more at lower opacity (equation 9 there)."""
         gate = torch.sigmoid(-NOISE_SLOPE * (gaussians.raw_opacities.sigmoid() - self.config.prune_opa))
         noise = torch.randn(len(gaussians), 3, generator=self.generator)
         quats = functional.normalize(gaussians.raw_quats, dim=1)

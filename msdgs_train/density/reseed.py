@@ -1,4 +1,4 @@
-"""Random Gaussians where a phase without deformation has left none, and the choice of a strategy."""
+"""Reseeding with random Gaussians after the static phase, and the choice of a strategy."""
 
 import torch
 
@@ -10,7 +10,7 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 
 RESEED_SEED = 7
-"""Added to the run's seed: not the positions at which training began."""
+"""Added to the run's seed, so that positions differ from the initial ones."""
 
 
 def make_strategy(schedule: Schedule, scene_scale: float, count: int) -> DensityStrategy:

@@ -18,7 +18,7 @@ class DensityStrategy(Protocol):
         ...
 
     def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Take in one view: gradients [N, 2] in pixels, radii [N] that are 0 if a Gaussian was not drawn."""
+        """Accumulate one view: gradients [N, 2] in pixels, radii [N] that are 0 if a Gaussian was not drawn."""
         ...
 
     def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:
@@ -26,15 +26,15 @@ class DensityStrategy(Protocol):
         ...
 
     def after_step(self, surgery: RowSurgery, step: int) -> None:
-        """Do what is due after this optimizer step, counted from 1."""
+        """Density control after this optimizer step, counted from 1."""
         ...
 
     def reset(self, count: int) -> None:
-        """Drop what was accumulated; there are `count` Gaussians now."""
+        """Drop the accumulated state; there are `count` Gaussians now."""
         ...
 
     def state(self) -> tuple[Tensor, ...]:
-        """What was accumulated, besides the generator, for a bit-exact continuation."""
+        """The accumulated state, besides the generator, for a bit-exact continuation."""
         ...
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:

@@ -1,4 +1,4 @@
-"""The exponential average of a model over its last steps, which reduces mini-batch noise."""
+"""Exponential moving average of a model's weights, which reduces mini-batch noise."""
 
 import copy
 from typing import Any, Generic, TypeVar
@@ -10,8 +10,8 @@ M = TypeVar("M", bound=nn.Module)
 
 
 class WeightAverage(Generic[M]):
-    """All steps weigh the same until there are `steps`; from then on it is exponential, and about a third of the weight
-    is older than `steps`."""
+    """The mean of the first `steps` steps, an exponential moving average after that; about a third of its weight is
+    older than `steps`."""
 
     def __init__(self, steps: int) -> None:
         self.model: M | None = None  # None: of no step
@@ -19,7 +19,7 @@ class WeightAverage(Generic[M]):
 
     @torch.no_grad()
     def add(self, model: M) -> None:
-        """One more step; all must have the same rows, in the same order."""
+        """Add one step; the Gaussians must be the same, in the same order."""
         self._count = min(self._count + 1, self._most)
         if self.model is None:
             self.model = copy.deepcopy(model)
@@ -33,11 +33,11 @@ class WeightAverage(Generic[M]):
         self.model, self._count = None, 0
 
     def state(self) -> dict[str, Any] | None:
-        """What `load_state` takes; None of no step."""
+        """The state for `load_state`; None before the first step."""
         return None if self.model is None else {"model": self.model.state_dict(), "count": self._count}
 
     def load_state(self, state: dict[str, Any] | None, model: M) -> None:
-        """Continue from there; `model` is of the last step."""
+        """Continue from a state; `model` is that of the last step."""
         self.reset()
         if state is not None:
             self.model, self._count = copy.deepcopy(model), state["count"]

@@ -1,4 +1,4 @@
-"""Which image comes next, and which parameters it updates.
+"""The order of the images, and the parameters that each of them updates.
 
 First all images train a static scene. Then what moves is tracked from the middle of the scene's time outwards, in a
 window that grows image by image, once or more. While it grows for the first time, of four samples
@@ -23,9 +23,9 @@ from msdgs_train.engine.schedule import Schedule
 Update = Literal["all", "motion", "static"]
 
 NEW_FRAME_BORDER = 0.01
-"""Fraction of the scene's time from the window's border inwards whose images are new."""
+"""Images within this fraction of the time range of the window's border are new frames."""
 MIN_NEW_FRAME_DISTANCE = 0.7
-"""New images are at least this fraction of the window out, and there is always one."""
+"""New frames are at least this fraction of the half width from the middle; the outermost image always is one."""
 
 
 class TrainingSample(NamedTuple):
@@ -44,7 +44,7 @@ class Curriculum(Protocol):
         ...
 
     def state(self) -> Tensor:
-        """What `load_state` continues from, besides the generator."""
+        """The state besides the generator, for `load_state`."""
         ...
 
     def load_state(self, state: Tensor) -> None:
@@ -53,7 +53,7 @@ class Curriculum(Protocol):
 
 
 class WindowCurriculum:
-    """A time window that grows from the middle. `_order`, indices, is what is left of a pass over its images."""
+    """A time window that grows from the middle. `_order` holds the indices that remain in a pass over its images."""
 
     def __init__(self, schedule: Schedule, frames: list[Frame], time_range: tuple[float, float]) -> None:
         self._schedule, self._frames, self._time_range = schedule, frames, time_range

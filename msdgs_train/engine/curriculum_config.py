@@ -8,7 +8,7 @@ from msdgs_train.settings import Checked
 
 @dataclass(frozen=True)
 class CurriculumConfig(Checked):
-    """Which images a run trains on, phase by phase."""
+    """The images of each phase of a run."""
 
     static_fraction: float = 0.1
     """The first fraction of the run trains on all images without deformation, until what is static is in place

@@ -11,7 +11,7 @@ from msdgs_train.layers.parameters import ParamGroup
 from msdgs_train.systems.base import ViewLoss
 
 ROLES = {"all": ("static", "motion", "binding"), "motion": ("motion",), "static": ("static",)}
-"""Which parameters a sample updates."""
+"""Roles of the parameters that a sample updates."""
 
 
 class ViewGradients(NamedTuple):

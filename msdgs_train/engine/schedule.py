@@ -1,4 +1,4 @@
-"""The phases of a run in steps, and all that depends on them."""
+"""The phases of a run in steps, and everything that depends on the step."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from msdgs_train.engine.config import TrainConfig
 
 
 class Phase(NamedTuple):
-    """Consecutive steps that train alike."""
+    """Consecutive steps of one kind."""
 
     name: str
     first: int
@@ -14,7 +14,7 @@ class Phase(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """What happens when. Steps are counted from 0 unless a method says so."""
+    """The schedule of a run. Steps are counted from 0 unless a method says otherwise."""
 
     config: TrainConfig
     num_steps: int
@@ -26,7 +26,7 @@ class Schedule(NamedTuple):
 
     @classmethod
     def from_config(cls, config: TrainConfig) -> "Schedule":
-        """Of these settings."""
+        """The schedule of these settings."""
         c, steps = config.curriculum, config.run.steps
         static_window = c.static_window_fraction if c.window_full_fraction else 0.0
         static_steps = round(c.static_fraction * steps)
@@ -42,7 +42,7 @@ class Schedule(NamedTuple):
         )
 
     def phases(self) -> list[Phase]:
-        """Those that there are, in order."""
+        """The phases of at least one step, in order."""
         starts = self.config.curriculum.window_start_widths
         if not self.config.model.layers or self.config.curriculum.window_full_fraction == 0:
             start = min(self.deform_start_step, self.num_steps) if self.config.model.layers else self.num_steps
@@ -71,11 +71,11 @@ class Schedule(NamedTuple):
         return start + (0.5 - start) * (grown % 1)
 
     def is_first_pass(self, step: int) -> bool:
-        """Whether times that the window takes in now have never been in it."""
+        """Whether the window grows for the first time."""
         return self._growth(step) <= 1
 
     def _growth(self, step: int) -> float:
-        """How many times the window has grown to all times."""
+        """Number of times that the window has grown to all times, with a fraction."""
         done = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
         return done * len(self.config.curriculum.window_start_widths)
 
@@ -84,7 +84,7 @@ class Schedule(NamedTuple):
         return step >= self.deform_start_step and len(self.config.model.layers) > 0
 
     def sh_degree(self, step: int) -> int:
-        """Of the spherical harmonics in use."""
+        """Degree of the spherical harmonics in use."""
         return min(step // self.config.optimizer.sh_degree_interval, self.config.model.sh_degree)
 
     def eps2d(self, step: int) -> float:
@@ -93,7 +93,7 @@ class Schedule(NamedTuple):
         return self.config.model.eps2d if init is None or step > self.full_window_step else init
 
     def max_gaussians(self, step: int) -> int:
-        """How many there may be after this step, counted from 1."""
+        """Upper bound of the number of Gaussians after this step, counted from 1."""
         most = self.config.density.max_gaussians
         return most - 2 * self.num_reseeded if step <= self.static_steps else most
 

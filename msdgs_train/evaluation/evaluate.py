@@ -1,4 +1,4 @@
-"""A run's models judged on held-out images: the last one and the best one, each by name."""
+"""Evaluation of the last and the best model of a run on held-out images."""
 
 import json
 import statistics
@@ -21,13 +21,13 @@ FILES = {"last": MODEL, "best": BEST}
 
 
 class Scores(NamedTuple):
-    """How close renderings are to their images; None where a score can't be had."""
+    """Metrics of one rendering; None for those that are unavailable."""
 
     psnr: float  # dB, data range 1
     ssim: float  # window 11, σ = 1.5
     lpips: float | None  # VGG-16
     flip: float | None  # mean ꟻLIP
-    moving_psnr: float | None  # dB, over the pixels of the moving region; None where nothing moves
+    moving_psnr: float | None  # dB, over the pixels of the moving region; None if nothing moves
 
 
 class EvaluatedModel(NamedTuple):
@@ -39,12 +39,12 @@ class EvaluatedModel(NamedTuple):
 
     @property
     def mean(self) -> Scores:
-        """Over the images; a score is left out where an image lacks it, and None where all do."""
+        """The mean over the images that have a score; None if none has."""
         columns = [[value for value in column if value is not None] for column in zip(*self.images, strict=True)]
         return Scores(*(statistics.fmean(column) if column else None for column in columns))  # type: ignore[arg-type]
 
     def render(self, frame: Frame) -> Tensor:
-        """[H, W, 3] in [0, 1], as the frame's camera sees the model at its time."""
+        """[H, W, 3] in [0, 1], rendered with the camera and time of the frame."""
         return self.loaded.render(frame.camera, frame.t).clamp(0, 1)
 
     def image(self, frame: Frame) -> Tensor:
@@ -53,28 +53,28 @@ class EvaluatedModel(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """All that is known about a run's models on one split."""
+    """The results of a run's models on one split."""
 
     data: Path
     split: str
     frames: list[Frame]
-    models: list[EvaluatedModel]  # last, and best if the run has kept one
-    best: Best | None  # how the best one was chosen
-    region_source: str  # "images" or "model": what the moving region is made from
-    masks: list[np.ndarray]  # [H, W] bool for each frame, the moving region; the same for all models
-    unavailable: dict[str, str]  # scores that could not be computed, and why
+    models: list[EvaluatedModel]  # last, and best if the run has one
+    best: Best | None  # how the best one was selected
+    region_source: str  # "images" or "model": the source of the moving region
+    masks: list[np.ndarray]  # [H, W] bool per frame, the moving region; the same for all models
+    unavailable: dict[str, str]  # scores that could not be computed, with the reason
 
 
 def evaluate_run(
     run: Path, data: Path | None = None, split: str = "test", progress: Callable[[int, int], None] | None = None
 ) -> Evaluation:
-    """Judge `model.pt` and, where there is one, `best.pt` of the run in folder `run` on a split.
+    """Evaluate `model.pt` and, if there is one, `best.pt` of the run in folder `run` on a split.
 
     Args:
-        run: the folder that `msdgs-train fit` has filled.
+        run: the folder of a run of `msdgs-train fit`.
         data: the dataset; by default the one that the run was trained on.
         split: "test", "val" or "train".
-        progress: called with images done and images in all.
+        progress: called with (done, total) images.
 
     Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
     """
@@ -99,22 +99,22 @@ def evaluate_run(
 
 
 def scores(rgb: Tensor, target: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
-    """Of one rendering and its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
+    """The scores of one rendering and its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
     psnr, ssim = image_metrics(rgb, target)
     others = {name: metric(rgb, target) for name, metric in perceptual.metrics.items()}
     return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, mask))
 
 
 def _image_width(run: Path) -> int | None:
-    """The setting that decides what images are judged; others may have come and gone between versions."""
+    """The width that the run was trained at, None for that of the images."""
     path = run / CONFIG
     try:
         return json.loads(path.read_text(encoding="utf-8"))["data"]["size"]
     except OSError as error:
-        problem = f"{error.strerror}; RUN is a folder that `msdgs-train fit DATA RUN` has filled"
+        problem = f"{error.strerror}; RUN must be the folder of a run of `msdgs-train fit DATA RUN`"
         raise RunInvalid(path, problem) from None
     except (ValueError, KeyError, TypeError) as error:
-        raise RunInvalid(path, f"isn't the settings of a run: {error!r}") from None
+        raise RunInvalid(path, f"isn't the configuration of a run: {error!r}") from None
 
 
 def _data_folder(run: Path, data: Path | None) -> Path:

@@ -11,7 +11,7 @@ from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.sheets import Panel, draw_sheet
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 
-DEFAULT_TIME = 0.3  # of the way through the scene: in the middle, where training begins, little has moved
+DEFAULT_TIME = 0.3  # fraction of the scene's time; in the middle, where the time window starts, deformations are small
 
 
 def write_steps(
@@ -21,12 +21,12 @@ def write_steps(
 
     Args:
         path: `model.pt` or `best.pt` of a run.
-        out: where to write; its folder is made where there is none. Atomic.
+        out: where to write; its folder is created if missing. Atomic.
         t: in the scene's time range.
         size: width of each image in pixels, the height in proportion.
-        camera: name of one that is stored in the model; by default the one whose image is nearest in time.
+        camera: name of a camera in the model; by default the one whose image is nearest in time.
 
-    Raises `CheckpointInvalid` where the model can't be read, `InvalidInput` naming what is out of range.
+    Raises `CheckpointInvalid` if the model can't be read, `InvalidInput` naming what is out of range.
     """
     if out.suffix.lower() != ".png":
         raise InvalidInput("out", "a .png file", out)
@@ -61,7 +61,7 @@ def _stored_camera(loaded: LoadedModel, t: float, name: str | None) -> dict[str,
 
 
 def camera_of(entry: dict[str, Any], width: int) -> Camera:
-    """A camera that a model holds, with images `width` pixels wide."""
+    """A camera from a model file, with images `width` pixels wide."""
     if width < 1:
         raise InvalidInput("size", "a width of 1 pixel or more", width)
     values = {name: entry[name] for name in ("fx", "fy", "cx", "cy", "width", "height")}

@@ -10,11 +10,11 @@ from torch import Tensor
 from msdgs_train.losses.photometric import ssim
 
 MAX_PSNR = 100.0
-"""Reported where two images are equal, in dB."""
+"""Reported for equal images, in dB."""
 
 
 class ImageMetrics(NamedTuple):
-    """How close images are to their images."""
+    """Metrics of a rendering against its image."""
 
     psnr: float  # dB, data range 1
     ssim: float  # at most 1
@@ -26,7 +26,7 @@ def psnr(rgb: Tensor, target: Tensor) -> float:
 
 
 def masked_psnr(rgb: Tensor, target: Tensor, mask: np.ndarray) -> float | None:
-    """PSNR in dB over the pixels of `mask`, [H, W] bool, and all channels of [H, W, 3]; None where there are none."""
+    """PSNR in dB over the pixels of `mask`, [H, W] bool, and all channels of [H, W, 3]; None if there are none."""
     inside = torch.from_numpy(mask)
     return psnr_from_mse(float((rgb - target)[inside].double().square().mean())) if mask.any() else None
 

@@ -1,14 +1,13 @@
-"""Where an image moves. A static background is easy to get right and hides what is wrong with the motion.
+"""The moving region of an image, since a static background hides errors of the motion.
 
-The moving region of a frame is where something can be seen, at its time, that moves over the scene's time:
+The moving region of a frame are the pixels that show, at its time, something that moves during the scene:
 
-- Where cameras are fixed, it comes from the images alone: the pixels of which a channel is more than `MIN_CHANGE`
-  away from its median over the images of this camera.
-- Where they are not, it comes from the models: the pixels of which a channel changes by more than `MIN_CHANGE` when the
-  Gaussians that move are left out. A Gaussian moves, in the view of a frame, if its centre's projections at `TIMES`
-  times, evenly spaced over the scene's, span more than `MIN_TRAVEL` pixels of width or height. What turns or grows
-  without its centre moving doesn't count. Where several models are compared, a pixel is in the region if it is in that
-  of any of them, so that all are judged on the same pixels.
+- If cameras are fixed, it is determined from the images: the pixels with a channel that differs by more than
+  `MIN_CHANGE` from its median over the images of the same camera.
+- Otherwise it is determined from the models: the pixels with a channel that changes by more than `MIN_CHANGE` without
+  the moving Gaussians. A Gaussian moves, in the view of a frame, if the projections of its center at `TIMES` evenly
+  spaced times span more than `MIN_TRAVEL` pixels in width or height; rotation and scaling alone don't count. With
+  several models the region is the union of theirs, so that all are evaluated on the same pixels.
 """
 
 from collections import defaultdict
@@ -29,20 +28,20 @@ from msdgs_train.rendering.rasterize import rasterize
 MIN_CHANGE = 0.1  # of the range of a channel
 MIN_TRAVEL = 1.0  # pixels
 TIMES = 9
-FIXED_TIMES = 3  # a camera with images at so many times is fixed
-MEDIAN_IMAGES = 25  # at most, evenly chosen
+FIXED_TIMES = 3  # a camera with images at this many times is fixed
+MEDIAN_IMAGES = 25  # at most, evenly spaced
 
 
 class MovingRegion(NamedTuple):
-    """Gives a frame's region, [H, W] bool, and says what it is made from."""
+    """The source of the moving region, and a function that gives it for a frame, [H, W] bool."""
 
     source: Literal["images", "model"]
     mask: Callable[[Frame], np.ndarray]
 
 
 def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -> MovingRegion:
-    """From the images where each camera of the split has images at `FIXED_TIMES` times or more, of any
-    split; otherwise from the models."""
+    """From the images if each camera of the split has images at `FIXED_TIMES` times or more, of any split; else
+    from the models."""
     groups: dict[bytes, list[Frame]] = defaultdict(list)
     for frame in (frame for frames in scene.splits.values() for frame in frames):
         groups[_identity(frame.camera)].append(frame)
@@ -63,28 +62,28 @@ class _ModelRegion:
     def __init__(self, loaded: LoadedModel, time_range: tuple[float, float]) -> None:
         self.model = loaded.model
         self.background = torch.tensor(loaded.scene.background)
-        self.centres = [loaded.model.pose(float(t)).means for t in np.linspace(*time_range, TIMES)]
+        self.centers = [loaded.model.pose(float(t)).means for t in np.linspace(*time_range, TIMES)]
 
     @torch.no_grad()
     def mask(self, camera: Camera, t: float) -> np.ndarray:
-        still = ~travels(self.centres, camera)
+        static = ~travels(self.centers, camera)
         posed = self.model.pose(t)
         whole, without = (
             rasterize(*gaussians, camera, self.background, self.model.rasterizer)[0].clamp(0, 1).numpy()
-            for gaussians in (posed, PosedGaussians(*(tensor[still] for tensor in posed)))
+            for gaussians in (posed, PosedGaussians(*(tensor[static] for tensor in posed)))
         )
         return _differs(whole, without)
 
 
-def travels(centres: list[Tensor], camera: Camera) -> Tensor:
-    """[N] bool: the projections of a centre, [N, 3] at each of several times, span more than `MIN_TRAVEL` pixels.
+def travels(centers: list[Tensor], camera: Camera) -> Tensor:
+    """[N] bool: the projections of a center, [N, 3] at each of several times, span more than `MIN_TRAVEL` pixels.
 
-    Times at which it isn't in front of the camera are left out.
+    Times at which it is behind the camera are ignored.
     """
     world_to_camera = torch.from_numpy(camera.world_to_camera).float()
     focal, infinity = torch.tensor([camera.fx, camera.fy]), torch.tensor(torch.inf)
     lowest, highest = infinity, -infinity
-    for means in centres:
+    for means in centers:
         points = means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
         pixels = focal * points[:, :2] / points[:, 2:]
         in_front = points[:, 2:] > GSPLAT.near_plane
@@ -105,6 +104,6 @@ def _differs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _identity(camera: Camera) -> bytes:
-    """Equal for cameras that are the same to six digits."""
+    """Equal for cameras that agree to six decimals."""
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
     return (np.concatenate([intrinsics, camera.camera_to_world.ravel()]).round(6) + 0.0).tobytes()

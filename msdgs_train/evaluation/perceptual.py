@@ -1,4 +1,4 @@
-"""LPIPS and ꟻLIP: metrics that other packages compute, where these are at hand. Nothing is ever downloaded."""
+"""LPIPS and ꟻLIP: metrics of other packages, if these are installed. Nothing is downloaded."""
 
 import importlib
 import pickle
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 Metric = Callable[[Tensor, Tensor], float]
-"""Of a rendering and its image, both [H, W, 3] in [0, 1]; 0 where they are equal, lower is better."""
+"""Of a rendering and its image, both [H, W, 3] in [0, 1]; 0 for equal images, lower is better."""
 
 
 class Unavailable(Exception):
@@ -18,14 +18,14 @@ class Unavailable(Exception):
 
 
 class PerceptualMetrics(NamedTuple):
-    """Those that can be computed, and why the others can't."""
+    """The available metrics, and the reasons why others are unavailable."""
 
     metrics: dict[str, Metric]
     unavailable: dict[str, str]
 
 
 def perceptual_metrics() -> PerceptualMetrics:
-    """`lpips` and `flip`, each either ready or with the reason why not."""
+    """`lpips` and `flip`, each as a metric or with the reason why it is unavailable."""
     found = PerceptualMetrics({}, {})
     for name, load in (("lpips", _load_lpips), ("flip", _load_flip)):
         try:
@@ -51,7 +51,7 @@ def _load_flip() -> Metric:
 def _load_lpips() -> Metric:
     """LPIPS with VGG-16, through the lpips package or else torchmetrics, on images scaled to [−1, 1].
 
-    This is how LPIPS is defined. The scripts of 3D Gaussian Splatting feed it [0, 1], so that theirs come out lower.
+    This is the definition of LPIPS. The scripts of 3D Gaussian Splatting pass [0, 1], which gives lower values.
     """
     weights = _vgg_weights()
     try:
@@ -70,7 +70,7 @@ def _vgg_weights() -> Path:
     try:
         models: Any = importlib.import_module("torchvision.models")
     except ImportError:
-        raise Unavailable("torchvision isn't installed, which LPIPS takes its network from") from None
+        raise Unavailable("torchvision isn't installed, whose VGG-16 LPIPS uses") from None
     name = models.VGG16_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[-1]
     path = Path(torch.hub.get_dir()) / "checkpoints" / name
     if not path.is_file():

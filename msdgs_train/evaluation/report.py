@@ -1,4 +1,4 @@
-"""What an evaluation leaves in RUN/eval: numbers as JSON, a table to read, and a contact sheet to look at."""
+"""The files of an evaluation in RUN/eval: numbers as JSON, a Markdown table and a contact sheet."""
 
 import json
 from pathlib import Path
@@ -11,14 +11,14 @@ from msdgs_train.datasets.common.files import write_text
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.evaluate import FILES, EvaluatedModel, Evaluation, Scores
-from msdgs_train.evaluation.sheets import ColourScale, Panel, color, draw_sheet
+from msdgs_train.evaluation.sheets import ColorScale, Panel, color, draw_sheet
 
 FOLDER = "eval"
 SHEET_ROWS = 8
-LARGEST_PANEL = 320  # pixels of width; smaller images are repeated up to SMALLEST_PANEL
-SMALLEST_PANEL = 200
-COLOUR_MAP = "magma"
-FULL_ERROR = 0.25  # mean over the channels, the brightest color of the map; fixed, so that sheets can be compared
+MAX_PANEL = 320  # pixels of width; smaller images are enlarged to MIN_PANEL or more
+MIN_PANEL = 200
+COLOR_MAP = "magma"
+FULL_ERROR = 0.25  # mean over the channels; fixed, so that sheets can be compared
 OUTLINE = (0, 220, 255)
 
 HEADINGS = {
@@ -26,7 +26,7 @@ HEADINGS = {
     "ssim": "SSIM ↑",
     "lpips": "LPIPS ↓",
     "flip": "ꟻLIP ↓",
-    "moving_psnr": "PSNR where it moves, dB ↑",
+    "moving_psnr": "moving PSNR, dB ↑",
 }
 
 
@@ -42,7 +42,7 @@ def write_evaluation(run: Path, evaluation: Evaluation) -> list[Path]:
 
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain values; a score that can't be had is null."""
+    """Plain values; an unavailable score is null."""
     return {
         "data": str(evaluation.data),
         "split": evaluation.split,
@@ -57,7 +57,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def as_markdown(evaluation: Evaluation) -> str:
-    """Tables of the means of each model and of its images, and what the columns mean."""
+    """Tables of the means of each model and of its images, with notes."""
     rows = [[*_names(evaluated), *cells(evaluation, evaluated.mean)] for evaluated in evaluation.models]
     parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} images of {evaluation.data}"]
     parts += [_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
@@ -71,7 +71,7 @@ def as_markdown(evaluation: Evaluation) -> str:
 
 
 def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
-    """A score each as text, in the order of `HEADINGS`."""
+    """The scores as text, in the order of `HEADINGS`."""
     digits = {"psnr": 2, "moving_psnr": 2}
     return [
         f"{value:.{digits.get(name, 4)}f}"
@@ -82,21 +82,21 @@ def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
 
 
 def notes(evaluation: Evaluation) -> list[str]:
-    """What has to be said below the table."""
-    made_from = {"images": "the images", "model": "the models"}[evaluation.region_source]
-    share = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
-    said = [f"Where it moves: {share:.1f} % of the pixels, found in {made_from}; the same for all models."]
+    """The notes below the table."""
+    source = {"images": "the images", "model": "the models"}[evaluation.region_source]
+    percent = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
+    lines = [f"moving region: {percent:.1f} % of the pixels, determined from {source}; the same for all models."]
     if evaluation.best is not None:
         best = evaluation.best
-        said.append(f"best: of the highest PSNR on `{best.split}` while training, {best.psnr:.2f} dB.")
+        lines.append(f"best: highest PSNR on `{best.split}` during training, {best.psnr:.2f} dB.")
     elif len(evaluation.models) < len(FILES):
-        said.append(f"best: this run has kept no {FILES['best']}.")
-    return [*said, *(f"{HEADINGS[name][:-2]}: unavailable, {why}." for name, why in evaluation.unavailable.items())]
+        lines.append(f"best: this run has no {FILES['best']}.")
+    return [*lines, *(f"{HEADINGS[name][:-2]}: unavailable, {why}." for name, why in evaluation.unavailable.items())]
 
 
 def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
-    """A row each for the worst frame of the last model, the best, and some evenly spaced in between: the image,
-    then each model's rendering and its error, with the moving region outlined. Atomic."""
+    """One row per frame, from the worst of the last model to its best, evenly spaced: the image, then the rendering of
+    each model and its error, with the moving region outlined. Atomic."""
     models = distinct_models(evaluation)
     by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: evaluation.models[0].images[index].psnr)
     count = min(SHEET_ROWS, len(by_psnr))
@@ -105,12 +105,12 @@ def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
     shown = "" if count == len(by_psnr) else f"{count} of "
     names = " and ".join(f"{evaluated.name} (step {evaluated.loaded.step:,})" for evaluated in models)
     title = f"{evaluation.split}, {shown}{len(by_psnr)} frames, worst first: {names}"
-    draw_sheet(path, title, rows, ColourScale("error", "0", f"≥ {FULL_ERROR}", COLOUR_MAP))
+    draw_sheet(path, title, rows, ColorScale("error", "0", f"≥ {FULL_ERROR}", COLOR_MAP))
 
 
 def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
-    """Several runs on the same split: a row for each of some evenly spread frames, the image first, then the last model
-    of each run. Atomic. Raises `InvalidInput` unless all were evaluated on the same frames."""
+    """Draw several runs on the same split: one row per frame, with the image and the last model of each run.
+    Atomic. Raises `InvalidInput` unless all were evaluated on the same frames."""
     first, *others = runs.values()
     names = [frame.name for frame in first.frames]
     if any([frame.name for frame in other.frames] != names for other in others):
@@ -128,7 +128,7 @@ def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
 
 
 def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:
-    """Without the best one where it is the last one, which need not be looked at twice."""
+    """The models without the best one if it is also the last one."""
     last, *others = evaluation.models
     return [last, *(evaluated for evaluated in others if evaluated.loaded.step != last.loaded.step)]
 
@@ -140,7 +140,7 @@ def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int) -> li
     for evaluated in models:
         scores, rgb = evaluated.images[index], evaluated.render(frame).numpy()
         moving = "" if scores.moving_psnr is None else f", moving {scores.moving_psnr:.1f}"
-        error = color(np.abs(rgb - target).mean(axis=-1) / FULL_ERROR, COLOUR_MAP)
+        error = color(np.abs(rgb - target).mean(axis=-1) / FULL_ERROR, COLOR_MAP)
         error[_outline(mask)] = OUTLINE
         row.append(Panel(_fitted(to_bytes(rgb)), f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
         row.append(Panel(_fitted(error), "error" + (", moving region outlined" if mask.any() else "")))
@@ -148,19 +148,19 @@ def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int) -> li
 
 
 def _outline(mask: np.ndarray) -> np.ndarray:
-    """[H, W] bool: pixels outside of the mask with a neighbour inside, so that nothing inside is covered."""
+    """[H, W] bool: pixels outside of the mask that border it, so that the inside isn't covered."""
     padded = np.pad(mask, 1)
     return ~mask & (padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
 
 
 def _fitted(pixels: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3] of a width that a sheet has room for, with pixels repeated or averaged."""
+    """uint8 [H, W, 3] enlarged or downscaled to the width of a panel."""
     height, width, _ = pixels.shape
-    if width <= LARGEST_PANEL:
-        times = -(-SMALLEST_PANEL // width)
+    if width <= MAX_PANEL:
+        times = -(-MIN_PANEL // width)
         return pixels.repeat(times, axis=0).repeat(times, axis=1)
     opaque = np.concatenate([pixels, np.full((height, width, 1), 255, np.uint8)], axis=2)
-    return resize_area(opaque, LARGEST_PANEL, max(1, round(height * LARGEST_PANEL / width)))[..., :3]
+    return resize_area(opaque, MAX_PANEL, max(1, round(height * MAX_PANEL / width)))[..., :3]
 
 
 def _model_as_json(evaluation: Evaluation, evaluated: EvaluatedModel) -> dict[str, Any]:

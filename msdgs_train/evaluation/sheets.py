@@ -1,4 +1,4 @@
-"""Sheets of images with captions, pixel for pixel."""
+"""Sheets of images with captions, without resampling."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,7 @@ DPI = 100
 MARGIN = 12  # pixels, around the sheet and between panels
 HEADER = 36
 CAPTION = 20
-LEAST_CELL = 240  # pixels of width, so that a caption fits
+MIN_CELL = 240  # pixels of width, so that a caption fits
 SCALE_WIDTH = 160
 MAX_SIDE = 2**16 - 1  # matplotlib's own limit
 
@@ -22,12 +22,12 @@ MAX_SIDE = 2**16 - 1  # matplotlib's own limit
 class Panel(NamedTuple):
     """One image of a sheet."""
 
-    pixels: np.ndarray  # [H, W, 3] uint8, drawn as they are
+    pixels: np.ndarray  # [H, W, 3] uint8, not resampled
     caption: str
 
 
-class ColourScale(NamedTuple):
-    """What the colors of a map mean; drawn at the top right."""
+class ColorScale(NamedTuple):
+    """The legend of a color map, at the top right."""
 
     label: str
     low: str
@@ -35,10 +35,10 @@ class ColourScale(NamedTuple):
     color_map: str  # of matplotlib
 
 
-def draw_sheet(path: Path, title: str, rows: list[list[Panel]], scale: ColourScale | None = None) -> None:
+def draw_sheet(path: Path, title: str, rows: list[list[Panel]], scale: ColorScale | None = None) -> None:
     """Write a PNG of `rows` of panels with a caption above each. Atomic.
 
-    Raises `InvalidInput` where the sheet would be too large for an image.
+    Raises `InvalidInput` if the sheet would be too large.
     """
     width, height = sheet_size(rows)
     if max(width, height) > MAX_SIDE:
@@ -67,21 +67,21 @@ def panel_corners(rows: list[list[Panel]]) -> list[list[tuple[int, int]]]:
 
 
 def sheet_size(rows: list[list[Panel]]) -> tuple[int, int]:
-    """Width and height of the whole, in pixels."""
+    """Width and height of the sheet, in pixels."""
     width = MARGIN + max(len(row) for row in rows) * (_cell_width(rows) + MARGIN)
     return width, panel_corners(rows)[-1][0][1] + max(len(panel.pixels) for panel in rows[-1]) + MARGIN
 
 
 def color(values: np.ndarray, color_map: str) -> np.ndarray:
-    """uint8 [H, W, 3] of values in [0, 1], [H, W]; what is above takes the last color."""
+    """uint8 [H, W, 3] of values in [0, 1], [H, W]; larger values get the last color."""
     return colormaps[color_map](np.clip(values, 0, 1), bytes=True)[..., :3]
 
 
 def _cell_width(rows: list[list[Panel]]) -> int:
-    return max(LEAST_CELL, *(panel.pixels.shape[1] for row in rows for panel in row))
+    return max(MIN_CELL, *(panel.pixels.shape[1] for row in rows for panel in row))
 
 
-def _draw_scale(figure: Figure, scale: ColourScale, width: int, height: int) -> None:
+def _draw_scale(figure: Figure, scale: ColorScale, width: int, height: int) -> None:
     bar = np.broadcast_to(np.linspace(0, 1, SCALE_WIDTH), (12, SCALE_WIDTH))
     right = width - MARGIN - 8 * len(scale.high)
     x, text_y = right - SCALE_WIDTH, 1 - (MARGIN + 10) / height

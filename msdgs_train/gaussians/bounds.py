@@ -1,4 +1,4 @@
-"""How large a scene is: by its cameras, and by the Gaussians that can be seen."""
+"""The size of a scene, from its cameras and from its visible Gaussians."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,8 +13,7 @@ from msdgs_train.gaussians.model import PosedGaussians
 BOUNDS_TIMES = 9
 VISIBLE_OPACITY = 0.05
 OUTSIDE_BOUNDS = 0.01
-"""Fraction of the means that is outside of the bounds on each side: some are flung far away, where no image shows
-them."""
+"""Fraction of the means beyond the bounds on each side: some are far away, outside of all images."""
 
 
 def scene_scale(cameras: Sequence[Camera]) -> float:
@@ -26,7 +25,7 @@ def scene_scale(cameras: Sequence[Camera]) -> float:
 def scene_bounds(
     pose: Callable[[float], PosedGaussians], time_range: tuple[float, float], scene_half_size: float
 ) -> list[list[float]]:
-    """Corners of the box that holds the means of visible Gaussians, over the times of the scene."""
+    """Corners of the bounding box of the means of visible Gaussians, over the time range."""
     boxes = []
     for t in np.linspace(*time_range, BOUNDS_TIMES):
         posed = pose(float(t))

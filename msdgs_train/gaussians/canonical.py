@@ -1,4 +1,4 @@
-"""The canonical Gaussians: what training stores for each Gaussian, before any deformation or activation."""
+"""The canonical Gaussians: their parameters before deformation and activation."""
 
 import math
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
 from msdgs_train.supports.base import Attribute
 
 INITIAL_OPACITY = 0.1
-MIN_NEIGHBOR_DISTANCE = 1e-7  # scene units; two points in one place still get a scale above 0
+MIN_NEIGHBOR_DISTANCE = 1e-7  # scene units; coincident points still get a scale above 0
 NO_ATTRIBUTES: Mapping[str, Attribute] = {}
 
 
@@ -49,7 +49,7 @@ class CanonicalGaussians(nn.Module):
         sh_rest: Tensor,
         **attributes: Tensor,
     ) -> None:
-        """`attributes`: what modulation and support store besides, N rows each; integers aren't trained."""
+        """`attributes`: those of modulation and support, [N, …] each; integers aren't trained."""
         super().__init__()
         self.means = nn.Parameter(means)
         self.log_scales = nn.Parameter(log_scales)
@@ -66,7 +66,7 @@ class CanonicalGaussians(nn.Module):
 
     @property
     def attributes(self) -> dict[str, Tensor]:
-        """What modulation and support store, by name."""
+        """Attributes of modulation and support, by name."""
         return {name: self.get_parameter(name) for name in self._names}
 
     def rows(self, ids: Tensor | None = None) -> GaussianRows:
@@ -86,8 +86,8 @@ class CanonicalGaussians(nn.Module):
         generator: torch.Generator,
         attributes: Mapping[str, Attribute] = NO_ATTRIBUTES,
     ) -> Self:
-        """One Gaussian per point, [N, 3], of colors in [0, 1], [N, 3]: round, opacity 0.1, its scale the mean distance
-        to its neighbors."""
+        """One isotropic Gaussian per point, [N, 3], of colors in [0, 1], [N, 3], and opacity 0.1; its scale is the mean
+        distance to its neighbors."""
         n = len(points)
         log_scales = neighbor_distances(points).clamp_min(MIN_NEIGHBOR_DISTANCE).log()
         return cls(

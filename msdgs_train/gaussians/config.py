@@ -1,4 +1,4 @@
-"""What a model is made of: a support, its layers, and every switch of the method, checked when it is built."""
+"""Settings of a model: its support, its layers and the switches of the method, checked when built."""
 
 import dataclasses
 import math
@@ -21,33 +21,33 @@ from msdgs_train.supports.registry import SUPPORTS
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Parts and switches of a model. The defaults are the paper's, with K = 2 layers; K = 0 is a static scene."""
+    """Settings of a model. The defaults are the paper's, with K = 2 layers; K = 0 is a static scene."""
 
     sh_degree: int = 3
     """Degree of the spherical harmonics, 0 to 3."""
     support: SupportConfig = GaussiansConfig()
-    """What the layers move, with its settings: gaussians, or nodes that carry the Gaussians (nodes:num_nodes=512)."""
+    """The points that layers move, with settings: gaussians, or control nodes (nodes:num_nodes=512)."""
     layers: tuple[LayerConfig, ...] = (MLPConfig(), MLPConfig())
     """The K layers in order, each a kind with settings of its own (mlp:width=96,depth=2); kinds may be mixed."""
     weights: bool = True
-    """Each layer predicts how much its step counts (equation 8); without, all steps count in full."""
+    """Each layer predicts a step weight (equation 8); without, all step weights are 1."""
     embedding_dim: int = 32
     """Numbers per Gaussian that the modulation reads; 0: no modulation."""
     modulation_targets: tuple[ModulationTarget, ...] = ("scales",)
-    """Which summed deltas the modulation multiplies, one or more of means, scales and quats."""
+    """The summed deltas that the modulation multiplies, one or more of means, scales and quats."""
     modulation_lr_init: float = 8e-4
     """Learning rate of the modulation network and its embeddings."""
     modulation_lr_final: float = 1.6e-6
     """At the last step, to which it decays exponentially."""
     scale_space: ScaleSpace = "log"
-    """Where deltas of scales are added: `log`, to their logarithms; `linear`, to the scales, as in DeformGS."""
+    """`log`: deltas are added to logarithms of scales; `linear`: to the scales, as in DeformGS."""
     opacity_head: bool = False
     """Layers also change opacities, before the sigmoid. Such a model can't be exported yet."""
     sh_head: bool = False
     """Layers also change colors, as SH coefficients. Such a model can't be exported yet."""
     eps2d: float = 0.3
-    """Added to the diagonal of projected covariances, px²: 0.3 in the field. With less, small things are sharper; other
-    programs, which add 0.3, then draw the model softer."""
+    """Dilation of projected covariances, px²; 0.3 in 3D Gaussian Splatting. A smaller one sharpens small structures;
+    other renderers, which add 0.3, then draw the model blurrier."""
 
     def __post_init__(self) -> None:
         for name in ("layers", "modulation_targets"):
@@ -94,7 +94,7 @@ class ModelConfig:
 
     @property
     def heads(self) -> Heads:
-        """What each layer predicts besides the deltas that all have."""
+        """Outputs of each layer besides deltas of means, scales and quaternions."""
         return Heads(self.weights, self.opacity_head, sh_coefficients(self.sh_degree) if self.sh_head else 0)
 
     @property
@@ -103,7 +103,7 @@ class ModelConfig:
         return LearningRate(self.modulation_lr_init, self.modulation_lr_final)
 
     def attributes(self) -> dict[str, Attribute]:
-        """What modulation and support store per Gaussian."""
+        """Attributes of modulation and support, stored per Gaussian."""
         own = {EMBEDDINGS: embeddings_attribute(self.embedding_dim, self.modulation_lr)} if self.embedding_dim else {}
         return own | (self.support.attributes() if self.layers else {})
 

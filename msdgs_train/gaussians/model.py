@@ -1,4 +1,4 @@
-"""The whole model: canonical Gaussians, a support, its chain of layers, and the modulation of what they change."""
+"""The whole model: canonical Gaussians, a support, its chain of layers, and the modulation of their deltas."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from msdgs_train.supports.base import CanonicalPoints
 
 
 class PosedGaussians(NamedTuple):
-    """N Gaussians at one time, activated: what a rasterizer takes."""
+    """N activated Gaussians at one time, as a rasterizer takes them."""
 
     means: Tensor  # [N, 3] scene units
     quats: Tensor  # [N, 4] wxyz, unit
@@ -30,7 +30,7 @@ class PosedGaussians(NamedTuple):
 
 
 class DynamicGaussians(nn.Module):
-    """Gaussians that move: `pose(t)` gives them at any time."""
+    """Gaussians with a deformation; `pose(t)` gives them at any time."""
 
     def __init__(self, config: ModelConfig, gaussians: CanonicalGaussians, bounds: SceneBounds = SceneBounds()) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class DynamicGaussians(nn.Module):
 
     @property
     def rasterizer(self) -> RasterizerOptions:
-        """The constants that it is drawn with."""
+        """Constants of the rasterizer for this model."""
         return GSPLAT._replace(eps2d=self.config.eps2d)
 
     def pose(
@@ -83,12 +83,12 @@ class DynamicGaussians(nn.Module):
         )
 
     def canonical_points(self, rows: GaussianRows | None = None) -> CanonicalPoints:
-        """What the support reads of all Gaussians, or of some rows."""
+        """The input of the support, of all Gaussians or of some rows."""
         g = self.gaussians.rows() if rows is None else rows
         return CanonicalPoints(g.means, unit_or_identity(g.raw_quats), g.attributes)
 
     def motion_groups(self) -> list[ParamGroup]:
-        """The parameter groups of layers, of modulation and of the attributes that these and the support read."""
+        """The parameter groups of layers, of modulation, and of attributes of modulation and support."""
         groups = [
             group._replace(name=f"layers.{index}.{group.name}")
             for index, layer in enumerate(self.deformation)
@@ -105,7 +105,7 @@ class DynamicGaussians(nn.Module):
         return groups
 
     def _modulated(self, deltas: Deltas, attributes: dict[str, Tensor]) -> Deltas:
-        """Equation 12, of the sums over all layers."""
+        """Equation 12, applied to the sums over all layers."""
         if self.modulation is None:
             return deltas
         factors: Factors = self.modulation(attributes[EMBEDDINGS])

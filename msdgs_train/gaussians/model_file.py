@@ -25,7 +25,7 @@ FORMAT = "msdgs-model/2"
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """What a model's scene is, besides its Gaussians; plain values only."""
+    """Time range, background, bounds and cameras of a model's scene; plain values only."""
 
     time_range: tuple[float, float] = (0.0, 1.0)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sRGB in [0, 1], as trained
@@ -35,7 +35,7 @@ class SceneInfo:
 
 
 class LoadedModel(NamedTuple):
-    """What `model.pt` holds."""
+    """The contents of `model.pt`."""
 
     model: DynamicGaussians
     scene: SceneInfo
@@ -84,12 +84,12 @@ def load_model(path: str | Path) -> LoadedModel:
 
 
 def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
-    """A model of this configuration and these tensors; RuntimeError names what is missing or too much."""
+    """A model of this configuration and these tensors; RuntimeError names missing and unexpected ones."""
     prefix = "gaussians."
     gaussians = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
     for layer in config.layers:
         layer.check_stored(len(state))
-    with torch.device("meta"):  # sizes that aren't what is stored may be any, and take no memory here
+    with torch.device("meta"):  # sizes that disagree with the stored tensors take no memory here
         DynamicGaussians(config, CanonicalGaussians(**gaussians)).load_state_dict(state, assign=True)
     model = DynamicGaussians(config, CanonicalGaussians(**gaussians))
     model.load_state_dict(state)
@@ -115,6 +115,6 @@ def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
 
 def _not_finite(state: dict[str, Tensor]) -> Iterator[tuple[str, int, int]]:
     for name, tensor in state.items():
-        count = int((~torch.isfinite(tensor.to(torch.float32))).sum())  # of float64 also what float32 can't hold
+        count = int((~torch.isfinite(tensor.to(torch.float32))).sum())  # also float64 values beyond float32
         if count:
             yield name, count, tensor.numel()

@@ -1,4 +1,4 @@
-"""Time-invariant modulation of what the layers change (paper, section 3.4)."""
+"""Time-invariant modulation of the summed deltas (paper, section 3.4)."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
@@ -12,8 +12,8 @@ from msdgs_train.supports.base import Attribute
 ModulationTarget = Literal["means", "scales", "quats"]
 
 MAX_LOG_FACTOR = 2.0
-"""Factors stay in [e^-2, e^2]. Unbounded they grew to 5,000 in 2,000 steps on one scene, and the loss blew up: a small
-change of a layer then changes some scale by orders of magnitude."""
+"""Factors are clamped to [e^-2, e^2]. Unbounded they grew to 5,000 in 2,000 steps on one scene and the loss diverged:
+a small change of a layer then changes some scale by orders of magnitude."""
 
 COLUMNS: dict[ModulationTarget, int] = {"means": 3, "scales": 3, "quats": 4}
 
@@ -22,14 +22,14 @@ EMBEDDINGS = "embeddings"
 
 
 class Factors(NamedTuple):
-    """What the summed deltas of N Gaussians are multiplied by; None: nothing."""
+    """Factors of the summed deltas of N Gaussians; None: not modulated."""
 
     means: Tensor | None  # [N, 3]
     scales: Tensor | None  # [N, 3]
     quats: Tensor | None  # [N, 4]
 
     def present(self) -> dict[str, Tensor]:
-        """Those that there are, by the name of what they multiply."""
+        """Factors by the name of the delta."""
         return {name: factors for name, factors in self._asdict().items() if factors is not None}
 
 
@@ -41,7 +41,7 @@ def embeddings_attribute(dim: int, lr: LearningRate) -> Attribute:
 
 
 class Modulation(nn.Module):
-    """F of equation 12: an embedding per Gaussian → factors for its summed deltas. They start at exactly 1.
+    """F of equation 12: an embedding per Gaussian → factors of its summed deltas, initially exactly 1.
 
     For scales alone, the paper's, it has 1,155 parameters besides the embeddings. Table 5 has the other targets.
     """

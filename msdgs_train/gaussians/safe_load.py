@@ -17,7 +17,7 @@ PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
 
 
 class CheckpointInvalid(MsdgsError):
-    """A checkpoint can't be read, or holds what no model can use."""
+    """A checkpoint can't be read, or holds values that no model can use."""
 
     def __init__(self, file: str | Path, problem: str) -> None:
         super().__init__(f"{file}: {problem}")
@@ -49,12 +49,12 @@ def load(path: str | Path) -> Any:
         raise CheckpointInvalid(path, f"can't be read: {error.strerror or error}") from error
     except CheckpointInvalid:
         raise
-    except Exception as error:  # where bits are turned its stack machine stumbles in any way
+    except Exception as error:  # a damaged pickle raises errors of any type
         raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
 
 
 def refuse_unlike_stored(path: str | Path, tensors: Mapping[str, Tensor]) -> None:
-    """Raise `CheckpointInvalid` for what isn't rows of plain numbers, or claims more of a storage than there is of it.
+    """Raise `CheckpointInvalid` for tensors that aren't dense plain numbers, or are larger than their storage.
 
     Strides of 0 make a few stored bytes a tensor of any size.
     """

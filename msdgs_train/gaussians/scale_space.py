@@ -1,4 +1,4 @@
-"""In which space deltas of scales are added: to their logarithms, or to the scales themselves."""
+"""The space in which deltas of scales are added: logarithmic or linear."""
 
 import math
 from typing import Literal
@@ -8,15 +8,15 @@ from torch import Tensor
 ScaleSpace = Literal["log", "linear"]
 
 LOG_SCALE_LIMIT = 20.0
-"""Scales stay within e^-20 and e^20: where a layer flings a Gaussian away its scale may vanish or overflow, and 0 · inf
-is NaN."""
+"""Scales are clamped to [e^-20, e^20]: a layer may produce any delta, and a scale that underflows or overflows gives
+NaN."""
 
 MIN_SCALE = math.exp(-LOG_SCALE_LIMIT)
-"""Where deltas are added to scales themselves, a scale may come out negative; it becomes this, far below a pixel."""
+"""Lower bound of scales in linear space, where deltas can make them negative; far below a pixel."""
 
 
 def activated_scales(log_scales: Tensor) -> Tensor:
-    """Standard deviations of their logarithms, within e^±20."""
+    """Standard deviations from their logarithms, clamped to e^±20."""
     return log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
 
 
@@ -28,5 +28,5 @@ def add_to_scales(space: ScaleSpace, log_scales: Tensor, deltas: Tensor) -> Tens
 
 
 def count_clamped(space: ScaleSpace, scales: Tensor) -> int:
-    """How many of N Gaussians have a scale that came out at 0 or below and was clamped."""
+    """Number of Gaussians with a scale that was clamped because it was 0 or below."""
     return 0 if space == "log" else int((scales <= MIN_SCALE).any(dim=1).sum())

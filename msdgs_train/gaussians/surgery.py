@@ -1,7 +1,7 @@
-"""Rows of the Gaussians' parameters together with Adam's moments of them.
+"""Adding, removing and resetting rows of the Gaussians' parameters together with Adam's moments.
 
-Density control changes how many Gaussians there are in the middle of a run. Each row of a parameter has a row of first
-and second moments beside it, which stays with it.
+Density control changes the number of Gaussians during a run. Each row of a parameter has a row of first and second
+moments, which stays with it.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 
 MOMENTS = frozenset({"exp_avg", "exp_avg_sq"})
-"""Of Adam's state, those with a row for each row of a parameter."""
+"""Entries of Adam's state with a row per row of a parameter."""
 
 
 @dataclass(frozen=True)

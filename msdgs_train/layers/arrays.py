@@ -1,4 +1,4 @@
-"""Tensors as kernels take them."""
+"""Tensors as NumPy arrays for kernels."""
 
 import numpy as np
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""What a deformation layer is: one step of a chain that moves points, Gaussians or control nodes (paper, equation 7).
+"""Settings of a deformation layer: one step of a chain that moves Gaussians or control nodes (paper, equation 7).
 
 A new kind is one file: a frozen dataclass that derives from `LayerConfig`, a module that derives from
 `DeformationLayer`, and a line that registers the first in `layers.registry`.
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from msdgs_train.layers.deformation import DeformationLayer
 
 HEAD_COLUMNS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
-"""Columns of a layer's deltas, in the order of `Heads.sizes`; that of the step weight, if any, is the last one."""
+"""Columns of a layer's deltas, in the order of `Heads.sizes`; the logit of the step weight, if any, is the last."""
 
 
 class Heads(NamedTuple):
-    """What a layer predicts besides deltas of means, scales and quaternions."""
+    """Outputs of a layer besides deltas of means, scales and quaternions."""
 
-    weight: bool = True  # without it every step counts in full, w = 1
+    weight: bool = True  # False: all step weights are 1
     opacity: bool = False
-    sh: int = 0  # coefficients (degree + 1)² a channel; 0: none
+    sh: int = 0  # coefficients (degree + 1)² per channel; 0: none
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Columns of: means, scales, quats, opacity, sh, weight before its sigmoid. 0 for what isn't there."""
+        """Columns of means, scales, quats, opacity, SH, and the logit of the weight; 0 for an absent output."""
         return (3, 3, 4, int(self.opacity), 3 * self.sh, int(self.weight))
 
 
@@ -33,7 +33,7 @@ PAPER_HEADS = Heads()
 
 
 class SceneBounds(NamedTuple):
-    """Where and when a model's scene takes place: what grids span. Stored with the weights."""
+    """The extent of a scene in space and time, which grids span. Stored with the weights."""
 
     scene_half_size: float = 1.0  # of a cube around the origin, scene units
     time_range: tuple[float, float] = (0.0, 1.0)
@@ -47,7 +47,7 @@ class LayerConfig:
     """The name of this kind of layer in configurations and files."""
 
     def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "DeformationLayer":
-        """A new layer that moves nothing yet; `num_points` is that of the control nodes, None for Gaussians."""
+        """A new layer, with zero deltas; `num_points` is the number of control nodes, None if it moves Gaussians."""
         raise NotImplementedError
 
     def check(self, field: str, moves_nodes: bool) -> None:
@@ -55,9 +55,9 @@ class LayerConfig:
         control nodes or Gaussians."""
 
     def check_stored(self, num_tensors: int) -> None:
-        """Raise `InvalidInput` where a model file of `num_tensors` tensors can't hold this layer.
+        """Raise `InvalidInput` if a model file with `num_tensors` tensors can't hold this layer.
 
-        A file's configuration is read before its tensors; one that asks for a million matrices must not make them.
+        Called before the layer is built, so that a damaged configuration doesn't allocate millions of tensors.
         """
 
 

@@ -11,7 +11,7 @@ from msdgs_train.layers.deformation import DeformationLayer
 
 
 class Deltas(NamedTuple):
-    """Weighted sums over the layers of what each point changes by at one time (equation 9), before modulation."""
+    """Weighted sums of the deltas over all layers at one time (equation 9), before modulation."""
 
     means: Tensor  # [N, 3] scene units
     scales: Tensor  # [N, 3] as the model's `scale_space` says; on nodes [N, 3] or [N, 6] of a stretch tensor
@@ -21,7 +21,7 @@ class Deltas(NamedTuple):
 
 
 class MultiStepDeformation(nn.Module):
-    """K layers; layer k sees the means as the layers before it have moved them. K = 0 moves nothing."""
+    """K layers; layer k reads the means as moved by the layers before it. With K = 0 all deltas are 0."""
 
     def __init__(self, layers: Iterable[DeformationLayer]) -> None:
         super().__init__()
@@ -48,12 +48,12 @@ class MultiStepDeformation(nn.Module):
         return deltas
 
     def operations(self) -> int:
-        """Floating-point operations a point."""
+        """Floating-point operations per point."""
         return sum(layer.operations() for layer in self)
 
 
 def _add_scales(total: Tensor, weight: Tensor, delta: Tensor) -> Tensor:
-    """Three columns are the first of six."""
+    """Add deltas of 3 columns, the diagonal, or 6, a symmetric tensor."""
     columns = max(total.shape[1], delta.shape[1])
     total, delta = (values if values.shape[1] == columns else pad(values, (0, 3)) for values in (total, delta))
     return torch.addcmul(total, weight, delta)

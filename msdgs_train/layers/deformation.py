@@ -1,4 +1,4 @@
-"""The interface of a deformation layer, and what it proposes for each point."""
+"""The interface of a deformation layer, and its outputs."""
 
 from collections.abc import Iterable
 from typing import ClassVar, NamedTuple
@@ -10,7 +10,7 @@ from msdgs_train.layers.parameters import ParamGroup
 
 
 class LayerStep(NamedTuple):
-    """What one layer proposes for N points at one time; the deltas aren't yet multiplied by the weight."""
+    """Outputs of one layer for N points at one time; the deltas are not yet multiplied by the weight."""
 
     delta_means: Tensor  # [N, 3] scene units
     delta_scales: Tensor  # [N, 3] as the model's `scale_space` says; on nodes [N, 3] or [N, 6] of a stretch tensor
@@ -21,7 +21,7 @@ class LayerStep(NamedTuple):
 
     @classmethod
     def of_columns(cls, columns: Tensor, heads: Heads) -> "LayerStep":
-        """From the heads' columns side by side, [N, sum of `heads.sizes`]."""
+        """From the concatenated outputs of all heads, [N, sum of `heads.sizes`]."""
         means, scales, quats, opacity, sh, logit = columns.split(heads.sizes, dim=1)
         weight = logit.sigmoid() if heads.weight else columns.new_ones(len(columns), 1)
         opacities = opacity[:, 0] if heads.opacity else None
@@ -29,13 +29,13 @@ class LayerStep(NamedTuple):
 
 
 class DeformationLayer(nn.Module):
-    """D_k of equation 7. It knows positions and times, not whether they are of Gaussians or of control nodes."""
+    """D_k of equation 7: a function of positions and time, of Gaussians or of control nodes."""
 
     kind: ClassVar[str]
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
-        """The step of points at `means`, [N, 3], where the layers before have moved them; `t` is a scalar tensor of
-        the same dtype and device."""
+        """Deltas of points at `means`, [N, 3], as moved by the layers before; `t` is a scalar tensor of the same dtype
+        and device."""
         raise NotImplementedError
 
     def parameter_groups(self) -> list[ParamGroup]:
@@ -48,14 +48,14 @@ class DeformationLayer(nn.Module):
         return {}
 
     def on_window(self, before: float, after: float) -> None:
-        """Extrapolate when the time window, centered in the time range, widens: half widths, as parts of the range."""
+        """Extrapolate when the time window widens; half widths, as fractions of the time range."""
 
     def new_frame_rows(self, times: Iterable[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Parameters, and a mask of their rows, whose steps are larger where newly admitted frames are at `times`."""
+        """Parameters, each with a mask of the rows that take larger steps because new frames are at `times`."""
         return []
 
     def operations(self) -> int:
-        """Floating-point operations a point: a product and a sum for each weight that it reads."""
+        """Floating-point operations per point; by default a product and a sum per weight of a Linear."""
         linears = [module for module in self.modules() if isinstance(module, nn.Linear)]
         return 2 * sum(linear.weight.numel() for linear in linears)
 

@@ -13,7 +13,7 @@ from msdgs_train.layers.deformation import DeformationLayer, LayerStep
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 
 HIDDEN_BIAS, XYZ_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
-"""Of a new layer: bias of the hidden units, and what the first Linear's columns are multiplied by."""
+"""Initialization: bias of the hidden units, and factors of the first Linear's columns."""
 
 
 def frequency_matrix(dimensions: int, frequencies: int) -> Tensor:
@@ -64,7 +64,7 @@ class MLPConfig(LayerConfig):
     time_features: int = 30
     """Outputs of the network of time."""
     skip: int = 0
-    """The input is read again after so many hidden layers, fewer than `depth`; 0: never."""
+    """Skip connection: the input is concatenated after so many hidden layers, fewer than `depth`; 0: none."""
     lr_init: float = 2e-3
     """Learning rate until all times take part."""
     lr_final: float = 2e-5
@@ -117,23 +117,25 @@ class MLPLayer(DeformationLayer):
 
     @torch.no_grad()
     def _initialize(self, trunk: list[nn.Linear]) -> None:
-        """He's initialisation with bias towards silence: a hidden unit answers to some places and times only.
+        """He's initialization with a negative bias: a hidden unit is active at some positions and times only.
 
-        The paper names none. With torch's default the last features of a small layer (width 96, depth 2) have a cosine
-        similarity of 0.98 for times 0.1 apart and 0.81 for places one unit apart: whatever one part of the scene
-        learns moves all others at all times, and they push it back. Here it is 0.57 and 0.39.
+        The paper doesn't specify any. With torch's default the last features of a small layer (width 96, depth 2) have
+        a cosine similarity of 0.98 for times 0.1 apart and 0.81 for positions one unit apart, so that a gradient of one
+        part of the scene moves all others at all times. Here it is 0.57 and 0.39.
         """
         for linear in (self.time_hidden, self.first, *trunk):
             nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
             nn.init.constant_(linear.bias, HIDDEN_BIAS)
-        for linear in trunk[1:]:  # silence grows with depth: at depth 4 no last unit would answer anywhere
+        for linear in trunk[
+            1:
+        ]:  # negative biases add up over the depth: at 4 no unit of the last layer would be active
             nn.init.zeros_(linear.bias)
         nn.init.kaiming_normal_(self.time_output.weight, nonlinearity="linear")
         nn.init.zeros_(self.time_output.bias)
         self.first.weight[:, : self.xyz_features] *= XYZ_GAIN
         self.first.weight[:, self.xyz_features :] *= TIME_GAIN
         deltas = sum(self.outputs.sizes[:-1])
-        self.heads.weight[:deltas] = 0  # a new layer moves nothing; its weight keeps a random direction to learn from
+        self.heads.weight[:deltas] = 0  # zero deltas at first; the step weight keeps random parameters
         self.heads.bias[:] = 0
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
@@ -154,7 +156,7 @@ class MLPLayer(DeformationLayer):
         return self.time_output(self.time_hidden(encoded).relu_())[0]
 
     def _read_input(self, linear: nn.Module, encoded: Tensor, code: Tensor) -> Tensor:
-        """[N, width] the part of a Linear that reads encoded means and time, its bias included."""
+        """[N, width] the product of a Linear with encoded means and time, plus its bias."""
         weight, bias = linear.get_parameter("weight"), linear.get_parameter("bias")
         at_time = torch.addmv(bias, weight[:, self.xyz_features : self.input_features], code)
         return torch.addmm(at_time, encoded, weight[:, : self.xyz_features].t())

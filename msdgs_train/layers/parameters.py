@@ -1,11 +1,12 @@
-"""Groups of parameters: what they are called, who trains them, and how their learning rate falls."""
+"""Parameter groups: names, roles in the curriculum, and learning rates."""
 
 from typing import Literal, NamedTuple
 
 from torch import nn
 
 Role = Literal["static", "motion", "binding"]
-"""Canonical attributes; deformation; and which node a Gaussian follows, which only complete samples train."""
+"""static: canonical attributes; motion: deformation; binding: skinning weights, which only samples that update all
+parameters train."""
 
 
 class LearningRate(NamedTuple):
@@ -13,7 +14,7 @@ class LearningRate(NamedTuple):
 
     init: float
     final: float
-    holds: bool = False  # at `init` until all times take part
+    holds: bool = False  # whether it stays at `init` until all times take part
 
     def at(self, step: float, num_steps: int, full_window_step: int) -> float:
         """The rate of one step of a run."""
@@ -22,12 +23,12 @@ class LearningRate(NamedTuple):
 
 
 def constant(rate: float) -> LearningRate:
-    """A rate that stays."""
+    """A constant rate."""
     return LearningRate(rate, rate)
 
 
 def exponential(init: float, final: float, step: float, steps: float) -> float:
-    """From `init` at step 0 to `final` at `steps`, along a straight line in the logarithm; `final` ever after."""
+    """Log-linear from `init` at step 0 to `final` at `steps`; `final` after that."""
     return init * (final / init) ** (min(step / steps, 1.0) if steps > 0 else 0.0)
 
 

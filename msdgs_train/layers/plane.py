@@ -35,7 +35,7 @@ class PlaneConfig(LayerConfig):
     width: int = 32
     """Hidden units."""
     multires: tuple[int, ...] = (1,)
-    """Grids, with so many times `resolution`; their features are put side by side. 4DGS has (1, 2)."""
+    """One grid per factor of `resolution`; their features are concatenated. 4DGS has (1, 2)."""
     lr_init: float = 2e-3
     """Learning rate of the networks until all times take part."""
     lr_final: float = 2e-5
@@ -47,7 +47,7 @@ class PlaneConfig(LayerConfig):
     time_smoothness_weight: float = 1e-2
     """Weight of the mean squared second difference along time."""
     l1_time_planes_weight: float = 0.0
-    """Weight of the mean distance of the planes over time from 1, where they change nothing."""
+    """Weight of the mean distance of the planes over time from 1, their neutral value."""
     plane_tv_weight: float = 1e-4
     """Weight of the mean squared first difference along space."""
     plane_smoothness_weight: float = 0.0
@@ -71,8 +71,8 @@ class PlaneConfig(LayerConfig):
 class PlaneGrid(nn.Module):
     """xy, xz, yz, xt, yt, zt planes of features, interpolated and multiplied.
 
-    Planes over time begin as ones, so that a new grid knows space only. It spans the whole of the time range and a cube
-    of space (one that is imported, any box); beyond its border a Gaussian reads the border's features.
+    Planes over time are initialized to ones, so that a new grid doesn't depend on time. It spans the time range and a
+    cube of space (an imported one, any box); positions outside read the features of the border.
     """
 
     cells: Tensor
@@ -88,7 +88,7 @@ class PlaneGrid(nn.Module):
         self.time = nn.Parameter(torch.ones(3, time_nodes, space_nodes, channels))
         self.register_buffer(
             "cells", torch.full((3,), (space_nodes - 1) / (2 * scene_half_size))
-        )  # a scene unit, by axis
+        )  # per scene unit, by axis
         self.register_buffer("origin", torch.full((3,), (space_nodes - 1) / 2))  # where (0, 0, 0) is, in cells
         first, last = time_range
         self.register_buffer("first_time", torch.tensor(first))
@@ -100,7 +100,7 @@ class PlaneGrid(nn.Module):
         return _PlaneFeatures.apply(self.space, self.lines(t), positions)
 
     def lines(self, t: Tensor) -> Tensor:
-        """[3, S, C] the planes over time at time `t`; the ends of the range hold beyond them."""
+        """[3, S, C] the planes over time at time `t`, which is clamped to the time range."""
         nodes = self.time.shape[1]
         place = ((t - self.first_time) * self.time_cells).clamp(0, nodes - 1)
         below = place.floor().clamp(max=nodes - 2)
@@ -109,10 +109,10 @@ class PlaneGrid(nn.Module):
 
     @torch.no_grad()
     def on_window(self, before: float, after: float) -> None:
-        """Copy what is known outwards when training's time window, around the middle of the range, widens.
+        """Extrapolate when the time window, centered in the range, widens.
 
-        `before` and `after` are half its widths, as parts of the range. A node of time that enters takes the values
-        of the outermost one that was in: what moves goes on from where it is, not from where it was in the middle.
+        `before` and `after` are half widths, as fractions of the range. Nodes of time that enter copy the outermost
+        one inside, so that motion continues from the last known state.
         """
         last = self.time.shape[1] - 1
         (low, high), (new_low, new_high) = (
@@ -127,7 +127,7 @@ class PlaneGrid(nn.Module):
         return self.time.diff(n=2, dim=1).square().mean()
 
     def l1_time_planes(self) -> Tensor:
-        """Mean distance of the planes over time from 1, at which they change nothing."""
+        """Mean distance of the planes over time from 1, their neutral value."""
         return (1 - self.time).abs().mean()
 
     def plane_tv(self) -> Tensor:
@@ -140,7 +140,7 @@ class PlaneGrid(nn.Module):
 
 
 class PlaneLayer(DeformationLayer):
-    """D_k of equation 11: features of planes over space and time, then one small MLP a head.
+    """D_k of equation 11: features of planes over space and time, then one small MLP per head.
 
     The paper's has one grid, a simplification of 4DGS's HexPlane: 131,083 parameters at the default sizes. With
     `multires` (1, 2), 32 features, 64 and 75 nodes, width 64 and no weight it is the network of 4DGS, 3,365,770
@@ -164,7 +164,7 @@ class PlaneLayer(DeformationLayer):
         with torch.no_grad():
             for i, head in enumerate(self.heads):
                 head.get_parameter("bias").zero_()
-                # a new layer moves nothing; its step weight learns from a random direction
+                # zero deltas at first; the step weight keeps random parameters
                 if not (outputs.weight and i == len(sizes) - 1):
                     head.get_parameter("weight").zero_()
 

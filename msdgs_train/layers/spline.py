@@ -1,8 +1,8 @@
-"""One step of deformation by free curves: each node has a translation, a rotation and a stretch of its own over time.
+"""One step of deformation by splines: each node has its own translation, rotation and stretch over time.
 
-What is learned of one time leaves other times as they are, where an MLP's weights serve all positions and times. On
-control nodes these are the motion bases of Shape of Motion (Wang et al. 2024), on splines, and with a stretch: a soft
-body takes few of them, where rigid ones must be many.
+A gradient at one time changes only nearby knots, while an MLP shares its weights over all positions and times. On
+control nodes these are Shape of Motion's motion bases (Wang et al. 2024) on splines, with a stretch: a soft body needs
+few of them, where rigid ones must be many.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.quaternions import multiply, unit
 
 ROTATION_WEIGHT = 0.3
-"""Scene units that a quaternion's unit counts as in temporal smoothness, and a stretch by as much again."""
+"""Scene units per unit of quaternions and of stretches in temporal smoothness."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class SplineConfig(LayerConfig):
     num_knots: int = 36
     """Intervals of a spline over the time range of the scene."""
     affine: bool = True
-    """Nodes stretch what follows them; else their motion is rigid."""
+    """Nodes have stretch tensors; otherwise their motion is rigid."""
     lr_init: float = 6e-4
     """Learning rate until all times take part."""
     lr_final: float = 6e-5
@@ -39,7 +39,7 @@ class SplineConfig(LayerConfig):
     """Weight of the mean size of second differences along time."""
 
     def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "SplineLayer":
-        assert num_points is not None  # `check` has seen to it
+        assert num_points is not None  # `check` refuses Gaussians
         return SplineLayer(self, num_points, bounds.time_range)
 
     def check(self, field: str, moves_nodes: bool) -> None:
@@ -49,7 +49,7 @@ class SplineConfig(LayerConfig):
 
 
 class SplineLayer(DeformationLayer):
-    """Uniform cubic B-splines of evenly spaced knots; step weights are 1."""
+    """Uniform cubic B-splines; step weights are 1."""
 
     kind = "spline"
     stretches: Tensor
@@ -82,7 +82,7 @@ class SplineLayer(DeformationLayer):
         return self.transls, self.rots, self.stretches
 
     def knots_at(self, t: Tensor) -> tuple[slice, Tensor]:
-        """The four knots that a time reads, and how far it is, in [0, 1], from the second to the third of them."""
+        """The four knots around a time, and its position, in [0, 1], between the second and the third of them."""
         knots = self.config.num_knots
         position = ((t - self.first_time) * self.knots_per_time).clamp(0, knots)
         first = min(int(position), knots - 1)
@@ -93,13 +93,13 @@ class SplineLayer(DeformationLayer):
         return [ParamGroup("curves", list(self.parameters()), lr, "motion")]
 
     def regularizers(self, t: Tensor, is_new_frame: bool) -> dict[str, Tensor]:
-        """Temporal smoothness, but not at new frames: a bounce needs a kink."""
+        """Temporal smoothness, but not at new frames, where motion may change abruptly, as in a bounce."""
         if is_new_frame:
             return {}
         return {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}
 
     def temporal_smoothness(self, t: Tensor) -> Tensor:
-        """Mean size of second differences along time of the knots that a time reads; translations count most."""
+        """Mean absolute second difference along time of the four knots around a time; translations count most."""
         read, _ = self.knots_at(t)
         transls, rots, stretches = (curve[read].diff(n=2, dim=0).abs().mean() for curve in self._curves)
         return transls + ROTATION_WEIGHT * (rots + stretches)
@@ -108,7 +108,7 @@ class SplineLayer(DeformationLayer):
     def on_window(self, before: float, after: float) -> None:
         """Beyond the window, translations and stretches are held constant and rotations continue at constant speed.
 
-        Rotation has inertia, and what falls will bounce: translations that went on would lose it under the ground.
+        Extrapolated translations would carry a falling object below the ground before it bounces.
         """
         knots = self.config.num_knots
         known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
@@ -116,24 +116,23 @@ class SplineLayer(DeformationLayer):
             rot, inner = (unit(self.rots[k]) for k in (last, last - outwards))
             step = multiply(rot, inner * rot.new_tensor([1.0, -1.0, -1.0, -1.0]))
             for k in range(last + outwards, knots + 3 if outwards > 0 else -1, outwards):
-                if abs(k - last) <= 3:  # as many as a time within the window reads
+                if abs(k - last) <= 3:  # knots that times within the window read
                     rot = unit(multiply(step, rot))
                 self.transls[k], self.rots[k], self.stretches[k] = self.transls[last], rot, self.stretches[last]
 
     def new_frame_rows(self, times: Iterable[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Of translations and rotations. Not of stretches: what is out of place would shrink until it has no gradient,
-        before it gets there."""
+        """Of translations and rotations. Not of stretches: a misplaced object would shrink until it has no gradient."""
         rows = torch.zeros(len(self.transls), dtype=torch.bool)
         for t in times:
             rows[self.knots_at(torch.tensor(t))[0]] = True
         return [(self.transls, rows), (self.rots, rows)]
 
     def operations(self) -> int:
-        """None: a node's curves are read once a frame."""
+        """0: curves are evaluated once per frame."""
         return 0
 
 
 def cubic_weights(part: Tensor) -> Tensor:
-    """[4] of the knots around a time, `part` of the way from the second to the third: a uniform cubic B-spline."""
+    """[4] weights of the knots around a time, at the fraction `part` between the second and the third."""
     u, v = part, 1 - part
     return torch.stack([v**3, 3 * u**3 - 6 * u**2 + 4, 3 * v**3 - 6 * v**2 + 4, u**3]) / 6

@@ -7,7 +7,7 @@ from msdgs_train.settings import Checked
 
 @dataclass(frozen=True)
 class LossConfig(Checked):
-    """What renderings are compared with images by."""
+    """Weights of the loss between a rendering and its image."""
 
     ssim_lambda: float = 0.2
     """Weight of 1 − SSIM; L1 has the rest (equation 13, where λ is that of L1)."""

@@ -1,4 +1,4 @@
-"""The same drawing by gsplat, for CUDA tensors. Its kernels fix the alpha and transmittance limits of `GSPLAT`."""
+"""Rendering by gsplat for CUDA tensors. Its kernels fix the alpha and transmittance limits of `GSPLAT`."""
 
 from typing import TYPE_CHECKING
 

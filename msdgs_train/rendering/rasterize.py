@@ -16,7 +16,7 @@ from msdgs_serve.scene import Camera, Gaussians
 
 
 class RasterizationInfo:
-    """What density control needs to know of one rendering."""
+    """Radii and gradients of one rendering, for density control."""
 
     radii: Tensor
     """[N] larger half-extent of the footprint in pixels, 0 where not drawn."""
@@ -47,7 +47,7 @@ def rasterize(
         options: rasterizer constants; on CUDA gsplat's limits of alpha and transmittance are fixed.
 
     Returns:
-        rgb [H, W, 3] with the background, alpha [H, W], and what density control needs.
+        rgb [H, W, 3] with the background, alpha [H, W], and radii and gradients for density control.
     """
     info = RasterizationInfo()
     if means.is_cuda:
@@ -60,7 +60,7 @@ def rasterize(
 
 
 BACKGROUND = 5
-"""Its place among the arguments; summing its gradient takes as long as half of the rest where an image is large."""
+"""Its index among the arguments; its gradient, as slow as half of the rest for a large image, is computed on demand."""
 
 
 class _Rasterize(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""The interface of a support: which points a chain of layers moves, and how these carry the Gaussians."""
+"""The interface of a support: which points a chain of layers moves, and how the Gaussians follow these points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Attribute(NamedTuple):
-    """A column of numbers that is stored per Gaussian, besides its shape, opacity and color."""
+    """Numbers stored per Gaussian besides mean, scales, rotation, opacity and color."""
 
     columns: int
     init: Callable[[int, int, torch.Generator], Tensor]  # of rows, columns and a generator; integers aren't trained
@@ -25,7 +25,7 @@ class Attribute(NamedTuple):
 
 
 class CanonicalPoints(NamedTuple):
-    """N canonical Gaussians as a support reads them."""
+    """The attributes of N canonical Gaussians that a support reads."""
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4] wxyz, unit
@@ -38,17 +38,17 @@ class SupportConfig:
 
     kind: ClassVar[str]
     moves_nodes: ClassVar[bool] = False
-    """Whether layers move control nodes, whose scale deltas are stretches, instead of Gaussians."""
+    """Whether layers move control nodes, whose scale deltas are stretch tensors, instead of Gaussians."""
 
     def build(self) -> "Support":
         """A new support."""
         raise NotImplementedError
 
     def check(self, field: str) -> None:
-        """Raise `InvalidInput` naming `field.SETTING` where a size is out of range."""
+        """Raise `InvalidInput` naming `field.SETTING` if a size is out of range."""
 
     def attributes(self) -> dict[str, Attribute]:
-        """What is stored per Gaussian, by name."""
+        """Attributes stored per Gaussian, by name."""
         return {}
 
 
@@ -62,22 +62,22 @@ class Support(nn.Module):
     def forward(
         self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None
     ) -> Deltas:
-        """What Gaussians change by at time `t`, a scalar tensor, after `num_layers` of the chain, or all."""
+        """Deltas of the Gaussians at time `t`, a scalar tensor, after the first `num_layers` of the chain, or all."""
         raise NotImplementedError
 
     def points(self, gaussians: CanonicalPoints) -> Tensor:
-        """[M, 3] where the chain's points are before any layer."""
+        """[M, 3] canonical positions of the points that the chain moves."""
         raise NotImplementedError
 
     def on_deform_start(self, gaussians: "CanonicalGaussians", surgery: "RowSurgery") -> None:
-        """Before the first step in which the deformation takes part."""
+        """Called before the first step with deformation."""
 
     def regularizers(self, chain: MultiStepDeformation, t: Tensor) -> dict[str, Tensor]:
         """Weighted terms of the loss at time `t`, by name."""
         return {}
 
     def baked(self, attributes: dict[str, Tensor]) -> dict[str, Any]:
-        """Arrays of N rows that a scene file stores per Gaussian, of the support's own attributes."""
+        """Arrays [N, …] that a scene file stores per Gaussian, made from the support's attributes."""
         return {}
 
     def spread(self, values: Tensor, attributes: dict[str, Tensor]) -> Tensor:

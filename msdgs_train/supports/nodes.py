@@ -1,7 +1,7 @@
-"""The support `nodes`: the chain moves control nodes, which carry the Gaussians by linear blend skinning.
+"""The support `nodes`: the chain moves control nodes, and the Gaussians follow by linear blend skinning.
 
 At one time a node has a translation, a rotation and a stretch about its position. Each Gaussian follows its nearest
-nodes with time-free weights. The chain costs the same whatever the number of Gaussians.
+nodes with weights that don't depend on time. The cost of the chain is independent of the number of Gaussians.
 """
 
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from msdgs_train.gaussians.surgery import RowSurgery
 
 NODE_MIN_OPACITY = 0.3
-"""Opacity from which a Gaussian's mean may become a node."""
+"""Gaussians of a larger opacity are candidates for nodes."""
 NODE_RADIUS = 0.5
-"""Standard deviation of the first skinning weights, in distances between nodes."""
+"""Standard deviation of the initial skinning weights, in distances between nodes."""
 MIN_NODE_RADIUS = 1e-3  # scene units
 MIN_INITIAL_LOGIT = -12.0
-"""Floor of initial logits: weight near 0, gradient not 0."""
+"""Lower bound of initial logits: weights near 0 keep a gradient."""
 ARAP_NEIGHBORS = 4
 MIN_DISTANCE = 0.01
 """Scene units, added to distances between nodes in local rigidity."""
@@ -45,13 +45,13 @@ class NodesConfig(SupportConfig):
     num_nodes: int = 256
     """Control nodes."""
     k_nearest: int = MAX_NEAREST
-    """Nodes nearest to a Gaussian that it may ever follow, at most 8."""
+    """Nodes that a Gaussian follows, at most 8: the nearest when the deformation starts."""
     skinning_lr_init: float = 2e-2
     """Learning rate of the skinning logits until all times take part."""
     skinning_lr_final: float = 2e-3
     """Of the skinning logits at the last step, to which it decays exponentially."""
     arap_weight: float = 0.1
-    """Weight of local rigidity: relative distance between where two neighboring nodes move one of them."""
+    """Weight of local rigidity between neighboring nodes (as rigid as possible)."""
 
     def build(self) -> "NodesSupport":
         return NodesSupport(self)
@@ -76,7 +76,7 @@ class NodesConfig(SupportConfig):
 
 
 class NodesSupport(Support):
-    """Points are control nodes, which stay where they were put."""
+    """The points are control nodes; their canonical positions are not trained."""
 
     kind = "nodes"
     nodes: Tensor
@@ -110,7 +110,7 @@ class NodesSupport(Support):
 
     @torch.no_grad()
     def on_deform_start(self, gaussians: "CanonicalGaussians", surgery: "RowSurgery") -> None:
-        """Put nodes among the opaque Gaussians, and have each Gaussian follow the nearest."""
+        """Place the nodes among opaque Gaussians and initialize the skinning weights."""
         logits, ids = self.initialize_nodes(gaussians.means.detach(), gaussians.raw_opacities.detach().sigmoid())
         surgery.replace_values("skinning_logits", logits)
         surgery.replace_values("node_ids", ids)
@@ -141,7 +141,8 @@ class NodesSupport(Support):
         return {"arap": self.config.arap_weight * self.local_rigidity(chain, t)}
 
     def local_rigidity(self, chain: MultiStepDeformation, t: Tensor) -> Tensor:
-        """Mean distance between where a node and its neighbors move it, relative to the distance between them."""
+        """Mean over pairs of neighbors: distance between one as moved by itself and as moved by the other, relative to
+        their canonical distance."""
         matrices, offsets, _ = self.motions(chain, t).split((9, 3, 4), dim=1)
         near = self.neighbors
         own = torch.einsum("bij,bj->bi", matrices.view(-1, 3, 3), self.nodes) + offsets
@@ -163,7 +164,7 @@ class NodesSupport(Support):
 
 
 def _first_nodes(n: int, columns: int, _: torch.Generator) -> Tensor:
-    """[N, F] any nodes, until there are some to follow."""
+    """[N, F] placeholders until nodes are initialized."""
     return torch.arange(columns).repeat(n, 1)
 
 

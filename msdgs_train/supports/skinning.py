@@ -15,20 +15,20 @@ PARTS = 4  # that the rows are split into; fixed, so that sums have the same ord
 
 
 def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Tensor) -> Tensor:
-    """What Gaussians change by, [N, 10]: means 3, logarithms of scales 3, quaternions 4.
+    """Deltas of N Gaussians, [N, 10]: means 3, logarithms of scales 3, quaternions 4.
 
     Args:
         means: [N, 3] canonical.
         quats: [N, 4] canonical, wxyz, unit.
-        weights: [N, F] of the nodes that each follows; rows sum to 1.
-        ids: [N, F] int64, which nodes these are.
+        weights: [N, F] skinning weights; rows sum to 1.
+        ids: [N, F] int64, of the nodes that each Gaussian follows.
         motions: [M, 16] of the nodes: matrix by rows, offset, unit quaternion.
     """
     return _Skin.apply(means, quats, weights, ids, motions)
 
 
 class _Skin(torch.autograd.Function):
-    """By matrices of torch a step of training takes 1.14 times as long."""
+    """With torch's matrix products instead a training step takes 1.14 times as long."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:

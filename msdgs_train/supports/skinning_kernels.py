@@ -1,11 +1,11 @@
-"""N Gaussians carried by the blends of motions that each follows, and the gradients of that.
+"""Kernels of linear blend skinning of N Gaussians by M nodes, and of its gradients.
 
-A motion is `MOTION` numbers: a matrix A [3, 3] row by row, an offset o [3], a quaternion r [4] wxyz. Blended with the
-weights of a Gaussian at x, of unit quaternion q and rotation R, they give
+The motion of a node is `MOTION` numbers: a matrix A [3, 3] row by row, an offset o [3], a quaternion r [4] wxyz. Their
+weighted sums over the nodes of a Gaussian with mean x, unit quaternion q and rotation R give its deltas:
 
-- A x + o - x, by how much its mean moves,
-- log |A R_j|, by how much the logarithms of its scales grow, from `MIN_STRETCH` on,
-- r q / |r| - q, by how much its quaternion changes.
+- mean: A x + o - x,
+- logarithms of scales: log max(|A R_j|, `MIN_STRETCH`),
+- quaternion: r q / |r| - q.
 """
 
 import math
@@ -20,14 +20,14 @@ from msdgs_serve.rasterizer.projection_backward import quaternion_gradient
 from msdgs_serve.scene.quaternion import MIN_NORM
 
 MAX_NEAREST = 8
-"""Motions nearest to a Gaussian, that it may ever follow."""
+"""Nodes that a Gaussian follows, at most."""
 MOTION = 16
-OFFSET, TURN = 9, 12
-"""Where the parts of a motion that follow the matrix begin."""
+OFFSET, ROT = 9, 12
+"""First columns of the offset and of the quaternion of a motion; the matrix is before them."""
 MIN_STRETCH = 0.05
 """Of a Gaussian's own axes."""
 DELTAS = 10
-"""Columns that a Gaussian changes by: mean 3, logarithms of scales 3, quaternion 4."""
+"""Columns of the deltas per Gaussian: mean 3, logarithms of scales 3, quaternion 4."""
 
 
 @kernel
@@ -41,20 +41,22 @@ def skin_forward(
     stop: int,
     deltas: np.ndarray,
 ) -> None:
-    """Rows `start` to `stop` of deltas [N, DELTAS]; means [N, 3], quats [N, 4], weights and ids [N, F] of the motions
-    [B, MOTION]."""
+    """Write rows `start` to `stop` of deltas [N, DELTAS].
+
+    Args: means [N, 3], quats [N, 4], weights and ids [N, F] of nodes, motions [M, MOTION].
+    """
     blended, flat = np.empty(MOTION, means.dtype), motions.reshape(-1)
     for n in range(np.uint64(start), np.uint64(stop)):
         _blend(weights, ids, flat, n, blended)
-        matrix, turn, _ = _parts(blended)
+        matrix, rot, _ = _parts(blended)
         mean, quat = (means[n, 0], means[n, 1], means[n, 2]), (quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
-        moved, turned = _times(matrix, mean), _product(turn, quat)
+        moved, rotated = _times(matrix, mean), _product(rot, quat)
         axes = rotation_columns(*quat)
         for i in range(3):
             deltas[n, i] = moved[i] + blended[OFFSET + i] - mean[i]
             deltas[n, 3 + i] = 0.5 * math.log(max(_square(_times(matrix, axes[i])), MIN_STRETCH**2))
         for i in range(4):
-            deltas[n, 6 + i] = turned[i] - quat[i]
+            deltas[n, 6 + i] = rotated[i] - quat[i]
 
 
 @kernel
@@ -72,8 +74,8 @@ def skin_backward(
     grad_weights: np.ndarray,
     grad_motions: np.ndarray,
 ) -> None:
-    """Add the gradients of rows `start` to `stop` to those of the motions, and set those of their own."""
-    blended, pulls, found = np.empty(MOTION, means.dtype), np.empty(MOTION, means.dtype), np.empty(16, means.dtype)
+    """Add the gradients of rows `start` to `stop` to `grad_motions`, and write those of the rows themselves."""
+    blended, grads, dots = np.empty(MOTION, means.dtype), np.empty(MOTION, means.dtype), np.empty(16, means.dtype)
     products, flat, grad_flat = (
         np.zeros(MAX_NEAREST * MOTION, means.dtype),
         motions.reshape(-1),
@@ -82,41 +84,44 @@ def skin_backward(
     g = grad_deltas
     for n in range(np.uint64(start), np.uint64(stop)):
         _blend(weights, ids, flat, n, blended)
-        matrix, turn, norm = _parts(blended)
+        matrix, rot, norm = _parts(blended)
         mean, quat = (means[n, 0], means[n, 1], means[n, 2]), (quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
-        on_mean, on_quat = (g[n, 0], g[n, 1], g[n, 2]), (g[n, 6], g[n, 7], g[n, 8], g[n, 9])
+        grad_mean, grad_quat = (g[n, 0], g[n, 1], g[n, 2]), (g[n, 6], g[n, 7], g[n, 8], g[n, 9])
         axes = rotation_columns(*quat)
-        on_0, on_1, on_2 = (
-            _on_stretched(matrix, axes[0], g[n, 3]),
-            _on_stretched(matrix, axes[1], g[n, 4]),
-            _on_stretched(matrix, axes[2], g[n, 5]),
+        grad_axis_0, grad_axis_1, grad_axis_2 = (
+            _grad_stretched(matrix, axes[0], g[n, 3]),
+            _grad_stretched(matrix, axes[1], g[n, 4]),
+            _grad_stretched(matrix, axes[2], g[n, 5]),
         )
         for i in range(3):
             for j in range(3):
-                pulls[3 * i + j] = (
-                    on_mean[i] * mean[j] + on_0[i] * axes[0][j] + on_1[i] * axes[1][j] + on_2[i] * axes[2][j]
+                grads[3 * i + j] = (
+                    grad_mean[i] * mean[j]
+                    + grad_axis_0[i] * axes[0][j]
+                    + grad_axis_1[i] * axes[1][j]
+                    + grad_axis_2[i] * axes[2][j]
                 )
-            pulls[OFFSET + i] = on_mean[i]
+            grads[OFFSET + i] = grad_mean[i]
         transposed = _transposed(matrix)
-        back = _times(transposed, on_mean)
+        grad_back = _times(transposed, grad_mean)
         for i in range(3):
-            grad_means[n, i] = back[i] - on_mean[i]
-        on_axes = _times(transposed, on_0), _times(transposed, on_1), _times(transposed, on_2)
-        of_axes = quaternion_gradient(*quat, on_axes)
-        of_turned = _product(_conjugate(turn), on_quat)
-        on_turn = _product(on_quat, _conjugate(quat))
-        along = turn[0] * on_turn[0] + turn[1] * on_turn[1] + turn[2] * on_turn[2] + turn[3] * on_turn[3]
+            grad_means[n, i] = grad_back[i] - grad_mean[i]
+        grad_axes = _times(transposed, grad_axis_0), _times(transposed, grad_axis_1), _times(transposed, grad_axis_2)
+        grad_quat_axes = quaternion_gradient(*quat, grad_axes)
+        grad_quat_rotated = _product(_conjugate(rot), grad_quat)
+        grad_rot = _product(grad_quat, _conjugate(quat))
+        radial = rot[0] * grad_rot[0] + rot[1] * grad_rot[1] + rot[2] * grad_rot[2] + rot[3] * grad_rot[3]
         for i in range(4):
-            grad_quats[n, i] = of_axes[i] + of_turned[i] - on_quat[i]
-            pulls[TURN + i] = (on_turn[i] - turn[i] * along) / norm
-        pull = load(pulls, 0)
+            grad_quats[n, i] = grad_quat_axes[i] + grad_quat_rotated[i] - grad_quat[i]
+            grads[ROT + i] = (grad_rot[i] - rot[i] * radial) / norm
+        grad = load(grads, 0)
         for k in range(np.uint64(weights.shape[1])):
-            place = np.uint64(ids[n, k]) * np.uint64(MOTION)
-            store(products, k * np.uint64(MOTION), pull * load(flat, place))
-            store(grad_flat, place, fma(spread(weights[n, k]), pull, load(grad_flat, place)))
-        store(found, 0, sums_of(_eight(products)))
+            row = np.uint64(ids[n, k]) * np.uint64(MOTION)
+            store(products, k * np.uint64(MOTION), grad * load(flat, row))
+            store(grad_flat, row, fma(spread(weights[n, k]), grad, load(grad_flat, row)))
+        store(dots, 0, sums_of(_eight(products)))
         for k in range(np.uint64(weights.shape[1])):
-            grad_weights[n, k] = found[k]
+            grad_weights[n, k] = dots[k]
 
 
 @inlined_kernel
@@ -129,11 +134,11 @@ def _blend(weights: np.ndarray, ids: np.ndarray, motions: np.ndarray, n: np.uint
 
 @inlined_kernel
 def _parts(blended: np.ndarray) -> tuple:
-    """The matrix [3][3] of a blend, its quaternion made unit, and what that was divided by."""
+    """The matrix [3][3] of a blended motion, its unit quaternion, and the norm before."""
     b = blended
     norm = max(math.sqrt(b[12] * b[12] + b[13] * b[13] + b[14] * b[14] + b[15] * b[15]), b.dtype.type(MIN_NORM))
-    turn = (b[12] / norm, b[13] / norm, b[14] / norm, b[15] / norm)
-    return ((b[0], b[1], b[2]), (b[3], b[4], b[5]), (b[6], b[7], b[8])), turn, norm
+    rot = (b[12] / norm, b[13] / norm, b[14] / norm, b[15] / norm)
+    return ((b[0], b[1], b[2]), (b[3], b[4], b[5]), (b[6], b[7], b[8])), rot, norm
 
 
 @inlined_kernel
@@ -157,12 +162,12 @@ def _square(v: tuple) -> float:
 
 
 @inlined_kernel
-def _on_stretched(matrix: tuple, axis: tuple, pull: float) -> tuple:
-    """The gradient of c = A R_j from that of log |c|: c / |c|², and none where |c| is kept from vanishing."""
+def _grad_stretched(matrix: tuple, axis: tuple, grad: float) -> tuple:
+    """The gradient in c = A R_j of log |c|, `grad` · c / |c|²; 0 if |c| is clamped."""
     c = _times(matrix, axis)
     square = _square(c)
-    share = pull / square if square > MIN_STRETCH**2 else 0 * square
-    return share * c[0], share * c[1], share * c[2]
+    factor = grad / square if square > MIN_STRETCH**2 else 0 * square
+    return factor * c[0], factor * c[1], factor * c[2]
 
 
 @inlined_kernel
@@ -183,7 +188,7 @@ def _conjugate(quat: tuple) -> tuple:
 
 @inlined_kernel
 def _eight(rows: np.ndarray) -> tuple:
-    """Vectors that lie one after the other."""
+    """Eight vectors, stored one after the other."""
     return (
         load(rows, 0),
         load(rows, 16),

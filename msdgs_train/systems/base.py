@@ -21,24 +21,24 @@ class ViewLoss(NamedTuple):
 
 
 class System(Protocol):
-    """All that differs between kinds of models while they are trained."""
+    """The part of training that depends on the kind of model."""
 
     @property
     def model(self) -> nn.Module:
-        """What is trained."""
+        """The trained module."""
         ...
 
     @property
     def size(self) -> int:
-        """Gaussians, or what else there may be more and fewer of."""
+        """Number of Gaussians, or of the corresponding elements."""
         ...
 
     def parameter_groups(self) -> list[ParamGroup]:
-        """All trainable parameters as they are now, with learning rates and roles."""
+        """All current trainable parameters, with learning rates and roles."""
         ...
 
     def before_step(self, optimizer: torch.optim.Optimizer, step: int) -> None:
-        """Do what is due before this step, counted from 0."""
+        """Called before this step, counted from 0."""
         ...
 
     def loss(self, sample: TrainingSample, target: Tensor, background: Tensor, step: int) -> ViewLoss:
@@ -46,7 +46,7 @@ class System(Protocol):
         ...
 
     def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Parameters and masks of rows that take larger steps where newly admitted frames are at `times`."""
+        """Parameters, each with a mask of the rows that take larger steps because new frames are at `times`."""
         ...
 
     def after_step(
@@ -56,15 +56,15 @@ class System(Protocol):
         ...
 
     def render(self, camera: Camera, t: float, background: Tensor, step: int) -> Tensor:
-        """[H, W, 3] of the model as it is evaluated and saved."""
+        """Render the model that is evaluated and saved, [H, W, 3]."""
         ...
 
     def generators(self) -> list[torch.Generator]:
-        """All of its randomness."""
+        """All random generators, which checkpoints store."""
         ...
 
     def state(self) -> dict[str, Any]:
-        """All that a bit-exact continuation needs besides optimizer and generators; tensors and plain values."""
+        """The state besides optimizer and generators for a bit-exact continuation; tensors and plain values."""
         ...
 
     def load_state(self, state: dict[str, Any], step: int) -> None:
@@ -72,5 +72,5 @@ class System(Protocol):
         ...
 
     def save(self, path: Path, step: int) -> None:
-        """Write the model as it is evaluated, atomically."""
+        """Write the model that is evaluated, atomically."""
         ...

@@ -1,4 +1,4 @@
-"""Systems of Gaussians: any support and any chain of layers, which is what sets the published ones apart."""
+"""Systems of Gaussians with any support and any chain of layers; published ones differ in their settings."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -129,7 +129,7 @@ class GaussianSplatting:
 
     @torch.no_grad()
     def save(self, path: Path, step: int) -> None:
-        """`model.pt`: the model with what a service needs to show it, times, background, bounds and cameras."""
+        """Write `model.pt`: the model with time range, background, bounds and cameras."""
         model, info = self.eval_model, self._scene_info(step)
         as_drawn = replace(model.config, eps2d=self.schedule.eps2d(step))
         model_file.save_model(path, model, info, step, as_drawn)
@@ -153,7 +153,7 @@ class GaussianSplatting:
         return model.pose(t, deform=self.schedule.deforms(step), sh_degree=self.schedule.sh_degree(step))
 
     def _regularizers(self, posed: PosedGaussians, sample: TrainingSample, step: int) -> Tensor | float:
-        """The weighted sum of all priors: of density control, of the support and of the layers."""
+        """The weighted sum of the regularizers of density control, support and layers."""
         terms = list(self.density.regularizers(posed).values())
         if self.schedule.deforms(step):
             time = torch.tensor(sample.t, dtype=posed.means.dtype)

@@ -1,4 +1,4 @@
-"""Systems by name: what a run's settings begin from, and who builds and trains the model.
+"""Systems by name: default settings, and the class that builds and trains the model.
 
 A system is one file in this folder, or a plugin, that calls `register_system`.
 """
@@ -38,7 +38,7 @@ def register_system(
     config: TrainConfig,
     build: Callable[[Schedule, SceneData], System] | None = None,
 ) -> None:
-    """Make a system known by its name."""
+    """Register a system under its name."""
     _ENTRIES[name] = SystemEntry(name, description, config.updated(system=name), build)
 
 
@@ -56,12 +56,12 @@ def systems() -> dict[str, SystemEntry]:
 
 
 def preset(name: str) -> TrainConfig:
-    """The settings of a system. Raises `InvalidInput` for a name that isn't known."""
+    """The settings of a system. Raises `InvalidInput` for an unknown name."""
     return _entry(name).config
 
 
 def system_of(schedule: Schedule, scene: SceneData) -> System:
-    """A new system of a run's settings."""
+    """A new system for a run's settings."""
     build = _entry(schedule.config.run.system).build
     if build is None:
         from msdgs_train.systems.gaussian_splatting import GaussianSplatting

@@ -1,4 +1,4 @@
-"""A model at one moment, and how any camera sees it."""
+"""A copy of a model at one step of training, and its rendering."""
 
 import copy
 from dataclasses import dataclass, field, replace
@@ -17,24 +17,23 @@ from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 
 Channel = Literal["rgb", "alpha", "depth"]
 OUTLYING_DEPTHS = (0.02, 0.98)
-"""Quantiles of the depths that are seen: what is nearer is white, what is farther black."""
+"""Quantiles of the visible depths that are drawn white and black."""
 
 
 @dataclass(eq=False)
 class Snapshot:
-    """A model that nobody changes any more. For one thread."""
+    """A model that isn't trained further. Not thread-safe."""
 
     model: DynamicGaussians
     background: tuple[float, float, float]  # sRGB in [0, 1]
-    deform: bool = True  # False in the warm-up, whose layers have not been trained
+    deform: bool = True  # False in the static phase, before layers are trained
     sh_degree: int | None = None  # of the bands in use; None: all
     _posed: tuple[tuple[float, int], Gaussians] | None = field(default=None, init=False)
 
     def draw(self, camera: Camera, t: float, layers: int, channel: Channel = "rgb") -> np.ndarray:
-        """[H, W, 3] uint8 at time `t`, after so many layers of the deformation.
+        """[H, W, 3] uint8 at time `t`, after `layers` of the deformation.
 
-        Alpha is white where nothing shines through, depth where it is nearest. Raises `InvalidInput` where Gaussians
-        aren't finite.
+        White is an alpha of 1 and the nearest depth. Raises `InvalidInput` if Gaussians aren't finite.
         """
         posed, options = self._pose(t, layers), self.model.rasterizer
         drawn = rasterize(posed, camera, background=self.background, depth=channel == "depth", options=options)
@@ -42,7 +41,7 @@ class Snapshot:
 
     @torch.no_grad()
     def _pose(self, t: float, layers: int) -> Gaussians:
-        """Kept until another is wanted: a camera that moves asks for the same again and again."""
+        """Cached for one time and number of layers: a moving camera needs the same Gaussians for each frame."""
         if self._posed is None or self._posed[0] != (t, layers):
             posed = self.model.pose(t, num_layers=layers, deform=self.deform, sh_degree=self.sh_degree)
             self._posed = (t, layers), Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
@@ -50,12 +49,10 @@ class Snapshot:
 
 
 def snapshot_of_training(trainer: Trainer) -> Snapshot:
-    """A copy of the model as it would be judged and saved now. Not to be called while a step is done."""
+    """A copy of the model as it would be evaluated and saved now. Must not be called during a step."""
     system, step = trainer.system, trainer.step_count
     if not isinstance(system, GaussianSplatting):
-        raise InvalidInput(
-            "viewer", "not used with this system, which isn't made of Gaussians", trainer.config.run.system
-        )
+        raise InvalidInput("viewer", "off for this system, which isn't made of Gaussians", trainer.config.run.system)
     schedule, model = trainer.schedule, copy.deepcopy(system.eval_model)
     model.config = replace(model.config, eps2d=schedule.eps2d(step))
     background = trainer.config.data.evaluation_background
@@ -63,7 +60,7 @@ def snapshot_of_training(trainer: Trainer) -> Snapshot:
 
 
 def snapshot_of_file(loaded: LoadedModel) -> Snapshot:
-    """What `model.pt` or `best.pt` holds."""
+    """The model of a `model.pt` or `best.pt`."""
     return Snapshot(loaded.model, loaded.scene.background)
 
 
@@ -79,7 +76,7 @@ def _image_of(rendering: Rendering, channel: Channel) -> np.ndarray:
 
 
 def _nearness(depth: np.ndarray) -> np.ndarray:
-    """[H, W] in [0, 1] of distances along the axis, which are infinite where nothing is; 1 is nearest."""
+    """[H, W] in [0, 1] of depths, infinite for empty pixels; 1 is nearest."""
     seen = np.isfinite(depth)
     if not seen.any():
         return np.zeros_like(depth)

@@ -76,6 +76,9 @@ def test_nerfstudios_path_is_read():
         ({"fps": 0}, "fps"),
         ({"render_width": None}, "render_width"),
         ({"render_height": 1.5}, "render_height"),
+        ({"render_height": 10**400}, "render_height"),
+        ({"fps": 10**400}, "fps"),
+        ({"camera_path": [{"camera_to_world": [10**400] * 16, "fov": 40}]}, "camera_path.0.camera_to_world"),
     ],
     ids=str,
 )

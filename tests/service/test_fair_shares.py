@@ -1,7 +1,6 @@
 """Who has how many places in the queue, and whose work is done next."""
 
 import asyncio
-import gc
 import threading
 import weakref
 from collections.abc import AsyncGenerator, Iterator
@@ -216,7 +215,6 @@ def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images
         async with aclosing(made(service)) as pieces:
             async for _ in pieces:
                 taken += 1
-                gc.collect()
                 assert len(images) == min(taken, MANY)
                 assert sum(image() is not None for image in images) <= 1
 

@@ -72,9 +72,9 @@ def test_motion_over_http(scene: Path):
         pixels, spec = decode(http.post("/render", json={**FRAME, "format": "exr"}).content, "exr")
         assert spec.channelnames == ("forward.u", "forward.v")
         np.testing.assert_array_equal(pixels, motion)
-        picture, _ = decode(http.post("/render", json=FRAME).content, "png")
-        assert (picture[np.abs(motion).max(axis=2) < 1e-6] == 0).all()
-        assert picture.max() > 200
+        drawn, _ = decode(http.post("/render", json=FRAME).content, "png")
+        assert (drawn[np.abs(motion).max(axis=2) < 1e-6] == 0).all()
+        assert drawn.max() > 200
         with Client(str(http.base_url)) as client:
             camera = Orbit(40, 10, distance=5, fov_y=40)
             frame = client.render(camera, 0.1, width=SIZE, height=SIZE, channels=("rgb", "motion"), dt=0.2)

@@ -63,7 +63,9 @@ def test_static_scenes(tmp_path: Path):
 
 def test_names_without_a_time_are_named(tmp_path: Path):
     folder = write_colmap(tmp_path, names=("a_1.png", "cam07/front.png"), ending="txt")
-    with pytest.raises(DatasetInvalid, match=r"images\[cam07/front\.png\]\.name` has no time: .*; choose another"):
+    with pytest.raises(
+        DatasetInvalid, match=r"images\[cam07/front\.png\]\.name` has no time: .* finds no number in it; set another"
+    ):
         load_scene(folder)
     with pytest.raises(DatasetInvalid, match=r"images\[a_1\.png\]\.name` has no time"):
         load_scene(folder, time_pattern="(a)")

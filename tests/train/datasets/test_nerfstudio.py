@@ -125,8 +125,8 @@ def test_points_may_lack_colors_and_files_points(tmp_path: Path):
 
 
 BAD_PLY = [
-    (lambda content: content[:40], "`file` is no PLY"),
-    (lambda content: b"", "`file` is no PLY"),
+    (lambda content: content[:40], "`file` is not a PLY"),
+    (lambda content: b"", "`file` is not a PLY"),
     (lambda content: content[:-24], "`vertex` is cut off: the header says 2, the file holds 1"),
     (lambda content: content.replace(b"ascii", b"latin"), "`format` must be one of ascii, .* got 'latin'"),
     (lambda content: content.replace(b"vertex 2", b"vertex -2"), "`element` must be vertex and a number"),

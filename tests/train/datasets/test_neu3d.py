@@ -79,12 +79,12 @@ def waves(width: int, height: int) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [160, 80, 40, 67])
 def test_size_reduces_a_video_as_it_does_images(tmp_path: Path, size: int):
-    pictures = [waves(160, 120), waves(160, 120)[::-1]]
+    drawings = [waves(160, 120), waves(160, 120)[::-1]]
     for name in ("cam00", "cam01"):
-        write_video(tmp_path / f"{name}.mp4", pictures)
+        write_video(tmp_path / f"{name}.mp4", drawings)
     np.save(tmp_path / "poses_bounds.npy", poses_bounds(2))
-    for frame, picture in zip(load_scene(tmp_path, size).splits["train"], pictures, strict=True):
-        rgba = np.dstack([picture, np.full((120, 160), 255, np.uint8)])
+    for frame, drawn in zip(load_scene(tmp_path, size).splits["train"], drawings, strict=True):
+        rgba = np.dstack([drawn, np.full((120, 160), 255, np.uint8)])
         want = resize_area(rgba, size, round(size * 0.75))[..., :3].astype(float)
         assert np.abs(frame.load_rgba()[..., :3] - want).mean() < tolerance("video_picture.mean")
 

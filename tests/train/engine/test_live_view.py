@@ -16,11 +16,12 @@ from msdgs_serve.scene.camera import look_at
 from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.metrics_log import to_bytes
-from msdgs_train.engine.run import Observer, Observers, RunResult, fit
+from msdgs_train.engine.observer import Observer, Observers
+from msdgs_train.engine.run import RunResult, fit
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.gaussians.model_file import LoadedModel, SceneInfo, save_model
+from msdgs_train.viewer.scene_view import view_of_data, view_of_file
 from msdgs_train.viewer.snapshot import Snapshot, snapshot_of_training
-from msdgs_train.viewer.stage import view_of_data, view_of_file
 from msdgs_train.viewer.training_view import TrainingView
 from msdgs_train.viewer.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
 from tests.support.models import SCENE, random_model
@@ -50,8 +51,8 @@ def _expected(loaded: LoadedModel, camera: Camera, t: float, layers: int) -> np.
     return to_bytes(rasterize(gaussians, camera, background=loaded.scene.background).rgb)
 
 
-def _is_grey(picture: np.ndarray) -> bool:
-    return int(np.ptp(picture, axis=2).max()) == 0
+def _is_grey(drawn: np.ndarray) -> bool:
+    return int(np.ptp(drawn, axis=2).max()) == 0
 
 
 def test_a_browsers_camera_is_ours() -> None:
@@ -121,11 +122,11 @@ def test_depth_is_white_where_it_is_nearest() -> None:
         model.gaussians.log_scales.fill_(-2.5)
         model.gaussians.raw_opacities.fill_(5.0)
     camera = Camera.from_fov(look_at(np.array([0.0, 0, -4]), np.zeros(3), np.array([0.0, -1, 0])), 80, 40, 40.0)
-    picture = Snapshot(model, (1.0, 1.0, 1.0)).draw(camera, 0.0, 0, "depth")
+    drawn = Snapshot(model, (1.0, 1.0, 1.0)).draw(camera, 0.0, 0, "depth")
     (near, far), _ = camera.project(model.gaussians.means.detach().numpy())
-    assert picture[20, int(near[0]), 0] > 250
-    assert picture[20, int(far[0]), 0] < 5
-    assert picture[0, 0, 0] == 0
+    assert drawn[20, int(near[0]), 0] > 250
+    assert drawn[20, int(far[0]), 0] < 5
+    assert drawn[0, 0, 0] == 0
 
 
 def test_a_model_without_motion_or_cameras_can_be_seen(page: PageServer) -> None:
@@ -198,9 +199,9 @@ def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, ba
     looks_on = _LooksOn(page)
     with Viewer("127.0.0.1", 0) as viewer:
         fit(config, data, tmp_path / "seen", observer=Observers(TrainingView(viewer, config.run.steps), looks_on))
-    pictures = [picture for picture in looks_on.client.images if picture.shape == (HEIGHT, WIDTH, 3)]
-    assert len(pictures) >= 2
-    assert not np.array_equal(pictures[0], pictures[-1]), "training should have been seen"
+    drawings = [drawn for drawn in looks_on.client.images if drawn.shape == (HEIGHT, WIDTH, 3)]
+    assert len(drawings) >= 2
+    assert not np.array_equal(drawings[0], drawings[-1]), "training should have been seen"
     alone, seen = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("alone", "seen"))
     for part in ("system", "optimizer", "generators", "curriculum", "averages"):
         _assert_equal(alone[part], seen[part])
@@ -281,8 +282,8 @@ def test_the_page_stays_after_the_run(
     options = ["--steps", "2", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--viewer"]
     assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
     printed = capsys.readouterr().out
-    assert "look at http://localhost:8080" in printed
-    assert "Ctrl-C ends it" in printed
+    assert "viewer: http://localhost:8080" in printed
+    assert "Ctrl-C closes it" in printed
 
 
 def test_a_model_file_is_viewed(
@@ -312,9 +313,14 @@ def test_without_viser_the_extra_is_named_before_anything_is_done(
 
 
 def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
-    for command, words in (("fit", ["--viewer", "--viewer-port", "after each"]), ("view", ["MODEL", "--port"])):
+    commands = (
+        (["fit", "--help"], ["--viewer", "while it trains"]),
+        (["fit", "--help-all"], ["--viewer-port", "--viewer-host"]),
+        (["view", "--help"], ["MODEL", "--port", "after each layer"]),
+    )
+    for command, words in commands:
         with pytest.raises(SystemExit):
-            cli.main([command, "--help"])
+            cli.main(command)
         text = " ".join(capsys.readouterr().out.split())
         for word in [*words, "msdgs[viewer]"]:
             assert word in text

@@ -16,8 +16,8 @@ from playwright.sync_api import Browser, Page
 
 from msdgs_train.cli import main as cli
 from msdgs_train.datasets import load_scene
+from msdgs_train.viewer.scene_view import view_of_data
 from msdgs_train.viewer.snapshot import Snapshot
-from msdgs_train.viewer.stage import view_of_data
 from msdgs_train.viewer.viewer import Viewer
 from tests.support.images import decode
 from tests.support.models import random_model

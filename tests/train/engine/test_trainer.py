@@ -265,13 +265,13 @@ def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
     load_model(tmp_path / "run" / "model.pt")
 
 
-def test_the_order_of_images_is_another_one_after_a_rollback(data: Path) -> None:
-    diverged, again = (Trainer(small_config(window_full_fraction=0.0), load_scene(data)) for _ in range(2))
-    first, second = ([_next_frame(trainer) for _ in range(7)] for trainer in (diverged, again))
+def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_path: Path) -> None:
+    trainer, other = (Trainer(small_config(window_full_fraction=0.0), load_scene(data)) for _ in range(2))
+    first, second = ([_next_frame(each) for _ in range(7)] for each in (trainer, other))
     assert first == second
-    again.retry_after(diverged)
-    assert [_next_frame(again) for _ in range(7)] != first
-    assert (again.rollbacks, again.lr_factor) == (1, 0.5)
+    trainer.roll_back(tmp_path / "no checkpoint yet")
+    assert [_next_frame(trainer) for _ in range(7)] != first
+    assert (trainer.rollbacks, trainer.lr_factor) == (1, 0.5)
 
 
 def _next_frame(trainer: Trainer) -> str:

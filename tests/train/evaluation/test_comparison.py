@@ -66,7 +66,7 @@ def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) 
         assert (config.run.steps, *counts, config.run.threads) == (6, 60, 90, 1)
 
 
-@pytest.mark.parametrize("name", ["ablation.toml", "shared_motions.toml"])
+@pytest.mark.parametrize("name", ["ablation.toml", "motion_bases.toml"])
 def test_tables_of_systems_in_the_repository_can_be_compared(name: str) -> None:
     file = ROOT / "benchmarks" / "training" / name
     systems = read_systems([str(file)], Budget(steps=6, init_num_pts=4000, max_gaussians=5000))
@@ -269,7 +269,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Pat
         process.kill()
     assert process.returncode == cli.EXIT_INTERRUPTED, output
     assert "static, scene, seed 0: interrupted" in output
-    assert "the same command goes on" in output
+    assert "the same command continues" in output
     assert (out / "static" / "scene_0" / "checkpoint.pt").exists()
     assert not (out / "k1").exists()
 

@@ -287,16 +287,16 @@ def test_sheet_shows_image_rendering_and_error(run: Path) -> None:
     assert {path.name for path in (run / "eval").iterdir()} == {"test.json", "test.md", "test.png"}
     sheet = _read(run / "eval" / "test.png")
     worst = min(range(2), key=lambda index: evaluation.models[0].images[index].psnr)
-    times = -(-evaluation_report.SMALLEST_PANEL // SIZE)
-    for picture in (_read(evaluation.frames[worst].image_path), _render(run / "model.pt", evaluation.frames[worst])):
-        assert _contains(to_bytes(sheet), to_bytes(picture).repeat(times, axis=0).repeat(times, axis=1))
+    times = -(-evaluation_report.MIN_PANEL // SIZE)
+    for drawn in (_read(evaluation.frames[worst].image_path), _render(run / "model.pt", evaluation.frames[worst])):
+        assert _contains(to_bytes(sheet), to_bytes(drawn).repeat(times, axis=0).repeat(times, axis=1))
 
 
-def _contains(sheet: np.ndarray, picture: np.ndarray) -> bool:
+def _contains(sheet: np.ndarray, drawn: np.ndarray) -> bool:
     """Whether the image lies somewhere in the sheet, pixel for pixel, in the first row."""
-    height, width, _ = picture.shape
+    height, width, _ = drawn.shape
     rows = sheet[HEADER + CAPTION : HEADER + CAPTION + height]
-    return any(np.array_equal(rows[:, x : x + width], picture) for x in range(sheet.shape[1] - width + 1))
+    return any(np.array_equal(rows[:, x : x + width], drawn) for x in range(sheet.shape[1] - width + 1))
 
 
 @pytest.mark.usefixtures("_clean")
@@ -346,7 +346,7 @@ def test_a_run_from_before_there_was_a_best_model(data: Path, run: Path, tmp_pat
     for name in ("config.json", "model.pt"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
     assert cli.main(["eval", str(tmp_path), "--data", str(data), "--split", "val"]) == 0
-    assert "this run has kept no best.pt" in (tmp_path / "eval" / "val.md").read_text()
+    assert "this run has no best.pt" in (tmp_path / "eval" / "val.md").read_text()
     assert set(json.loads((tmp_path / "eval" / "val.json").read_text())["models"]) == {"last"}
 
 
@@ -357,7 +357,7 @@ def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: 
     assert cli.main(["eval", str(run), str(other), "--sheet", str(path)]) == 0
     assert f"wrote {path}" in capsys.readouterr().out.replace("\n", "")
     frame, sheet = evaluate_run(run).frames[0], to_bytes(_read(path))
-    times = -(-evaluation_report.SMALLEST_PANEL // SIZE)
+    times = -(-evaluation_report.MIN_PANEL // SIZE)
     for image in (_read(frame.image_path), *(_render(each / "model.pt", frame) for each in (run, other))):
         assert _contains(sheet, to_bytes(image).repeat(times, axis=0).repeat(times, axis=1))
     assert cli.main(["eval"]) == cli.EXIT_INVALID

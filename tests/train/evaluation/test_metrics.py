@@ -22,9 +22,9 @@ def test_a_tenth_everywhere_is_20_db() -> None:
 
 
 def test_equal_images_get_the_cap_and_nan_stays() -> None:
-    picture = torch.rand(4, 4, 3)
-    assert psnr(picture, picture) == MAX_PSNR
-    assert math.isnan(psnr(picture * math.nan, picture))
+    drawn = torch.rand(4, 4, 3)
+    assert psnr(drawn, drawn) == MAX_PSNR
+    assert math.isnan(psnr(drawn * math.nan, drawn))
 
 
 def test_renderings_are_clamped_first() -> None:

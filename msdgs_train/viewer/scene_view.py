@@ -1,4 +1,4 @@
-"""Where and when a scene takes place, and from where it is seen at first."""
+"""Time range and initial camera of a viewer."""
 
 import math
 from collections.abc import Sequence
@@ -16,25 +16,25 @@ DEFAULT_FOV = 50.0  # degrees, vertical
 
 
 class SceneView(NamedTuple):
-    """What a viewer has to know before it shows anything. World axes, scene units."""
+    """Time range, number of layers and initial camera. World axes, scene units."""
 
     time_range: tuple[float, float]
     layers: int  # K
     eye: np.ndarray  # [3]
-    target: np.ndarray  # [3] in the middle of the first image; the camera turns around it
+    target: np.ndarray  # [3] on the optical axis; the camera orbits around it
     up: np.ndarray  # [3] unit
     fov_y: float  # radians
 
 
 def view_of_data(scene: SceneData, layers: int) -> SceneView:
-    """Seen as in the first image."""
+    """The camera of the first training image."""
     middle = np.zeros(3) if scene.points is None or not len(scene.points) else np.median(scene.points, axis=0)
     cameras = [frame.camera for frame in scene.splits["train"]]
     return _seen_by(cameras, middle, scene.time_range, layers)
 
 
 def view_of_file(loaded: LoadedModel) -> SceneView:
-    """Seen by the first camera that the model holds, or where it has none from aside, z upwards."""
+    """The first camera in the model, or one from the side with z up if it has none."""
     low, high = np.array(loaded.scene.bounds)
     cameras = [camera_of(entry, entry["width"]) for entry in loaded.scene.cameras]
     if not cameras:
@@ -45,7 +45,7 @@ def view_of_file(loaded: LoadedModel) -> SceneView:
 
 
 def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[float, float], layers: int) -> SceneView:
-    """By the first of them; the target is the point of its axis that is nearest to `middle`, [3]."""
+    """The first camera; the target is the point of its optical axis nearest to `middle`, [3]."""
     first = cameras[0]
     forward = first.camera_to_world[:3, 2]
     ahead = float((middle - first.position) @ forward)

@@ -1,0 +1,134 @@
+"""A layer kind and a system from outside the package train, resume, are evaluated, compared, exported and served."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.renderer import Renderer
+from msdgs_train.evaluation.layer_strip import camera_of
+from msdgs_train.gaussians.model_file import load_model
+from msdgs_train.layers.base import PAPER_HEADS, SceneBounds
+from msdgs_train.layers.chain import MultiStepDeformation
+from tests.support.plugin_example import FourierConfig
+from tests.support.processes import ROOT, run_python
+from tests.support.tolerances import assert_close, tolerance
+from tests.support.training_scene import assert_same_bits, state_of
+
+PLUGIN = ROOT / "tests" / "support" / "plugin_example.py"
+SMALL = ["--steps=24", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--eval-every=0", "--sh-degree=1"]
+SMALL += ["--static-fraction=0.2", "--refine-start=4", "--refine-every=4"]
+
+pytestmark = pytest.mark.slow
+
+
+def run(module: str, *arguments: object, code: int = 0) -> str:
+    """What a command prints, in a process of its own that knows of no plugin but those it is given."""
+    environment = {name: value for name, value in os.environ.items() if name != "MSDGS_PLUGINS"}
+    done = subprocess.run(
+        [sys.executable, "-m", module, *map(str, arguments)],
+        cwd=ROOT,
+        env=environment | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def train(*arguments: object, code: int = 0) -> str:
+    return run("msdgs_train", *arguments, "--plugin", PLUGIN, code=code)
+
+
+@pytest.fixture(scope="module")
+def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    folder = tmp_path_factory.mktemp("plugin") / "whole"
+    train("fit", data, folder, "--preset", "sparse-fourier", *SMALL)
+    return folder
+
+
+def test_a_stopped_run_resumes_with_the_same_bits(data: Path, trained: Path, tmp_path: Path) -> None:
+    stopped = tmp_path / "stopped"
+    said = train("fit", data, stopped, "--preset", "sparse-fourier", *SMALL, "--max-minutes=1e-9")
+    assert "out of time at step 1," in said
+    train("fit", data, stopped, "--resume", "--max-minutes", "None")
+    assert_same_bits(state_of(stopped), state_of(trained))
+    config = json.loads((trained / "config.json").read_text())
+    assert [layer["kind"] for layer in config["model"]["layers"]] == ["fourier", "fourier"]
+    moved = state_of(trained)["/system/model/deformation.layers.1.offsets"]
+    assert bool(moved.any()), "the layer learns"
+
+
+def test_it_is_evaluated_and_compared_in_worker_processes(data: Path, trained: Path, tmp_path: Path) -> None:
+    train("eval", trained)
+    report = json.loads((trained / "eval" / "test.json").read_text())
+    assert report["models"]["last"]["mean"]["psnr"] > 5
+    options = ["--seeds", 0, "--steps", 6, "--init-num-pts", 60, "--max-gaussians", 90, "--jobs", 1]
+    train("compare", "sparse-fourier", "--data", data, "--out", tmp_path / "out", *options)
+    (compared,) = json.loads((tmp_path / "out" / "comparison.json").read_text())["runs"]
+    assert compared["system"] == "sparse-fourier"
+    assert compared["deformation_parameters"] > 0
+
+
+def test_its_layers_stand_beside_others_on_the_command_line(data: Path, tmp_path: Path) -> None:
+    layers = ["--support", "nodes:num_nodes=5", "--layers", "spline", "fourier:frequencies=2", "mlp:width=8"]
+    train("fit", data, tmp_path / "run", *SMALL, "--steps=3", *layers)
+    stored = json.loads((tmp_path / "run" / "config.json").read_text())["model"]["layers"]
+    assert [layer["kind"] for layer in stored] == ["spline", "fourier", "mlp"]
+
+
+def test_without_the_plugin_it_is_named_what_is_missing(data: Path, trained: Path, tmp_path: Path) -> None:
+    fit = ["fit", data, tmp_path / "run"]
+    assert "--plugin MODULE, got sparse-fourier" in run("msdgs_train", *fit, "--preset", "sparse-fourier", code=2)
+    assert "--plugin MODULE, got fourier" in run("msdgs_train", *fit, "--layers", "fourier", code=2)
+    assert "--plugin MODULE, got fourier" in run("msdgs_train", "eval", trained, code=2)
+    missing = run("msdgs_train", *fit, "--plugin", tmp_path / "none.py", code=2)
+    assert "`plugin` must be a module that can be imported, or a Python file" in missing
+
+
+def test_a_fourier_layer_has_the_period_of_its_time_range() -> None:
+    layer = FourierConfig(frequencies=3).build(SceneBounds(1.0, (2.0, 6.0)), PAPER_HEADS, None).double()
+    means = torch.randn(7, 3, dtype=torch.float64)
+    with torch.no_grad():
+        layer.matrices.normal_()
+        layer.offsets.normal_()
+        first, last, middle = (layer(means, torch.tensor(t).double()) for t in (2.0, 6.0, 4.0))
+    assert_close(first.delta_means, last.delta_means, "encoding.float32")
+    assert float((first.delta_means - middle.delta_means).abs().max()) > 0.1
+    assert MultiStepDeformation([layer]).operations() == 2 * 3 * 11
+
+
+def test_it_is_exported_and_served(trained: Path, tmp_path: Path) -> None:
+    """The scene file needs neither the plugin nor torch, and holds the poses of the model."""
+    scene = tmp_path / "scene.onnx"
+    export = "import sys; from export.to_onnx import *; sys.exit(main(tyro.cli(ExportOptions)))"
+    run_python(export, trained / "model.pt", scene, MSDGS_PLUGINS=str(PLUGIN))
+    loaded, session = load_model(trained / "model.pt"), DeformationSession(scene)
+    drawn = session.gaussians(0.37)
+    with torch.no_grad():
+        posed = loaded.model.pose(0.37)
+    for field in ("means", "quats", "scales"):
+        want = getattr(posed, field).numpy()
+        np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))
+    entry = loaded.scene.cameras[0]
+    image = Renderer().render(session, camera_of(entry, entry["width"]), 0.37)
+    want = loaded.render(camera_of(entry, entry["width"]), 0.37).clamp(0, 1)
+    assert_close(image.rgb, want.numpy(), "served_frame")
+
+
+def test_the_documented_code_is_the_example() -> None:
+    """All of it, in the order layer, export, system; the other tests of this file run it."""
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)\n```", page, re.DOTALL)
+    head, layer, export, system = blocks
+    assert "\n\n\n".join((head, layer, system)) + f"\n\n{export}\n" == PLUGIN.read_text(encoding="utf-8")
