@@ -187,6 +187,7 @@ def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: Scen
     while trainer.step_count < 25:
         trainer.step()
     (layer,) = splatting(trainer).model.deformation
+    assert isinstance(layer, SplineLayer)
     curves = {"transls": layer.transls, "rots": layer.rots, "stretches": layer.stretches}
     (view,) = views = trainer._render_and_backward()
     assert view.sample.update == "motion"
