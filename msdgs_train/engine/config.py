@@ -122,6 +122,10 @@ class TrainConfig:
             changed["model"] = ModelConfig.from_dict({**config.model.to_dict(), **model})
         return dataclasses.replace(config, **changed)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as plain values: a worker process loads plugins before it needs their classes."""
+        return TrainConfig.from_dict, (self.to_dict(),)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values by group, ready for JSON."""
         groups = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "model"}

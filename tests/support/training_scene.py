@@ -16,7 +16,7 @@ from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.run import Observer
-from msdgs_train.engine.trainer import StepResult
+from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.base import LayerConfig
@@ -25,6 +25,7 @@ from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.nodes import NodesConfig
+from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from tests.support.scenes import gaussians_of
 
 SIZE = 24
@@ -80,6 +81,12 @@ def shrunk(config: TrainConfig) -> TrainConfig:
         model=model, steps=12, static_fraction=0.25, threads=2, init_num_pts=60, max_gaussians=90,
         refine_start=4, refine_every=4, sh_degree_interval=4,
     )  # fmt: skip
+
+
+def splatting(trainer: Trainer) -> GaussianSplatting:
+    """The system of a trainer, which is one of Gaussians."""
+    assert isinstance(trainer.system, GaussianSplatting)
+    return trainer.system
 
 
 class StopAfter(Observer):

@@ -111,8 +111,8 @@ def test_a_fourier_layer_has_the_period_of_its_time_range() -> None:
 def test_it_is_exported_and_served(trained: Path, tmp_path: Path) -> None:
     """The scene file needs neither the plugin nor torch, and holds the poses of the model."""
     scene = tmp_path / "scene.onnx"
-    export = "import sys; from export.to_onnx import *; sys.exit(main(tyro.cli(ExportOptions)))"
-    run_python(export, trained / "model.pt", scene, MSDGS_PLUGINS=str(PLUGIN))
+    code = "import sys; from tests.support.models import *; export_scene(*map(Path, sys.argv[1:]), times=5)"
+    run_python(code, trained / "model.pt", scene, MSDGS_PLUGINS=str(PLUGIN))
     loaded, session = load_model(trained / "model.pt"), DeformationSession(scene)
     drawn = session.gaussians(0.37)
     with torch.no_grad():

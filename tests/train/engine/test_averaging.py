@@ -19,6 +19,7 @@ from tests.support.training_scene import (
     StopAfter,
     assert_same_bits,
     small_config,
+    splatting,
     state_of,
 )
 
@@ -47,16 +48,16 @@ def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
     for step in range(1, STEPS + 1):
         trainer.step()
         if step <= BEGINS:
-            assert trainer.system.eval_model is trainer.system.model
+            assert splatting(trainer).eval_model is splatting(trainer).model
             continue
-        seen.append(_parameters(trainer.system.model))
+        seen.append(_parameters(splatting(trainer).model))
         if len(seen) <= KEPT:
             expected = [np.mean(values, axis=0) for values in zip(*seen, strict=True)]
         else:
             expected = [(1 - 1 / KEPT) * old + last / KEPT for old, last in zip(expected, seen[-1], strict=True)]
-        for mean, value in zip(_parameters(trainer.system.eval_model), expected, strict=True):
+        for mean, value in zip(_parameters(splatting(trainer).eval_model), expected, strict=True):
             np.testing.assert_allclose(mean, value, rtol=1e-5, atol=1e-6)
-    moved = zip(_parameters(trainer.system.eval_model), seen[-1], strict=True)
+    moved = zip(_parameters(splatting(trainer).eval_model), seen[-1], strict=True)
     assert sum(not np.array_equal(mean, last) for mean, last in moved) > 5
 
 
@@ -66,7 +67,7 @@ def test_it_is_evaluated_shown_and_saved(data: Path, tmp_path: Path) -> None:
         trainer.step()
     trainer.system.save(tmp_path / "model.pt", STEPS)
     saved = load_model(tmp_path / "model.pt")
-    last = LoadedModel(trainer.system.model, saved.scene, STEPS)
+    last = LoadedModel(splatting(trainer).model, saved.scene, STEPS)
     for evaluated in trainer.evaluate("test"):
         view = (evaluated.frame.camera, evaluated.frame.t)
         np.testing.assert_array_equal(saved.render(*view).clamp(0, 1), evaluated.rgb)
@@ -104,9 +105,9 @@ def test_with_more_steps_it_begins_again(data: Path, tmp_path: Path) -> None:
     before = _saved(data, tmp_path / "checkpoint.pt", STEPS)
     longer = Trainer(CONFIG.updated(steps=2 * STEPS), before.scene)
     longer.load_checkpoint(tmp_path / "checkpoint.pt")
-    assert longer.system.eval_model is longer.system.model
+    assert splatting(longer).eval_model is splatting(longer).model
     longer.step()
-    assert longer.system.eval_model is longer.system.model
+    assert splatting(longer).eval_model is splatting(longer).model
 
 
 def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_path: Path) -> None:
@@ -116,8 +117,8 @@ def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_pa
     seen = []
     for _ in range(2):
         shorter.step()
-        seen.append(_parameters(shorter.system.model))
-    for mean, *values in zip(_parameters(shorter.system.eval_model), *seen, strict=True):
+        seen.append(_parameters(splatting(shorter).model))
+    for mean, *values in zip(_parameters(splatting(shorter).eval_model), *seen, strict=True):
         np.testing.assert_allclose(mean, np.mean(values, axis=0), rtol=1e-5, atol=1e-6)
 
 

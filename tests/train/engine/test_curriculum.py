@@ -21,7 +21,7 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.spline import SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
 from msdgs_train.systems import gaussian_splatting as system_module
-from tests.support.training_scene import MIXED_ON_NODES, MOTION_BASES, SMALL_MODEL, small_config, write_scene
+from tests.support.training_scene import MIXED_ON_NODES, MOTION_BASES, SMALL_MODEL, small_config, splatting, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -186,17 +186,18 @@ def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: Scen
     trainer = Trainer(config, scene)
     while trainer.step_count < 25:
         trainer.step()
-    (layer,) = trainer.system.model.deformation
+    (layer,) = splatting(trainer).model.deformation
+    assert isinstance(layer, SplineLayer)
     curves = {"transls": layer.transls, "rots": layer.rots, "stretches": layer.stretches}
     (view,) = views = trainer._render_and_backward()
     assert view.sample.update == "motion"
     read, _ = layer.knots_at(torch.tensor(view.sample.t))
     average_gradients(trainer.system.parameter_groups(), views)
-    start = deepcopy((trainer.system.model.state_dict(), trainer.optimizer.state_dict()))
+    start = deepcopy((splatting(trainer).model.state_dict(), trainer.optimizer.state_dict()))
     before = {name: curve.detach().clone() for name, curve in curves.items()}
     trainer.optimizer.step()
     steps = {name: curve.detach() - before[name] for name, curve in curves.items()}
-    trainer.system.model.load_state_dict(start[0])
+    splatting(trainer).model.load_state_dict(start[0])
     trainer.optimizer.load_state_dict(start[1])
     step_with_new_frames(trainer.optimizer, trainer.system.new_frame_rows([view.sample.t]))
     for name, curve in curves.items():

@@ -15,7 +15,7 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.systems.registry import DEFAULT, preset, systems
-from tests.support.training_scene import shrunk
+from tests.support.training_scene import shrunk, splatting
 
 pytestmark = pytest.mark.slow
 
@@ -77,7 +77,7 @@ def test_unknown_names_are_refused_with_those_there_are() -> None:
 @pytest.mark.parametrize("name", systems())
 def test_each_preset_trains(name: str, data: Path) -> None:
     trainer = Trainer(shrunk(preset(name)), load_scene(data))
-    deformation = trainer.system.model.deformation
+    deformation = splatting(trainer).model.deformation
     before = {n: p.detach().clone() for n, p in deformation.named_parameters()}
     results = [trainer.step() for _ in range(12)]
     assert results[-1].skipped == 0

@@ -41,6 +41,7 @@ from tests.support.training_scene import (
     StopAfter,
     assert_same_bits,
     small_config,
+    splatting,
     state_of,
 )
 
@@ -58,7 +59,7 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     points, colors = numbers.uniform(-0.5, 0.5, (found, 3)), numbers.uniform(0.1, 0.9, (found, 3))
     scene = dataclasses.replace(load_scene(data), points=points, point_colors=colors)
     trainer = Trainer(small_config(), scene)
-    first, started = trainer.system.model.gaussians, min(found, trainer.config.density.init_num_pts)
+    first, started = splatting(trainer).model.gaussians, min(found, trainer.config.density.init_num_pts)
     assert 20 < trainer.config.density.init_num_pts < 500
     assert len(first) == started
     nearest = np.linalg.norm(first.means.detach().numpy()[:, None] - points[None], axis=2).argmin(axis=1)
@@ -164,11 +165,11 @@ def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: P
 def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(small_config(steps=100, refine_every=0), load_scene(data))
     trainer.step()
-    before = [p.detach().clone() for p in trainer.system.model.parameters()]
+    before = [p.detach().clone() for p in splatting(trainer).model.parameters()]
     monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: rgb.sum() * float("nan"))
     result = trainer.step()
     assert (result.step, result.skipped) == (2, 1)
-    assert all(torch.equal(a, b) for a, b in zip(before, trainer.system.model.parameters(), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(before, splatting(trainer).model.parameters(), strict=True))
     with pytest.raises(TrainingDiverged, match="up to step 21"):
         _steps(trainer, 19)
 
@@ -182,7 +183,7 @@ def test_images_of_a_step_share_it_evenly(data: Path) -> None:
         found = []
         for _ in range(6 // batch_size):
             average_gradients(trainer.system.parameter_groups(), trainer._render_and_backward())
-            found.append([p.grad.clone() for p in trainer.system.model.parameters() if p.grad is not None])
+            found.append([p.grad.clone() for p in splatting(trainer).model.parameters() if p.grad is not None])
         return found
 
     one_by_one, at_once = gradients(1, 1), gradients(6, 3)[0]
@@ -196,7 +197,7 @@ def test_images_of_a_step_share_it_evenly(data: Path) -> None:
 def test_a_gradient_is_the_mean_over_the_images_that_update_the_parameter(data: Path) -> None:
     trainer = Trainer(small_config(batch_size=2, window_full_fraction=0.0), load_scene(data))
     first, second = trainer._render_and_backward()
-    groups, means = trainer.system.parameter_groups(), trainer.system.model.gaussians.means
+    groups, means = trainer.system.parameter_groups(), splatting(trainer).model.gaussians.means
     average_gradients(groups, [first, second])
     assert means.grad is not None
     assert torch.equal(means.grad, (first.gradients[id(means)] + second.gradients[id(means)]) / 2)
@@ -290,7 +291,7 @@ def test_weighted_regularizers_are_added_to_the_loss(data: Path, monkeypatch: py
     )  # fmt: skip
     strategy: dict[str, Any] = {"density_strategy": "mcmc", "opacity_reg": 2e4, "scale_reg": 3e5} if mcmc else {}
     model = dataclasses.replace(small_config().model, layers=(plane, MLP))
-    system = Trainer(small_config(model=model, static_fraction=0.0, **strategy), load_scene(data)).system
+    system = splatting(Trainer(small_config(model=model, static_fraction=0.0, **strategy), load_scene(data)))
     expected, layer = 0.0, system.model.deformation.layers[0]
     assert isinstance(layer, PlaneLayer)
     with torch.no_grad():
@@ -319,7 +320,7 @@ def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
     trainer = Trainer(small_config(model=model, static_fraction=0.0), load_scene(data))
     assert trainer.step().clamped_scales == 0
     with torch.no_grad():
-        trainer.system.model.get_parameter("deformation.layers.0.heads.bias")[4] = -1e3
+        splatting(trainer).model.get_parameter("deformation.layers.0.heads.bias")[4] = -1e3
     result = trainer.step()
     assert result.clamped_scales == result.gaussians
 
@@ -328,13 +329,13 @@ def test_an_outlier_of_a_gradient_is_clipped(data: Path, monkeypatch: pytest.Mon
     trainer = Trainer(small_config(steps=100, static_fraction=0.0), load_scene(data))
     monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: 1e9 * (rgb - target).sum() ** 2)
     _steps(trainer, 3)
-    gradients = [p.grad for p in trainer.system.model.deformation.parameters() if p.grad is not None]
+    gradients = [p.grad for p in splatting(trainer).model.deformation.parameters() if p.grad is not None]
     assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer_module.MAX_GRADIENT_NORM)
 
 
 def test_the_static_phase_leaves_the_deformation_alone(data: Path) -> None:
     trainer = Trainer(small_config(static_fraction=0.25), load_scene(data))
-    deformation = trainer.system.model.deformation
+    deformation = splatting(trainer).model.deformation
     before = [p.detach().clone() for p in deformation.parameters()]
     _steps(trainer, 6)
     assert all(torch.equal(a, b) for a, b in zip(before, deformation.parameters(), strict=True))

@@ -75,7 +75,8 @@ def test_gradients_are_those_of_the_slow_pose(chain: str) -> None:
         return sum(float((f.numpy() * v).sum()) for f, v in zip(factors, posed, strict=True))
 
     posed = model.pose(0.37)
-    fast = sum((f * v).sum() for f, v in zip(factors, (posed.means, posed.scales, posed.quats), strict=True))
+    moved = zip(factors, (posed.means, posed.scales, posed.quats), strict=True)
+    fast = torch.stack([(f * v).sum() for f, v in moved]).sum()
     names = [n for n, p in model.named_parameters() if p.requires_grad and not n.endswith(("opacities", "dc", "rest"))]
     assert {"gaussians.means", "gaussians.raw_quats", "gaussians.skinning_logits"} < set(names)
     parameters = [model.get_parameter(name) for name in names]
@@ -124,9 +125,9 @@ def test_a_gaussian_that_is_squeezed_to_nothing_keeps_a_scale_and_a_finite_gradi
         torch.randn(4, columns, generator=generator, dtype=torch.float64) for columns in (3, 4, 1, 16)
     )
     motions[:, :9] = 0.0
-    tensors = [means, quats / quats.norm(dim=1, keepdim=True), torch.ones_like(weights)]
+    unit = quats / quats.norm(dim=1, keepdim=True)
     motions.requires_grad_()
-    deltas = skin(*tensors, torch.arange(4)[:, None], motions)
+    deltas = skin(means, unit, torch.ones_like(weights), torch.arange(4)[:, None], motions)
     assert_close(deltas[:, 3:6].exp().detach(), np.full((4, 3), MIN_STRETCH), "rotation")
     (gradient,) = torch.autograd.grad(deltas.sum(), [motions])
     assert torch.isfinite(gradient).all()

@@ -8,6 +8,7 @@ import torch
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.spline import SplineConfig, SplineLayer, cubic_weights
+from msdgs_train.supports.nodes import NodesSupport
 from tests.support.models import NODES, SPLINE, random_model
 from tests.support.reference_deformation import plain_step
 from tests.support.tolerances import assert_close, tolerance
@@ -91,6 +92,7 @@ def test_straight_motion_is_smooth() -> None:
 def test_rigid_motions_stay_rigid() -> None:
     model = random_model(20, layers=(replace(SPLINE, affine=False),), support=NODES, embedding_dim=0).double()
     assert not any("stretches" in name for name, _ in model.named_parameters())
+    assert isinstance(model.support, NodesSupport)
     matrices = model.support.motions(model.deformation, time(0.3))[:, :9].view(-1, 3, 3).detach()
     assert float((matrices @ matrices.transpose(1, 2) - torch.eye(3)).abs().max()) <= EXACT
 
