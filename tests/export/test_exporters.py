@@ -3,6 +3,7 @@
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
-from tests.support.models import SCENE, random_model
+from tests.support.models import MLP, SCENE, random_model
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
@@ -38,7 +39,7 @@ QUIET = Console(quiet=True)
 
 def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
     """A moving scene of 300 Gaussians."""
-    model = random_model(300, noise=0.02, time_frequencies=2, **config)
+    model = random_model(300, noise=0.02, layers=(replace(MLP, time_frequencies=2),) * 2, **config)
     file = folder / "scene.onnx"
     file.write_bytes(build(plan, bake(model, SCENE, "0" * 64)).SerializeToString())
     return file
