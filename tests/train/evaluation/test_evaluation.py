@@ -368,7 +368,7 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
         cli.main(["eval", "--help"])
     assert exit_info.value.code == 0
     text = capsys.readouterr().out
-    for word in ("RUN", "DATA", "--split", "LPIPS", "moves", "contact sheet"):
+    for word in ("RUN", "DATA", "--split", "LPIPS", "moving", "contact sheet"):
         assert word in text
 
 
