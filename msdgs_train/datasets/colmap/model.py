@@ -61,5 +61,5 @@ def check_model(file: Path, field: str, model: str) -> None:
     if model not in PARAMETERS:
         known = ", ".join(PARAMETERS)
         raise DatasetInvalid(
-            file, field, f"is {model}, and only {known} are supported: undistort the images with COLMAP"
+            file, field, f"is {model}, but only {known} are supported: undistort the images with COLMAP"
         )
