@@ -46,6 +46,8 @@ class Fit:
     The paper's MLP system:  msdgs-train fit data/scene runs/paper --preset msdgs-mlp
 
     All settings of a preset:  msdgs-train fit --preset deformgs --help-all
+
+    Layers and systems of your own:  msdgs-train fit data/scene runs/own --plugin my_plugin.py --preset my-system
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
