@@ -29,6 +29,7 @@ class Lack(NamedTuple):
 LACKS = (
     Lack("no Chromium on this machine", "the page in a browser", debian="chromium"),
     Lack("there is no prometheus to run", "the dashboard's queries", debian="prometheus"),
+    Lack("needs strace", "which files native code opens", debian="strace"),
     Lack("kubernetes-validate isn't installed", "the Kubernetes manifests", python="kubernetes-validate"),
 )
 
