@@ -1,13 +1,13 @@
 """What an export needs to know of a kind of deformation layer."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 import torch
 
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.layers.base import HEAD_COLUMNS
+from msdgs_train.layers.base import HEAD_COLUMNS, Heads
 from msdgs_train.layers.deformation import DeformationLayer
 
 HEADS = tuple(HEAD_COLUMNS)
@@ -53,6 +53,17 @@ class FieldLayerExport:
 
     removable_heads = frozenset(HEADS)
     scale_columns = 3
+
+    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+        """The outputs of the heads `used`, times the step weight, if the layer predicts one, and the gate."""
+        has_weight = cast(Heads, inputs.layer.outputs).weight
+        rows = output_rows(used, has_weight)
+        return weighted(graph, inputs, self.outputs(graph, inputs, rows), len(rows), has_weight)
+
+    def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
+        """Add the nodes of the field. Returns [P, len(rows)]: those of its output columns, the logit of the weight,
+        if there is one, last."""
+        raise NotImplementedError
 
 
 def output_rows(used: list[str], has_weight: bool) -> np.ndarray:

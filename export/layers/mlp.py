@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import torch
 
-from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
+from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, zero
 from export.layers.graph import GraphBuilder, to_numpy
 from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.mlp import MLPLayer
@@ -15,12 +15,9 @@ from msdgs_train.layers.mlp import MLPLayer
 class MLPExport(FieldLayerExport):
     """Of `MLPLayer`."""
 
-    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+    def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Encoded means and time through the hidden layers, then one product for all heads."""
-        layer = cast(MLPLayer, inputs.layer)
-        rows = output_rows(used, layer.outputs.weight)
-        outputs = _outputs(graph, inputs.name, layer, inputs.means, inputs.time, rows)
-        return weighted(graph, inputs, outputs, len(rows), layer.outputs.weight)
+        return _outputs(graph, inputs.name, cast(MLPLayer, inputs.layer), inputs.means, inputs.time, rows)
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose rows of the last Linear are all 0."""

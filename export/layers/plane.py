@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from onnx import TensorProto
 
-from export.layers.base import HEADS, FieldLayerExport, LayerInputs, output_rows, weighted, zero
+from export.layers.base import HEADS, FieldLayerExport, LayerInputs, zero
 from export.layers.graph import GraphBuilder, to_numpy
 from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
@@ -19,12 +19,9 @@ SECOND_AXES = np.array([1, 2, 2], np.int64)
 class PlaneExport(FieldLayerExport):
     """Of `PlaneLayer`."""
 
-    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+    def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Features of the planes, then a hidden layer and a product for each head."""
-        layer = cast(PlaneLayer, inputs.layer)
-        rows = output_rows(used, layer.outputs.weight)
-        outputs = _outputs(graph, inputs.name, layer, inputs.means, inputs.time, rows)
-        return weighted(graph, inputs, outputs, len(rows), layer.outputs.weight)
+        return _outputs(graph, inputs.name, cast(PlaneLayer, inputs.layer), inputs.means, inputs.time, rows)
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose Linear is all 0."""

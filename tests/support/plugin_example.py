@@ -102,7 +102,7 @@ register_system(
 # export
 try:
     from export.layers import LAYERS, LayerInputs
-    from export.layers.base import FieldLayerExport, output_rows, weighted, zero
+    from export.layers.base import FieldLayerExport, zero
     from export.layers.graph import GraphBuilder, to_numpy
 except ImportError:  # training needs neither `export` nor onnx
     pass
@@ -111,10 +111,9 @@ else:
     class FourierExport(FieldLayerExport):
         """`FourierLayer` as nodes of an ONNX graph."""
 
-        def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
+        def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
             layer, name = inputs.layer, inputs.name
             assert isinstance(layer, FourierLayer)
-            rows = output_rows(used, layer.outputs.weight)
             series = self.series(graph, inputs, layer)
             matrices = to_numpy(layer.matrices)[:, :, rows].reshape(len(layer.matrices), -1)
             flat = graph.node("MatMul", [series, graph.constant(f"{name}.matrices", matrices)], f"{name}.flat")
@@ -122,8 +121,7 @@ else:
             matrix = graph.node("Reshape", [flat, shape], f"{name}.matrix")
             offsets = graph.constant(f"{name}.offsets", to_numpy(layer.offsets)[:, rows])
             offset = graph.node("MatMul", [series, offsets], f"{name}.offset")
-            outputs = graph.node("Gemm", [inputs.means, matrix, offset], f"{name}.outputs")
-            return weighted(graph, inputs, outputs, len(rows), layer.outputs.weight)
+            return graph.node("Gemm", [inputs.means, matrix, offset], f"{name}.outputs")
 
         def series(self, graph: GraphBuilder, inputs: LayerInputs, layer: FourierLayer) -> str:
             """[1, 2 F]."""
