@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from tests.support.processes import free_port
 from tests.support.scene_files import write_scene
 
+NGINX = Path(__file__).resolve().parents[2] / "docker" / "nginx" / "nginx.conf"
 START_SECONDS = 120
 MOMENT = 0.01
 PROGRAM = "import sys; from msdgs_serve.api.cli import main; sys.exit(main())"
@@ -122,6 +123,28 @@ def wait_until_ready(running: Running) -> None:
                 return
         time.sleep(MOMENT)
     raise SystemExit("the service did not become ready")
+
+
+@contextmanager
+def proxy(running: Sequence[Running], work: Path) -> Iterator[int]:
+    """The port of nginx with docker/'s settings before these services; it needs `nginx` (Debian: nginx-light)."""
+    program = shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin")
+    if program is None:
+        raise SystemExit("nginx is not installed; on Debian: apt-get install nginx-light")
+    port, folder = free_port(), work / "nginx"
+    folder.mkdir()
+    settings = NGINX.read_text().replace("listen 8080", f"listen {port}").replace("/tmp/", f"{folder}/")
+    (folder / "nginx.conf").write_text(settings)
+    (folder / "replicas.conf").write_text("".join(f"server 127.0.0.1:{each.port} max_fails=0;\n" for each in running))
+    user = "user root;" if os.geteuid() == 0 else ""  # or the worker couldn't enter `work`
+    command = [program, "-c", str(folder / "nginx.conf"), "-g", f"daemon off; {user}"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        try:
+            wait_until_ready(Running(port, process))
+            yield port
+        finally:
+            process.terminate()
+            process.wait()
 
 
 def make_scenes(folder: Path, scene: Path) -> Path:
