@@ -1,7 +1,7 @@
 """What an export needs to know of a kind of support."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,22 +29,22 @@ class SupportInputs(NamedTuple):
     attributes: Mapping[str, np.ndarray]  # a layout's, or `Support.baked` of all moving Gaussians
 
 
-class SupportExport(Protocol):
+class SupportExport:
     """How supports of one kind are exported. Register one in `export.supports.SUPPORTS` under the kind's name."""
 
-    heads_are_removable: bool
+    heads_are_removable = True
     """Whether a head of the layers that is always 0 is one of the Gaussians that is."""
 
     def bytes_per_gaussian(self, support: Support) -> int:
         """What the support stores per Gaussian in a scene file."""
-        ...
+        return 0
 
     def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout | None:
         """The rows of a graph of all moving Gaussians, of canonical means [M, 3] and attributes `Support.baked`; None
         for a graph that poses the Gaussians asked for alone."""
-        ...
+        return None
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         """Add the nodes of the chain and of what follows it. Returns summed deltas of the rows by head, those that
         aren't always 0 (equations 7 to 9, before modulation)."""
-        ...
+        raise NotImplementedError

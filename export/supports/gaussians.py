@@ -1,27 +1,12 @@
 """The support `gaussians` as a graph: the chain runs on the canonical means."""
 
-from collections.abc import Mapping
-
-import numpy as np
-
 from export.layers.chain import summed_deltas, used_heads
 from export.layers.graph import GraphBuilder
-from export.supports.base import Layout, SupportInputs
-from msdgs_train.supports.base import Support
+from export.supports.base import SupportExport, SupportInputs
 
 
-class GaussiansExport:
+class GaussiansExport(SupportExport):
     """Of `GaussiansSupport`."""
-
-    heads_are_removable = True
-
-    def bytes_per_gaussian(self, support: Support) -> int:
-        """Nothing."""
-        return 0
-
-    def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout | None:
-        """None: layers run on the Gaussians asked for."""
-        return None
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         """Of the chain itself."""

@@ -13,7 +13,7 @@ from onnx import TensorProto
 from export.layers.base import HEADS
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder, to_numpy
-from export.supports.base import Layout, SupportInputs
+from export.supports.base import Layout, SupportExport, SupportInputs
 from export.supports.blocks import WEIGHT_ONE, block_layout
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.supports.base import Support
@@ -24,7 +24,7 @@ WIDTHS = {"means": 3, "scales": 3, "quats": 4}
 IDENTITY = np.array([1, 0, 0, 0], np.float32)
 
 
-class NodesExport:
+class NodesExport(SupportExport):
     """Of `NodesSupport`."""
 
     heads_are_removable = False

@@ -66,7 +66,7 @@ def row(name: str, operator: Operator) -> str:
         inputs[-1] += ", once or several times"
     attributes = []
     for attribute, values in operator.attributes.items():
-        shown = [element_name(v) for v in values] if attribute == "to" else values
+        shown = [element_name(v) for v in values if isinstance(v, int)] if attribute == "to" else values
         if attribute == "perm":
             attributes.append("`perm` of three axes")
             continue
