@@ -5,13 +5,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from export.spatial_order import morton_order
 from export.supports.base import Layout
 
 BLOCK_SIZES = (64, 128, 256)
 BLOCK_NODES = 8
 """Nodes of a block are padded to a multiple of this."""
-GRID_BITS = 20
-"""Of a coordinate in Morton order."""
+SORTING_GAIN = 0.9
+"""Rows are sorted if this makes the matrices of weights smaller than this times those in the order given, which needs
+no index from Gaussians to rows."""
 WEIGHT_ONE = 32767
 """A skinning weight of 1 as it is stored, in 16 bits: one of 4 weights is off by 1.5e-5 at most."""
 
@@ -29,34 +31,28 @@ class Blocks(NamedTuple):
         return self.nodes.size * self.ids.shape[2]
 
 
-def morton_order(points: np.ndarray) -> np.ndarray:
-    """[N] int64 indices of points, [N, 3], along a Z-order curve through their bounding box; a stable sort."""
-    low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
-    cells = (points.astype(np.float64) - low) / np.maximum(high - low, np.finfo(np.float32).tiny)
-    codes = np.zeros(len(points), np.uint64)
-    for axis, values in enumerate((cells * (2**GRID_BITS - 1)).astype(np.uint64).T):
-        for bit in range(GRID_BITS):
-            codes |= (values >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(codes, kind="stable")
-
-
 def block_layout(means: np.ndarray, node_ids: np.ndarray, skinning_weights: np.ndarray) -> Layout:
-    """Rows along a Z-order curve, the last one repeated until the last block is full, and their blocks.
+    """Rows in the order given, if neighbors in it are neighbors in space, or along a Z-order curve; the last row is
+    repeated until the last block is full.
 
     Args:
         means: [N, 3] canonical, N > 0.
         node_ids: [N, F] nodes that each Gaussian follows.
         skinning_weights: [N, F]; rows sum to 1.
     """
-    order = morton_order(means)
     stored = _stored_weights(skinning_weights)
-    layouts = []
-    for size in BLOCK_SIZES:
-        size = min(size, len(order))
-        rows = np.append(order, np.repeat(order[-1:], -len(order) % size))
-        layouts.append((rows, _blocks(node_ids[rows], stored[rows], size)))
-    rows, blocks = min(layouts, key=lambda layout: layout[1].size)
+    given, sorted_ = (_smallest(order, node_ids, stored) for order in (np.arange(len(means)), morton_order(means)))
+    rows, blocks = sorted_ if sorted_[1].size < SORTING_GAIN * given[1].size else given
     return Layout(rows, blocks._asdict())
+
+
+def _smallest(order: np.ndarray, node_ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, Blocks]:
+    """Padded rows and blocks of the size whose matrices are smallest."""
+    layouts = []
+    for size in sorted({min(size, len(order)) for size in BLOCK_SIZES}):
+        rows = np.append(order, np.repeat(order[-1:], -len(order) % size))
+        layouts.append((rows, _blocks(node_ids[rows], weights[rows], size)))
+    return min(layouts, key=lambda layout: layout[1].size)
 
 
 def _blocks(node_ids: np.ndarray, weights: np.ndarray, size: int) -> Blocks:
