@@ -1,10 +1,18 @@
 """Blocks of Gaussians on control nodes: every Gaussian keeps its nodes and weights, whatever the order."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
+from export.jobs.bake import bake
+from export.plans.registry import build
 from export.spatial_order import morton_order
 from export.supports.blocks import WEIGHT_ONE, block_layout
+from msdgs_serve.deformation import DeformationSession
+from tests.support.models import NODES, SCENE, random_model
+from tests.support.tolerances import tolerance
 
 
 def skinning(count: int, nodes: int, follows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -54,3 +62,18 @@ def test_morton_order_of_a_grid_visits_each_octant_at_once():
 @pytest.mark.parametrize("means", [np.zeros((0, 3), np.float32), np.full((3, 3), 2.0, np.float32)])
 def test_morton_order_of_points_without_extent(means: np.ndarray):
     np.testing.assert_array_equal(morton_order(means), np.arange(len(means)))
+
+
+def test_a_scene_on_nodes_is_posed_in_one_call():
+    """However many Gaussians there are; any of them, after any number of layers."""
+    count = 5000
+    model = random_model(count, noise=0.02, support=replace(NODES, num_nodes=30), sh_degree=0)
+    contents = build("network", bake(model, SCENE, "0" * 64)).SerializeToString()
+    session = DeformationSession("nodes.onnx", contents=contents)
+    assert session.cost.calls == 1
+    ids = np.random.default_rng(2).permutation(count)[:700]
+    for steps, layers in ((None, None), (1.0, 1), (0.0, 0)):
+        with torch.no_grad():
+            posed = model.pose(0.3, layers, ids=torch.from_numpy(ids))
+        for got, want in zip(session.pose(0.3, ids, steps), (posed.means, posed.quats, posed.scales), strict=True):
+            np.testing.assert_allclose(got, want.numpy(), rtol=0, atol=tolerance("export.nodes.relative"))
