@@ -10,7 +10,7 @@ from msdgs_serve.imaging import ImageFormat, encode
 from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera
 
-LARGEST = 16
+MAX_FRAMES = 16
 """Frames of a block: what a worker that dies takes with it, and what Ctrl-C throws away."""
 
 
@@ -39,7 +39,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Look:
+class OutputOptions:
     """How frames are drawn and written."""
 
     image_format: ImageFormat
@@ -50,10 +50,10 @@ class Look:
 def plan_blocks(views: Sequence[View], numbers: Sequence[int], workers: int = 1) -> list[Block]:
     """The frames `numbers` of `views` in blocks: all of one scene after each other, by time.
 
-    Blocks have `LARGEST` frames, or fewer where `workers` would have less than four each. A time that has more frames
+    Blocks have `MAX_FRAMES` frames, or fewer where `workers` would have less than four each. A time that has more frames
     than fit into what is left of a block begins a new one.
     """
-    size = max(1, min(LARGEST, len(numbers) // (4 * workers)))
+    size = max(1, min(MAX_FRAMES, len(numbers) // (4 * workers)))
     scenes = list(dict.fromkeys(view.scene for view in views))
     blocks = []
     for scene in scenes:
@@ -64,7 +64,7 @@ def plan_blocks(views: Sequence[View], numbers: Sequence[int], workers: int = 1)
 
 
 def draw_block(
-    block: Block, session: DeformationSession, renderer: Renderer, look: Look
+    block: Block, session: DeformationSession, renderer: Renderer, look: OutputOptions
 ) -> Iterator[tuple[int, bytes]]:
     """Number and file contents of each frame, one after the other."""
     for number, camera, t in block.frames:

@@ -14,7 +14,7 @@ from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
 
 DEFAULT_FPS = 24.0
 MAX_FPS = 240.0
-LARGEST = 1e9
+MAX_NUMBER = 1e9
 """Of any number of a path: single precision neither overflows nor underflows."""
 
 
@@ -138,6 +138,6 @@ def _numbers(value: Any, count: int, name: str) -> np.ndarray:
     if not good or any(isinstance(each, bool) or not isinstance(each, int | float) for each in value):
         raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", "something else")
     numbers: list[float] = list(value)
-    if not all(-LARGEST <= each <= LARGEST for each in numbers):
-        raise InvalidInput(name, f"finite and at most {LARGEST:g}", "NaN, infinity or more")
+    if not all(-MAX_NUMBER <= each <= MAX_NUMBER for each in numbers):
+        raise InvalidInput(name, f"finite and at most {MAX_NUMBER:g}", "NaN, infinity or more")
     return np.array(numbers, dtype=np.float64)

@@ -19,7 +19,7 @@ from msdgs_serve.threads import THREADS_VARIABLE
 if TYPE_CHECKING:
     from msdgs_serve.api.settings import Settings
 
-ROOM_FOR_REFUSALS = 200
+MAX_REJECTIONS = 200
 """Requests that a replica may have beside those with a place in its queue: it answers them at once, with 503 and
 `Retry-After`. Ray Serve would keep them waiting, or refuse them without saying for how long."""
 
@@ -45,7 +45,7 @@ def deployment(settings: "Settings", replicas: int = 1, cores: int = 1) -> Any:
     """The service with these settings as a Ray Serve application, to be given to `serve.run`."""
     from ray import serve  # pyright: ignore[reportMissingImports]  # an extra
 
-    places = settings.concurrent_renders + settings.queued_renders + ROOM_FOR_REFUSALS
+    places = settings.concurrent_renders + settings.queued_renders + MAX_REJECTIONS
 
     # made in the replica, as scenes and locks don't travel
     replica = serve.ingress(lambda: _service(settings, cores))()
@@ -79,11 +79,11 @@ def _service(settings: "Settings", cores: int) -> Any:
             yield state
 
     app.router.lifespan_context = loaded
-    app.add_middleware(_Without, REQUEST_ID)
+    app.add_middleware(_DropHeader, REQUEST_ID)
     return app
 
 
-class _Without:
+class _DropHeader:
     """Leaves a header out of answers: Ray's proxy, which has given the request its id, adds it too."""
 
     def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]], header: str) -> None:

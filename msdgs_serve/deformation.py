@@ -62,7 +62,7 @@ class DeformationSession:
             self._check_sample(t)
 
     @property
-    def most_steps(self) -> int:
+    def max_steps(self) -> int:
         """How many deformation layers can be applied one after the other; 0 where the scene's plan doesn't run them."""
         return 0 if self._steps is None else len(self.scene.metadata.layers)
 
@@ -70,11 +70,11 @@ class DeformationSession:
         """Raise `InvalidInput` where the scene can't be posed after so many layers."""
         if steps is None:
             return
-        if not self.most_steps:
+        if not self.max_steps:
             plan = self.scene.metadata.plan
             raise InvalidInput("steps", f"left out: the plan {plan} doesn't run layers one by one", steps)
-        if not 0 <= steps <= self.most_steps:
-            raise InvalidInput("steps", f"in [0, {self.most_steps}], the scene's layers", steps)
+        if not 0 <= steps <= self.max_steps:
+            raise InvalidInput("steps", f"in [0, {self.max_steps}], the scene's layers", steps)
 
     def pose(
         self, t: float, ids: npt.ArrayLike | None = None, steps: float | None = None
@@ -110,7 +110,7 @@ class DeformationSession:
         return self.scene.gaussians(*self.pose(t, steps=steps))
 
     @contextmanager
-    def answering_for(self, t: float) -> Iterator[None]:
+    def blaming_scene_file(self, t: float) -> Iterator[None]:
         """Turn `InvalidInput` about this scene's Gaussians at `t` into `SceneFileInvalid`: only the first and the last
         time are looked at when a file is loaded."""
         try:
@@ -170,7 +170,7 @@ class DeformationSession:
     def _check_sample(self, t: float) -> None:
         sample = slice(min(self.scene.moving_count, 64))
         posed = self.pose(t, np.arange(sample.stop))
-        with self.answering_for(t):
+        with self.blaming_scene_file(t):
             Gaussians(*posed, self.scene.opacities[sample], self.scene.sh[sample]).validate()
 
     def _run(self, t: float, ids: npt.NDArray[np.int64], steps: float | None = None) -> list[FloatArray]:

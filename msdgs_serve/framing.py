@@ -9,11 +9,11 @@ from msdgs_serve.scene.baked import SceneMetadata
 
 DEFAULT_SIZE = 512
 DEFAULT_FOV_Y = 50.0
-LEAST_CONVERGENCE = 0.02
+MIN_CONVERGENCE = 0.02
 """Of the viewing axes, the mean square sine of their angles to the direction that they have most in common; below it
 they are so nearly parallel that where they meet says little."""
 
-GRAIN = 1e-5
+ROUNDING = 1e-5
 """Of the bounds' diagonal: what is finer is rounding of poses, and would fill links with digits."""
 
 
@@ -50,11 +50,11 @@ def _meeting_point(poses: np.ndarray, low: np.ndarray, high: np.ndarray, otherwi
 
     Bounds hold Gaussians far out as well, so that their middle may be beside all that cameras look at.
     """
-    grain = 10.0 ** np.floor(np.log10(GRAIN * max(np.linalg.norm(high - low), 1e-3)))
+    grain = 10.0 ** np.floor(np.log10(ROUNDING * max(np.linalg.norm(high - low), 1e-3)))
     eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [N, 3, 3] takes the part along an axis away
     system = across.mean(axis=0)
-    if np.linalg.eigvalsh(system)[0] < LEAST_CONVERGENCE:
+    if np.linalg.eigvalsh(system)[0] < MIN_CONVERGENCE:
         return otherwise
     point = np.linalg.solve(system, (across @ eyes[:, :, None]).mean(axis=0)[:, 0])
     point = np.round(point / grain) * grain

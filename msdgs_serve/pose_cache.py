@@ -7,8 +7,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.render_job import RenderCancelled, RenderJob
 from msdgs_serve.scene import Gaussians, InvalidInput
-from msdgs_serve.watch import Interrupted, Watch
 
 PoseKey = tuple[weakref.ref[DeformationSession], float, float | None]
 
@@ -46,19 +46,19 @@ class PoseCache:
         with self._lock:
             return CacheUse(len(self._sizes), sum(self._sizes.values()), self._hits, self._misses)
 
-    def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
-        """The scene's Gaussians at `t`, perhaps after some of its layers; notes `hit` or `miss` with the watch."""
+    def get(self, session: DeformationSession, t: float, job: RenderJob, steps: float | None = None) -> Gaussians:
+        """The scene's Gaussians at `t`, perhaps after some of its layers; notes `hit` or `miss` with the job."""
         key = (weakref.ref(session), t, steps)  # a scene that was replaced is not kept alive
-        with watch.stage(STAGE):
+        with job.stage(STAGE):
             while True:
                 future, mine = self._claim(key)
-                watch.notes[STAGE] = "miss" if mine else "hit"
+                job.notes[STAGE] = "miss" if mine else "hit"
                 if mine:
                     self._compute(session, key, future)
                 try:
                     return future.result()
-                except Interrupted:
-                    watch.check()  # not this one's: who computed it gave up, so it is claimed anew
+                except RenderCancelled:
+                    job.check()  # not this one's: who computed it gave up, so it is claimed anew
 
     def _claim(self, key: PoseKey) -> tuple[Future[Gaussians], bool]:
         """The pose, perhaps still being computed, and whether the caller is to compute it."""
@@ -82,10 +82,10 @@ class PoseCache:
             return
         with self._lock:
             self._sizes[key] = _own_bytes(gaussians, session)
-            self._make_room()
+            self._evict()
         future.set_result(gaussians)
 
-    def _make_room(self) -> None:
+    def _evict(self) -> None:
         for key in [key for key in self._sizes if key[0]() is None]:
             self._forget(key)
         total = sum(self._sizes.values())

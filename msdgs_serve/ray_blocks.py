@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from msdgs_serve.blocks import Block, Look, draw_block
+from msdgs_serve.blocks import Block, OutputOptions, draw_block
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.ray_tasks import RayTasks, in_turns
 from msdgs_serve.renderer import Renderer
@@ -18,7 +18,7 @@ OPEN_SCENES = 2
 """That a worker keeps: blocks come scene by scene, and while one ends the next begins."""
 
 
-def draw_on_ray(blocks: Sequence[Block], look: Look, cores: int) -> Iterator[tuple[int, bytes]]:
+def draw_on_ray(blocks: Sequence[Block], look: OutputOptions, cores: int) -> Iterator[tuple[int, bytes]]:
     """Number and file contents of each frame, block by block as they end. One core draws one block.
 
     Needs a connection, `ray_cluster`. Raises `MsdgsError` for what can't be drawn.
@@ -33,7 +33,7 @@ def draw_on_ray(blocks: Sequence[Block], look: Look, cores: int) -> Iterator[tup
         yield from frames
 
 
-def _draw(stored: dict[Path, Any], look: Look, block: Block) -> list[tuple[int, bytes]]:
+def _draw(stored: dict[Path, Any], look: OutputOptions, block: Block) -> list[tuple[int, bytes]]:
     os.environ[THREADS_VARIABLE] = "1"  # other blocks have the other cores
     session, renderer = _opened(block.scene, stored[block.scene])
     return list(draw_block(block, session, renderer, look))

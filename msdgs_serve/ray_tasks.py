@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 
 AUTO = "auto"
 MAX_LOSSES = 5
-AHEAD = 2
+TASKS_PER_CORE = 2
 """Tasks for each core: one that runs, and one whose turn comes when that has ended."""
 
 
@@ -125,7 +125,7 @@ class RayTasks(Generic[Item, Result]):
 def in_turns(tasks: RayTasks[Item, Result], items: list[Item], cores: int) -> Iterator[tuple[Item, Result]]:
     """All items with their results as they end; a few are ahead of the cores, so that results don't pile up."""
     waiting = iter(items)
-    for item in itertools.islice(waiting, AHEAD * cores):
+    for item in itertools.islice(waiting, TASKS_PER_CORE * cores):
         tasks.submit(item)
     while len(tasks):
         for ended in tasks.ended():

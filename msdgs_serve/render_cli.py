@@ -19,7 +19,7 @@ from typing import cast, get_args
 import numpy as np
 import OpenImageIO as oiio
 
-from msdgs_serve.blocks import Block, Look, View, draw_block, plan_blocks
+from msdgs_serve.blocks import Block, OutputOptions, View, draw_block, plan_blocks
 from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_path_file, read_scene_names, turn_around
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
@@ -102,7 +102,7 @@ def _run(options: argparse.Namespace) -> None:
     files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(views))]
     background = "transparent" if transparent else "scene"
     drawn = RenderOptions(background, depth="depth" in default_channels(image_format))
-    _draw(views, files, Look(image_format, options.quality, drawn), options.ray)
+    _draw(views, files, OutputOptions(image_format, options.quality, drawn), options.ray)
     if is_film:
         unfinished = options.out.with_name(f".{options.out.name}.part")
         with unfinished.open("wb") as file:
@@ -151,7 +151,7 @@ def _size(options: argparse.Namespace) -> tuple[int, int] | None:
     return None if options.width is None else (options.width, options.height)
 
 
-def _draw(views: Sequence[View], files: Sequence[Path], look: Look, ray: str | None) -> None:
+def _draw(views: Sequence[View], files: Sequence[Path], look: OutputOptions, ray: str | None) -> None:
     """The files that aren't there yet; each appears whole."""
     missing = [number for number, file in enumerate(files) if not file.exists()]
     if len(missing) < len(files):
@@ -173,7 +173,7 @@ def _draw(views: Sequence[View], files: Sequence[Path], look: Look, ray: str | N
             _show_progress(done, len(missing), time.monotonic() - started)
 
 
-def _draw_here(blocks: Sequence[Block], look: Look) -> Iterator[tuple[int, bytes]]:
+def _draw_here(blocks: Sequence[Block], look: OutputOptions) -> Iterator[tuple[int, bytes]]:
     renderer = Renderer()
     for scene, of_one_scene in itertools.groupby(blocks, lambda block: block.scene):
         session = DeformationSession(scene)

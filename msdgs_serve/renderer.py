@@ -10,8 +10,8 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import Image, average
 from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, as_trained, rasterize
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
-from msdgs_serve.watch import Watch
 
 Color = tuple[float, float, float]
 Background = Color | Literal["scene", "transparent"]
@@ -70,38 +70,44 @@ class Renderer:
         camera: Camera,
         t: float,
         options: RenderOptions = DEFAULT_OPTIONS,
-        watch: Watch | None = None,
+        job: RenderJob | None = None,
     ) -> Image:
         """The frame that `camera` sees at `t`. The same arguments give the same pixels, whatever else runs.
 
-        `watch` times the stages `pose` and `draw` and may end the work between them.
+        `job` times the stages `pose` and `draw` and may end the work between them.
 
         Raises:
             InvalidInput: if `t` or a moment of the shutter is outside of the scene's time range, or it has no such
                 steps.
-            Interrupted: if the watch was stopped.
+            RenderCancelled: if the job was stopped.
             SceneFileInvalid: if the scene's Gaussians at such a moment are none that can be drawn.
         """
-        watch = watch or Watch()
+        job = job or RenderJob()
         check_times(session, t, options.shutter, options.motion_dt)
         if options.shutter is None:
-            return self._moment(session, camera, t, t, options, watch)
+            return self._moment(session, camera, t, t, options, job)
         moments = options.shutter.times(t)
-        return average(self._moment(session, camera, t, moment, options, watch) for moment in moments)
+        return average(self._moment(session, camera, t, moment, options, job) for moment in moments)
 
     def posed(
-        self, session: DeformationSession, t: float, watch: Watch | None = None, steps: float | None = None
+        self, session: DeformationSession, t: float, job: RenderJob | None = None, steps: float | None = None
     ) -> Gaussians:
         """The scene's Gaussians at `t`, from the cache where it has them."""
-        return self.cache.get(session, t, watch or Watch(), steps)
+        return self.cache.get(session, t, job or RenderJob(), steps)
 
     def _moment(
-        self, session: DeformationSession, camera: Camera, t: float, moment: float, options: RenderOptions, watch: Watch
+        self,
+        session: DeformationSession,
+        camera: Camera,
+        t: float,
+        moment: float,
+        options: RenderOptions,
+        job: RenderJob,
     ) -> Image:
-        gaussians, later = self.posed(session, moment, watch, options.steps), None
+        gaussians, later = self.posed(session, moment, job, options.steps), None
         if options.motion_dt is not None:
-            later = self.posed(session, moment + options.motion_dt, watch, options.steps)
-        with watch.stage("draw"), session.answering_for(moment):
+            later = self.posed(session, moment + options.motion_dt, job, options.steps)
+        with job.stage("draw"), session.blaming_scene_file(moment):
             background = resolve_background(session, options.background)
             constants = as_trained(session.scene.metadata, options.rasterizer)
             extra = None if later is None else displacements(gaussians, later, camera)

@@ -17,7 +17,7 @@ from functools import cache
 from typing import Any
 
 THREADS_VARIABLE = "MSDGS_THREADS"
-GIVING_WAY = 10
+NICENESS = 10
 """Niceness of threads that compute for requests: under too much load /live is answered in a quarter of the time that it
 takes without, or less; with 5 the gain is smaller."""
 
@@ -52,14 +52,14 @@ def checking(check: Callable[[], object]) -> Iterator[None]:
         _check.reset(token)
 
 
-def give_way() -> None:
+def lower_priority() -> None:
     """This thread, and those that it starts from now on, let other threads go first (Linux).
 
     Without it a thread that is woken up to answer something short waits while all cores compute.
     """
     if sys.platform == "linux":  # elsewhere priorities are the process's
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), GIVING_WAY)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
 @contextmanager

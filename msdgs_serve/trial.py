@@ -17,7 +17,7 @@ from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.threads import THREADS_VARIABLE
 
-MEMORY, MEMORY_A_BYTE = 1 << 29, 6
+MEMORY, MEMORY_PER_BYTE = 1 << 29, 6
 """Bytes that the process may have: its own, and for each byte of the file, besides those of a call of the graph."""
 
 OPEN_FILES = 64
@@ -29,7 +29,7 @@ def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
 
     Raises `SceneFileInvalid` with what that process says, or that it didn't end well.
     """
-    memory = MEMORY + MEMORY_A_BYTE * file.stat().st_size + limits.memory_bytes
+    memory = MEMORY + MEMORY_PER_BYTE * file.stat().st_size + limits.memory_bytes
     given = json.dumps({"file": str(file), "limits": vars(limits), "memory": memory, "seconds": seconds})
     command = [sys.executable, "-P", "-m", "msdgs_serve.trial", given]
     environment = {**os.environ, THREADS_VARIABLE: "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from msdgs_serve.api.errors import KIND, Refused, refusal
+from msdgs_serve.api.errors import KIND, RequestRejected, rejection
 from msdgs_serve.api.keys import client_of
 from msdgs_serve.api.prefix import route_path
 from msdgs_serve.api.work import WorkQueue
@@ -43,8 +43,8 @@ class Admission:
                 place.enter_context(
                     self._queue.admitted(client_of(scope), streamed=call in self._streamed, at_once=at_once)
                 )
-            except Refused as refused:
+            except RequestRejected as refused:
                 scope["route"], scope[KIND] = route, refused.kind
-                await refusal(refused)(scope, receive, send)
+                await rejection(refused)(scope, receive, send)
                 return
             await self._app(scope, receive, send)

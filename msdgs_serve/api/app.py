@@ -25,8 +25,8 @@ World and cameras have OpenCV axes: x right, y down, z forward. Angles are degre
 client's own where it sends a plain one."""
 
 STREAMED = (("POST", "/scenes"),)
-SAID_OF_FRAMES = ("Msdgs-Scene", "Msdgs-Plan", "Msdgs-Error", "Msdgs-Channels")
-EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *SAID_OF_FRAMES, "Retry-After")
+FRAME_HEADERS = ("Msdgs-Scene", "Msdgs-Plan", "Msdgs-Error", "Msdgs-Channels")
+EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *FRAME_HEADERS, "Retry-After")
 
 
 def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> FastAPI:

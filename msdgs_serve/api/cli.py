@@ -16,7 +16,7 @@ from msdgs_serve.api.observe import JsonLines
 from msdgs_serve.api.openapi import render_examples
 from msdgs_serve.api.server import Server
 from msdgs_serve.api.settings import PROGRAM, Settings
-from msdgs_serve.rasterizer.ahead import compile_kernels
+from msdgs_serve.rasterizer.precompile import compile_kernels
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import MsdgsError
 from msdgs_serve.store import SceneStore

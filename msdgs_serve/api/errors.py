@@ -42,7 +42,7 @@ MAX_MESSAGE_LENGTH = 200
 logger = logging.getLogger("msdgs_serve")
 
 
-class Refused(MsdgsError):
+class RequestRejected(MsdgsError):
     """A request that is not carried out for another reason than its values; knows its own status."""
 
     def __init__(
@@ -127,7 +127,7 @@ def problem_of(error: Exception) -> tuple[int, bytes]:
     return response.status_code, bytes(response.body)
 
 
-def refusal(error: Refused) -> Response:
+def rejection(error: RequestRejected) -> Response:
     """The answer to what is refused."""
     errors = [FieldError(field=error.field, message=str(error))] if error.field else []
     return problem_response(error.status, str(error), errors, error.headers)
@@ -135,15 +135,15 @@ def refusal(error: Refused) -> Response:
 
 async def _on_domain_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, MsdgsError)
-    request.scope[KIND] = error.kind if isinstance(error, Refused) else KINDS.get(type(error), "internal")
+    request.scope[KIND] = error.kind if isinstance(error, RequestRejected) else KINDS.get(type(error), "internal")
     return _domain_problem(error)
 
 
 def _domain_problem(error: MsdgsError) -> Response:
     if isinstance(error, ClientGone):
         return Response(status_code=CLIENT_CLOSED_REQUEST)  # nobody reads it; the metrics and the log do
-    if isinstance(error, Refused):
-        return refusal(error)
+    if isinstance(error, RequestRejected):
+        return rejection(error)
     status = next((status for kind, status in STATUS_OF.items() if isinstance(error, kind)), None)
     if status is None:
         logger.error("unexpected domain error", exc_info=error)

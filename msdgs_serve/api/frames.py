@@ -19,10 +19,10 @@ from msdgs_serve.api.service import Service
 from msdgs_serve.imaging import FORMATS, Channel, DepthRange, Image, encode
 from msdgs_serve.imaging.encode import check_encodable, npy, numbers
 from msdgs_serve.imaging.formats import default_channels
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import Background, RenderOptions, Shutter, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
-from msdgs_serve.watch import Watch
 
 ZIP = "application/zip"
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the first that a ZIP file can hold; equal requests give equal bytes
@@ -93,39 +93,39 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
 
 
-def draw_frame(service: Service, plan: FramePlan, t: float, watch: Watch) -> bytes:
-    """The file of one frame. The watch has the stages `pose`, `draw` and `encode`."""
-    image = _draw(service, plan, t, watch)
-    with watch.stage("encode"):
+def draw_frame(service: Service, plan: FramePlan, t: float, job: RenderJob) -> bytes:
+    """The file of one frame. The job has the stages `pose`, `draw` and `encode`."""
+    image = _draw(service, plan, t, job)
+    with job.stage("encode"):
         return encode(image, plan.request.format, plan.request.quality, plan.channels, plan.depth_range)
 
 
-async def draw_plan(service: Service, plan: FramePlan, watch: Watch) -> bytes:
+async def draw_plan(service: Service, plan: FramePlan, job: RenderJob) -> bytes:
     """The file of a plan, when its turns come: where it has several times, each is a part of the work."""
     run = service.queue.run
     if not isinstance(plan.request.t, list):
-        return await run(lambda: draw_frame(service, plan, plan.times[0], watch), watch)
+        return await run(lambda: draw_frame(service, plan, plan.times[0], job), job)
     if plan.request.format == "npy":
-        draw = partial(_draw_numbers, service, plan, watch=watch)
-        arrays = [await run(partial(draw, t), watch, part=True) for t in plan.times]
-        return await run(lambda: npy(np.stack(arrays)), watch, part=True)
-    draw = partial(draw_frame, service, plan, watch=watch)
-    files = [await run(partial(draw, t), watch, part=True) for t in plan.times]
-    return await run(lambda: _zipped(files, FORMATS[plan.request.format].extension), watch, part=True)
+        draw = partial(_draw_numbers, service, plan, job=job)
+        arrays = [await run(partial(draw, t), job, part=True) for t in plan.times]
+        return await run(lambda: npy(np.stack(arrays)), job, part=True)
+    draw = partial(draw_frame, service, plan, job=job)
+    files = [await run(partial(draw, t), job, part=True) for t in plan.times]
+    return await run(lambda: _zipped(files, FORMATS[plan.request.format].extension), job, part=True)
 
 
-def _draw(service: Service, plan: FramePlan, t: float, watch: Watch) -> Image:
-    return service.renderer.render(plan.scene.session, plan.camera, t, plan.options, watch)
+def _draw(service: Service, plan: FramePlan, t: float, job: RenderJob) -> Image:
+    return service.renderer.render(plan.scene.session, plan.camera, t, plan.options, job)
 
 
-def _draw_numbers(service: Service, plan: FramePlan, t: float, watch: Watch) -> np.ndarray:
-    return numbers(_draw(service, plan, t, watch), plan.channels)
+def _draw_numbers(service: Service, plan: FramePlan, t: float, job: RenderJob) -> np.ndarray:
+    return numbers(_draw(service, plan, t, job), plan.channels)
 
 
-def server_timing(watch: Watch) -> str:
+def server_timing(job: RenderJob) -> str:
     """The `Server-Timing` header: milliseconds by stage, and whether poses came from the cache."""
-    notes = {stage: f';desc="{note}"' for stage, note in watch.notes.items()}
-    return ", ".join(f"{stage};dur={1000 * s:.2f}{notes.get(stage, '')}" for stage, s in watch.seconds.items())
+    notes = {stage: f';desc="{note}"' for stage, note in job.notes.items()}
+    return ", ".join(f"{stage};dur={1000 * s:.2f}{notes.get(stage, '')}" for stage, s in job.seconds.items())
 
 
 def is_unchanged(if_none_match: str | None, etag: str) -> bool:

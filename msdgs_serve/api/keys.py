@@ -22,13 +22,13 @@ OPEN_PATHS = ("/live", "/ready", "/")
 OPEN_FOLDER = "/viewer/"
 OPERATED_PATHS = ("/metrics",)
 WRITTEN_PATH, WRITTEN_FOLDER = "/scenes", "/scenes/"
-SHORTEST_KEY = 16
+MIN_KEY_LENGTH = 16
 MAX_BYTES = 1 << 20
 CLIENT = "msdgs.client"
 """Key of an ASGI scope: whose key was used, as the first digits of its digest."""
 CLIENT_DIGITS = 16
 
-LINE = re.compile(rf"(?P<scopes>\w+(,\w+)*)[ \t]+(?P<key>\S{{{SHORTEST_KEY},}})")
+LINE = re.compile(rf"(?P<scopes>\w+(,\w+)*)[ \t]+(?P<key>\S{{{MIN_KEY_LENGTH},}})")
 
 
 class Key(NamedTuple):
@@ -122,7 +122,7 @@ def _key_of(number: int, text: str) -> Key:
     match = LINE.fullmatch(text)
     scopes = frozenset(match["scopes"].split(",")) if match else frozenset()
     if match is None or not scopes <= set(SCOPES):
-        form = f"`scopes key`, as in `{','.join(SCOPES)} <a key of {SHORTEST_KEY} or more letters>`"
+        form = f"`scopes key`, as in `{','.join(SCOPES)} <a key of {MIN_KEY_LENGTH} or more letters>`"
         got = "a key without scopes" if " " not in text and "\t" not in text else "something else"
         raise InvalidInput(f"api_keys_file, line {number}", form, got)
     return Key(_digest(match["key"].encode()), scopes)

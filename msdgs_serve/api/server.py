@@ -8,7 +8,7 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from msdgs_serve.api.doorman import Doorman
+from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.protocol import limited_protocol
 from msdgs_serve.api.service import Phase, Service
 from msdgs_serve.api.settings import Settings
@@ -25,10 +25,12 @@ class Server(uvicorn.Server):
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         self.service: Service = app.state.service
-        # with keys or other origins a refusal depends on headers, which the application looks at
+        # with keys or other origins a rejection depends on headers, which the application looks at
         is_plain = settings.api_keys_file is None and not settings.cors_origins
-        doorman = Doorman(self.service.queue, self.service.metrics, settings.max_body_bytes) if is_plain else None
-        protocol = limited_protocol(settings.header_seconds, settings.read_seconds, doorman)
+        early_rejection = (
+            EarlyRejection(self.service.queue, self.service.metrics, settings.max_body_bytes) if is_plain else None
+        )
+        protocol = limited_protocol(settings.header_seconds, settings.read_seconds, early_rejection)
         config = uvicorn.Config(
             app,
             http=protocol,  # pyright: ignore[reportArgumentType]

@@ -14,7 +14,7 @@ import anyio.to_thread
 from fastapi import Depends, FastAPI, Request
 
 from msdgs_serve.api.cameras import resolve_camera
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.schemas import RenderRequest
 from msdgs_serve.api.settings import Settings
@@ -24,10 +24,10 @@ from msdgs_serve.imaging import encode
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.store import SceneStore, ServedScene
-from msdgs_serve.threads import give_way
+from msdgs_serve.threads import lower_priority
 from msdgs_serve.trial import try_scene
 
-LAST_LOOK_SECONDS = 2.0
+JOIN_SECONDS = 2.0
 """That the end waits for the thread that looks after files: cut off amid a call, libraries complain on the terminal."""
 
 logger = logging.getLogger("msdgs_serve")
@@ -61,14 +61,14 @@ class Service:
     @asynccontextmanager
     async def lifespan(self, _: FastAPI) -> AsyncIterator[None]:
         """Load and warm up beside the event loop, look after changed files, let go of threads in the end."""
-        thread = threading.Thread(target=self._live, name="scenes", daemon=True)
+        thread = threading.Thread(target=self._load_and_refresh, name="scenes", daemon=True)
         thread.start()
         try:
             yield
         finally:
             self._stopped.set()
             self.queue.shut_down()
-            await anyio.to_thread.run_sync(thread.join, LAST_LOOK_SECONDS)
+            await anyio.to_thread.run_sync(thread.join, JOIN_SECONDS)
 
     def drain(self) -> None:
         """Finish what there is, refuse what comes."""
@@ -93,16 +93,18 @@ class Service:
         return self.store.add(name, incoming, replace=replace)
 
     def check_uploads(self) -> None:
-        """Raises `Refused` where clients may not add and delete scenes."""
+        """Raises `RequestRejected` where clients may not add and delete scenes."""
         if not self.settings.uploads:
-            raise Refused(HTTPStatus.FORBIDDEN, "forbidden", "Scenes can't be added or deleted here: no --uploads.")
+            raise RequestRejected(
+                HTTPStatus.FORBIDDEN, "forbidden", "Scenes can't be added or deleted here: no --uploads."
+            )
 
     def log_problem(self, error: SceneFileInvalid) -> None:
         """For the operator: what a client isn't told."""
         logger.error("%s", error)
 
-    def _live(self) -> None:
-        give_way()  # loading a scene disturbs nobody
+    def _load_and_refresh(self) -> None:
+        lower_priority()  # loading a scene disturbs nobody
         started = time.perf_counter()
         try:
             self._warm_up()

@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
 
-PART_TURN = 4
+PART_INTERVAL = 4
 """While both wait, one in so many turns is of a batch or a film; the others are of single frames."""
 
 
@@ -36,7 +36,7 @@ class Turns(Generic[Item]):
         """What is done now, out of the line; None where nothing waits."""
         if not (self._singles or self._parts):
             return None
-        is_part = not self._singles or (bool(self._parts) and self._singles_in_a_row >= PART_TURN - 1)
+        is_part = not self._singles or (bool(self._parts) and self._singles_in_a_row >= PART_INTERVAL - 1)
         self._singles_in_a_row = 0 if is_part else self._singles_in_a_row + 1
         lines = self._parts if is_part else self._singles
         client = next(iter(lines))

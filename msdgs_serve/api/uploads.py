@@ -11,7 +11,7 @@ from pathlib import Path
 
 import anyio
 
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.store import SUFFIX
 
@@ -46,7 +46,7 @@ class Uploads:
         """Of threads that open what has come: more would wait for each other, and frames for a thread."""
 
     def scan(self) -> None:
-        """Look at what is there; other processes may write into the folder too."""
+        """OutputOptions at what is there; other processes may write into the folder too."""
         found: dict[str, Stored] = {}
         for file in self._folder.glob(f"*{SUFFIX}"):
             with suppress(OSError):  # it is gone meanwhile
@@ -56,7 +56,7 @@ class Uploads:
 
     @contextmanager
     def room(self, name: str, owner: str | None) -> Iterator[Stored]:
-        """Around an upload, after a `scan`. Raises `Refused` (507) where it may not be stored, or the disk is full."""
+        """Around an upload, after a `scan`. Raises `RequestRejected` (507) where it may not be stored, or the disk is full."""
         upload = Stored(name, owner)
         with self._lock:
             self._coming.add(upload)
@@ -72,12 +72,12 @@ class Uploads:
                 self._coming.discard(upload)
 
     def grow(self, upload: Stored, size: int) -> None:
-        """So many bytes more have come. Raises `Refused`: 413 for a file that is too large, 507 for all else."""
+        """So many bytes more have come. Raises `RequestRejected`: 413 for a file that is too large, 507 for all else."""
         limits = self._settings
         upload.bytes += size
         if upload.bytes > limits.max_scene_megabytes * MIB:
             detail = f"A scene file must be at most {limits.max_scene_megabytes} MiB."
-            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "large_body", detail, field="body")
+            raise RequestRejected(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "large_body", detail, field="body")
         if shutil.disk_usage(self._folder).free < limits.min_free_megabytes * MIB + size:
             raise _no_room("disk_full", f"The service leaves {limits.min_free_megabytes} MiB of its disk free.")
         with self._lock:
@@ -120,5 +120,5 @@ def _check(scenes: list[Stored], most: int, megabytes: int, whose: str) -> None:
         raise _no_room("quota", f"{whose} has room for {megabytes} MiB of scenes; delete some first.")
 
 
-def _no_room(kind: str, detail: str) -> Refused:
-    return Refused(HTTPStatus.INSUFFICIENT_STORAGE, kind, detail, field="body")
+def _no_room(kind: str, detail: str) -> RequestRejected:
+    return RequestRejected(HTTPStatus.INSUFFICIENT_STORAGE, kind, detail, field="body")

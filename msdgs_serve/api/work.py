@@ -15,14 +15,14 @@ from typing import Any, TypeVar
 
 from starlette.requests import Request
 
-from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.errors import ClientGone, RequestRejected
 from msdgs_serve.api.turns import Turns
-from msdgs_serve.threads import give_way
-from msdgs_serve.watch import Watch
+from msdgs_serve.render_job import RenderJob
+from msdgs_serve.threads import lower_priority
 
 Result = TypeVar("Result")
 
-LONGEST_RETRY = 60
+MAX_RETRY_SECONDS = 60
 FIRST_GUESS = 0.5  # seconds a piece of work takes, until one was measured
 SMOOTHING = 0.1
 UNKNOWN = "unknown"
@@ -70,7 +70,7 @@ class WorkQueue:
         self._workers = workers
         self._places = workers + waiting
         self._seconds = seconds
-        self._executor = ThreadPoolExecutor(workers, "render", initializer=give_way)
+        self._executor = ThreadPoolExecutor(workers, "render", initializer=lower_priority)
         self._lock = threading.Lock()
         self._turns: Turns[_Piece] = Turns()
         self._held: Counter[str] = Counter()  # places by client
@@ -93,7 +93,7 @@ class WorkQueue:
     def admitted(self, client: str, *, streamed: bool = False, at_once: bool = True) -> Iterator[None]:
         """Around a call: it has a place from now, or unless `at_once` from its first work, until that is done.
 
-        A streamed call has its place to the end, and no later work of any call is refused. Raises `Refused` where there
+        A streamed call has its place to the end, and no later work of any call is refused. Raises `RequestRejected` where there
         is no place for it.
         """
         call = _Call(client, streamed)
@@ -110,10 +110,10 @@ class WorkQueue:
             else:
                 call.future.add_done_callback(lambda _: self._leave(call))
 
-    def refuse_if_full(self, client: str) -> None:
-        """Raise `Refused` where a call that isn't streamed would not be admitted now."""
+    def reject_if_full(self, client: str) -> None:
+        """Raise `RequestRejected` where a call that isn't streamed would not be admitted now."""
         with self._lock:
-            self._refuse_if_full(client)
+            self._reject_if_full(client)
 
     def close(self) -> None:
         """Refuse new work; what is there is finished."""
@@ -124,16 +124,16 @@ class WorkQueue:
         self.close()
         self._executor.shutdown(wait=False, cancel_futures=True)
 
-    async def run(self, work: Callable[[], Result], watch: Watch, *, part: bool = False) -> Result:
+    async def run(self, work: Callable[[], Result], job: RenderJob, *, part: bool = False) -> Result:
         """Do `work` when its turn comes; where the call wasn't admitted before, it may be refused here.
 
         `part`: of work that goes on, so that the call keeps its place; single frames of others come in between. Whoever
-        awaits this may be cancelled: work that waits is dropped, and work that runs is ended by its watch.
+        awaits this may be cancelled: work that waits is dropped, and work that runs is ended by its job.
 
         Raises:
-            Refused: with 503 where the queue is full or closed, with 504 when the time is over.
+            RequestRejected: with 503 where the queue is full or closed, with 504 when the time is over.
         """
-        piece = self._submit(work, watch, part=part)
+        piece = self._submit(work, job, part=part)
         waiter = asyncio.wrap_future(piece.future)
         waiter.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody may be left to look
         try:
@@ -141,26 +141,26 @@ class WorkQueue:
                 return await asyncio.shield(waiter)
         except TimeoutError:
             detail = f"It took longer than {self._seconds:g} s, the time limit of a request."
-            raise Refused(HTTPStatus.GATEWAY_TIMEOUT, "deadline", detail) from None
+            raise RequestRejected(HTTPStatus.GATEWAY_TIMEOUT, "deadline", detail) from None
         finally:
             if not piece.future.done():
-                watch.stop()
+                job.cancel()
                 if piece.future.cancel():
                     with self._lock:
                         self._turns.remove(piece)
 
-    def _submit(self, work: Callable[[], Result], watch: Watch, *, part: bool) -> _Piece:
+    def _submit(self, work: Callable[[], Result], job: RenderJob, *, part: bool) -> _Piece:
         submitted = time.perf_counter()
         admitted = _call.get()
         call = admitted or _Call(UNKNOWN, streamed=False)
 
         def timed() -> Result:
             started = time.perf_counter()
-            watch.add("queue", started - submitted)
+            job.add("queue", started - submitted)
             with self._lock:
                 self._running += 1
             try:
-                watch.check()
+                job.check()
                 return work()
             finally:
                 with self._lock:
@@ -186,7 +186,7 @@ class WorkQueue:
 
     def _take_place(self, call: _Call, *, again: bool = False) -> None:
         if not again:
-            self._refuse_if_full(call.client, streamed=call.streamed)
+            self._reject_if_full(call.client, streamed=call.streamed)
         self._held[call.client] += 1
         self._streams += call.streamed
         call.has_place = True
@@ -200,10 +200,10 @@ class WorkQueue:
                 if not self._held[call.client]:
                     del self._held[call.client]
 
-    def _refuse_if_full(self, client: str, *, streamed: bool = False) -> None:
+    def _reject_if_full(self, client: str, *, streamed: bool = False) -> None:
         if self._closed:
             detail = "The service is about to stop; ask again, another one may answer."
-            raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "draining", detail, retry_after=1)
+            raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "draining", detail, retry_after=1)
         taken = self._held.total()
         if taken >= self._places:
             detail = f"All {self._places} places for work and in the queue are taken; try again later."
@@ -214,8 +214,8 @@ class WorkQueue:
         else:
             return
         seconds = math.ceil(taken * self._mean_seconds / self._workers)
-        retry_after = min(max(1, seconds), LONGEST_RETRY)
-        raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
+        retry_after = min(max(1, seconds), MAX_RETRY_SECONDS)
+        raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
 
 
 async def unless_gone(request: Request, call: Awaitable[Result]) -> Result:

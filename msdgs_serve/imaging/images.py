@@ -8,7 +8,7 @@ from msdgs_serve.imaging.formats import Channel
 from msdgs_serve.imaging.image import Image
 from msdgs_serve.scene import InvalidInput
 
-FARTHEST_GREY = 0.15
+FARTHEST_BRIGHTNESS = 0.15
 """Of the farthest depth, so that it differs from nothing at all, which is black."""
 
 
@@ -45,7 +45,7 @@ def display_image(image: Image, channel: Channel, depth_range: DepthRange | None
     near, far = depth_range or depths_of(depth)
     seen = np.isfinite(depth)
     place = np.clip((np.where(seen, depth, far) - near) / max(far - near, 1e-12), 0, 1)
-    return (np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0) * image.alpha)[..., None]
+    return (np.where(seen, 1 - (1 - FARTHEST_BRIGHTNESS) * place, 0) * image.alpha)[..., None]
 
 
 def channel_of(image: Image, channel: Channel) -> np.ndarray:

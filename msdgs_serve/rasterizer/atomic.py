@@ -12,7 +12,7 @@ from msdgs_serve.rasterizer.jit import kernel
 
 TAKEN, DONE = range(2)
 """Of the counters [2] of a piece of work: how many of its parts are taken, and how many of these are done."""
-PATIENCE = 5000
+MAX_POLLS = 5000
 """Looks at what others do, 0.03 ms and more; a thread that sleeps takes twice as long to wake up."""
 
 
@@ -39,7 +39,7 @@ def _lower_fetch_add(context: Any, builder: Any, signature: Any, values: Any) ->
 @kernel
 def all_done(counters: np.ndarray, count: int) -> bool:
     """Whether `count` parts are done, perhaps by other threads, now or in a moment."""
-    for _ in range(PATIENCE):
+    for _ in range(MAX_POLLS):
         if fetch_add(counters, DONE, 0) >= count:
             return True
     return False

@@ -10,38 +10,18 @@ import math
 
 import numpy as np
 
+from msdgs_serve.rasterizer.alpha import PixelLimits, exponent_terms, log2_alpha, pixel_limits
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
-from msdgs_serve.rasterizer.compositing import (
-    BLOCK_SIDE,
-    BLOCKS,
-    PIXELS,
-    TILES_A_TURN,
-    Frame,
-    PixelLimits,
-    exponent_of,
-    grid_of_a_tile,
-    log2_alpha,
-    pixel_limits,
-    place_in_tile,
-    touched_blocks,
-)
+from msdgs_serve.rasterizer.compositing import TILES_PER_TURN, Frame
 from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
-from msdgs_serve.rasterizer.lane_types import LANES
-from msdgs_serve.rasterizer.lanes import bits_of, filled, fma, lowest_bit, minimum, select, spread
-from msdgs_serve.rasterizer.lanes_memory import load, load_square, load_square_of_triples, prefetch, store, sums_of
-from msdgs_serve.rasterizer.projection import (
-    BLUE,
-    DEPTH,
-    EXTENT_X,
-    GREEN,
-    RECORD,
-    RED,
-    Splats,
-    X,
-    Y,
-)
+from msdgs_serve.rasterizer.splats import BLUE, DEPTH, EXTENT_X, GREEN, RECORD, RED, Splats, X, Y
+from msdgs_serve.rasterizer.tile_blocks import BLOCK_SIDE, BLOCKS, PIXELS, grid_of_a_tile, place_in_tile, touched_blocks
 from msdgs_serve.rasterizer.tiles import TileLists
+from msdgs_serve.rasterizer.vector_memory import load, prefetch, store
+from msdgs_serve.rasterizer.vector_squares import load_square, load_square_of_triples
+from msdgs_serve.rasterizer.vector_types import NUM_LANES
+from msdgs_serve.rasterizer.vectors import bits_of, filled, fma, lowest_bit, minimum, select, spread, sums_of
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_parallel, run_together, threads_to_use
 
@@ -50,16 +30,16 @@ from msdgs_serve.threads import run_parallel, run_together, threads_to_use
 LEFT, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND, PIXEL_X, PIXEL_Y = (
     np.uint64(PIXELS * place) for place in range(8)
 )
-SUMS = LANES
+SUMS = NUM_LANES
 """Numbers of a pair of splat and tile, nine in use: red, green, blue, then the moments of d loss / d sigma about the
 splat: 1, x, y, xx, xy, yy."""
 
-PAIRS_A_ROUND = 1 << 18
+PAIRS_PER_ROUND = 1 << 18
 """16 MB of sums: with those of 1,400,000 pairs at once, 85 MB, the gradient takes 1.1 times as long."""
 
 DEPTHS_LOOKED_AT = 1000
 """To find those that part the splats among threads."""
-AHEAD = np.uint64(16)
+PREFETCH_DISTANCE = np.uint64(16)
 """Pairs between asking for a record and needing it."""
 
 
@@ -93,10 +73,10 @@ def composite_backward(
 
 
 def _rounds(offsets: np.ndarray) -> list[tuple[int, int]]:
-    """(first, past) of tiles, all of them in order, with `PAIRS_A_ROUND` or fewer pairs each or a single tile."""
+    """(first, past) of tiles, all of them in order, with `PAIRS_PER_ROUND` or fewer pairs each or a single tile."""
     rounds, first, count = [], 0, len(offsets) - 1
     while first < count:
-        past = int(np.searchsorted(offsets, offsets[first] + PAIRS_A_ROUND, side="right")) - 1
+        past = int(np.searchsorted(offsets, offsets[first] + PAIRS_PER_ROUND, side="right")) - 1
         past = max(min(past, count), first + 1)
         rounds.append((first, past))
         first = past
@@ -132,18 +112,18 @@ def _tiles_backward(
     origin = np.zeros(RECORD, records.dtype)
     grid = grid_of_a_tile(records)
     for block in range(np.uint64(BLOCKS)):
-        store(state, PIXEL_X + block * np.uint64(LANES), load(grid, 32) + grid[block])
-        store(state, PIXEL_Y + block * np.uint64(LANES), load(grid, 48) + grid[np.uint64(16) + block])
+        store(state, PIXEL_X + block * np.uint64(NUM_LANES), load(grid, 32) + grid[block])
+        store(state, PIXEL_Y + block * np.uint64(NUM_LANES), load(grid, 48) + grid[np.uint64(16) + block])
     rgb, alpha, grad_rgb, grad_alpha = images
     height, width = alpha.shape
     base = np.uint64(tiles.offsets[first_tile])
     flat, flat_sums = records.reshape(-1), pair_sums.reshape(-1)
     pixels = (rgb.reshape(-1), alpha.reshape(-1), grad_rgb.reshape(-1), grad_alpha.reshape(-1))
     while True:
-        first = fetch_add(counters, TAKEN, TILES_A_TURN)
+        first = fetch_add(counters, TAKEN, TILES_PER_TURN)
         if first >= past_tile:
             return all_done(counters, past_tile)
-        end_of_turn = min(first + TILES_A_TURN, past_tile)
+        end_of_turn = min(first + TILES_PER_TURN, past_tile)
         for tile in range(first, end_of_turn):
             x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
             origin[0], origin[1] = x0, y0
@@ -156,8 +136,8 @@ def _tiles_backward(
             first_pair, past = np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])
             pair = first_pair
             while pair < past and alive != np.uint64(0):
-                ahead = min(pair + AHEAD, past - np.uint64(1))
-                prefetch(flat, np.uint64(tiles.splat_ids[ahead]) * np.uint64(RECORD))
+                upcoming = min(pair + PREFETCH_DISTANCE, past - np.uint64(1))
+                prefetch(flat, np.uint64(tiles.splat_ids[upcoming]) * np.uint64(RECORD))
                 store(record, 0, load(flat, np.uint64(tiles.splat_ids[pair]) * np.uint64(RECORD)) - load(origin, 0))
                 bits = alive & bits_of(touched_blocks(record, grid, limits.log2_alpha_min))
                 place = (pair - base) * np.uint64(SUMS)
@@ -173,7 +153,7 @@ def _load_tile(width: int, x0: int, y0: int, pixels: tuple, state: np.ndarray) -
     1920 × 1080 takes 1.1 times as long."""
     rgb, alphas, grad_rgb, grad_alphas = pixels
     for block in range(np.uint64(BLOCKS)):
-        lane = block * np.uint64(LANES)
+        offset = block * np.uint64(NUM_LANES)
         column, row = np.int64(block % np.uint64(BLOCK_SIDE)), np.int64(block // np.uint64(BLOCK_SIDE))
         start = (y0 + BLOCK_SIDE * row) * width + x0 + BLOCK_SIDE * column
         _prefetch_block(width, start + TILE, pixels)
@@ -181,12 +161,12 @@ def _load_tile(width: int, x0: int, y0: int, pixels: tuple, state: np.ndarray) -
         grad_red, grad_green, grad_blue = load_square_of_triples(grad_rgb, 3 * start, 3 * width)
         alpha, grad_alpha = load_square(alphas, start, width), load_square(grad_alphas, start, width)
         behind = fma(red, grad_red, fma(green, grad_green, fma(blue, grad_blue, alpha * grad_alpha)))
-        store(state, LEFT + lane, filled(1, behind))
-        store(state, GRAD_RED + lane, grad_red)
-        store(state, GRAD_GREEN + lane, grad_green)
-        store(state, GRAD_BLUE + lane, grad_blue)
-        store(state, GRAD_ALPHA + lane, grad_alpha)
-        store(state, BEHIND + lane, behind)
+        store(state, LEFT + offset, filled(1, behind))
+        store(state, GRAD_RED + offset, grad_red)
+        store(state, GRAD_GREEN + offset, grad_green)
+        store(state, GRAD_BLUE + offset, grad_blue)
+        store(state, GRAD_ALPHA + offset, grad_alpha)
+        store(state, BEHIND + offset, behind)
 
 
 @kernel
@@ -235,30 +215,30 @@ def _splat_backward(
     sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
     done = np.uint64(0)
     # read once: the compiler can't know that what is written below is not the record
-    x, y, exponent_terms = spread(record[X]), spread(record[Y]), exponent_of(record)
+    x, y, terms = spread(record[X]), spread(record[Y]), exponent_terms(record)
     red, green, blue = spread(record[RED]), spread(record[GREEN]), spread(record[BLUE])
     while bits != np.uint64(0):
         block = lowest_bit(bits)
         bits &= bits - np.uint64(1)
-        lane = block * np.uint64(LANES)
-        pixel_x, pixel_y = load(state, PIXEL_X + lane), load(state, PIXEL_Y + lane)
+        offset = block * np.uint64(NUM_LANES)
+        pixel_x, pixel_y = load(state, PIXEL_X + offset), load(state, PIXEL_Y + offset)
         dx, dy = pixel_x - x, pixel_y - y
-        left = load(state, LEFT + lane)
-        exponent = log2_alpha(*exponent_terms, pixel_x, pixel_y)
+        left = load(state, LEFT + offset)
+        exponent = log2_alpha(*terms, pixel_x, pixel_y)
         raw_alpha = exp2(exponent, limits.exp2)
         uncut = raw_alpha < limits.alpha_max
         alpha = minimum(raw_alpha, filled(limits.alpha_max, raw_alpha))
         alpha = select(exponent >= limits.log2_alpha_min, alpha, zero)
         after = fma(-alpha, left, left)
         goes_on = after > limits.transmittance_min
-        store(state, LEFT + lane, select(goes_on, after, zero))
+        store(state, LEFT + offset, select(goes_on, after, zero))
         weight = select(goes_on, alpha * left, zero)
-        grad_red, grad_green = load(state, GRAD_RED + lane), load(state, GRAD_GREEN + lane)
-        grad_blue = load(state, GRAD_BLUE + lane)
-        share = fma(grad_red, red, load(state, GRAD_ALPHA + lane))
+        grad_red, grad_green = load(state, GRAD_RED + offset), load(state, GRAD_GREEN + offset)
+        grad_blue = load(state, GRAD_BLUE + offset)
+        share = fma(grad_red, red, load(state, GRAD_ALPHA + offset))
         share = fma(grad_blue, blue, fma(grad_green, green, share))
-        behind = fma(-weight, share, load(state, BEHIND + lane))
-        store(state, BEHIND + lane, behind)
+        behind = fma(-weight, share, load(state, BEHIND + offset))
+        store(state, BEHIND + offset, behind)
         # d alpha / d sigma = -alpha where the splat is drawn and not cut to alpha_max
         grad_sigma = select(uncut & goes_on, alpha * fma(-left, share, behind / (1 - alpha)), zero)
         sum_red, sum_green = fma(weight, grad_red, sum_red), fma(weight, grad_green, sum_green)
@@ -295,7 +275,9 @@ def _add_up(
         first = _first_at(nearest, start, end, records, tiles.splat_ids)
         stop = _first_at(past, first, end, records, tiles.splat_ids)
         for pair in range(first, stop):
-            prefetch(flat, np.uint64(tiles.splat_ids[min(pair + AHEAD, stop - np.uint64(1))]) * np.uint64(SUMS))
+            prefetch(
+                flat, np.uint64(tiles.splat_ids[min(pair + PREFETCH_DISTANCE, stop - np.uint64(1))]) * np.uint64(SUMS)
+            )
             place = np.uint64(tiles.splat_ids[pair]) * np.uint64(SUMS)
             store(flat, place, load(flat, place) + load(flat_pairs, (pair - base) * np.uint64(SUMS)))
 

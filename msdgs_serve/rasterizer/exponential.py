@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lane_types import Lanes
-from msdgs_serve.rasterizer.lanes import exponent_of, filled, mantissa_of, rounder, select, times_power_of_two
+from msdgs_serve.rasterizer.vector_types import Vector
+from msdgs_serve.rasterizer.vectors import exponent_of, filled, mantissa_of, rounder, select, times_power_of_two
 
 ATANH_SERIES = tuple(2 / math.log(2) / n for n in range(21, 0, -2))
 """Of 2 atanh(s) / ln 2 over s, highest power of s² first."""
@@ -34,7 +34,7 @@ def exp2_polynomial(degree: int) -> tuple[float, ...]:
 
 
 @kernel
-def exp2(x: Lanes, polynomial: tuple[float, ...]) -> Lanes:
+def exp2(x: Vector, polynomial: tuple[float, ...]) -> Vector:
     """2^x where that is a normal number; what is returned for other x means nothing."""
     rounded = x + rounder(x)
     r = x - (rounded - rounder(x))
@@ -45,7 +45,7 @@ def exp2(x: Lanes, polynomial: tuple[float, ...]) -> Lanes:
 
 
 @kernel
-def log2(x: Lanes) -> Lanes:
+def log2(x: Vector) -> Vector:
     """log2 of positive normal numbers, by 2 atanh((m - 1) / (m + 1)) / ln 2; within 1e-15 in float64."""
     exponent, mantissa = exponent_of(x), mantissa_of(x)
     upper = mantissa > math.sqrt(2)
@@ -59,7 +59,7 @@ def log2(x: Lanes) -> Lanes:
 
 
 @kernel
-def arctangent(x: Lanes) -> Lanes:
+def arctangent(x: Vector) -> Vector:
     """atan(x) of numbers that aren't negative, within some roundings."""
     steep = x > 1
     x = select(steep, 1 / x, x)

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.harmonics import harmonics, harmonics_slope
+from msdgs_serve.rasterizer.geometry import covariance2d, half_axis, rotation_columns, seen_at, turned
+from msdgs_serve.rasterizer.harmonics import four_coefficients, harmonics, harmonics_slope, last_coefficient, raw_colors
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lane_types import LANES, Index, Lanes, Mask
-from msdgs_serve.rasterizer.lanes import converted, filled, select, square_root
-from msdgs_serve.rasterizer.lanes_memory import (
+from msdgs_serve.rasterizer.projection import part_count, part_range
+from msdgs_serve.rasterizer.splats import EXTENT_X, ROOT_A, ROOT_B, ROOT_C, ROOT_SCALE, Splats
+from msdgs_serve.rasterizer.vector_memory import (
     load,
     load_columns,
     load_four_columns,
@@ -20,24 +21,8 @@ from msdgs_serve.rasterizer.lanes_memory import (
     store,
     store_columns,
 )
-from msdgs_serve.rasterizer.projection import (
-    EXTENT_X,
-    ROOT_A,
-    ROOT_B,
-    ROOT_C,
-    ROOT_SCALE,
-    Splats,
-    covariance2d,
-    four_coefficients,
-    half_axis,
-    last_coefficient,
-    part_of_lanes,
-    parts_of_lanes,
-    raw_colors,
-    rotation_columns,
-    seen_at,
-    turned,
-)
+from msdgs_serve.rasterizer.vector_types import NUM_LANES, Index, Mask, Vector
+from msdgs_serve.rasterizer.vectors import converted, filled, select, square_root
 from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
@@ -71,13 +56,13 @@ def project_backward(
     if options.mip:
         raise InvalidInput("options.mip", "False for gradients", options.mip)
     count = len(gaussians)
-    flat = np.empty((count, LANES), gaussians.means.dtype)
+    flat = np.empty((count, NUM_LANES), gaussians.means.dtype)
     sh = gaussians.sh.reshape(count, 3 * gaussians.sh.shape[1])
     grad_sh = np.empty_like(sh)
     g = gaussians
     arrays = (g.means, g.quats, g.scales, g.opacities, sh, splats.records, sums, flat, grad_sh)
     view = view_of(camera, options)
-    parts = parts_of_lanes(count)
+    parts = part_count(count)
     run_parallel(_backward_part, [(part, parts, view, *arrays) for part in range(parts)])
     means, quats, scales, opacities, means2d, _ = np.split(flat, [3, 7, 10, 11, 13], axis=1)
     return GaussianGradients(means, quats, scales, opacities[:, 0], grad_sh.reshape(gaussians.sh.shape), means2d)
@@ -99,10 +84,10 @@ def _backward_part(
     grad_sh: np.ndarray,
 ) -> None:
     double = np.empty(1, np.float64)
-    scratch, pulls = np.empty(48 * LANES, sh.dtype), np.zeros(LANES * LANES, sh.dtype)
+    scratch, pulls = np.empty(48 * NUM_LANES, sh.dtype), np.zeros(NUM_LANES * NUM_LANES, sh.dtype)
     w, t = view.rotation, view.translation
-    start, stop = part_of_lanes(part, parts, len(means))
-    for first in range(start, stop, LANES):
+    start, stop = part_range(part, parts, len(means))
+    for first in range(start, stop, NUM_LANES):
         record, moments = load_columns(records, first), load_columns(sums, first)
         drawn = record[_EXTENT] > 0
         mean = load_triples(means, first)
@@ -177,7 +162,7 @@ def _backward_part(
 
 
 @kernel
-def _turned_back(w: np.ndarray, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+def _turned_back(w: np.ndarray, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
     """W transposed times a vector."""
     return (
         w[0, 0] * x + w[1, 0] * y + w[2, 0] * z,
@@ -188,7 +173,7 @@ def _turned_back(w: np.ndarray, x: Lanes, y: Lanes, z: Lanes) -> tuple[Lanes, La
 
 @kernel
 def _axis_gradient(
-    w: np.ndarray, jacobian: tuple, covariance: tuple, half: tuple, axis: tuple, seen: tuple, size: Lanes
+    w: np.ndarray, jacobian: tuple, covariance: tuple, half: tuple, axis: tuple, seen: tuple, size: Vector
 ) -> tuple:
     """Of one axis: d loss / d scale, / d its vector in the world, [3], / d (j00, j02, j11, j12), [4]."""
     v_xx, v_xy, v_yy = covariance
@@ -202,8 +187,8 @@ def _axis_gradient(
 
 @kernel
 def _covariance_gradient(
-    half: tuple, eps2d: float, sum_xx: Lanes, sum_xy: Lanes, sum_yy: Lanes
-) -> tuple[Lanes, Lanes, Lanes]:
+    half: tuple, eps2d: float, sum_xx: Vector, sum_xy: Vector, sum_yy: Vector
+) -> tuple[Vector, Vector, Vector]:
     """d loss / d covariance, xx, xy, yy: it is M Mᵀ + eps I, and d conic = -conic d covariance conic."""
     xx, xy, yy, _, det = covariance2d(half, eps2d)
     a, b, c = yy / det, -xy / det, xx / det
@@ -214,7 +199,7 @@ def _covariance_gradient(
 
 
 @kernel
-def _mean_gradient(record: tuple, moments: tuple) -> tuple[Lanes, Lanes]:
+def _mean_gradient(record: tuple, moments: tuple) -> tuple[Vector, Vector]:
     """d loss / d projected mean: sigma is half of |root @ d|², with d growing as the mean falls."""
     a, b = record[_A] * (1 / ROOT_SCALE), record[_B] * (1 / ROOT_SCALE)
     c = record[_C] * (1 / ROOT_SCALE)
@@ -223,7 +208,9 @@ def _mean_gradient(record: tuple, moments: tuple) -> tuple[Lanes, Lanes]:
 
 
 @kernel
-def quaternion_gradient(w: Lanes, x: Lanes, y: Lanes, z: Lanes, columns: tuple) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+def quaternion_gradient(
+    w: Vector, x: Vector, y: Vector, z: Vector, columns: tuple
+) -> tuple[Vector, Vector, Vector, Vector]:
     """From the gradient of the rotation matrix, by columns."""
     (g00, g10, g20), (g01, g11, g21), (g02, g12, g22) = columns
     return (
@@ -242,12 +229,12 @@ def _color_gradient(
     scratch: np.ndarray,
     pulls: np.ndarray,
     drawn: Mask,
-    wx: Lanes,
-    wy: Lanes,
-    wz: Lanes,
+    wx: Vector,
+    wy: Vector,
+    wz: Vector,
     moments: tuple,
     grad_sh: np.ndarray,
-) -> tuple[Lanes, Lanes, Lanes]:
+) -> tuple[Vector, Vector, Vector]:
     """Write the coefficients' gradients; returns that of the mean through the line of sight."""
     double = np.empty(1, np.float64)
     dx, dy, dz = wx - view.position[0], wy - view.position[1], wz - view.position[2]
@@ -262,19 +249,19 @@ def _color_gradient(
     functions = sh.shape[1] // 3
     basis = harmonics(x, y, z)
     for k in range(functions):
-        place = np.uint64(3 * LANES * k)
+        place = np.uint64(3 * NUM_LANES * k)
         store(scratch, place, basis[k] * red)
-        store(scratch, place + np.uint64(LANES), basis[k] * green)
-        store(scratch, place + np.uint64(2 * LANES), basis[k] * blue)
+        store(scratch, place + np.uint64(NUM_LANES), basis[k] * green)
+        store(scratch, place + np.uint64(2 * NUM_LANES), basis[k] * blue)
     pull = (red, green, blue)
     for k in range(np.uint64(0), np.uint64(functions & ~3), np.uint64(4)):
         c = four_coefficients(sh, first, k)
         for j in range(4):
-            store(pulls, (k + np.uint64(j)) * np.uint64(LANES), _dot(c[j], pull))
+            store(pulls, (k + np.uint64(j)) * np.uint64(NUM_LANES), _dot(c[j], pull))
     if functions % 4:
-        store(pulls, np.uint64(LANES * (functions - 1)), _dot(last_coefficient(sh, first), pull))
-    for window in range(0, sh.shape[1], LANES):
-        store_columns(grad_sh, first, window, _sixteen(scratch, np.uint64(LANES * window)))
+        store(pulls, np.uint64(NUM_LANES * (functions - 1)), _dot(last_coefficient(sh, first), pull))
+    for window in range(0, sh.shape[1], NUM_LANES):
+        store_columns(grad_sh, first, window, _sixteen(scratch, np.uint64(NUM_LANES * window)))
     gx, gy, gz = harmonics_slope(pulls, x, y, z)
     px, py, pz = converted(gx, double), converted(gy, double), converted(gz, double)
     along = px * dx + py * dy + pz * dz
@@ -282,13 +269,13 @@ def _color_gradient(
 
 
 @kernel
-def _dot(a: tuple, b: tuple) -> Lanes:
+def _dot(a: tuple, b: tuple) -> Vector:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel
 def _sixteen(scratch: np.ndarray, place: Index) -> tuple:
-    """16 `Lanes` that lie side by side."""
+    """16 `Vector` that lie side by side."""
     return (
         load(scratch, place),
         load(scratch, place + np.uint64(16)),

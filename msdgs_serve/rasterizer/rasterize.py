@@ -7,7 +7,8 @@ import numpy.typing as npt
 
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.counts import count_splats
-from msdgs_serve.rasterizer.projection import BLUE, RED, Splats, project
+from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.splats import BLUE, RED, Splats
 from msdgs_serve.rasterizer.tiles import TileLists, bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.camera import Camera
@@ -55,7 +56,7 @@ def rasterize(
     if background.shape != (3,) or not np.isfinite(background).all():
         raise InvalidInput("background", "3 finite numbers", background.tolist())
     splats = project(gaussians, camera, options)
-    if not splats.sound:
+    if not splats.valid:
         gaussians.validate()
     extra = _checked_extra(extra, gaussians)
     tiles = bin_into_tiles(splats, camera.width, camera.height)

@@ -9,18 +9,18 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes_memory import prefetch
-from msdgs_serve.rasterizer.projection import Splats
+from msdgs_serve.rasterizer.splats import Splats
+from msdgs_serve.rasterizer.vector_memory import prefetch
 from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.threads import run_parallel, run_serially, split_evenly, threads_to_use
 
 DIGIT_BITS = 12
 """Of the sort: counters of 16 kB, half of a level-1 cache."""
 
-SPLATS_A_PART = 16_384
+SPLATS_PER_PART = 16_384
 """Fewer aren't worth another thread."""
 
-AHEAD = np.uint64(16)
+PREFETCH_DISTANCE = np.uint64(16)
 """Splats between asking for a rectangle and needing it."""
 
 
@@ -39,7 +39,7 @@ def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
     count, (nearest, farthest) = splats.visible, splats.depth_range
     digits = _digits(np.uint64(nearest), max(farthest - nearest, 0).bit_length())
     offsets = np.empty(columns * rows + 1, np.int64)
-    if count < SPLATS_A_PART:
+    if count < SPLATS_PER_PART:
         few = (count, splats.keys, splats.drawn, digits, splats.rectangles, rows, columns, offsets)
         (splat_ids,) = run_serially(_bin_few, [few])
         return TileLists(offsets, splat_ids, columns, rows)
@@ -90,7 +90,7 @@ def _sorted_by_depth(splats: Splats, digits: _Digits) -> np.ndarray:
 
 
 def _parts(count: int) -> list[tuple[int, int]]:
-    most = 1 + count // SPLATS_A_PART
+    most = 1 + count // SPLATS_PER_PART
     return split_evenly(count, min(threads_to_use(), most) if most > 1 else 1) or [(0, 0)]
 
 
@@ -177,8 +177,8 @@ def _gather_rectangles(
     of splats on each tile, four additions however large a rectangle is."""
     flat = rectangles.reshape(-1)
     for k in range(np.uint64(start), np.uint64(stop)):
-        ahead = min(k + AHEAD, np.uint64(stop) - np.uint64(1))
-        prefetch(flat, np.uint64(order[ahead]) * np.uint64(4))
+        upcoming = min(k + PREFETCH_DISTANCE, np.uint64(stop) - np.uint64(1))
+        prefetch(flat, np.uint64(order[upcoming]) * np.uint64(4))
         i = np.uint64(order[k])
         left, right, top, bottom = (
             np.uint64(rectangles[i, 0]),

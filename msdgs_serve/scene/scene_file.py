@@ -22,7 +22,7 @@ _INPUTS: Mapping[str, tuple[int, Shape]] = {
 }
 _COLUMNS = {"means": 3, "quats": 4, "scales": 3}
 _POSED_BYTES = 4 * sum(_COLUMNS.values())
-_AT_A_TIME = 1 << 22
+_CHUNK_VALUES = 1 << 22
 """Values that are looked at at once, so that looking takes no memory to speak of."""
 
 
@@ -97,7 +97,7 @@ def _check_finite(tensor: Tensor) -> None:
     if tensor.element != FLOAT:
         return
     flat = tensor.array().reshape(-1)
-    parts = (flat[start : start + _AT_A_TIME] for start in range(0, flat.size, _AT_A_TIME))
+    parts = (flat[start : start + _CHUNK_VALUES] for start in range(0, flat.size, _CHUNK_VALUES))
     bad = sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts)
     if bad:
         raise ModelInvalid(tensor.name, f"holds {bad:,} values that are NaN or infinite")

@@ -10,7 +10,7 @@ const BOTTOM = 36;
 const DB_STEP = 10;
 const HIGHEST = 110; // dB; what is exact is drawn here
 const PLACES = [[1, 1.5, 2, 3, 4, 5, 6, 7, 8], [1, 2, 5], [1]]; // of a decade, as many as there is room for
-const MOST_TICKS = 6;
+const MAX_TICKS = 6;
 const KINDS = ["network", "prefix", "int8", "lowrank", "keyframes"];
 
 /** Draw into an <svg>; `tell(text)` gets a sentence about the point that is looked at. */
@@ -51,7 +51,7 @@ function scale(values, [first, last]) {
 
 function timeAxis(points, x) {
   const [fastest, slowest] = [points[0].milliseconds, points.at(-1).milliseconds];
-  const inside = PLACES.map((decade) => ticksOf(decade, fastest, slowest)).find((ticks) => ticks.length <= MOST_TICKS);
+  const inside = PLACES.map((decade) => ticksOf(decade, fastest, slowest)).find((ticks) => ticks.length <= MAX_TICKS);
   const marked = inside?.length > 1 ? inside : [fastest, slowest].map((place) => Number(place.toPrecision(2)));
   const ticks = marked.flatMap((place) => [
     make("line", { class: "grid", x1: x(place), x2: x(place), y1: TOP, y2: HEIGHT - BOTTOM }),

@@ -18,7 +18,7 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from msdgs_serve.api.keys import SHORTEST_KEY
+from msdgs_serve.api.keys import MIN_KEY_LENGTH
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.work import WorkQueue
@@ -110,7 +110,7 @@ def test_prometheus_has_a_key_where_keys_are_asked_for():
     assert job["authorization"]["credentials_file"] == f"/run/secrets/{secret}"
     default = re.search(r":-(\S+)}", document["secrets"][secret]["file"])
     assert default
-    assert len((DOCKER / default[1]).read_text().strip()) < SHORTEST_KEY, "what is there by default is nobody's key"
+    assert len((DOCKER / default[1]).read_text().strip()) < MIN_KEY_LENGTH, "what is there by default is nobody's key"
 
 
 def test_the_proxy_says_whom_it_asks_for_and_is_believed():

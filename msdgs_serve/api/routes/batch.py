@@ -18,8 +18,8 @@ from msdgs_serve.api.frames import FramePlan, draw_frame, plan_frame, server_tim
 from msdgs_serve.api.openapi import BATCH_RESPONSE, problems
 from msdgs_serve.api.schemas import BatchItem, BatchRequest, RenderRequest
 from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.scene import InvalidInput, MsdgsError
-from msdgs_serve.watch import Watch
 
 BOUNDARY = "msdgs-frame"
 NDJSON = "application/x-ndjson"
@@ -91,24 +91,24 @@ async def _items(service: Service, frames: list[dict[str, Any]], multipart: bool
         else:
             planned.setdefault(plan.etag, []).append((index, plan))
     for same in sorted(planned.values(), key=lambda plans: (plans[0][1].scene.name, plans[0][1].times[0])):
-        plan, watch = same[0][1], Watch()
+        plan, job = same[0][1], RenderJob()
         try:
-            work = partial(_drawn, service, plan, watch, multipart)
-            image = await service.queue.run(work, watch, part=True)
+            work = partial(_drawn, service, plan, job, multipart)
+            image = await service.queue.run(work, job, part=True)
         except Exception as error:
             for index, _ in same:
                 yield _failed(index, error)
             continue
-        service.metrics.count_stages(watch.seconds)
+        service.metrics.count_stages(job.seconds)
         for index, _ in same:
             item = Item(index, HTTPStatus.OK, plan=plan, body=image)
-            item.timing = server_timing(watch)
+            item.timing = server_timing(job)
             yield item
 
 
-def _drawn(service: Service, plan: FramePlan, watch: Watch, multipart: bool) -> bytes:
+def _drawn(service: Service, plan: FramePlan, job: RenderJob, multipart: bool) -> bytes:
     """As it is sent, made where it is drawn: base64 of a large frame would keep all other calls waiting."""
-    image = draw_frame(service, plan, plan.times[0], watch)
+    image = draw_frame(service, plan, plan.times[0], job)
     return image if multipart else base64.b64encode(image)
 
 

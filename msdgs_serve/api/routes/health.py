@@ -6,7 +6,7 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from msdgs_serve import __version__
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.metrics import MEDIA_TYPE
 from msdgs_serve.api.openapi import problems
 from msdgs_serve.api.schemas import Live, Ready
@@ -28,7 +28,7 @@ async def ready(service: SharedService) -> Ready:
     """503 until scenes are loaded and kernels compiled, and again once the service is about to stop; needs no key."""
     if service.phase is not Phase.READY:
         detail = f"The service is {service.phase.value}."
-        raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, service.phase.value, detail, retry_after=1)
+        raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, service.phase.value, detail, retry_after=1)
     return Ready()
 
 

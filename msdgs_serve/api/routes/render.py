@@ -14,7 +14,7 @@ from msdgs_serve.api.queries import request_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
-from msdgs_serve.watch import Watch
+from msdgs_serve.render_job import RenderJob
 
 IfNoneMatch = Annotated[
     str | None, Header(max_length=8192, description="`ETag`s of frames that the client has", examples=['"0123"'])
@@ -72,8 +72,8 @@ async def answer(
     headers = plan.headers(service.settings.frame_max_age)
     if is_unchanged(if_none_match, plan.etag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    watch = Watch()
-    image = await unless_gone(request, draw_plan(service, plan, watch))
-    service.metrics.count_stages(watch.seconds)
-    headers["Server-Timing"] = server_timing(watch)
+    job = RenderJob()
+    image = await unless_gone(request, draw_plan(service, plan, job))
+    service.metrics.count_stages(job.seconds)
+    headers["Server-Timing"] = server_timing(job)
     return Response(image, media_type=plan.media_type, headers=headers)

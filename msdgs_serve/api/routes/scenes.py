@@ -16,7 +16,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
-from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.errors import ClientGone, RequestRejected
 from msdgs_serve.api.keys import CLIENT
 from msdgs_serve.api.numbers import Name
 from msdgs_serve.api.openapi import SCENE_BODY, problems
@@ -75,7 +75,7 @@ def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
     served = service.store.get(name)
     report = read_report(service.store.file(name), served.session.scene.metadata.checkpoint_sha256)
     if report is None:
-        raise Refused(HTTPStatus.NOT_FOUND, "not_found", "There is no report of this scene.")
+        raise RequestRejected(HTTPStatus.NOT_FOUND, "not_found", "There is no report of this scene.")
     return report
 
 
@@ -118,7 +118,7 @@ async def add_scene(
     except SceneFileInvalid as error:
         service.log_problem(error)
         detail = f"The file breaks the contract msdgs/1: `{error.field}` {error.problem}"
-        raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
+        raise RequestRejected(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
     response.headers["Location"] = f"/scenes/{quote(name, safe='')}"
@@ -162,7 +162,7 @@ async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
             raise ClientGone("the client closed the connection") from None
         except TimeoutError:
             detail = f"The next part of the body must come within {seconds:g} s."
-            raise Refused(HTTPStatus.REQUEST_TIMEOUT, "slow_body", detail, field="body") from None
+            raise RequestRejected(HTTPStatus.REQUEST_TIMEOUT, "slow_body", detail, field="body") from None
 
 
 def _describe(store: SceneStore, name: str) -> SceneDetail:
@@ -179,7 +179,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         contract=metadata.contract,
         plan=metadata.plan,
         layers=list(metadata.layers),
-        steps=served.session.most_steps,
+        steps=served.session.max_steps,
         gaussians=counts,
         sh_degree=metadata.sh_degree,
         time_range=metadata.time_range,

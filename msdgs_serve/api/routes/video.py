@@ -17,11 +17,11 @@ from msdgs_serve.api.schemas import RenderRequest, VideoRequest
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
 from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_nerfstudio
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import RenderOptions, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
 from msdgs_serve.video import VIDEO_FORMATS, FilmWriter, check_video
-from msdgs_serve.watch import Watch
 
 router = APIRouter(tags=["frames"])
 
@@ -57,7 +57,7 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
     return StreamingResponse(_joined(first, film), media_type=VIDEO_FORMATS[body.format].media_type)
 
 
-class _Unsent:
+class _OutputBuffer:
     """A file that can only be written to, and what of it nobody has taken yet."""
 
     def __init__(self) -> None:
@@ -75,12 +75,12 @@ class _Unsent:
 
 async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> AsyncGenerator[bytes]:
     """The file in pieces. Each frame is drawn and encoded when its turn comes and the piece before has been sent on."""
-    options, watch, unsent = RenderOptions(body.background), Watch(), _Unsent()
+    options, job, unsent = RenderOptions(body.background), RenderJob(), _OutputBuffer()
     writer = FilmWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
 
     def add(camera: Camera, t: float) -> bytes:
-        pixels = service.renderer.render(scene.session, camera, t, options, watch).display_pixels()
-        with watch.stage("encode"):
+        pixels = service.renderer.render(scene.session, camera, t, options, job).display_pixels()
+        with job.stage("encode"):
             writer.add(pixels)
         return unsent.take()
 
@@ -89,9 +89,9 @@ async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: 
         return unsent.take()
 
     for camera, t in path.frames:
-        yield await service.queue.run(partial(add, camera, t), watch, part=True)
-    yield await service.queue.run(close, watch, part=True)
-    service.metrics.count_stages(watch.seconds)
+        yield await service.queue.run(partial(add, camera, t), job, part=True)
+    yield await service.queue.run(close, job, part=True)
+    service.metrics.count_stages(job.seconds)
 
 
 async def _joined(first: bytes, rest: AsyncGenerator[bytes]) -> AsyncGenerator[bytes]:

@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header
 from fastapi.responses import Response
 
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.frames import is_unchanged
 
 FOLDER = Path(__file__).parents[2] / "viewer"
@@ -60,7 +60,7 @@ async def page(if_none_match: IfNoneMatch = None) -> Response:
 async def page_file(name: str, if_none_match: IfNoneMatch = None) -> Response:
     """What the page is made of."""
     if name not in FILES:
-        raise Refused(HTTPStatus.NOT_FOUND, "not_found", "The page has no such file.")
+        raise RequestRejected(HTTPStatus.NOT_FOUND, "not_found", "The page has no such file.")
     return _answer(FILES[name], if_none_match)
 
 

@@ -26,8 +26,8 @@ MODEL: Schema = {
     5: Field("model_version", Kind.SKIPPED),
     6: Field("doc_string", Kind.SKIPPED),
     7: Field("graph", Kind.BYTES),
-    8: Field("opset_import", Kind.BYTES, most=8),
-    14: Field("metadata_props", Kind.BYTES, most=MAX_PROPERTIES),
+    8: Field("opset_import", Kind.BYTES, max_count=8),
+    14: Field("metadata_props", Kind.BYTES, max_count=MAX_PROPERTIES),
     20: Field("training_info", Kind.REFUSED),
     25: Field("functions", Kind.REFUSED),
     26: Field("configuration", Kind.REFUSED),
@@ -35,27 +35,27 @@ MODEL: Schema = {
 OPSET: Schema = {1: Field("domain", Kind.NAME), 2: Field("version", Kind.INTEGER)}
 PROPERTY: Schema = {1: Field("key", Kind.NAME), 2: Field("value", Kind.TEXT)}
 GRAPH: Schema = {
-    1: Field("node", Kind.BYTES, most=MAX_NODES),
+    1: Field("node", Kind.BYTES, max_count=MAX_NODES),
     2: Field("name", Kind.SKIPPED),
-    5: Field("initializer", Kind.BYTES, most=MAX_CONSTANTS),
+    5: Field("initializer", Kind.BYTES, max_count=MAX_CONSTANTS),
     10: Field("doc_string", Kind.SKIPPED),
-    11: Field("input", Kind.BYTES, most=MAX_PORTS),
-    12: Field("output", Kind.BYTES, most=MAX_PORTS),
-    13: Field("value_info", Kind.SKIPPED, most=MAX_VALUE_INFOS),
+    11: Field("input", Kind.BYTES, max_count=MAX_PORTS),
+    12: Field("output", Kind.BYTES, max_count=MAX_PORTS),
+    13: Field("value_info", Kind.SKIPPED, max_count=MAX_VALUE_INFOS),
     14: Field("quantization_annotation", Kind.REFUSED),
     15: Field("sparse_initializer", Kind.REFUSED),
-    16: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
+    16: Field("metadata_props", Kind.SKIPPED, max_count=MAX_PROPERTIES),
 }
 NODE: Schema = {
-    1: Field("input", Kind.NAME, most=MAX_OPERANDS),
-    2: Field("output", Kind.NAME, most=MAX_OPERANDS),
+    1: Field("input", Kind.NAME, max_count=MAX_OPERANDS),
+    2: Field("output", Kind.NAME, max_count=MAX_OPERANDS),
     3: Field("name", Kind.NAME),
     4: Field("op_type", Kind.NAME),
-    5: Field("attribute", Kind.BYTES, most=16),
+    5: Field("attribute", Kind.BYTES, max_count=16),
     6: Field("doc_string", Kind.SKIPPED),
     7: Field("domain", Kind.NAME),
     8: Field("overload", Kind.NAME),
-    9: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
+    9: Field("metadata_props", Kind.SKIPPED, max_count=MAX_PROPERTIES),
     10: Field("device_configurations", Kind.REFUSED),
 }
 ATTRIBUTE: Schema = {
@@ -79,7 +79,7 @@ ATTRIBUTE: Schema = {
     23: Field("sparse_tensors", Kind.REFUSED),
 }
 TENSOR: Schema = {
-    1: Field("dims", Kind.INTEGER, most=MAX_RANK),
+    1: Field("dims", Kind.INTEGER, max_count=MAX_RANK),
     2: Field("data_type", Kind.ENUM),
     3: Field("segment", Kind.REFUSED),
     4: Field("float_data", Kind.REFUSED),
@@ -93,13 +93,13 @@ TENSOR: Schema = {
     12: Field("doc_string", Kind.SKIPPED),
     13: Field("external_data", Kind.REFUSED),
     14: Field("data_location", Kind.ENUM),
-    16: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
+    16: Field("metadata_props", Kind.SKIPPED, max_count=MAX_PROPERTIES),
 }
 PORT: Schema = {
     1: Field("name", Kind.NAME),
     2: Field("type", Kind.BYTES),
     3: Field("doc_string", Kind.SKIPPED),
-    4: Field("metadata_props", Kind.SKIPPED, most=MAX_PROPERTIES),
+    4: Field("metadata_props", Kind.SKIPPED, max_count=MAX_PROPERTIES),
 }
 TYPE: Schema = {
     1: Field("tensor_type", Kind.BYTES),
@@ -110,7 +110,7 @@ TYPE: Schema = {
     9: Field("optional_type", Kind.REFUSED),
 }
 TENSOR_TYPE: Schema = {1: Field("elem_type", Kind.ENUM), 2: Field("shape", Kind.BYTES)}
-TENSOR_SHAPE: Schema = {1: Field("dim", Kind.BYTES, most=MAX_RANK)}
+TENSOR_SHAPE: Schema = {1: Field("dim", Kind.BYTES, max_count=MAX_RANK)}
 DIMENSION: Schema = {
     1: Field("dim_value", Kind.INTEGER),
     2: Field("dim_param", Kind.NAME),

@@ -31,8 +31,8 @@ class Kind(Enum):
 
     INTEGER = "int64"
     ENUM = "number from 0 to 2³¹ − 1"
-    NAME = "printable text of at most 200 bytes"
-    TEXT = "UTF-8 text of at most 1 MiB"
+    NAME = "printable text of at max_count 200 bytes"
+    TEXT = "UTF-8 text of at max_count 1 MiB"
     BYTES = "bytes"
     SKIPPED = "skipped"  # of any wire type: has no meaning for a scene and is never passed on
     REFUSED = "refused"
@@ -44,7 +44,7 @@ class Field:
 
     name: str
     kind: Kind
-    most: int = 1
+    max_count: int = 1
 
 
 Schema = Mapping[int, Field]
@@ -55,7 +55,7 @@ def read_message(message: memoryview, schema: Schema, what: str) -> dict[str, An
 
     Nothing is copied: bytes are parts of `message`, whose name is `what`. Raises `ModelInvalid` about `file`.
     """
-    values: dict[str, Any] = {field.name: [] for field in schema.values() if field.most > 1}
+    values: dict[str, Any] = {field.name: [] for field in schema.values() if field.max_count > 1}
     position, counts = 0, dict[int, int]()
     while position < len(message):
         key, position = _varint(message, position)
@@ -66,11 +66,11 @@ def read_message(message: memoryview, schema: Schema, what: str) -> dict[str, An
         if field.kind is Kind.REFUSED:
             raise _invalid(f"{what} has `{field.name}`, which a scene file may not have")
         counts[number] = counts.get(number, 0) + 1
-        if counts[number] > field.most:
-            often = "once" if field.most == 1 else f"{field.most:,} times"
+        if counts[number] > field.max_count:
+            often = "once" if field.max_count == 1 else f"{field.max_count:,} times"
             raise _invalid(f"{what} has `{field.name}` more than {often}")
         value, position = _value(message, position, wire_type, field, what)
-        if field.most > 1:
+        if field.max_count > 1:
             values[field.name].append(value)
         else:
             values[field.name] = value

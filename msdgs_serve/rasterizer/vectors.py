@@ -1,6 +1,6 @@
 """Sixteen numbers at once: the lane-wise operations that the rasterizer's inner loops are written in.
 
-In compiled kernels a `Lanes` is one LLVM vector of 16 float32 or float64, and a mask one of 16 bits: on a CPU with
+In compiled kernels a `Vector` is one LLVM vector of 16 float32 or float64, and a mask one of 16 bits: on a CPU with
 AVX-512 a float32 operation is one instruction, elsewhere LLVM splits it. LLVM's own vectorizer doesn't find these
 loops: plain ones take 3x the time. Without the compiler the very same kernels run on NumPy arrays of 16, which is what
 each function's body does.
@@ -15,16 +15,16 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import lower_builtin
 
-from msdgs_serve.rasterizer.lane_types import (
+from msdgs_serve.rasterizer.vector_types import (
     FREEDOMS,
-    LANES,
     MASK,
+    NUM_LANES,
     REALS,
     Index,
-    Lanes,
-    LanesType,
     Mask,
     MaskType,
+    Vector,
+    VectorType,
     broadcast,
     llvm,
     lowered,
@@ -38,9 +38,9 @@ from msdgs_serve.rasterizer.lane_types import (
 def _same_or_number(a: types.Type, b: types.Type) -> types.Type | None:
     """The type of the lanes where both arguments are alike or one is a single number."""
     number = (types.Float, types.Integer)
-    if isinstance(a, LanesType) and isinstance(b, number):
+    if isinstance(a, VectorType) and isinstance(b, number):
         return a
-    if isinstance(b, LanesType) and isinstance(a, number):
+    if isinstance(b, VectorType) and isinstance(a, number):
         return b
     return same(a, b)
 
@@ -50,7 +50,7 @@ def _masks(*arguments: types.Type) -> types.Type | None:
 
 
 def _mask_for(kind: types.Type | None) -> types.Type | None:
-    return MaskType(kind.count) if isinstance(kind, LanesType) else None
+    return MaskType(kind.count) if isinstance(kind, VectorType) else None
 
 
 def _arithmetic() -> None:
@@ -70,91 +70,91 @@ def _arithmetic() -> None:
     typed(operator.invert, lambda a: _masks(a))
     lowered(operator.invert, MaskType)(lambda b, x: b.not_(x))
     typed(operator.neg, lambda a: same(a))
-    lowered(operator.neg, LanesType)(lambda b, x: b.fneg(x))
+    lowered(operator.neg, VectorType)(lambda b, x: b.fneg(x))
 
 
 def _lower_mixed(function: Callable, lower: Callable) -> None:
     """For lanes and lanes, lanes and a number, a number and lanes."""
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        like = next(kind for kind in signature.args if isinstance(kind, LanesType))
-        lanes = [
+        like = next(kind for kind in signature.args if isinstance(kind, VectorType))
+        vectors = [
             value
-            if isinstance(kind, LanesType)
+            if isinstance(kind, VectorType)
             else broadcast(builder, context.cast(builder, value, kind, like.dtype), like.count)
             for kind, value in zip(signature.args, values, strict=True)
         ]
-        return lower(builder, *lanes)
+        return lower(builder, *vectors)
 
-    lower_builtin(function, LanesType, LanesType)(code)
+    lower_builtin(function, VectorType, VectorType)(code)
     for number in (types.Float, types.Integer):
-        lower_builtin(function, LanesType, number)(code)
-        lower_builtin(function, number, LanesType)(code)
+        lower_builtin(function, VectorType, number)(code)
+        lower_builtin(function, number, VectorType)(code)
 
 
 _arithmetic()
 
 
-def spread(value: Any) -> Lanes:
+def spread(value: Any) -> Vector:
     """One number in all lanes."""
-    return np.full(LANES, value)
+    return np.full(NUM_LANES, value)
 
 
-typed(spread, lambda value: LanesType(value) if isinstance(value, types.Float) else None)
+typed(spread, lambda value: VectorType(value) if isinstance(value, types.Float) else None)
 for _number in REALS:
     lowered(spread, _number)(lambda b, value: broadcast(b, value))
 
 
-def filled(value: Any, like: Lanes) -> Lanes:
-    """One number in as many lanes, and of the type, of another `Lanes`."""
+def filled(value: Any, like: Vector) -> Vector:
+    """One number in as many lanes, and of the type, of another `Vector`."""
     return np.full_like(like, value)
 
 
-typed(filled, lambda value, like: like if isinstance(like, LanesType) else None)
+typed(filled, lambda value, like: like if isinstance(like, VectorType) else None)
 
 
-@lower_builtin(filled, types.Number, LanesType)
+@lower_builtin(filled, types.Number, VectorType)
 def _lower_filled(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     like = signature.args[1]
     return broadcast(builder, context.cast(builder, values[0], signature.args[0], like.dtype), like.count)
 
 
-def fma(a: Lanes, b: Lanes, c: Lanes) -> Lanes:
+def fma(a: Vector, b: Vector, c: Vector) -> Vector:
     """a b + c, rounded once."""
     return a * b + c
 
 
-def minimum(a: Lanes, b: Lanes) -> Lanes:
+def minimum(a: Vector, b: Vector) -> Vector:
     """The smaller; `b` where either is NaN."""
     return np.where(a < b, a, b)
 
 
-def maximum(a: Lanes, b: Lanes) -> Lanes:
+def maximum(a: Vector, b: Vector) -> Vector:
     """The larger; `b` where either is NaN."""
     return np.where(a > b, a, b)
 
 
-def square_root(a: Lanes) -> Lanes:
+def square_root(a: Vector) -> Vector:
     """√a."""
     return np.sqrt(a)
 
 
-def negative(a: Lanes) -> Lanes:
+def negative(a: Vector) -> Vector:
     """-|a|."""
     return -np.abs(a)
 
 
-def select(mask: Mask, a: Lanes, b: Lanes) -> Lanes:
+def select(mask: Mask, a: Vector, b: Vector) -> Vector:
     """`a` where the mask is set, else `b`."""
     return np.where(mask, a, b)
 
 
-def rounder(a: Lanes) -> Any:
+def rounder(a: Vector) -> Any:
     """What, added to a number of that type, rounds it to a whole one: 1.5 times the reach of its mantissa."""
     return a.dtype.type(1.5 * 2 ** np.finfo(a.dtype).nmant)
 
 
-def times_power_of_two(a: Lanes, rounded: Lanes) -> Lanes:
+def times_power_of_two(a: Vector, rounded: Vector) -> Vector:
     """a 2ⁿ, where `rounded` is n + `rounder`: its last bits, n, are added to the exponent of `a`."""
     return np.ldexp(a, (rounded - rounder(a)).astype(np.int32))
 
@@ -166,27 +166,27 @@ typed(square_root, lambda a: same(a))
 typed(negative, lambda a: same(a))
 typed(select, lambda mask, a, b: same(a, b) if _mask_for(a) == mask else None)
 typed(times_power_of_two, lambda a, rounded: same(a, rounded))
-typed(rounder, lambda a: a.dtype if isinstance(a, LanesType) else None)
+typed(rounder, lambda a: a.dtype if isinstance(a, VectorType) else None)
 
 
-def converted(a: Lanes, like: np.ndarray) -> Lanes:
+def converted(a: Vector, like: np.ndarray) -> Vector:
     """The same numbers in the dtype of an array."""
     return a.astype(like.dtype)
 
 
-def exponent_of(a: Lanes) -> Lanes:
+def exponent_of(a: Vector) -> Vector:
     """⌊log2 a⌋ of positive normal numbers."""
     return (np.frexp(a)[1] - 1).astype(a.dtype)
 
 
-def mantissa_of(a: Lanes) -> Lanes:
+def mantissa_of(a: Vector) -> Vector:
     """a / 2^exponent_of(a), in [1, 2)."""
     return 2 * np.frexp(a)[0]
 
 
 typed(exponent_of, lambda a: same(a))
 typed(mantissa_of, lambda a: same(a))
-typed(converted, lambda a, like: LanesType(like.dtype, a.count) if same(a) and isinstance(like, types.Array) else None)
+typed(converted, lambda a, like: VectorType(like.dtype, a.count) if same(a) and isinstance(like, types.Array) else None)
 
 
 def _layout(vector: ir.VectorType) -> tuple[ir.VectorType, Callable[[int], ir.Constant], int, int]:
@@ -220,13 +220,13 @@ def _with_sign(builder: Any, a: Any) -> Any:
     return builder.bitcast(builder.or_(builder.bitcast(a, integers), sign), a.type)
 
 
-@lower_builtin(rounder, LanesType)
+@lower_builtin(rounder, VectorType)
 def _lower_rounder(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     place = _layout(values[0].type)[3]
     return ir.Constant(context.get_data_type(signature.return_type), 1.5 * 2**place)
 
 
-@lower_builtin(converted, LanesType, types.Array)
+@lower_builtin(converted, VectorType, types.Array)
 def _lower_converted(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     vector = ir.VectorType(context.get_data_type(signature.return_type.dtype), values[0].type.count)
     if vector == values[0].type:
@@ -234,55 +234,57 @@ def _lower_converted(context: Any, builder: Any, signature: Any, values: Any) ->
     return (builder.fpext if vector.element == ir.DoubleType() else builder.fptrunc)(values[0], vector)
 
 
-lowered(fma, LanesType, LanesType, LanesType)(lambda b, x, y, z: llvm(b, f"llvm.fma.{suffix(x.type)}", x.type, x, y, z))
-lowered(minimum, LanesType, LanesType)(lambda b, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
-lowered(maximum, LanesType, LanesType)(lambda b, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
-lowered(square_root, LanesType)(lambda b, x: llvm(b, f"llvm.sqrt.{suffix(x.type)}", x.type, x))
-lowered(negative, LanesType)(_with_sign)
-lowered(select, MaskType, LanesType, LanesType)(lambda b, mask, x, y: b.select(mask, x, y))
-lowered(times_power_of_two, LanesType, LanesType)(_times_power)
-lowered(exponent_of, LanesType)(_exponent)
-lowered(mantissa_of, LanesType)(_mantissa)
+lowered(fma, VectorType, VectorType, VectorType)(
+    lambda b, x, y, z: llvm(b, f"llvm.fma.{suffix(x.type)}", x.type, x, y, z)
+)
+lowered(minimum, VectorType, VectorType)(lambda b, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
+lowered(maximum, VectorType, VectorType)(lambda b, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
+lowered(square_root, VectorType)(lambda b, x: llvm(b, f"llvm.sqrt.{suffix(x.type)}", x.type, x))
+lowered(negative, VectorType)(_with_sign)
+lowered(select, MaskType, VectorType, VectorType)(lambda b, mask, x, y: b.select(mask, x, y))
+lowered(times_power_of_two, VectorType, VectorType)(_times_power)
+lowered(exponent_of, VectorType)(_exponent)
+lowered(mantissa_of, VectorType)(_mantissa)
 
 
-def pair(a: Lanes, b: Lanes) -> Lanes:
+def pair(a: Vector, b: Vector) -> Vector:
     """Both side by side; every operation above takes twice or four times as many lanes too. One long chain of
     operations leaves most of a core idle, chains side by side fill it."""
     return np.concatenate([a, b])
 
 
-def first_of(pair_: Lanes) -> Lanes:
+def first_of(pair_: Vector) -> Vector:
     """The first half of a pair, of lanes or masks."""
     return pair_[: len(pair_) // 2]
 
 
-def second_of(pair_: Lanes) -> Lanes:
+def second_of(pair_: Vector) -> Vector:
     """The second half of a pair, of lanes or masks."""
     return pair_[len(pair_) // 2 :]
 
 
 def _half_of(pair_: types.Type) -> types.Type | None:
-    if isinstance(pair_, LanesType):
-        return LanesType(pair_.dtype, pair_.count // 2)
+    if isinstance(pair_, VectorType):
+        return VectorType(pair_.dtype, pair_.count // 2)
     return MaskType(pair_.count // 2) if isinstance(pair_, MaskType) else None
 
 
-typed(pair, lambda a, b: LanesType(a.dtype, 2 * a.count) if same(a, b) else None)
+typed(pair, lambda a, b: VectorType(a.dtype, 2 * a.count) if same(a, b) else None)
 typed(first_of, lambda pair_: _half_of(pair_))
 typed(second_of, lambda pair_: _half_of(pair_))
-lowered(pair, LanesType, LanesType)(lambda b, x, y: shuffled(b, x, y, range(2 * x.type.count)))
-for _either in (LanesType, MaskType):
+lowered(pair, VectorType, VectorType)(lambda b, x, y: shuffled(b, x, y, range(2 * x.type.count)))
+for _either in (VectorType, MaskType):
     lowered(first_of, _either)(lambda b, x: shuffled(b, x, x, range(x.type.count // 2)))
     lowered(second_of, _either)(lambda b, x: shuffled(b, x, x, range(x.type.count // 2, x.type.count)))
 
 
 def bits_of(mask: Mask) -> Any:
     """The mask as a number: lane 0 is bit 0."""
-    return int(np.dot(mask, 1 << np.arange(LANES)))
+    return int(np.dot(mask, 1 << np.arange(NUM_LANES)))
 
 
 typed(bits_of, lambda mask: types.uint64 if mask == MASK else None)
-lowered(bits_of, MASK)(lambda b, mask: b.zext(b.bitcast(mask, ir.IntType(LANES)), ir.IntType(64)))
+lowered(bits_of, MASK)(lambda b, mask: b.zext(b.bitcast(mask, ir.IntType(NUM_LANES)), ir.IntType(64)))
 
 
 def lowest_bit(bits: Index) -> Any:
@@ -292,3 +294,35 @@ def lowest_bit(bits: Index) -> Any:
 
 typed(lowest_bit, lambda bits: types.uint64 if bits == types.uint64 else None)
 lowered(lowest_bit, types.uint64)(lambda b, bits: b.cttz(bits, ir.Constant(ir.IntType(1), 1)))
+
+
+def sums_of(columns: tuple[Vector, ...]) -> Vector:
+    """The sum of each of up to 16 `Vector`, in the lane of its number; 0 in the others."""
+    return sixteen(columns).sum(axis=1)
+
+
+def sixteen(columns: tuple[Vector, ...]) -> np.ndarray:
+    """[16, 16] columns as rows, filled up with zeros."""
+    return np.stack([*columns, *[np.zeros_like(columns[0])] * (NUM_LANES - len(columns))])
+
+
+def filled_up(builder: Any, columns: Any) -> list[Any]:
+    """The vectors of a tuple, and vectors of zeros up to 16."""
+    vectors = [builder.extract_value(columns, k) for k in range(len(columns.type))]
+    return vectors + [ir.Constant(vectors[0].type, [0.0] * NUM_LANES)] * (NUM_LANES - len(vectors))
+
+
+typed(sums_of, lambda columns: columns.dtype if isinstance(columns, types.UniTuple) else None)
+
+
+@lower_builtin(sums_of, types.UniTuple)
+def _lower_sums_of(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    vectors = filled_up(builder, values[0])
+    lower, upper = ([lane for k in range(start, start + 8) for lane in (k, NUM_LANES + k)] for start in (0, 8))
+    while len(vectors) > 1:  # two vectors of partial sums become one, whose neighbours belong to one and the other
+        pairs = [(vectors[k], vectors[k + len(vectors) // 2]) for k in range(len(vectors) // 2)]
+        vectors = [
+            builder.fadd(shuffled(builder, a, b, lower), shuffled(builder, a, b, upper), flags=FREEDOMS)
+            for a, b in pairs
+        ]
+    return vectors[0]

@@ -1,14 +1,14 @@
 """Calls that are refused before anybody has parsed them.
 
 Under four times too much load most calls are refused, and frames wait for the interpreter meanwhile: of the frames that
-the service draws at its peak, 83 % are still answered with the doorman and 69 to 76 % without (`benchmarks.service
+the service draws at its peak, 83 % are still answered with the early_rejection and 69 to 76 % without (`benchmarks.service
 --only overload`).
 """
 
 import time
 from collections.abc import Iterable, Mapping
 
-from msdgs_serve.api.errors import Refused, refusal
+from msdgs_serve.api.errors import RequestRejected, rejection
 from msdgs_serve.api.keys import address_of
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.observe import IDENTITY, Answered, record, request_id, usable_id
@@ -23,10 +23,10 @@ KNOWN = frozenset(
 Headers = Iterable[tuple[bytes, bytes]]
 
 
-class Doorman:
+class EarlyRejection:
     """Answers for the application while its queue is full, where a call is of the plainest kind.
 
-    That is `POST /render` that comes whole, in one piece, with headers that change nothing about a refusal. It gets the
+    That is `POST /render` that comes whole, in one piece, with headers that change nothing about a rejection. It gets the
     same answer, line in the log and counts as from the application.
     """
 
@@ -45,8 +45,8 @@ class Doorman:
             return None
         started = time.perf_counter()
         try:
-            self._queue.refuse_if_full(address_of(client))
-        except Refused as error:
+            self._queue.reject_if_full(address_of(client))
+        except RequestRejected as error:
             refused = error
         else:
             return None
@@ -57,7 +57,7 @@ class Doorman:
         identity = usable_id(headers.get(IDENTITY, b""))
         token = request_id.set(identity)
         try:
-            response = refusal(refused)
+            response = rejection(refused)
             seconds = time.perf_counter() - started
             answered = Answered(METHOD, PATH, PATH, response.status_code, refused.kind, seconds, len(response.body))
             record(self._metrics, answered, client)

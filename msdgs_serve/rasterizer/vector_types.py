@@ -11,9 +11,9 @@ from numba.extending import lower_builtin, register_model, type_callable
 
 from msdgs_serve.rasterizer.jit import FAST_MATH
 
-LANES = 16
+NUM_LANES = 16
 
-Lanes = Any
+Vector = Any
 """16 numbers: an LLVM vector in kernels, an array [16] without the compiler."""
 Mask = Any
 """16 truth values."""
@@ -22,16 +22,16 @@ Index = int | np.integer
 access: 3.5x."""
 
 
-class LanesType(types.Type):
+class VectorType(types.Type):
     """What numba calls 16 numbers of a type, or 32 of a `pair`."""
 
-    def __init__(self, dtype: types.Type, count: int = LANES) -> None:
+    def __init__(self, dtype: types.Type, count: int = NUM_LANES) -> None:
         self.dtype, self.count = dtype, count
-        super().__init__(f"Lanes({dtype}, {count})")
+        super().__init__(f"Vector({dtype}, {count})")
 
 
-@register_model(LanesType)
-class _LanesModel(models.PrimitiveModel):
+@register_model(VectorType)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, fe_type: Any) -> None:
         super().__init__(manager, fe_type, ir.VectorType(manager.lookup(fe_type.dtype).get_data_type(), fe_type.count))
 
@@ -39,7 +39,7 @@ class _LanesModel(models.PrimitiveModel):
 class MaskType(types.Type):
     """What numba calls 16 truth values, or 32."""
 
-    def __init__(self, count: int = LANES) -> None:
+    def __init__(self, count: int = NUM_LANES) -> None:
         self.count = count
         super().__init__(f"Mask({count})")
 
@@ -88,7 +88,7 @@ def suffix(vector: ir.VectorType) -> str:
     return f"v{vector.count}{kinds[vector.element]}"
 
 
-def broadcast(builder: Any, value: Any, count: int = LANES) -> Any:
+def broadcast(builder: Any, value: Any, count: int = NUM_LANES) -> Any:
     """A vector of one value."""
     vector = ir.VectorType(value.type, count)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -98,9 +98,35 @@ def broadcast(builder: Any, value: Any, count: int = LANES) -> Any:
 
 def same(*arguments: types.Type) -> types.Type | None:
     """The one floating type of all arguments."""
-    return arguments[0] if isinstance(arguments[0], LanesType) and set(arguments) == {arguments[0]} else None
+    return arguments[0] if isinstance(arguments[0], VectorType) and set(arguments) == {arguments[0]} else None
 
 
 def shuffled(builder: Any, a: Any, b: Any, lanes: Sequence[int]) -> Any:
     """These lanes of two vectors, counted from the first of `a` to the last of `b`."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes)))
+
+
+def is_array(array: Any, ndim: int) -> bool:
+    shaped = isinstance(array, types.Array) and array.ndim == ndim and array.layout == "C"
+    return shaped and array.dtype in REALS
+
+
+def none_if(fits: Any) -> types.Type | None:
+    """What a function that returns nothing returns, for arguments that it takes."""
+    return types.none if fits else None
+
+
+def first_lanes(builder: Any, count: Any) -> Any:
+    """The mask of the first `count` lanes, an i64 that may be negative or above 16."""
+    integers = ir.VectorType(ir.IntType(64), NUM_LANES)
+    return builder.icmp_signed("<", ir.Constant(integers, list(range(NUM_LANES))), broadcast(builder, count))
+
+
+def masked_load(builder: Any, place: Any, alignment: int, mask: Any, otherwise: Any) -> Any:
+    name = f"llvm.masked.load.{suffix(otherwise.type)}.p0"
+    return llvm(builder, name, otherwise.type, place, ir.Constant(ir.IntType(32), alignment), mask, otherwise)
+
+
+def masked_store(builder: Any, place: Any, alignment: int, mask: Any, vector: Any) -> None:
+    name = f"llvm.masked.store.{suffix(vector.type)}.p0"
+    llvm(builder, name, ir.VoidType(), vector, place, ir.Constant(ir.IntType(32), alignment), mask)

@@ -1,4 +1,4 @@
-"""A watch over one piece of work: how long its stages take, and whether anybody still waits for it."""
+"""A job over one piece of work: how long its stages take, and whether anybody still waits for it."""
 
 import time
 from collections.abc import Iterator
@@ -8,27 +8,27 @@ from msdgs_serve.scene import MsdgsError
 from msdgs_serve.threads import checking
 
 
-class Interrupted(MsdgsError):
+class RenderCancelled(MsdgsError):
     """Nobody waits for the work any more."""
 
 
-class Watch:
-    """Times stages by name; once `stop` was called, ends the work between them and inside. One thread works, any may
+class RenderJob:
+    """Times stages by name; once `cancel` was called, ends the work between them and inside. One thread works, any may
     stop it."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}  # by stage; one that comes again adds to its time
         self.notes: dict[str, str] = {}  # what there is to say of a stage, as in pose: "hit"
-        self._stopped = False
+        self._cancelled = False
 
-    def stop(self) -> None:
+    def cancel(self) -> None:
         """End the work at its next check."""
-        self._stopped = True
+        self._cancelled = True
 
     def check(self) -> None:
-        """Raises `Interrupted` once `stop` was called."""
-        if self._stopped:
-            raise Interrupted("nobody waits for this any more")
+        """Raises `RenderCancelled` once `cancel` was called."""
+        if self._cancelled:
+            raise RenderCancelled("nobody waits for this any more")
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

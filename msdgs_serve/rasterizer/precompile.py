@@ -9,14 +9,14 @@ from numba.core import config
 from msdgs_serve.rasterizer.jit import RASTERIZER
 from msdgs_serve.rasterizer.kernel_files import is_writable
 from msdgs_serve.rasterizer.rasterize import rasterize
-from msdgs_serve.rasterizer.tiles import SPLATS_A_PART
+from msdgs_serve.rasterizer.tiles import SPLATS_PER_PART
 from msdgs_serve.scene.camera import Camera, look_at
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
 
 SIZE = 32
 """Pixels along a side: several tiles."""
-COUNTS = (40, SPLATS_A_PART + 40)
+COUNTS = (40, SPLATS_PER_PART + 40)
 """Gaussians: more than one group of lanes, and a rest; few, and so many that they are sorted in parts."""
 
 
