@@ -1,4 +1,4 @@
-"""A job over one piece of work: how long its stages take, and whether anybody still waits for it."""
+"""A render job: times its stages and can be cancelled."""
 
 import time
 from collections.abc import Iterator
@@ -9,30 +9,30 @@ from msdgs_serve.threads import checking
 
 
 class RenderCancelled(MsdgsError):
-    """Nobody waits for the work any more."""
+    """The job was cancelled: its client is gone or its time limit has passed."""
 
 
 class RenderJob:
-    """Times stages by name; once `cancel` was called, ends the work between them and inside. One thread works, any may
-    stop it."""
+    """Times the stages of a render by name. One thread works on it; any thread may cancel it, which ends the work at
+    its next check."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}  # by stage; one that comes again adds to its time
-        self.notes: dict[str, str] = {}  # what there is to say of a stage, as in pose: "hit"
+        self.seconds: dict[str, float] = {}  # by stage; repeated stages add up
+        self.notes: dict[str, str] = {}  # remarks by stage, such as pose: "hit"
         self._cancelled = False
 
     def cancel(self) -> None:
-        """End the work at its next check."""
+        """End the job at its next check."""
         self._cancelled = True
 
     def check(self) -> None:
-        """Raises `RenderCancelled` once `cancel` was called."""
+        """Raise `RenderCancelled` if the job was cancelled."""
         if self._cancelled:
-            raise RenderCancelled("nobody waits for this any more")
+            raise RenderCancelled("the render was cancelled")
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Check, also before each part that the work inside has on the pool, and time it."""
+        """Time the stage, and check before it and before each part of its work on the thread pool."""
         self.check()
         started = time.perf_counter()
         try:
@@ -42,5 +42,5 @@ class RenderJob:
             self.add(name, time.perf_counter() - started)
 
     def add(self, name: str, seconds: float) -> None:
-        """Count time to a stage."""
+        """Add time to a stage."""
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds

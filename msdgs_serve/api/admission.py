@@ -1,4 +1,4 @@
-"""Calls that take a place in the queue of renders."""
+"""Admission of requests to the render queue."""
 
 from collections.abc import Collection, Mapping
 from contextlib import ExitStack
@@ -12,20 +12,20 @@ from msdgs_serve.api.prefix import route_path
 from msdgs_serve.api.work import WorkQueue
 
 Call = tuple[str, str]
-"""Method and path."""
+"""HTTP method and path."""
 
 
 class Admission:
-    """ASGI middleware: gives a call its place, or refuses it, before its body is parsed and a route is looked for.
+    """ASGI middleware that admits a request to the queue or rejects it, before its body is parsed and routed.
 
-    Under too much load refusals are most of the work. Who may have the answer already, by `If-None-Match`, needs no
-    place until it has work.
+    Under overload most of the work is rejecting requests. A request with `If-None-Match` takes a place in the queue
+    only once it has work.
     """
 
     def __init__(
         self, app: ASGIApp, queue: WorkQueue, routes: Mapping[Call, BaseRoute], streamed: Collection[Call]
     ) -> None:
-        """`routes`: those that take a place; `streamed`: of these, whose answers are sent while others are drawn."""
+        """`routes` are those that take a place in the queue; `streamed` are calls whose responses are streamed."""
         self._app = app
         self._queue = queue
         self._routes = routes

@@ -1,8 +1,7 @@
-"""Calls that are refused before anybody has parsed them.
+"""Rejection of requests before they are parsed, while the queue is full.
 
-Under four times too much load most calls are refused, and frames wait for the interpreter meanwhile: of the frames that
-the service draws at its peak, 83 % are still answered with the early_rejection and 69 to 76 % without (`benchmarks.service
---only overload`).
+Under 4x overload most requests are rejected, and renders wait for the interpreter meanwhile: goodput is 83 % of the
+peak with early rejection and 69 to 76 % without (`benchmarks.service --only overload`).
 """
 
 import time
@@ -24,22 +23,22 @@ Headers = Iterable[tuple[bytes, bytes]]
 
 
 class EarlyRejection:
-    """Answers for the application while its queue is full, where a call is of the plainest kind.
+    """Rejects simple requests in place of the application while its queue is full.
 
-    That is `POST /render` that comes whole, in one piece, with headers that change nothing about a rejection. It gets the
-    same answer, line in the log and counts as from the application.
+    A simple request is a `POST /render` that arrives in one piece, with headers that don't affect a rejection.
+    Response, access log and metrics are the same as from the application.
     """
 
     def __init__(self, queue: WorkQueue, metrics: Metrics, max_body_bytes: int) -> None:
-        """Bodies of more than `max_body_bytes` are refused for that, by the application."""
+        """Bodies of more than `max_body_bytes` are left to the application, which rejects them for their size."""
         self._queue = queue
         self._metrics = metrics
         self._max_body_bytes = max_body_bytes
 
     def answer(self, data: bytes, client: tuple[str, int] | None, always: Headers) -> bytes | None:
-        """What to write to a connection that has sent `data` between two calls, with the headers `always`.
+        """Return the response to `data` that a client sent as a new request, or None to pass it to the application.
 
-        None: `data` is for the application.
+        `always` are headers of every response.
         """
         if not data.startswith(START):
             return None
@@ -69,7 +68,7 @@ class EarlyRejection:
 
 
 def _known_headers(head: bytes) -> Mapping[bytes, bytes]:
-    """By names in small letters; none where one is broken, there twice or not known to change nothing."""
+    """Return headers by lower-case name; none if any of them is malformed, repeated or not in `KNOWN`."""
     found: dict[bytes, bytes] = {}
     for line in head.split(b"\r\n"):
         name, colon, value = line.partition(b":")

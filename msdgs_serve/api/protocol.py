@@ -1,8 +1,7 @@
-"""HTTP/1.1 as uvicorn speaks it, with the time limits that it lacks: on headers, and on clients that don't read.
+"""uvicorn's HTTP/1.1 protocol with time limits on request headers and on clients that don't read their responses.
 
-An answer's head is written together with the first part of its body. Each write wakes the client, and where all cores
-are busy it takes the one on which the loop runs, which has Python's interpreter meanwhile: under four times too much
-load 10 % more frames were answered so.
+The head of a response is written together with the first part of its body. Each write wakes up the client, which may
+preempt the event loop while that holds Python's interpreter: under 4x overload 10 % more frames are answered.
 """
 
 import asyncio
@@ -17,11 +16,11 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.errors import MEDIA_TYPE, problem_response
 
-NOTHING_BUFFERED = (b"", False)  # nor an end of the connection
+NOTHING_BUFFERED = (b"", False)  # no data, and the connection is open
 
 
 class LimitedProtocol(H11Protocol):
-    """Closes connections whose headers don't come within `header_seconds`, or that take no bytes for `read_seconds`."""
+    """Closes connections whose headers take longer than `header_seconds` or that read nothing for `read_seconds`."""
 
     def __init__(
         self,
@@ -41,12 +40,12 @@ class LimitedProtocol(H11Protocol):
         self._unsent = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Headers are awaited from now on."""
+        """Start the time limit of the first headers."""
         super().connection_made(transport)
         self._start_header_timer()
 
     def data_received(self, data: bytes) -> None:
-        """Headers are complete once h11 has left its idle state; what comes after the answer may begin new ones."""
+        """Stop the time limit when h11 has left its idle state: then the headers are complete."""
         if self._is_rejected_early(data):
             return
         super().data_received(data)
@@ -56,32 +55,32 @@ class LimitedProtocol(H11Protocol):
             self._start_header_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nothing is awaited any more."""
+        """Cancel all timers."""
         self._header_timer = _cancelled(self._header_timer)
         self._read_timer = _cancelled(self._read_timer)
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """The client reads more slowly than is written: look at it again and again."""
+        """Start checking whether the client reads."""
         super().pause_writing()
         self._start_read_timer()
 
     def resume_writing(self) -> None:
-        """It has read nearly all."""
+        """Stop checking, as the client has read nearly everything."""
         self._read_timer = _cancelled(self._read_timer)
         super().resume_writing()
 
     def timeout_keep_alive_handler(self) -> None:
-        """The answer has been given and nothing more is asked; a client that didn't read all of it is let go too."""
+        """Close an idle connection, even if the client hasn't read all of its response."""
         super().timeout_keep_alive_handler()
         self._start_read_timer()
 
     def send_400_response(self, msg: str) -> None:
-        """A problem like any other, for what is no HTTP."""
-        self._send_problem(http.HTTPStatus.BAD_REQUEST, "That is no HTTP/1.1 request, or its headers are too long.")
+        """Answer invalid HTTP with a problem."""
+        self._send_problem(http.HTTPStatus.BAD_REQUEST, "Not a valid HTTP/1.1 request, or its headers are too long.")
 
     def _is_rejected_early(self, data: bytes) -> bool:
-        """Whether this was a call, and the early_rejection has answered it: h11 then knows nothing of it."""
+        """Whether `data` was a request that was rejected early; h11 doesn't see it then."""
         between = self.conn.their_state is h11.IDLE and self.conn.our_state is h11.IDLE
         if self._doorman is None or not between or self.conn.trailing_data != NOTHING_BUFFERED:
             return False
@@ -100,7 +99,7 @@ class LimitedProtocol(H11Protocol):
     def _on_headers_late(self) -> None:
         self._header_timer = None
         if not self.transport.is_closing() and self.conn.their_state is h11.IDLE:
-            detail = f"The headers must be complete after {self._header_seconds:g} s."
+            detail = f"The headers must be complete within {self._header_seconds:g} s."
             self._send_problem(http.HTTPStatus.REQUEST_TIMEOUT, detail)
 
     def _start_read_timer(self) -> None:
@@ -126,7 +125,7 @@ class LimitedProtocol(H11Protocol):
 
 
 class _HeadWithBody(h11.Connection):
-    """Keeps the head of an answer back until more of it is sent."""
+    """Delays the head of a response until the next part of it is sent."""
 
     _head = b""
 
@@ -144,7 +143,7 @@ class _HeadWithBody(h11.Connection):
 def limited_protocol(
     header_seconds: float, read_seconds: float, early_rejection: EarlyRejection | None
 ) -> Callable[..., LimitedProtocol]:
-    """What uvicorn makes a connection's protocol with."""
+    """Return the protocol factory for uvicorn."""
     return partial(
         LimitedProtocol, header_seconds=header_seconds, read_seconds=read_seconds, early_rejection=early_rejection
     )

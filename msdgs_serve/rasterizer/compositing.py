@@ -1,7 +1,8 @@
 """Alpha blending of the splats of each tile, front to back (equation 2).
 
-A tile of 16 × 16 pixels is 16 blocks of 4 × 4, one `Vector` each. Splats are taken 64 at a time: first the ellipses of
-16 at once are tested against each block, then each block blends the splats that touch it, its state in registers.
+A tile of 16 × 16 pixels is 16 blocks of 4 × 4, one `Vector` each. Splats are processed in batches of 64: the ellipses
+of 16 splats at a time are tested against each block, then each block blends the splats that touch it, with its state in
+registers.
 """
 
 from typing import NamedTuple
@@ -29,7 +30,7 @@ from msdgs_serve.rasterizer.splats import (
 from msdgs_serve.rasterizer.tile_blocks import (
     BLOCK_SIDE,
     BLOCKS,
-    MIDDLE,
+    CENTER,
     PIXELS,
     grid_of_a_tile,
     max_distance,
@@ -55,20 +56,21 @@ from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_together
 
 BATCH = np.uint64(64)
-"""Splats: as many as a number has bits. The records of the next batch are fetched meanwhile; without that a frame of
-1,000,000 splats takes 1.07x the time."""
+"""Splats per batch: as many as a bit mask has bits. The records of the next batch are prefetched; without that a frame
+of 1,000,000 splats takes 1.07x the time."""
 TILES_PER_TURN = 16
+"""Tiles that a thread takes at a time."""
 TILES_PER_ROUND = 4096
-"""A megapixel: then the threads wait for each other, and who no longer wants the image may say so."""
+"""A megapixel. Between rounds the threads join, and the render job may be cancelled."""
 
 
 class Frame(NamedTuple):
-    """What is drawn into; in the splats' dtype."""
+    """The images that are drawn, in the splats' dtype."""
 
-    rgb: np.ndarray  # [H, W, 3] the background included
+    rgb: np.ndarray  # [H, W, 3] background included
     alpha: np.ndarray  # [H, W] 1 - transmittance
-    depth: np.ndarray  # [H, W] mean distance along the camera axis, infinite where alpha is 0; or [0, 0]: not drawn
-    median_depth: np.ndarray  # [H, W] of the splat that takes half of the light, else infinite; or [0, 0]
+    depth: np.ndarray  # [H, W] mean distance along the camera axis, infinite if alpha is 0; [0, 0] if not drawn
+    median_depth: np.ndarray  # [H, W] depth at which transmittance falls to 1/2, or infinite; [0, 0] if not drawn
 
 
 def composite(
@@ -82,7 +84,7 @@ def composite(
     depth: bool = False,
     median_depth: bool = False,
 ) -> Frame:
-    """Blend the splats into an image; where the median depth is drawn, the mean is too."""
+    """Blend the splats into an image. `median_depth` implies `depth`."""
     dtype = splats.records.dtype
     depths = (True, True) if median_depth else (True,) if depth else ()
     mean, median = (np.empty((height, width) if len(depths) > k else (0, 0), dtype) for k in range(2))
@@ -106,10 +108,11 @@ def _composite_tiles(
     depths: tuple,
     frame: Frame,
 ) -> bool:
-    """Draw tiles, `TILES_PER_TURN` of them at each turn, up to the tile `past`; whether all of them are drawn.
+    """Draw tiles up to the tile `past`, `TILES_PER_TURN` at a time. Return whether all of them are drawn.
 
-    `depths` is (), (True,) or (True, True), none, the mean, the median too: which is known when this is compiled, and
-    what isn't wanted costs nothing. The mean makes a frame of 10,000 at 400 × 400 take 1.03 to 1.07 times as long.
+    `depths` is () for no depth, (True,) for the mean, (True, True) for mean and median. Its length is known at compile
+    time, so that depths that are not drawn cost nothing. The mean makes a frame of 10,000 splats at 400 × 400 take 1.03
+    to 1.07 times as long.
     """
     state = np.empty(6 * PIXELS, records.dtype)
     batch = np.empty(RECORD * int(BATCH), records.dtype)
@@ -130,23 +133,23 @@ def _composite_tiles(
             clear_tile(state, depths)
             alive[:] = True
             entry, end = np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])
-            some = True
-            while some and entry < end:
+            unfinished = True
+            while unfinished and entry < end:
                 for k in range(entry + BATCH, entry + BATCH + BATCH):
                     prefetch(flat, np.uint64(tiles.splat_ids[min(k, last)]) * np.uint64(RECORD))
                 touching[:] = np.uint64(0)
-                many = min(end - entry, BATCH)
-                for k in range(np.uint64(0), many, np.uint64(NUM_LANES)):
+                count = min(end - entry, BATCH)
+                for k in range(np.uint64(0), count, np.uint64(NUM_LANES)):
                     columns = load_columns_of(records, tiles.splat_ids, entry + k)
                     _mark_touching(columns, x0, y0, limits, k, batch, touching)
-                there = np.uint64(0xFFFFFFFFFFFFFFFF) >> (BATCH - many)
-                some = False
+                valid = np.uint64(0xFFFFFFFFFFFFFFFF) >> (BATCH - count)
+                unfinished = False
                 for block in range(np.uint64(BLOCKS)):
                     if alive[block]:
-                        bits = touching[block] & there
+                        bits = touching[block] & valid
                         if bits != np.uint64(0):
                             alive[block] = _blend_block(block, bits, batch, grid, limits, depths, state)
-                        some |= alive[block]
+                        unfinished |= alive[block]
                 entry += BATCH
             columns, rows = min(TILE, width - x0), min(TILE, height - y0)
             if columns == TILE and rows == TILE:
@@ -160,8 +163,8 @@ def _composite_tiles(
 def _mark_touching(
     columns: tuple, x0: int, y0: int, limits: PixelLimits, first: np.uint64, batch: np.ndarray, touching: np.ndarray
 ) -> None:
-    """Write 16 splats, whose records' columns these are, into the batch from place `first`, and set the bits from
-    `first` of each block that they touch."""
+    """Write 16 splats into the batch from place `first`, given the columns of their records, and set their bits in
+    the masks of the blocks that they touch."""
     real = batch.dtype.type
     x, y = columns[X] - real(x0), columns[Y] - real(y0)
     a, b, c = columns[ROOT_A], columns[ROOT_B], columns[ROOT_C]
@@ -172,10 +175,10 @@ def _mark_touching(
         store(batch, first + np.uint64(column) * BATCH, columns[column])
     reach = max_distance(columns[LOG2_OPACITY], limits.log2_alpha_min)
     for row in range(np.uint64(BLOCK_SIDE)):
-        middle_y = real(BLOCK_SIDE) * real(row) + real(MIDDLE) - y
+        center_y = real(BLOCK_SIDE) * real(row) + real(CENTER) - y
         for column in range(np.uint64(BLOCK_SIDE)):
-            middle_x = real(BLOCK_SIDE) * real(column) + real(MIDDLE) - x
-            touched = bits_of(touches_block(middle_x, middle_y, a, b, c, reach, columns[EXTENT_X]))
+            center_x = real(BLOCK_SIDE) * real(column) + real(CENTER) - x
+            touched = bits_of(touches_block(center_x, center_y, a, b, c, reach, columns[EXTENT_X]))
             touching[row * np.uint64(BLOCK_SIDE) + column] |= touched << first
 
 
@@ -189,9 +192,9 @@ def _blend_block(
     depths: tuple,
     state: np.ndarray,
 ) -> bool:
-    """Blend the splats of the batch that `bits` names into a block; whether any of its pixels is still open.
+    """Blend the splats of the batch whose `bits` are set into a block. Return whether any of its pixels is unfinished.
 
-    The transmittance of a pixel that is done is kept with a minus sign.
+    The transmittance of a finished pixel is stored with a minus sign.
     """
     offset = block * np.uint64(NUM_LANES)
     pixel_x, pixel_y = load(grid, 32) + grid[block], load(grid, 48) + grid[np.uint64(16) + block]
@@ -241,7 +244,7 @@ def _without_lowest(bits: np.uint64) -> np.uint64:
 
 @kernel
 def _without_three(bits: np.uint64) -> tuple[np.uint64, np.uint64, np.uint64]:
-    """The bits without the lowest one, without the lowest two, without the lowest three."""
+    """Return the bits without the lowest one, without the lowest two and without the lowest three."""
     second = _without_lowest(bits)
     third = _without_lowest(second)
     return second, third, _without_lowest(third)
@@ -272,7 +275,7 @@ def _blended(
     offset: np.uint64,
     sums: tuple,
 ) -> tuple[Mask, Vector, Vector, Vector, Vector, Vector]:
-    """Which pixels are open, and what is left of the light, red, green, blue and depth, behind one more splat."""
+    """Blend one splat. Return the mask of unfinished pixels, and transmittance, color and depth behind it."""
     open_, left, red, green, blue, depth = sums
     after = fma(-alpha, left, left)
     open_ = open_ & (after > limits.transmittance_min)
@@ -292,7 +295,7 @@ def _blended(
 def _keep_median(
     open_: Mask, before: Vector, after: Vector, depth: float, state: np.ndarray, offset: np.uint64
 ) -> None:
-    """Where the light falls to a half or less between two transmittances, keep the depth."""
+    """Store the depth in pixels whose transmittance falls to a half or less at this splat."""
     place = offset + np.uint64(5 * PIXELS)
     kept = load(state, place)
     store(state, place, select(open_ & (before > 0.5) & (after <= 0.5), filled(depth, kept), kept))

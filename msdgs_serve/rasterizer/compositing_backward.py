@@ -1,8 +1,8 @@
-"""Gradient of the blending. Runs front to back like the forward pass and repeats its arithmetic, so that it takes the
-very decisions (which splat is drawn in which pixel) that the image was made with.
+"""Gradient of the blending. Runs front to back and repeats the arithmetic of the forward pass, so that it draws exactly
+the same splats in each pixel.
 
-For a pixel with gradient g, the splat's share of the loss is s = color · g_rgb + g_alpha and
-d loss / d alpha_i = T_i s_i - (what all splats behind it and the background add) / (1 - alpha_i).
+For a pixel with gradient g, the splat's contribution to the loss is s = color · g_rgb + g_alpha and
+d loss / d alpha_i = T_i s_i - (contributions of all splats behind it and the background) / (1 - alpha_i).
 """
 
 import itertools
@@ -25,22 +25,22 @@ from msdgs_serve.rasterizer.vectors import bits_of, filled, fma, lowest_bit, min
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_parallel, run_together, threads_to_use
 
-# places in a tile's scratch: what is left of the light (0 where a pixel is done), the pixel's gradient, what is still
-# behind, and where the pixels are in the tile
+# offsets in a tile's state: transmittance (0 if the pixel is finished), the pixel's gradient, the contribution of
+# splats behind, and the pixel's position in the tile
 LEFT, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND, PIXEL_X, PIXEL_Y = (
     np.uint64(PIXELS * place) for place in range(8)
 )
 SUMS = NUM_LANES
-"""Numbers of a pair of splat and tile, nine in use: red, green, blue, then the moments of d loss / d sigma about the
-splat: 1, x, y, xx, xy, yy."""
+"""Numbers per pair of splat and tile, of which nine are used: red, green, blue, and the moments 1, x, y, xx, xy, yy of
+d loss / d sigma about the splat's mean."""
 
 PAIRS_PER_ROUND = 1 << 18
-"""16 MB of sums: with those of 1,400,000 pairs at once, 85 MB, the gradient takes 1.1 times as long."""
+"""16 MB of sums; in one round of 1,400,000 pairs (85 MB) the gradient takes 1.1 times as long."""
 
-DEPTHS_LOOKED_AT = 1000
-"""To find those that part the splats among threads."""
+DEPTH_SAMPLES = 1000
+"""Depths that are sampled to divide the splats among threads."""
 PREFETCH_DISTANCE = np.uint64(16)
-"""Pairs between asking for a record and needing it."""
+"""Pairs between prefetch and use of a record."""
 
 
 def composite_backward(
@@ -51,10 +51,10 @@ def composite_backward(
     grad_rgb: np.ndarray,
     grad_alpha: np.ndarray,
 ) -> np.ndarray:
-    """The sums of each splat, [N, SUMS]: zero where it isn't drawn.
+    """Return the sums of each splat, [N, SUMS], zero if it isn't drawn.
 
     Args:
-        frame: what `composite` drew; its depth is not looked at.
+        frame: the result of `composite`; its depths are not used.
         grad_rgb: [H, W, 3].
         grad_alpha: [H, W].
     """
@@ -73,7 +73,7 @@ def composite_backward(
 
 
 def _rounds(offsets: np.ndarray) -> list[tuple[int, int]]:
-    """(first, past) of tiles, all of them in order, with `PAIRS_PER_ROUND` or fewer pairs each or a single tile."""
+    """Return consecutive ranges (first, past) of tiles, of at most `PAIRS_PER_ROUND` pairs or a single tile each."""
     rounds, first, count = [], 0, len(offsets) - 1
     while first < count:
         past = int(np.searchsorted(offsets, offsets[first] + PAIRS_PER_ROUND, side="right")) - 1
@@ -84,8 +84,8 @@ def _rounds(offsets: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _depths_between(records: np.ndarray, parts: int) -> list[float]:
-    """Depths from -infinity to infinity, between which there are about as many splats each, judged by some of them."""
-    some = records[:: max(len(records) // DEPTHS_LOOKED_AT, 1)]
+    """Return depths from -infinity to infinity that divide the splats into about equal `parts`, by a sample of them."""
+    some = records[:: max(len(records) // DEPTH_SAMPLES, 1)]
     some = np.sort(some[some[:, EXTENT_X] > 0, DEPTH])
     return [-math.inf, *(float(some[len(some) * part // parts]) for part in range(1, parts) if len(some)), math.inf]
 
@@ -102,8 +102,9 @@ def _tiles_backward(
     pair_sums: np.ndarray,
     seen: np.ndarray,
 ) -> bool:
-    """Write the sums of each pair of splat and tile, of tiles `first_tile` to `past_tile`, and how many pairs of a tile
-    have been: those behind what hides them are left out. Whether all these tiles are done.
+    """Write the sums of each pair of splat and tile, for tiles `first_tile` to `past_tile`, and into `seen` how many
+    pairs of each tile were processed: those behind finished pixels are skipped. Return whether all these tiles are
+    done.
 
     `images` are color, alpha, and the gradients of both.
     """
@@ -149,8 +150,8 @@ def _tiles_backward(
 
 @inlined_kernel
 def _load_tile(width: int, x0: int, y0: int, pixels: tuple, state: np.ndarray) -> None:
-    """What the tile's state is before the first splat. Pixel by pixel, as a cut tile's, a frame of 10,000 splats at
-    1920 × 1080 takes 1.1 times as long."""
+    """Initialize the tile's state. Pixel by pixel, as in `_load_cut_tile`, a frame of 10,000 splats at 1920 × 1080
+    takes 1.1 times as long."""
     rgb, alphas, grad_rgb, grad_alphas = pixels
     for block in range(np.uint64(BLOCKS)):
         offset = block * np.uint64(NUM_LANES)
@@ -171,7 +172,7 @@ def _load_tile(width: int, x0: int, y0: int, pixels: tuple, state: np.ndarray) -
 
 @kernel
 def _load_cut_tile(width: int, x0: int, y0: int, size: tuple, pixels: tuple, state: np.ndarray) -> None:
-    """As `_load_tile`, of a tile of which the image has so many columns and rows."""
+    """Initialize the state of a tile that extends beyond the image, of which `size` columns and rows are inside."""
     rgb, alphas, grad_rgb, grad_alphas = pixels
     columns, rows = size
     state[:PIXEL_X] = 0
@@ -190,7 +191,7 @@ def _load_cut_tile(width: int, x0: int, y0: int, size: tuple, pixels: tuple, sta
 
 @inlined_kernel
 def _prefetch_block(width: int, start: int, pixels: tuple) -> None:
-    """Fetch a block of the next tile while this one is worked on: its rows are a page away from each other."""
+    """Prefetch a block of the next tile: rows of an image are a memory page apart."""
     rgb, alphas, grad_rgb, grad_alphas = pixels
     for row in range(BLOCK_SIDE):
         pixel = start + row * width
@@ -209,12 +210,12 @@ def _splat_backward(
     sums: np.ndarray,
     place: np.uint64,
 ) -> np.uint64:
-    """Write the sums of a splat over the blocks that `bits` names; returns those of them that are done now."""
+    """Write the sums of a splat over the blocks whose `bits` are set. Return the mask of blocks that it finishes."""
     zero = spread(record.dtype.type(0))
     sum_red, sum_green, sum_blue = zero, zero, zero
     sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
     done = np.uint64(0)
-    # read once: the compiler can't know that what is written below is not the record
+    # read once: to the compiler, the stores below may change the record
     x, y, terms = spread(record[X]), spread(record[Y]), exponent_terms(record)
     red, green, blue = spread(record[RED]), spread(record[GREEN]), spread(record[BLUE])
     while bits != np.uint64(0):
@@ -265,8 +266,8 @@ def _add_up(
     pair_sums: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Add up the tiles of splats from a depth to another, always in the same order: in each tile they are next to each
-    other."""
+    """Add the sums of a splat's tiles, for splats at depths from `nearest` to `past`, which are consecutive in each
+    tile. The order of the additions is always the same."""
     flat_pairs, flat = pair_sums.reshape(-1), sums.reshape(-1)
     base = np.uint64(tiles.offsets[first_tile])
     for tile in range(np.uint64(first_tile), np.uint64(past_tile)):
@@ -284,7 +285,7 @@ def _add_up(
 
 @kernel
 def _first_at(depth: float, start: np.uint64, end: np.uint64, records: np.ndarray, splat_ids: np.ndarray) -> np.uint64:
-    """The first pair from `start` of a tile, before `end`, whose splat is at a depth or behind it."""
+    """Return the first pair of a tile, from `start` to `end`, whose splat is at `depth` or behind it."""
     while start < end:
         middle = (start + end) >> np.uint64(1)
         if np.float32(records[np.uint64(splat_ids[middle]), DEPTH]) < np.float32(depth):

@@ -1,4 +1,4 @@
-"""How many splats each pixel blends: an image of where a frame's work is. Apart from the drawing, which it slows."""
+"""Count the splats that each pixel blends, an image of where a frame's work is. A pass of its own after drawing."""
 
 from typing import NamedTuple
 
@@ -18,14 +18,14 @@ from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
 
 
 class Counts(NamedTuple):
-    """Of one frame."""
+    """Numbers of splats in one frame."""
 
-    blended: np.ndarray  # [H, W] splats that add to a pixel, in the splats' dtype
-    evaluated: int  # a splat in a pixel of a 4 × 4 block that its ellipse touches and that is not done: the arithmetic
+    blended: np.ndarray  # [H, W] splats that contribute to a pixel, in the splats' dtype
+    evaluated: int  # pairs of splat and pixel whose alpha is computed: pixels of touched, unfinished 4 × 4 blocks
 
 
 def count_splats(splats: Splats, tiles: TileLists, width: int, height: int, options: RasterizerOptions) -> Counts:
-    """Take the decisions of the compositing, and count instead of blending."""
+    """Repeat the decisions of `composite`, and count instead of blending."""
     limits = pixel_limits(options, splats.records.dtype)
     blended = np.empty((height, width), splats.records.dtype)
     ranges = split_evenly(len(tiles.offsets) - 1, 8 * threads_to_use())
@@ -58,7 +58,7 @@ def _count_tiles(
                     continue
                 x, y = load(grid, 32) + grid[block], load(grid, 48) + grid[16 + block]
                 exponent = log2_alpha(*terms, x, y)
-                # 32 lanes as the compositing has them, so that LLVM makes the same instructions
+                # two vectors as in `composite`, so that LLVM generates the same instructions
                 alpha = first_of(exp2(pair(exponent, exponent), limits.exp2))
                 alpha = minimum(alpha, spread(limits.alpha_max))
                 drawn = (exponent >= limits.log2_alpha_min) & (left > 0)

@@ -11,7 +11,7 @@ from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, View
 
 @kernel
 def rotation_columns(w: Vector, x: Vector, y: Vector, z: Vector) -> tuple:
-    """The rotation matrix of unit quaternions, by columns, [3][3]."""
+    """Return the columns of the rotation matrices of unit quaternions, [3][3]."""
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
@@ -20,8 +20,8 @@ def rotation_columns(w: Vector, x: Vector, y: Vector, z: Vector) -> tuple:
 
 
 @kernel
-def turned(rotation: np.ndarray, vector: tuple) -> tuple[Vector, Vector, Vector]:
-    """A matrix [3, 3] times a vector."""
+def rotate(rotation: np.ndarray, vector: tuple) -> tuple[Vector, Vector, Vector]:
+    """Return a matrix [3, 3] times a vector [3]."""
     a, b, c = vector
     return (
         rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c,
@@ -32,7 +32,7 @@ def turned(rotation: np.ndarray, vector: tuple) -> tuple[Vector, Vector, Vector]
 
 @kernel
 def half_axis(jacobian: tuple, axis: tuple, size: Vector) -> tuple[Vector, Vector]:
-    """J times a vector in camera axes, times its length: x and y in the image."""
+    """Return the image of an axis of an ellipsoid: J @ axis * size, x and y."""
     x, y, z = axis
     (xx, xy, xz), (yx, yy, yz) = jacobian
     return (xx * x + xy * y + xz * z) * size, (yx * x + yy * y + yz * z) * size
@@ -40,9 +40,9 @@ def half_axis(jacobian: tuple, axis: tuple, size: Vector) -> tuple[Vector, Vecto
 
 @kernel
 def covariance2d(half: tuple, eps2d: float) -> tuple[Vector, Vector, Vector, Vector, Vector]:
-    """xx, xy, yy of M Mᵀ + eps I for half-axes M, [3][2], and the determinants before eps I and with it.
+    """Return xx, xy, yy of M Mᵀ + eps I for half-axes M, [3][2], and its determinants without and with eps I.
 
-    These are sums of squares (Cauchy-Binet), so that a needle of 1e6 : 1 keeps its digits.
+    The determinants are sums of squares (Cauchy-Binet), so that needles of 1e6 : 1 lose no digits to cancellation.
     """
     (mx0, my0), (mx1, my1), (mx2, my2) = half
     xx, yy = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, my0 * my0 + my1 * my1 + my2 * my2
@@ -53,14 +53,14 @@ def covariance2d(half: tuple, eps2d: float) -> tuple[Vector, Vector, Vector, Vec
 
 
 @kernel
-def seen_at(view: View, x: Vector, y: Vector, z: Vector) -> tuple:
-    """Where points in camera axes are drawn, and the Jacobian of that, [2][3]."""
+def project_points(view: View, x: Vector, y: Vector, z: Vector) -> tuple:
+    """Project points in camera axes. Return u and v in pixels and the Jacobian, [2][3]."""
     zero = filled(0, z)
     if view.model == ORTHOGRAPHIC:
         u, v = view.fx * x, view.fy * y
         jacobian = ((filled(view.fx, z), zero, zero), (zero, filled(view.fy, z), zero))
     elif view.model == FISHEYE:
-        # a speck away from the axis, so that nothing is divided by 0 on it
+        # slightly off the axis, to avoid a division by 0 on it
         square = x * x + y * y + 1e-20 * z * z
         radius = square_root(square)
         theta = arctangent(radius / z)
@@ -93,11 +93,11 @@ def seen_at(view: View, x: Vector, y: Vector, z: Vector) -> tuple:
 def direction(
     view: View, x: Vector, y: Vector, z: Vector, depth: Vector, like: np.ndarray
 ) -> tuple[Vector, Vector, Vector]:
-    """Unit vectors of the lines of sight to points in the world, in the dtype of `like`."""
+    """Return the unit viewing directions to points in the world, in the dtype of `like`."""
     if view.model == ORTHOGRAPHIC:
         r = view.rotation
         return spread(like.dtype.type(r[2, 0])), spread(like.dtype.type(r[2, 1])), spread(like.dtype.type(r[2, 2]))
-    # divided by the depth before anything is squared: its square need not be a float32
+    # divided by the depth before squaring: the square of a distance may overflow float32
     per_depth, position = 1 / depth, view.position
     dx = converted((x - position[0]) * per_depth, like)
     dy = converted((y - position[1]) * per_depth, like)

@@ -1,4 +1,4 @@
-"""Spherical harmonics for the kernels: values and derivatives, degree 0 to 3."""
+"""Spherical harmonics of degree 0 to 3 for the kernels: values, derivatives and colors."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ C30, C31, C32, C33, C34, C35, C36 = SH_C3
 
 @kernel
 def harmonics_above_0(x: Any, y: Any, z: Any) -> tuple:
-    """The 15 basis functions of degree 1 to 3 at the unit direction (x, y, z), numbers or `Vector`."""
+    """Return the 15 basis functions of degree 1 to 3 at unit directions (x, y, z), numbers or vectors."""
     xx, yy, zz = x * x, y * y, z * z
     return (
         -SH_C1 * y,
@@ -39,21 +39,26 @@ def harmonics_above_0(x: Any, y: Any, z: Any) -> tuple:
 
 @kernel
 def harmonics(x: Vector, y: Vector, z: Vector) -> tuple:
-    """The 16 of degree 0 to 3; the first is a constant even where there is no direction and the others are NaN."""
+    """Return the 16 basis functions of degree 0 to 3; the first is constant even if the direction is NaN."""
     return (filled(SH_C0, x),) + harmonics_above_0(x, y, z)  # noqa: RUF005 numba unpacks no tuples
 
 
 @kernel
-def harmonics_slope(pulls: np.ndarray, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
-    """The gradient in (x, y, z) of the sum of pull times basis function, 16 directions at a time.
+def harmonics_gradient(weights: np.ndarray, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return the gradient in (x, y, z) of the sum of weight times basis function, for 16 directions at a time.
 
-    `pulls` has 16 `Vector` for each of the functions 0 to 15; the first is of no consequence.
+    `weights` [16 × 16] has one vector for each basis function; the first has no effect.
     """
     xx, yy, zz = x * x, y * y, z * z
-    p1, p2, p3 = load(pulls, 16), load(pulls, 32), load(pulls, 48)
-    p4, p5, p6, p7, p8 = load(pulls, 64), load(pulls, 80), load(pulls, 96), load(pulls, 112), load(pulls, 128)
-    p9, p10, p11, p12 = C30 * load(pulls, 144), C31 * load(pulls, 160), C32 * load(pulls, 176), C33 * load(pulls, 192)
-    p13, p14, p15 = C34 * load(pulls, 208), C35 * load(pulls, 224), C36 * load(pulls, 240)
+    p1, p2, p3 = load(weights, 16), load(weights, 32), load(weights, 48)
+    p4, p5, p6, p7, p8 = load(weights, 64), load(weights, 80), load(weights, 96), load(weights, 112), load(weights, 128)
+    p9, p10, p11, p12 = (
+        C30 * load(weights, 144),
+        C31 * load(weights, 160),
+        C32 * load(weights, 176),
+        C33 * load(weights, 192),
+    )
+    p13, p14, p15 = C34 * load(weights, 208), C35 * load(weights, 224), C36 * load(weights, 240)
     dx = -SH_C1 * p3 + C20 * y * p4 - 2 * C22 * x * p6 + C23 * z * p7 + 2 * C24 * x * p8
     dx += 6 * x * y * p9 + y * z * p10 - 2 * x * y * p11 - 6 * x * z * p12
     dx += (4 * zz - 3 * xx - yy) * p13 + 2 * x * z * p14 + 3 * (xx - yy) * p15
@@ -67,7 +72,7 @@ def harmonics_slope(pulls: np.ndarray, x: Vector, y: Vector, z: Vector) -> tuple
 
 @inlined_kernel
 def raw_colors(sh: np.ndarray, first: int, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
-    """SH + 0.5 towards the unit directions (x, y, z), before the cut at 0; `sh` is [N, 3 coefficients]."""
+    """Return SH + 0.5 in unit directions (x, y, z), before clamping at 0; `sh` is [N, 3 × coefficients]."""
     functions = sh.shape[1] // 3
     basis = harmonics(x, y, z)
     color = filled(0.5, x), filled(0.5, x), filled(0.5, x)
@@ -90,9 +95,9 @@ def _added(color: tuple, coefficient: tuple, value: Vector) -> tuple[Vector, Vec
 
 @kernel
 def four_coefficients(sh: np.ndarray, first: int, k: Index) -> tuple:
-    """Of 16 Gaussians from `first` the coefficients of functions `k` to `k` + 3, red, green and blue, [4][3].
+    """Return red, green and blue coefficients of basis functions `k` to `k` + 3 of 16 Gaussians from `first`, [4][3].
 
-    Loaded one function at a time projecting takes 1.4 times as long.
+    Loading one function at a time makes the projection take 1.4 times as long.
     """
     place = np.uint64(3) * k
     a = load_four_columns(sh, first, place)
@@ -102,7 +107,7 @@ def four_coefficients(sh: np.ndarray, first: int, k: Index) -> tuple:
 
 @kernel
 def last_coefficient(sh: np.ndarray, first: int) -> tuple[Vector, Vector, Vector]:
-    """Of 16 Gaussians from `first` the coefficient of the last function, red, green and blue."""
+    """Return red, green and blue coefficients of the last basis function of 16 Gaussians from `first`."""
     if sh.shape[1] == 3:
         return load_triples(sh, first)
     _, r, g, b = load_four_columns(sh, first, sh.shape[1] - 4)

@@ -1,7 +1,6 @@
-"""3D Gaussians to 2D splats: position, depth, inverse covariance, footprint and color, 16 Gaussians at a time.
+"""Project 3D Gaussians to 2D splats: position, depth, inverse covariance, footprint and color, 16 at a time.
 
-Computed in float64, stored as the Gaussians' dtype: the arithmetic is once a Gaussian, and needles and giants lose
-nothing to cancellation.
+Computed in float64, so that extreme shapes and sizes lose nothing to cancellation; stored in the Gaussians' dtype.
 """
 
 import math
@@ -10,7 +9,7 @@ import numpy as np
 
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.exponential import log2
-from msdgs_serve.rasterizer.geometry import covariance2d, direction, half_axis, rotation_columns, seen_at, turned
+from msdgs_serve.rasterizer.geometry import covariance2d, direction, half_axis, project_points, rotate, rotation_columns
 from msdgs_serve.rasterizer.harmonics import raw_colors
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.splats import ROOT_SCALE, Splats, empty_records
@@ -21,7 +20,7 @@ from msdgs_serve.rasterizer.vector_memory import (
     prefetch,
     store,
     store_rows,
-    store_whole_numbers,
+    store_uint16,
 )
 from msdgs_serve.rasterizer.vector_types import NUM_LANES, Mask, Vector
 from msdgs_serve.rasterizer.vectors import (
@@ -42,9 +41,9 @@ from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.threads import run_together, threads_to_use
 
 PREFETCH_DISTANCE = 2 * NUM_LANES
-"""Gaussians between asking for their numbers and needing them; of 1,000,000 a frame takes 0.95 of the time for it."""
+"""Gaussians between prefetch and use; a frame of 1,000,000 takes 0.95 times as long with it."""
 MIN_PARTS = 8
-"""Of the Gaussians, for two threads and more: another is late by the time it takes to wake up, and takes fewer."""
+"""Parts for two or more threads: the others start later, by the time that waking up takes, and do fewer parts."""
 
 
 def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) -> Splats:
@@ -52,7 +51,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     gaussians = _kernel_arrays(gaussians)
     count, dtype = len(gaussians), gaussians.means.dtype
     view = view_of(camera, options)
-    records = empty_records(-(-count // NUM_LANES) * NUM_LANES, dtype)  # whole groups: stored without a look at the end
+    records = empty_records(-(-count // NUM_LANES) * NUM_LANES, dtype)  # whole vectors: stores need no mask
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
     g = gaussians
@@ -65,20 +64,20 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
 
 
 def part_count(count: int) -> int:
-    """How many parts of `range(count)` the threads take."""
+    """Return into how many parts `range(count)` is split for the threads."""
     threads = threads_to_use()
     return max(min(max(2 * threads, MIN_PARTS) if threads > 1 else 1, -(-count // NUM_LANES)), 1)
 
 
 @kernel
 def part_range(part: int, parts: int, count: int) -> tuple[int, int]:
-    """Where a part of `range(count)` starts and stops; all but the last have whole groups of 16."""
+    """Return start and stop of a part of `range(count)`; all parts but the last are whole vectors of 16."""
     groups = -(-count // NUM_LANES)
     return groups * part // parts * NUM_LANES, min(groups * (part + 1) // parts * NUM_LANES, count)
 
 
 def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
-    """The same numbers in C order, writable and of one dtype: for each other combination numba would compile anew."""
+    """Return the arrays in C order, writable and of one dtype: numba compiles once for each combination."""
     dtype = np.float64 if gaussians.means.dtype == np.float64 else np.float32
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     return Gaussians(*(np.require(array, dtype, ("C", "W")) for array in arrays))
@@ -86,10 +85,10 @@ def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
 
 @kernel
 def _project_parts(counters: np.ndarray, found: np.ndarray, view: View, gaussians: tuple, splats: tuple) -> bool:
-    """Project all parts, one at each turn, and write where each starts and what it has `found`, [P, 5]; whether all of
-    them are done.
+    """Project parts until none is left, and write for each its start and the results of `_project_range` into `found`,
+    [P, 5]. Return whether all parts are done.
 
-    `gaussians` are the arrays of `Gaussians`, harmonics flat; `splats` the records, rectangles and keys of `Splats`.
+    `gaussians` are the arrays of `Gaussians` with flattened SH; `splats` are records, rectangles and keys of `Splats`.
     """
     while True:
         k = fetch_add(counters, TAKEN, 1)
@@ -103,8 +102,8 @@ def _project_parts(counters: np.ndarray, found: np.ndarray, view: View, gaussian
 
 @kernel
 def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: tuple) -> tuple[int, int, int, bool]:
-    """Splats `start` to `stop`. Keys are written from `start`; where they end, bits of the least and the largest depth
-    that is drawn, and whether all that was read is what a Gaussian may have."""
+    """Project Gaussians `start` to `stop`; keys of drawn splats are written from `start`. Return the end of the keys,
+    the bits of the smallest and the largest drawn depth, and whether all values that were read are valid."""
     means, quats, scales, opacities, sh = gaussians
     records, rectangles, keys = splats
     real = records.dtype.type
@@ -138,20 +137,20 @@ def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: 
         if bits_of(drawn) == np.uint64(0):
             _store_nothing(records, first)
             continue
-        u, v, jacobian = seen_at(view, x, y, z)
+        u, v, jacobian = project_points(view, x, y, z)
         qw, qx = converted(qs[0], double), converted(qs[1], double)
         qy, qz = converted(qs[2], double), converted(qs[3], double)
         axes = rotation_columns(qw, qx, qy, qz)
         half = (
-            half_axis(jacobian, turned(r, axes[0]), converted(ss[0], double)),
-            half_axis(jacobian, turned(r, axes[1]), converted(ss[1], double)),
-            half_axis(jacobian, turned(r, axes[2]), converted(ss[2], double)),
+            half_axis(jacobian, rotate(r, axes[0]), converted(ss[0], double)),
+            half_axis(jacobian, rotate(r, axes[1]), converted(ss[1], double)),
+            half_axis(jacobian, rotate(r, axes[2]), converted(ss[2], double)),
         )
         xx, xy, yy, sharp, det = covariance2d(half, view.eps2d)
         if view.mip:
             opacity = opacity * square_root(sharp / det)
             drawn = drawn & (opacity >= view.alpha_min)
-        # from here on in the records' dtype: ratios, roots and sums of the above lose nothing in float32
+        # from here on in the records' dtype: ratios, roots and sums lose nothing in float32
         u, v = converted(u, records), converted(v, records)
         # alpha_min <= 2^(log2_opacity - |root @ d|²) bounds the distance; that ellipse has this bounding box
         log2_opacity = log2(maximum(converted(opacity, records), spread(real(view.alpha_min))))
@@ -191,14 +190,14 @@ def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: 
             ),
         )
         scale, past_column, past_row = 1 / TILE, spread(real(view.tile_columns)), spread(real(view.tile_rows))
-        # clamped as floats: a giant's bounds do not fit an integer
+        # clamped as floats: bounds of large splats overflow integers
         sides = (
             select(drawn, maximum(scale * (u - extent_x), zero), zero),
             select(drawn, minimum(scale * (u + extent_x) + 1, past_column), zero),
             select(drawn, maximum(scale * (v - extent_y), zero), zero),
             select(drawn, minimum(scale * (v + extent_y) + 1, past_row), zero),
         )
-        store_whole_numbers(rectangles, first, sides)
+        store_uint16(rectangles, first, sides)
         store(depths, 0, converted(z, records))
         while bits != np.uint64(0):
             lane = lowest_bit(bits)
@@ -212,13 +211,13 @@ def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: 
 
 @kernel
 def abs_sum(a: Vector, b: Vector, c: Vector) -> Vector:
-    """|a| + |b| + |c|: less than infinity where all are finite."""
+    """Return |a| + |b| + |c|, which is finite if all three are."""
     return -(negative(a) + negative(b) + negative(c))
 
 
 @kernel
 def _usable(means: tuple, quats: tuple, scales: tuple, opacities: Vector) -> Mask:
-    """What `Gaussians.validate` asks of all but harmonics."""
+    """Whether Gaussians pass the checks of `Gaussians.validate`, except those of SH coefficients."""
     squares = quats[0] * quats[0] + quats[1] * quats[1] + quats[2] * quats[2] + quats[3] * quats[3]
     usable = (abs_sum(means[0], means[1], means[2]) < np.inf) & (abs_sum(scales[0], scales[1], scales[2]) < np.inf)
     usable = usable & (scales[0] > 0) & (scales[1] > 0) & (scales[2] > 0)
@@ -228,7 +227,7 @@ def _usable(means: tuple, quats: tuple, scales: tuple, opacities: Vector) -> Mas
 
 @kernel
 def depth_bits(depth: float) -> np.uint64:
-    """The bits of a depth as a float32: of positive ones they sort as the numbers do."""
+    """Return the bits of a depth as float32; bits of positive numbers sort as the numbers do."""
     return np.uint64(np.float32(depth).view(np.uint32))
 
 

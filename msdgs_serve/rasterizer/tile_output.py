@@ -13,7 +13,7 @@ from msdgs_serve.rasterizer.view import TILE
 
 @inlined_kernel
 def clear_tile(state: np.ndarray, depths: tuple) -> None:
-    """All of the light is left, and nothing has been seen."""
+    """Set transmittance to 1, colors and depth sum to 0, and the median depth to infinity."""
     real = state.dtype.type
     for k in range(np.uint64(0), np.uint64(PIXELS), np.uint64(NUM_LANES)):
         store(state, k, spread(real(1)))
@@ -26,7 +26,7 @@ def clear_tile(state: np.ndarray, depths: tuple) -> None:
 
 @inlined_kernel
 def prefetch_tile(width: int, x0: int, y0: int, rows: int, depths: tuple, pixels: tuple) -> None:
-    """Fetch what the tile will be written to while it is blended: a row's pixels are a page away from the next's."""
+    """Prefetch the pixels that the tile is written to: rows of an image are a memory page apart."""
     rgb, alphas, means, _ = pixels
     for row in range(rows):
         start = (y0 + row) * width + x0
@@ -39,7 +39,7 @@ def prefetch_tile(width: int, x0: int, y0: int, rows: int, depths: tuple, pixels
 
 @inlined_kernel
 def _finish_block(block: np.uint64, state: np.ndarray, background: np.ndarray) -> tuple[Vector, Vector, Vector, Vector]:
-    """Red, green, blue and alpha of a block's pixels when all has been drawn."""
+    """Return red, green, blue and alpha of a block's pixels after blending."""
     offset = block * np.uint64(NUM_LANES)
     left = -negative(load(state, offset))
     red = load(state, offset + np.uint64(PIXELS)) + left * background[0]
@@ -50,7 +50,7 @@ def _finish_block(block: np.uint64, state: np.ndarray, background: np.ndarray) -
 
 @inlined_kernel
 def _mean_depth(block: np.uint64, state: np.ndarray, alpha: Vector) -> Vector:
-    """Of a block's pixels when all has been drawn."""
+    """Return the mean depth of a block's pixels after blending."""
     depth = load(state, block * np.uint64(NUM_LANES) + np.uint64(4 * PIXELS)) / alpha
     return select(alpha > 0, depth, spread(state.dtype.type(np.inf)))
 
@@ -59,7 +59,7 @@ def _mean_depth(block: np.uint64, state: np.ndarray, alpha: Vector) -> Vector:
 def write_tile(
     width: int, x0: int, y0: int, state: np.ndarray, background: np.ndarray, depths: tuple, pixels: tuple
 ) -> None:
-    """Into `pixels`, the images of a frame as they lie in memory."""
+    """Write a tile into `pixels`, the flattened images of a frame."""
     rgb, alphas, means, medians = pixels
     for block in range(np.uint64(BLOCKS)):
         red, green, blue, alpha = _finish_block(block, state, background)
@@ -77,7 +77,7 @@ def write_tile(
 def write_cut_tile(
     width: int, x0: int, y0: int, size: tuple, state: np.ndarray, background: np.ndarray, depths: tuple, pixels: tuple
 ) -> None:
-    """As `write_tile`, of a tile of which the image has so many columns and rows."""
+    """Write a tile that extends beyond the image, of which `size` columns and rows are inside."""
     rgb, alphas, means, medians = pixels
     columns, rows = size
     for block in range(np.uint64(BLOCKS)):

@@ -1,7 +1,7 @@
-"""`Vector` from memory and back: rows of arrays become columns on the way, and columns rows.
+"""Load vectors from arrays and store them: contiguous numbers, or columns of 16 rows.
 
-As in `lanes.py` the body of each function is what it does without the compiler. Rows of 3 and 4 numbers have loads of
-their own: with masked ones of 16 columns for any width projecting takes 1.2 to 1.5 times as long.
+The body of each function is its definition without the compiler, as in `vectors.py`. Rows of 3 and 4 numbers have loads
+of their own: with masked loads of 16 columns for any width the projection takes 1.2 to 1.5 times as long.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ from msdgs_serve.rasterizer.vector_types import (
     shuffled,
     typed,
 )
-from msdgs_serve.rasterizer.vectors import filled_up, sixteen
+from msdgs_serve.rasterizer.vectors import as_rows, padded
 
 
 def _columns_of(array: Any, count: int) -> types.Type | None:
@@ -33,7 +33,7 @@ def _columns_of(array: Any, count: int) -> types.Type | None:
 
 
 def _vector_at(context: Any, builder: Any, signature: Any, values: Any) -> tuple[Any, int]:
-    """Pointer to 16 numbers of the first argument, an array, at the index that is the second; its alignment."""
+    """Return a pointer to 16 numbers of the first argument, an array, at the second, an index, and its alignment."""
     kind = signature.args[0]
     data = context.make_array(kind)(context, builder, values[0]).data
     place = builder.gep(data, [context.cast(builder, values[1], signature.args[1], types.intp)])
@@ -42,7 +42,7 @@ def _vector_at(context: Any, builder: Any, signature: Any, values: Any) -> tuple
 
 
 def load(array: np.ndarray, start: Index) -> Vector:
-    """16 consecutive numbers of an array [n]."""
+    """Return 16 consecutive numbers of an array [n]."""
     return array[int(start) : int(start) + NUM_LANES].copy()
 
 
@@ -52,52 +52,51 @@ def store(array: np.ndarray, start: Index, vector: Vector) -> None:
 
 
 def load_or(array: np.ndarray, start: Index, otherwise: Vector) -> Vector:
-    """The numbers of an array [n] from `start`; `otherwise` past its end."""
+    """Return 16 numbers of an array [n] from `start`, or those of `otherwise` past its end."""
     found = array[int(start) : int(start) + NUM_LANES]
     return np.concatenate([found, otherwise[len(found) :]])
 
 
 def load_triples(array: np.ndarray, first_row: Index) -> tuple[Vector, Vector, Vector]:
-    """The columns of 16 rows of an array [n, 3]; 0 past its rows."""
+    """Return the columns of 16 rows of an array [n, 3], 0 past its last row."""
     found = array[int(first_row) :][:NUM_LANES]
     x, y, z = np.concatenate([found, np.zeros((NUM_LANES - len(found), 3), array.dtype)]).T.copy()
     return x, y, z
 
 
 def load_four_columns(array: np.ndarray, first_row: Index, first_column: Index) -> tuple[Vector, ...]:
-    """4 of the columns, which must be there, of 16 rows of an array [n, m]; past the end of the rows the last counts
-    again."""
+    """Return 4 columns, which must exist, of 16 rows of an array [n, m]; past the last row that row is repeated."""
     rows = np.minimum(np.arange(int(first_row), int(first_row) + NUM_LANES), len(array) - 1)
     return tuple(array[rows, int(first_column) : int(first_column) + 4].T.copy())
 
 
 def load_columns(array: np.ndarray, first_row: Index) -> tuple[Vector, ...]:
-    """The columns of 16 rows of an array [n, 16]; past the end of the rows the last counts again."""
+    """Return the columns of 16 rows of an array [n, 16]; past the last row that row is repeated."""
     return tuple(column for first in range(0, NUM_LANES, 4) for column in load_four_columns(array, first_row, first))
 
 
 def load_columns_of(array: np.ndarray, rows: np.ndarray, start: Index) -> tuple[Vector, ...]:
-    """The 16 columns of an array [n, 16], at the rows that 16 numbers of `rows` [m] name from `start`; past the end of
-    `rows` its last number counts again."""
+    """Return the columns of an array [n, 16] at 16 row indices, which are those of `rows` [m] from `start`; past the
+    end of `rows` its last index is repeated."""
     found = rows[np.minimum(np.arange(int(start), int(start) + NUM_LANES), len(rows) - 1)]
     return tuple(array[found].T.copy())
 
 
 def store_columns(array: np.ndarray, first_row: Index, first_column: Index, columns: tuple[Vector, ...]) -> None:
-    """Write up to 16 columns, and 0 for those that lack, into 16 rows of an array [n, m]; what is past its rows and
-    columns is dropped."""
+    """Write up to 16 columns, and 0 in the remaining ones, into 16 rows of an array [n, m]; numbers past its rows and
+    columns are dropped."""
     block = array[int(first_row) :, int(first_column) :][:NUM_LANES, :NUM_LANES]
-    block[:] = sixteen(columns).T[: block.shape[0], : block.shape[1]]
+    block[:] = as_rows(columns).T[: block.shape[0], : block.shape[1]]
 
 
 def store_rows(array: np.ndarray, first_row: Index, columns: tuple[Vector, ...]) -> None:
-    """Write up to 16 columns, and 0 for those that lack, into 16 rows, which must be there, of an array [n, 16]."""
-    array[int(first_row) : int(first_row) + NUM_LANES] = sixteen(columns).T
+    """Write up to 16 columns, and 0 in the remaining ones, into 16 rows, which must exist, of an array [n, 16]."""
+    array[int(first_row) : int(first_row) + NUM_LANES] = as_rows(columns).T
 
 
-def store_whole_numbers(array: np.ndarray, first_row: Index, columns: tuple[Vector, ...]) -> None:
-    """Write 4 columns of numbers in [0, 65535], cut off at the point, into 16 rows of an array [n, 4] of uint16; rows
-    past its end are dropped."""
+def store_uint16(array: np.ndarray, first_row: Index, columns: tuple[Vector, ...]) -> None:
+    """Truncate 4 columns of numbers in [0, 65535] to integers and write them into 16 rows of an array [n, 4] of uint16;
+    rows past its end are dropped."""
     rows = array[int(first_row) :][:NUM_LANES]
     rows[:] = np.stack(columns, axis=1)[: len(rows)]
 
@@ -135,7 +134,7 @@ def _lower_load_or(context: Any, builder: Any, signature: Any, values: Any) -> A
 
 
 def _transposed(builder: Any, vectors: list[Any]) -> list[Any]:
-    """16 vectors as the columns of a matrix to those that are its rows: four rounds of interleaving."""
+    """Return the rows of a matrix whose columns are 16 vectors, by four rounds of interleaving."""
     lower = [lane for k in range(NUM_LANES // 2) for lane in (k, NUM_LANES + k)]
     upper = [lane for k in range(NUM_LANES // 2, NUM_LANES) for lane in (k, NUM_LANES + k)]
     low, high = (ir.Constant(ir.VectorType(ir.IntType(32), NUM_LANES), lanes) for lanes in (lower, upper))
@@ -146,7 +145,7 @@ def _transposed(builder: Any, vectors: list[Any]) -> list[Any]:
 
 
 def _rows(context: Any, builder: Any, kind: Any, array: Any, first_row: Any, first_column: Any) -> tuple[Any, Any, Any]:
-    """Of an array [n, m]: pointers to the 16 rows, the number of rows and that of columns from there."""
+    """Return pointers to 16 rows of an array [n, m], and how many rows and columns there are from the first."""
     array = context.make_array(kind)(context, builder, array)
     count, width = (builder.extract_value(array.shape, axis) for axis in (0, 1))
     start = builder.add(builder.mul(first_row, width), first_column)
@@ -160,7 +159,7 @@ def _rows(context: Any, builder: Any, kind: Any, array: Any, first_row: Any, fir
 
 @lower_builtin(load_triples, types.Array, types.Integer)
 def _lower_load_triples(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    """48 numbers in a row; a column takes two shuffles."""
+    """Load 48 consecutive numbers; a column takes two shuffles."""
     kind = signature.args[0]
     array = context.make_array(kind)(context, builder, values[0])
     row = context.cast(builder, values[1], signature.args[1], types.intp)
@@ -200,7 +199,7 @@ def _lower_load_columns(context: Any, builder: Any, signature: Any, values: Any)
 def _clamped_rows(
     context: Any, builder: Any, kind: Any, array: Any, row_kind: Any, first_row: Any
 ) -> tuple[list[Any], ir.Type]:
-    """Pointers to 16 rows of an array [n, m], to the last one where there are no more; what they point to."""
+    """Return pointers to 16 rows of an array [n, m], repeating the last row, and the type that they point to."""
     array = context.make_array(kind)(context, builder, array)
     count, width = (builder.extract_value(array.shape, axis) for axis in (0, 1))
     rows = _up_to_last(builder, context.cast(builder, first_row, row_kind, types.intp), count)
@@ -209,7 +208,7 @@ def _clamped_rows(
 
 
 def _up_to_last(builder: Any, start: Any, count: Any) -> list[Any]:
-    """16 numbers from `start`, i64; from `count` on the last below it again."""
+    """Return 16 indices from `start` on, as i64, clamped to `count` - 1."""
     last = builder.sub(count, ir.Constant(ir.IntType(64), 1))
     numbers = [builder.add(start, ir.Constant(ir.IntType(64), k)) for k in range(NUM_LANES)]
     return [builder.select(builder.icmp_signed("<", number, last), number, last) for number in numbers]
@@ -235,8 +234,8 @@ def _sixteen_columns(builder: Any, places: list[Any], real: ir.Type) -> list[Any
 
 
 def _four_columns(builder: Any, places: list[Any], real: ir.Type, first: Any) -> list[Any]:
-    """Columns `first` to `first` + 3 of the 16 rows that begin at `places`. Groups of four rows lie side by side, so
-    that only the four by four within a group are turned round."""
+    """Return columns `first` to `first` + 3 of the 16 rows that begin at `places`. The rows are loaded such that only
+    squares of 4 × 4 numbers need to be transposed."""
     quarter, size = ir.VectorType(real, 4), 4 if real == ir.FloatType() else 8
     pieces = []
     for place in places:
@@ -263,7 +262,7 @@ def _lower_store_columns(context: Any, builder: Any, signature: Any, values: Any
         context.cast(builder, v, t, types.intp) for v, t in zip(values[1:3], signature.args[1:3], strict=True)
     )
     places, count, width = _rows(context, builder, kind, values[0], row, column)
-    rows = _transposed(builder, filled_up(builder, values[3]))
+    rows = _transposed(builder, padded(builder, values[3]))
     some = first_lanes(builder, width)
     for k, (place, row_vector) in enumerate(zip(places, rows, strict=True)):
         with builder.if_then(builder.icmp_signed("<", ir.Constant(ir.IntType(64), k), count)):
@@ -281,19 +280,19 @@ def _lower_store_rows(context: Any, builder: Any, signature: Any, values: Any) -
     row = context.cast(builder, values[1], signature.args[1], types.intp)
     place = builder.gep(array.data, [builder.mul(row, ir.Constant(ir.IntType(64), NUM_LANES))])
     vector = ir.VectorType(context.get_data_type(kind.dtype), NUM_LANES).as_pointer()
-    for k, row_vector in enumerate(_transposed(builder, filled_up(builder, values[2]))):
+    for k, row_vector in enumerate(_transposed(builder, padded(builder, values[2]))):
         there = builder.gep(place, [ir.Constant(ir.IntType(64), NUM_LANES * k)])
         builder.store(row_vector, builder.bitcast(there, vector), align=kind.dtype.bitwidth // 8)
     return context.get_dummy_value()
 
 
-WHOLE_NUMBERS = types.Array(types.uint16, 2, "C")
-typed(store_whole_numbers, lambda array, row, columns: none_if(array == WHOLE_NUMBERS and len(columns) == 4))
+UINT16_ROWS = types.Array(types.uint16, 2, "C")
+typed(store_uint16, lambda array, row, columns: none_if(array == UINT16_ROWS and len(columns) == 4))
 
 
-@lower_builtin(store_whole_numbers, types.Array, types.Integer, types.UniTuple)
-def _lower_store_whole_numbers(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    """A row is one number of 64 bits, its first column the lowest: what numba runs on stores those first."""
+@lower_builtin(store_uint16, types.Array, types.Integer, types.UniTuple)
+def _lower_store_uint16(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """Combine a row into one number of 64 bits, its first column lowest, as in little-endian memory."""
     array = context.make_array(signature.args[0])(context, builder, values[0])
     row = context.cast(builder, values[1], signature.args[1], types.intp)
     half, whole = (ir.VectorType(ir.IntType(bits), NUM_LANES) for bits in (32, 64))
@@ -308,7 +307,7 @@ def _lower_store_whole_numbers(context: Any, builder: Any, signature: Any, value
 
 
 def prefetch(array: np.ndarray, place: Index) -> None:
-    """Have the cache line of an element of an array [n] fetched meanwhile; nothing without the compiler."""
+    """Prefetch the cache line of an element of an array [n]; does nothing without the compiler."""
 
 
 typed(prefetch, lambda array, place: types.none)

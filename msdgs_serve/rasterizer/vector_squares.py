@@ -1,4 +1,4 @@
-"""Vectors from and to squares of 4 × 4 numbers, or triples of numbers, in an array: the pixels of a block in an image.
+"""Load and store vectors as squares of 4 × 4 numbers or triples of an array: the pixels of a block of an image.
 
 The body of each function is its definition without the compiler, as in `vectors.py`.
 """
@@ -33,19 +33,19 @@ def store_square(array: np.ndarray, start: Index, stride: Index, vector: Vector)
 
 
 def store_square_of_triples(array: np.ndarray, start: Index, stride: Index, a: Vector, b: Vector, c: Vector) -> None:
-    """Write 4 × 4 triples (a, b, c) into an array [n], 4 of them from `start`, the next 4 `stride` further."""
+    """Write 4 × 4 triples (a, b, c) into an array [n]: 4 from `start`, the next 4 `stride` further, and so on."""
     for row, triples in enumerate(np.stack([a, b, c], axis=1).reshape(4, 12)):
         array[int(start) + row * int(stride) :][:12] = triples
 
 
 def load_square(array: np.ndarray, start: Index, stride: Index) -> Vector:
-    """4 × 4 numbers of an array [n]: 4 from `start`, the next 4 `stride` further, and so on."""
+    """Return 4 × 4 numbers of an array [n]: 4 from `start`, the next 4 `stride` further, and so on."""
     return np.concatenate([array[int(start) + row * int(stride) :][:4] for row in range(4)])
 
 
 def load_square_of_triples(array: np.ndarray, start: Index, stride: Index) -> tuple[Vector, Vector, Vector]:
-    """4 × 4 triples of an array [n], 4 of them from `start`, the next 4 `stride` further: the first of each triple,
-    the second, the third."""
+    """Return the first, second and third numbers of 4 × 4 triples of an array [n]: 4 triples from `start`, the next 4
+    `stride` further, and so on."""
     triples = np.concatenate([array[int(start) + row * int(stride) :][:12] for row in range(4)])
     return triples[0::3].copy(), triples[1::3].copy(), triples[2::3].copy()
 
@@ -62,7 +62,7 @@ typed(
 def _store_pieces(
     context: Any, builder: Any, signature: Any, values: Any, pieces: list[Any], write: Callable | None = None
 ) -> Any:
-    """Write vectors into the array, the first argument, at the second, each the third further than the one before."""
+    """Write vectors into the array (first argument) from the start (second), each one stride (third) further."""
     kind = signature.args[0]
     data = context.make_array(kind)(context, builder, values[0]).data
     start, stride = (
@@ -79,7 +79,8 @@ def _store_pieces(
 
 
 def _load_pieces(context: Any, builder: Any, signature: Any, values: Any, count: int) -> list[Any]:
-    """Four vectors of `count` numbers of the array, the first argument, from the second on, each the third further."""
+    """Load four vectors of `count` numbers of the array (first argument) from the start (second), a stride (third)
+    apart."""
     kind = signature.args[0]
     data = context.make_array(kind)(context, builder, values[0]).data
     start, stride = (
@@ -95,7 +96,7 @@ def _load_pieces(context: Any, builder: Any, signature: Any, values: Any, count:
 
 
 def _every(builder: Any, pieces: list[Any], first: int, step: int) -> Any:
-    """16 numbers: of each of four vectors the one at `first` and three more, `step` apart."""
+    """Return a vector of four numbers of each of four vectors: from `first` on, `step` apart."""
     length = 4 * step
     lanes = [first + k * step for k in range(4)]
     both = [*lanes, *(length + lane for lane in lanes)]
@@ -117,7 +118,7 @@ def _lower_store_square_of_triples(context: Any, builder: Any, signature: Any, v
     rows = []
     for row in range(4):
         wanted = [(pixel, channel) for pixel in range(4 * row, 4 * row + 4) for channel in range(3)]
-        # two sources a shuffle: first and second value, then those and the third; the last 4 lanes are not written
+        # a shuffle has two sources: combine first and second value, then the third; the last 4 lanes are not written
         two = [channel * NUM_LANES + pixel if channel < 2 else 0 for pixel, channel in wanted]
         three = [place if channel < 2 else NUM_LANES + pixel for place, (pixel, channel) in enumerate(wanted)]
         some = shuffled(builder, values[3], values[4], [*two, 0, 0, 0, 0])

@@ -1,9 +1,8 @@
-"""Sixteen numbers at once: the lane-wise operations that the rasterizer's inner loops are written in.
+"""Operations on SIMD vectors of 16 numbers, in which the rasterizer's inner loops are written.
 
-In compiled kernels a `Vector` is one LLVM vector of 16 float32 or float64, and a mask one of 16 bits: on a CPU with
-AVX-512 a float32 operation is one instruction, elsewhere LLVM splits it. LLVM's own vectorizer doesn't find these
-loops: plain ones take 3x the time. Without the compiler the very same kernels run on NumPy arrays of 16, which is what
-each function's body does.
+In compiled kernels a `Vector` is an LLVM vector of 16 float32 or float64, and a `Mask` one of 16 bits: on a CPU with
+AVX-512 a float32 operation is one instruction, elsewhere LLVM splits it. LLVM doesn't vectorize these loops by itself:
+scalar ones take 3x the time. Without the compiler the same kernels run on NumPy arrays [16], by the functions' bodies.
 """
 
 import operator
@@ -36,7 +35,7 @@ from msdgs_serve.rasterizer.vector_types import (
 
 
 def _same_or_number(a: types.Type, b: types.Type) -> types.Type | None:
-    """The type of the lanes where both arguments are alike or one is a single number."""
+    """Return the vector type if both arguments have it or one of them is a single number."""
     number = (types.Float, types.Integer)
     if isinstance(a, VectorType) and isinstance(b, number):
         return a
@@ -54,9 +53,13 @@ def _mask_for(kind: types.Type | None) -> types.Type | None:
 
 
 def _arithmetic() -> None:
-    """+ - * / and < <= > >= between lanes, or lanes and a number, and & | ~ between masks: NumPy has them already."""
+    """Define + - * / < <= > >= of vectors, or of a vector and a number, and & | ~ of masks; NumPy arrays have them."""
     binary = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
-    binary |= {operator.iadd: "fadd", operator.isub: "fsub", operator.imul: "fmul"}  # which are the same for numbers
+    binary |= {
+        operator.iadd: "fadd",
+        operator.isub: "fsub",
+        operator.imul: "fmul",
+    }  # in place, which is the same for numbers
     comparisons = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}
     for function, name in binary.items():
         typed(function, lambda a, b: _same_or_number(a, b))
@@ -74,7 +77,7 @@ def _arithmetic() -> None:
 
 
 def _lower_mixed(function: Callable, lower: Callable) -> None:
-    """For lanes and lanes, lanes and a number, a number and lanes."""
+    """Define an operation of two vectors, of a vector and a number, and of a number and a vector."""
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         like = next(kind for kind in signature.args if isinstance(kind, VectorType))
@@ -96,7 +99,7 @@ _arithmetic()
 
 
 def spread(value: Any) -> Vector:
-    """One number in all lanes."""
+    """Return a vector with one number in all lanes."""
     return np.full(NUM_LANES, value)
 
 
@@ -106,7 +109,7 @@ for _number in REALS:
 
 
 def filled(value: Any, like: Vector) -> Vector:
-    """One number in as many lanes, and of the type, of another `Vector`."""
+    """Return a vector of the type of `like` with one number in all lanes."""
     return np.full_like(like, value)
 
 
@@ -120,42 +123,42 @@ def _lower_filled(context: Any, builder: Any, signature: Any, values: Any) -> An
 
 
 def fma(a: Vector, b: Vector, c: Vector) -> Vector:
-    """a b + c, rounded once."""
+    """Return a b + c, rounded once."""
     return a * b + c
 
 
 def minimum(a: Vector, b: Vector) -> Vector:
-    """The smaller; `b` where either is NaN."""
+    """Return the smaller numbers; `b` if either is NaN."""
     return np.where(a < b, a, b)
 
 
 def maximum(a: Vector, b: Vector) -> Vector:
-    """The larger; `b` where either is NaN."""
+    """Return the larger numbers; `b` if either is NaN."""
     return np.where(a > b, a, b)
 
 
 def square_root(a: Vector) -> Vector:
-    """√a."""
+    """Return √a."""
     return np.sqrt(a)
 
 
 def negative(a: Vector) -> Vector:
-    """-|a|."""
+    """Return -|a|."""
     return -np.abs(a)
 
 
 def select(mask: Mask, a: Vector, b: Vector) -> Vector:
-    """`a` where the mask is set, else `b`."""
+    """Return `a` in lanes where the mask is set, else `b`."""
     return np.where(mask, a, b)
 
 
 def rounder(a: Vector) -> Any:
-    """What, added to a number of that type, rounds it to a whole one: 1.5 times the reach of its mantissa."""
+    """Return the number that, added to one of the type of `a`, rounds it to an integer: 1.5 × 2^mantissa bits."""
     return a.dtype.type(1.5 * 2 ** np.finfo(a.dtype).nmant)
 
 
 def times_power_of_two(a: Vector, rounded: Vector) -> Vector:
-    """a 2ⁿ, where `rounded` is n + `rounder`: its last bits, n, are added to the exponent of `a`."""
+    """Return a 2ⁿ for `rounded` = n + `rounder(a)`: its last bits, n, are added to the exponent of `a`."""
     return np.ldexp(a, (rounded - rounder(a)).astype(np.int32))
 
 
@@ -170,17 +173,17 @@ typed(rounder, lambda a: a.dtype if isinstance(a, VectorType) else None)
 
 
 def converted(a: Vector, like: np.ndarray) -> Vector:
-    """The same numbers in the dtype of an array."""
+    """Return the numbers in the dtype of the array `like`."""
     return a.astype(like.dtype)
 
 
 def exponent_of(a: Vector) -> Vector:
-    """⌊log2 a⌋ of positive normal numbers."""
+    """Return ⌊log2 a⌋ of positive normal numbers."""
     return (np.frexp(a)[1] - 1).astype(a.dtype)
 
 
 def mantissa_of(a: Vector) -> Vector:
-    """a / 2^exponent_of(a), in [1, 2)."""
+    """Return a / 2^exponent_of(a), in [1, 2)."""
     return 2 * np.frexp(a)[0]
 
 
@@ -190,7 +193,8 @@ typed(converted, lambda a, like: VectorType(like.dtype, a.count) if same(a) and 
 
 
 def _layout(vector: ir.VectorType) -> tuple[ir.VectorType, Callable[[int], ir.Constant], int, int]:
-    """Of a vector of floats: that of integers as wide, how to write a constant of it, bias and place of exponents."""
+    """Return, for a vector of floats, the integer vector type of equal width, a function that makes its constants, and
+    the bias and bit position of the exponents."""
     bits, bias, place = (32, 127, 23) if vector.element == ir.FloatType() else (64, 1023, 52)
     integers = ir.VectorType(ir.IntType(bits), vector.count)
     return integers, lambda value: ir.Constant(integers, [value] * vector.count), bias, place
@@ -248,18 +252,18 @@ lowered(mantissa_of, VectorType)(_mantissa)
 
 
 def pair(a: Vector, b: Vector) -> Vector:
-    """Both side by side; every operation above takes twice or four times as many lanes too. One long chain of
-    operations leaves most of a core idle, chains side by side fill it."""
+    """Return both vectors as one of twice the size; the operations above take vectors of 32 and 64 lanes too. One long
+    chain of dependent operations leaves most of a core idle, several independent chains fill it."""
     return np.concatenate([a, b])
 
 
 def first_of(pair_: Vector) -> Vector:
-    """The first half of a pair, of lanes or masks."""
+    """Return the first half of a pair of vectors or masks."""
     return pair_[: len(pair_) // 2]
 
 
 def second_of(pair_: Vector) -> Vector:
-    """The second half of a pair, of lanes or masks."""
+    """Return the second half of a pair of vectors or masks."""
     return pair_[len(pair_) // 2 :]
 
 
@@ -279,7 +283,7 @@ for _either in (VectorType, MaskType):
 
 
 def bits_of(mask: Mask) -> Any:
-    """The mask as a number: lane 0 is bit 0."""
+    """Return the mask as a number; lane 0 is bit 0."""
     return int(np.dot(mask, 1 << np.arange(NUM_LANES)))
 
 
@@ -288,7 +292,7 @@ lowered(bits_of, MASK)(lambda b, mask: b.zext(b.bitcast(mask, ir.IntType(NUM_LAN
 
 
 def lowest_bit(bits: Index) -> Any:
-    """The place of the lowest set bit of a number that is not 0."""
+    """Return the position of the lowest set bit of a number that is not 0."""
     return (int(bits) & -int(bits)).bit_length() - 1
 
 
@@ -297,17 +301,17 @@ lowered(lowest_bit, types.uint64)(lambda b, bits: b.cttz(bits, ir.Constant(ir.In
 
 
 def sums_of(columns: tuple[Vector, ...]) -> Vector:
-    """The sum of each of up to 16 `Vector`, in the lane of its number; 0 in the others."""
-    return sixteen(columns).sum(axis=1)
+    """Return the sums of up to 16 vectors, each in the lane of its index; 0 in the other lanes."""
+    return as_rows(columns).sum(axis=1)
 
 
-def sixteen(columns: tuple[Vector, ...]) -> np.ndarray:
-    """[16, 16] columns as rows, filled up with zeros."""
+def as_rows(columns: tuple[Vector, ...]) -> np.ndarray:
+    """Return up to 16 vectors as rows of an array [16, 16], followed by zeros."""
     return np.stack([*columns, *[np.zeros_like(columns[0])] * (NUM_LANES - len(columns))])
 
 
-def filled_up(builder: Any, columns: Any) -> list[Any]:
-    """The vectors of a tuple, and vectors of zeros up to 16."""
+def padded(builder: Any, columns: Any) -> list[Any]:
+    """Return the vectors of a tuple, followed by vectors of zeros up to 16."""
     vectors = [builder.extract_value(columns, k) for k in range(len(columns.type))]
     return vectors + [ir.Constant(vectors[0].type, [0.0] * NUM_LANES)] * (NUM_LANES - len(vectors))
 
@@ -317,9 +321,9 @@ typed(sums_of, lambda columns: columns.dtype if isinstance(columns, types.UniTup
 
 @lower_builtin(sums_of, types.UniTuple)
 def _lower_sums_of(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    vectors = filled_up(builder, values[0])
+    vectors = padded(builder, values[0])
     lower, upper = ([lane for k in range(start, start + 8) for lane in (k, NUM_LANES + k)] for start in (0, 8))
-    while len(vectors) > 1:  # two vectors of partial sums become one, whose neighbours belong to one and the other
+    while len(vectors) > 1:  # adds neighbouring lanes of two vectors of partial sums into one vector
         pairs = [(vectors[k], vectors[k + len(vectors) // 2]) for k in range(len(vectors) // 2)]
         vectors = [
             builder.fadd(shuffled(builder, a, b, lower), shuffled(builder, a, b, upper), flags=FREEDOMS)

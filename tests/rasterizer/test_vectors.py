@@ -119,7 +119,7 @@ def test_memory(dtype: type):
 @kernel
 def whole_numbers(columns: np.ndarray, row: int, out: np.ndarray) -> None:
     a, b, c, d = (memory.load(columns, 0), memory.load(columns, 16), memory.load(columns, 32), memory.load(columns, 48))
-    memory.store_whole_numbers(out, row, (a, b, c, d))
+    memory.store_uint16(out, row, (a, b, c, d))
 
 
 @DTYPES

@@ -19,8 +19,8 @@ from starlette.types import Receive, Scope, Send
 from msdgs_serve.api.body_limit import BodyLimit
 from msdgs_serve.api.keys import KeyCheck, read_keys
 from msdgs_serve.api.observe import JsonLines, request_id
+from msdgs_serve.imaging.display import FARTHEST_BRIGHTNESS
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
-from msdgs_serve.imaging.images import FARTHEST_BRIGHTNESS
 from tests.service.test_api import eventually
 from tests.service.test_api_poison import check_problem
 from tests.support.images import decode

@@ -1,4 +1,4 @@
-"""A film along a camera path."""
+"""Render a video along a camera path."""
 
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
@@ -28,7 +28,7 @@ router = APIRouter(tags=["frames"])
 
 @router.post(
     "/render/video",
-    summary="A film along a camera path",
+    summary="A video along a camera path",
     response_class=Response,
     responses={
         **VIDEO_RESPONSE,
@@ -45,20 +45,20 @@ router = APIRouter(tags=["frames"])
     },
 )
 async def render_video(body: VideoRequest, service: SharedService, request: Request) -> Response:
-    """Draws every frame, and sends the film while it does. The time limit holds for each frame, others draw in between;
-    where one fails the connection is closed, so that the film is known to be incomplete.
+    """Streams the video while its frames are rendered, with renders of other requests in between. The time limit holds
+    per frame; if one fails, the connection is closed, so that the client knows that the video is incomplete.
 
-    For long films `msdgs-render` on the machine itself shows its progress and goes on where it was stopped.
+    For long videos use `msdgs-render` on the machine itself, which shows its progress and can be resumed.
     """
     check_video(body.format)
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
     film = _film(service, body, scene, path)
-    first = await unless_gone(request, anext(film))  # what goes wrong at once still has its status
+    first = await unless_gone(request, anext(film))  # an error in the first frame still gets its status
     return StreamingResponse(_joined(first, film), media_type=VIDEO_FORMATS[body.format].media_type)
 
 
 class _OutputBuffer:
-    """A file that can only be written to, and what of it nobody has taken yet."""
+    """A write-only file whose new contents are taken piece by piece."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
@@ -74,7 +74,7 @@ class _OutputBuffer:
 
 
 async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> AsyncGenerator[bytes]:
-    """The file in pieces. Each frame is drawn and encoded when its turn comes and the piece before has been sent on."""
+    """Yield the file in pieces. Each frame is rendered when its turn comes and the previous piece was sent."""
     options, job, unsent = RenderOptions(body.background), RenderJob(), _OutputBuffer()
     writer = FilmWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
 
@@ -108,7 +108,7 @@ def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath
     if (body.frames is None) == (body.path is None):
         raise InvalidInput("frames", "given, or path", "neither" if body.frames is None else "both")
     if (body.width is None) != (body.height is None):
-        raise InvalidInput("width", "given together with height", "one of them")
+        raise InvalidInput("width", "given together with height", "only one of them")
     size = None if body.width is None or body.height is None else (body.width, body.height)
     if body.path is not None:
         path = read_nerfstudio(body.path.model_dump(exclude_none=True), metadata.time_range, size)
