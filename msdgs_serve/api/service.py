@@ -99,9 +99,10 @@ class Service:
                 HTTPStatus.FORBIDDEN, "forbidden", "The service runs without --uploads: scenes can't be changed."
             )
 
-    def log_problem(self, error: SceneFileInvalid) -> None:
-        """For the operator: what a client isn't told."""
-        logger.error("%s", error)
+    def log_rejected_upload(self, name: str, error: SceneFileInvalid) -> None:
+        """Log why the file that a client uploaded as `name` is invalid, with details that the client isn't told."""
+        details = f": {error.details}" if error.details else ""
+        logger.info("upload of scene %r rejected: `%s` %s%s", name, error.field, error.problem, details)
 
     def _load_and_refresh(self) -> None:
         lower_priority()  # loading scenes must not delay requests

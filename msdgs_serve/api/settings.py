@@ -115,7 +115,7 @@ class Settings(BaseSettings):
     threads: int | None = Field(default=None, ge=1, le=256, description="render threads; default: one per core")
     log_format: Literal["text", "json"] = Field(default="text", description="`json`: one object per line")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="warning", description="`info` logs every request"
+        default="warning", description="`info` logs every request and invalid upload"
     )
 
     @property

@@ -118,7 +118,7 @@ async def add_scene(
             added = await anyio.to_thread.run_sync(add, limiter=uploads.opening)
             uploads.added(upload)
     except SceneFileInvalid as error:
-        service.log_problem(error)
+        service.log_rejected_upload(name, error)
         detail = f"The file violates the contract msdgs/1: `{error.field}` {error.problem}"
         raise RequestRejected(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
