@@ -56,7 +56,7 @@ class Uploads:
 
     @contextmanager
     def receiving(self, name: str, owner: str | None) -> Iterator[Stored]:
-        """Count an upload within the context, after `scan`. Raises `RequestRejected` (507) for quotas and full disks."""
+        """Count an upload in the context, after `scan`. Raises `RequestRejected` (507) for quotas and full disks."""
         upload = Stored(name, owner)
         with self._lock:
             self._incoming.add(upload)
