@@ -13,10 +13,10 @@ Row = dict[str, Any]
 
 def print_tables(result: Row, console: Console) -> None:
     """Each section that has been measured."""
-    at_most = result["machine"]
-    console.print(at_most["name"])
-    if "gflops" in at_most:
-        rates = f"{at_most['gflops']:.0f} GFLOP/s of float32 fma, {at_most['gigabytes']:.1f} GB/s copied"
+    machine = result["machine"]
+    console.print(machine["name"])
+    if "gflops" in machine:
+        rates = f"{machine['gflops']:.0f} GFLOP/s of float32 fma, {machine['gigabytes']:.1f} GB/s copied"
         console.print(f"at most seen in this run: {rates}")
     for section, title in (("frames", "Seeded scenes"), ("real", "Real splats")):
         if section in result:

@@ -1,4 +1,4 @@
-"""Work that nobody waits for any more ends, wherever it is."""
+"""Cancelled render jobs end, between stages and inside of them."""
 
 import threading
 
@@ -13,7 +13,7 @@ from msdgs_serve.threads import checking, run_parallel
 from tests.support.scenes import front_camera, gaussians_of
 
 
-def test_a_stopped_watch_lets_no_stage_begin():
+def test_a_cancelled_job_lets_no_stage_begin():
     job = RenderJob()
     job.cancel()
     with pytest.raises(RenderCancelled), job.stage("draw"):

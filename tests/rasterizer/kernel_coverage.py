@@ -43,7 +43,7 @@ def kernel_files() -> list[Path]:
 
 
 def main() -> int:
-    """Start anew with the compiler off, as it can't be switched off later."""
+    """Start again with the compiler off, as it can't be switched off later."""
     if os.environ.get("NUMBA_DISABLE_JIT") != "1":
         environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
         return subprocess.call([sys.executable, "-m", "tests.rasterizer.kernel_coverage"], cwd=ROOT, env=environment)

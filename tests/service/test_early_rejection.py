@@ -1,4 +1,4 @@
-"""Calls that are refused before they are parsed: when that is, and that nobody can tell the difference."""
+"""Requests that are rejected before they are parsed, with the same answer as from the application."""
 
 import logging
 import socket
@@ -107,10 +107,10 @@ def sent(connection: socket.socket, data: bytes) -> tuple[bytes, dict[str, str],
 
 
 @in_this_process
-def test_nobody_can_tell_the_difference(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_the_answer_is_that_of_the_application(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """The same answer, line in the log and counts as the application's; the connection is as good as before."""
     write_scene(tmp_path / "ball.onnx")
-    slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # a header that the early_rejection doesn't know
+    slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # an unknown header
     named = HEAD + b"X-Request-ID: mine\r\n\r\n" + BODY
     servers: list[Server] = []
     caplog.set_level(logging.INFO, "msdgs_serve.access")

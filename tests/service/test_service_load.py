@@ -32,7 +32,7 @@ FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 class SlowPoses(PoseCache):
     """Poses that wait until they may go on, once `slow` is set, and are never remembered.
 
-    From the `last` on that may begin, they wait until nobody wants them any more.
+    From the `last` on that may begin, they wait until they are cancelled.
     """
 
     def __init__(self) -> None:
@@ -130,7 +130,7 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
 
 
 def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
-    """A request on a connection of its own; whoever closes that is gone."""
+    """A request on a connection of its own; closing it disconnects the client."""
     request = client.build_request("POST", path, json=body)
     request.read()
     host = client.base_url.host

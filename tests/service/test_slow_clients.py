@@ -1,4 +1,4 @@
-"""Clients that send or read too slowly are let go, and disturb nobody."""
+"""Clients that send or read too slowly are disconnected, and don't delay others."""
 
 import contextlib
 import socket
