@@ -138,7 +138,7 @@ def test_a_file_that_ends_its_process_is_refused_at_upload(tmp_path: Path, monke
         monkeypatch.setattr(Settings, "graph_limits", dying)
         answer = client.post("/scenes", params={"name": "walk"}, content=contents)
         assert (answer.status_code, list(folder.iterdir())) == (422, [])
-        assert "ends the process that tries it" in answer.json()["detail"]
+        assert "crashes the process that tests it" in answer.json()["detail"]
         monkeypatch.undo()
         assert client.post("/scenes", params={"name": "walk"}, content=contents).status_code == 201
 

@@ -98,7 +98,7 @@ def test_a_file_that_says_no_scopes_is_refused_with_the_line_that_it_needs(tmp_p
 def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
     (tmp_path / "keys").write_bytes(b"\xff\xfe")
     for path in (tmp_path / "keys", tmp_path / "missing", tmp_path):
-        with pytest.raises(InvalidInput, match="a text file"):
+        with pytest.raises(InvalidInput, match="a readable text file"):
             read_keys(path)
 
 
