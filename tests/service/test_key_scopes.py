@@ -81,7 +81,7 @@ def test_a_key_may_have_several_scopes(tmp_path: Path):
         ("# ours\nread 0123456789abcdef\nfedcba9876543210\n", "line 3"),
         ("admin 0123456789abcdef", "line 1"),
         ("read,,write 0123456789abcdef", "line 1"),
-        ("read 0123456789abcde", "16 or more letters"),
+        ("read 0123456789abcde", "16 or more characters"),
         ("read 0123456789abcdef extra", "line 1"),
         ("read 0123456789abcdef\nwrite 0123456789abcdef", "different keys"),
         ("", "0 keys"),
