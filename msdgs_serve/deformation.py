@@ -76,7 +76,7 @@ class DeformationSession:
             return
         if not self.max_steps:
             plan = self.scene.metadata.plan
-            raise InvalidInput("steps", f"left out, as the plan {plan} doesn't run layers one by one", steps)
+            raise InvalidInput("steps", f"left out, as the plan {plan} runs no layers", steps)
         if not 0 <= steps <= self.max_steps:
             raise InvalidInput("steps", f"in [0, {self.max_steps}], the scene's layers", steps)
 

@@ -105,9 +105,7 @@ def test_steps_that_the_scene_has_not_are_refused(session: DeformationSession, s
 def test_a_scene_without_layers_has_no_steps(tmp_path: Path, steps: float):
     session = DeformationSession(write_scene(tmp_path / "scene.onnx"))
     assert session.max_steps == 0
-    with pytest.raises(
-        InvalidInput, match="`steps` must be left out, as the plan network doesn't run layers one by one"
-    ):
+    with pytest.raises(InvalidInput, match="`steps` must be left out, as the plan network runs no layers"):
         session.pose(0.5, steps=steps)
 
 

@@ -41,10 +41,10 @@ class CallCost:
         frame = self.operations * calls
         if self.memory_bytes > limits.memory_bytes:
             taken, allowed = self.memory_bytes / 2**20, limits.memory_bytes / 2**20
-            return f"raises the cost of a frame to {taken:,.0f} MiB of values; the limit is {allowed:,.0f} MiB"
+            return f"brings a frame to {taken:,.0f} MiB of values; the limit is {allowed:,.0f} MiB"
         if self.operations > limits.call_operations:
             taken, allowed = self.operations, limits.call_operations
-            return f"raises the cost of a call to {taken:.2g} operations; the limit is {allowed:.2g}"
+            return f"brings a call to {taken:.2g} operations; the limit is {allowed:.2g}"
         if frame > limits.operations:
-            return f"raises the cost of a frame to {frame:.2g} operations; the limit is {limits.operations:.2g}"
+            return f"brings a frame to {frame:.2g} operations; the limit is {limits.operations:.2g}"
         return None
