@@ -58,7 +58,7 @@ def check_video(video_format: str) -> None:
         raise VideoUnavailable("videos need PyAV: pip install 'msdgs[video]'") from None
 
 
-class FilmWriter:
+class VideoWriter:
     """Encodes sRGB frames, [H, W, 3] uint8 of one size, into a file that may not support `seek`.
 
     The codecs need even sizes: an odd last row or column is dropped. Not safe to use from several threads.
@@ -98,8 +98,8 @@ class FilmWriter:
 
 
 def write_video(frames: Iterable[np.ndarray], fps: float, video_format: VideoFormat, file: BinaryIO) -> int:
-    """Write frames to a file and return their number. See `FilmWriter`."""
-    writer, count = FilmWriter(file, fps, video_format), 0
+    """Write frames to a file and return their number. See `VideoWriter`."""
+    writer, count = VideoWriter(file, fps, video_format), 0
     for pixels in frames:
         writer.add(pixels)
         count += 1

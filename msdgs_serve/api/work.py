@@ -91,7 +91,7 @@ class WorkQueue:
 
     @contextmanager
     def admitted(self, client: str, *, streamed: bool = False, at_once: bool = True) -> Iterator[None]:
-        """Hold a place for a call within the context: from now, or unless `at_once` from its first work, until it ends.
+        """Hold a place for a call within the context, from now if `at_once`, else from its first work, until it ends.
 
         A streamed call holds its place to the end; later work of an admitted call is never rejected. Raises
         `RequestRejected` if there is no place.

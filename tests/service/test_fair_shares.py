@@ -199,7 +199,7 @@ def times(count: int) -> list[float]:
 def film(service: Service) -> AsyncGenerator[bytes]:
     frames = [{"camera": ORBIT, "t": t} for t in times(MANY)]
     body = VideoRequest.model_validate({"frames": frames, "width": 32, "height": 32})
-    return video._film(service, body, *video._path(service, body))
+    return video._stream_video(service, body, *video._path(service, body))
 
 
 def lines(service: Service) -> AsyncGenerator[Any]:

@@ -21,7 +21,7 @@ from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import RenderOptions, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
-from msdgs_serve.video import VIDEO_FORMATS, FilmWriter, check_video
+from msdgs_serve.video import VIDEO_FORMATS, VideoWriter, check_video
 
 router = APIRouter(tags=["frames"])
 
@@ -52,9 +52,9 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
     """
     check_video(body.format)
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
-    film = _film(service, body, scene, path)
-    first = await unless_gone(request, anext(film))  # an error in the first frame still gets its status
-    return StreamingResponse(_joined(first, film), media_type=VIDEO_FORMATS[body.format].media_type)
+    stream = _stream_video(service, body, scene, path)
+    first = await unless_gone(request, anext(stream))  # an error in the first frame still gets its status
+    return StreamingResponse(_joined(first, stream), media_type=VIDEO_FORMATS[body.format].media_type)
 
 
 class _OutputBuffer:
@@ -73,10 +73,10 @@ class _OutputBuffer:
         return taken
 
 
-async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> AsyncGenerator[bytes]:
+async def _stream_video(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> AsyncGenerator[bytes]:
     """Yield the file in pieces. Each frame is rendered when its turn comes and the previous piece was sent."""
     options, job, unsent = RenderOptions(body.background), RenderJob(), _OutputBuffer()
-    writer = FilmWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
+    writer = VideoWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
 
     def add(camera: Camera, t: float) -> bytes:
         pixels = service.renderer.render(scene.session, camera, t, options, job).display_pixels()
