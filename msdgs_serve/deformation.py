@@ -115,7 +115,7 @@ class DeformationSession:
         return self.scene.gaussians(*self.pose(t, steps=steps))
 
     @contextmanager
-    def blaming_scene_file(self, t: float) -> Iterator[None]:
+    def as_scene_file_error(self, t: float) -> Iterator[None]:
         """Turn `InvalidInput` about this scene's Gaussians at `t` into `SceneFileInvalid`: loading checks the first and
         the last time only."""
         try:
@@ -175,7 +175,7 @@ class DeformationSession:
     def _check_sample(self, t: float) -> None:
         sample = slice(min(self.scene.moving_count, 64))
         posed = self.pose(t, np.arange(sample.stop))
-        with self.blaming_scene_file(t):
+        with self.as_scene_file_error(t):
             Gaussians(*posed, self.scene.opacities[sample], self.scene.sh[sample]).validate()
 
     def _run(self, t: float, ids: npt.NDArray[np.int64], steps: float | None = None) -> list[FloatArray]:

@@ -46,7 +46,8 @@ def framing(metadata: SceneMetadata) -> Framing:
 
 
 def _nearest_point(poses: np.ndarray, low: np.ndarray, high: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Return the point nearest to all viewing axes of poses [N, 4, 4], if it is in the bounds and in front of most.
+    """Return the point nearest to all viewing axes of poses [N, 4, 4], if it is in the bounds and in front of most,
+    else `otherwise`.
 
     Bounds include distant Gaussians, so that no camera may look at their center.
     """

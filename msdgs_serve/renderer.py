@@ -106,7 +106,7 @@ class Renderer:
         gaussians, later = self.posed(session, time, job, options.steps), None
         if options.motion_dt is not None:
             later = self.posed(session, time + options.motion_dt, job, options.steps)
-        with job.stage("draw"), session.blaming_scene_file(time):
+        with job.stage("draw"), session.as_scene_file_error(time):
             background = resolve_background(session, options.background)
             constants = as_trained(session.scene.metadata, options.rasterizer)
             extra = None if later is None else displacements(gaussians, later, camera)

@@ -73,7 +73,9 @@ class _OutputBuffer:
         return taken
 
 
-async def _stream_video(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> AsyncGenerator[bytes]:
+async def _stream_video(
+    service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath
+) -> AsyncGenerator[bytes]:
     """Yield the file in pieces. Each frame is rendered when its turn comes and the previous piece was sent."""
     options, job, unsent = RenderOptions(body.background), RenderJob(), _OutputBuffer()
     writer = VideoWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
