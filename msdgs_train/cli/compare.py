@@ -1,13 +1,20 @@
 """`msdgs-train compare`."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, rich_table
+
+if TYPE_CHECKING:
+    from msdgs_train.comparison.matrix import Run
+    from msdgs_train.comparison.pools import RunEnd
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,6 @@ class Compare:
 
     def execute(self) -> int:
         from msdgs_serve.threads import thread_count
-        from msdgs_train.cli.compare_progress import ComparisonProgress
         from msdgs_train.comparison.matrix import Budget, make_runs, read_systems
         from msdgs_train.comparison.pools import processes, ray_tasks
         from msdgs_train.comparison.report import HEADINGS, table, write_comparison
@@ -69,8 +75,8 @@ class Compare:
             pool = processes(self.jobs or max(1, thread_count() // self.threads))
         else:
             pool = ray_tasks(self.ray, self.threads, self.jobs)
-        with ComparisonProgress(console, len(runs)) as progress:
-            complete = train_all(runs, pool, progress.ended)
+        with _progress(len(runs)) as on_end:
+            complete = train_all(runs, pool, on_end)
         results = collect(runs)
         if results:
             paths = write_comparison(self.out, results, len(runs) - len(results))
@@ -83,3 +89,18 @@ class Compare:
             console.print("interrupted; the same command continues", soft_wrap=True)
             return EXIT_INTERRUPTED
         return 0 if len(results) == len(runs) else EXIT_INVALID
+
+
+@contextmanager
+def _progress(total: int) -> "Iterator[Callable[[Run, RunEnd], None]]":
+    """A bar over the runs; yields a function that advances it and prints a line about an ended run."""
+    columns = BarColumn(None), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("runs", total=total)
+
+        def on_end(run: "Run", end: "RunEnd") -> None:
+            bar.advance(task)
+            line = f"{run.name}: {end.status}" + (f", {end.message}" if end.message else "")
+            console.print(line, soft_wrap=True, markup=False, style="red" if end.status == "failed" else None)
+
+        yield on_end

@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
 
 from rich.console import Console
 from rich.progress import Progress
@@ -12,14 +11,6 @@ EXIT_INVALID = 2
 EXIT_INTERRUPTED = 130  # as a shell reports a program that Ctrl-C has stopped
 
 console = Console()
-
-
-class Command(Protocol):
-    """The options of one command."""
-
-    def execute(self) -> int:
-        """Run the command; returns the exit code."""
-        ...
 
 
 def rich_table(

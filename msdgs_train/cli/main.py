@@ -10,7 +10,7 @@ from rich.console import Console
 
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.cli.compare import Compare
-from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, Command
+from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_train.cli.evaluate import Evaluate
 from msdgs_train.cli.fit import Fit, parse_fit
 from msdgs_train.cli.steps import Steps
@@ -53,7 +53,7 @@ def _without_plugins(arguments: Sequence[str]) -> list[str]:
     return rest
 
 
-def _parse(arguments: Sequence[str]) -> Command:
+def _parse(arguments: Sequence[str]) -> Commands:
     if arguments[:1] == ["fit"]:
         return parse_fit(arguments[1:])
     description = f"{__doc__}\n\n{EPILOG}"

@@ -44,8 +44,8 @@ class Pool(Protocol):
         """Start a run, or continue it."""
         ...
 
-    def ended(self) -> Iterator[tuple[Run, RunEnd]]:
-        """The runs that have ended; waits up to `POLL_SECONDS`."""
+    def ended(self, timeout: float | None = None) -> Iterator[tuple[Run, RunEnd]]:
+        """The runs that have ended; waits for the first of them, up to `timeout` seconds."""
         ...
 
     def stop(self) -> None:
@@ -85,34 +85,21 @@ class _Processes:
     def submit(self, run: Run) -> None:
         self._going[self._executor.submit(_train_here, run)] = run
 
-    def ended(self) -> Iterator[tuple[Run, RunEnd]]:
-        for future in wait(self._going, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED).done:
+    def ended(self, timeout: float | None = None) -> Iterator[tuple[Run, RunEnd]]:
+        for future in wait(self._going, timeout=timeout, return_when=FIRST_COMPLETED).done:
             yield self._going.pop(future), future.result()
 
     def stop(self) -> None:
         self._stop.set()
 
 
-class _RayPool:
+class _RayPool(RayTasks[Run, RunEnd]):
     def __init__(self, jobs: int, threads: int) -> None:
         import ray  # pyright: ignore[reportMissingImports]  # an extra
 
         self.jobs = jobs
         self._flag = ray.remote(num_cpus=0)(_Flag).remote()
-        self._tasks: RayTasks[Run, RunEnd] = RayTasks(_train_on_ray, [self._flag], cores=threads)
-        self._given: dict[Path, Run] = {}
-
-    def __len__(self) -> int:
-        return len(self._tasks)
-
-    def submit(self, run: Run) -> None:
-        there = dataclasses.replace(run, folder=run.folder.absolute(), data=run.data.absolute())
-        self._given[there.folder] = run
-        self._tasks.submit(there)
-
-    def ended(self) -> Iterator[tuple[Run, RunEnd]]:
-        for there, end in self._tasks.ended(POLL_SECONDS):
-            yield self._given.pop(there.folder), end
+        super().__init__(_train_on_ray, [self._flag], Path.cwd(), cores=threads)
 
     def stop(self) -> None:
         self._flag.set.remote()
@@ -151,8 +138,10 @@ class _ParentObserver(Observer):
         return _is_orphan() or (_stop is not None and _stop.is_set())
 
 
-def _train_on_ray(flag: list[Any], run: Run) -> RunEnd:
-    return _train(run, _FlagObserver(flag[0]))
+def _train_on_ray(flag: list[Any], folder: Path, run: Run) -> RunEnd:
+    """Train one run; relative paths are those of `folder`, in which the command was given."""
+    there = dataclasses.replace(run, folder=folder / run.folder, data=folder / run.data)
+    return _train(there, _FlagObserver(flag[0]))
 
 
 def _train_here(run: Run) -> RunEnd:

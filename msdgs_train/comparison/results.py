@@ -48,21 +48,6 @@ class Result:
     curve: list[CurvePoint]
 
 
-class Spread(NamedTuple):
-    """Mean and sample standard deviation; None for a single value."""
-
-    mean: float
-    deviation: float | None
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Spread":
-        return cls(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
-
-    def shown(self, digits: int) -> str:
-        """As text: mean ± deviation."""
-        return f"{self.mean:,.{digits}f}" + ("" if self.deviation is None else f" ± {self.deviation:,.{digits}f}")
-
-
 def collect(runs: Sequence[Run]) -> list[Result]:
     """Results of the finished runs; frames are timed one after the other."""
     return [_result(run) for run in runs if is_finished(run)]

@@ -9,7 +9,7 @@ from typing import Any
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
-from msdgs_train.comparison.pools import Pool, RunEnd
+from msdgs_train.comparison.pools import POLL_SECONDS, Pool, RunEnd
 from msdgs_train.engine.config import differences
 from msdgs_train.engine.run_record import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
 
@@ -40,7 +40,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
                     waiting.clear()
                 while waiting and len(trainers) < trainers.jobs:
                     trainers.submit(waiting.pop(0))
-                for run, end in trainers.ended():
+                for run, end in trainers.ended(POLL_SECONDS):
                     on_end(run, end)
         finally:
             signal.signal(signal.SIGINT, old)

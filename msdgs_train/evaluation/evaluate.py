@@ -1,6 +1,5 @@
 """Evaluation of the last and the best model of a run on held-out images."""
 
-import json
 import statistics
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, composite, load_scene
-from msdgs_train.engine.run_record import BEST, CONFIG, MODEL, RECORD, Best, RunInvalid, read_record
+from msdgs_train.engine.run_record import BEST, MODEL, RECORD, Best, RunInvalid, read_config, read_record
 from msdgs_train.evaluation.metrics import image_metrics, masked_psnr
 from msdgs_train.evaluation.moving_region import moving_region
 from msdgs_train.evaluation.perceptual import PerceptualMetrics, perceptual_metrics
@@ -78,7 +77,7 @@ def evaluate_run(
 
     Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
     """
-    size = _image_width(run)
+    size = read_config(run).data.size
     loaded = {name: load_model(run / file) for name, file in FILES.items() if name == "last" or (run / file).exists()}
     data = _data_folder(run, data)
     scene = load_scene(data, size)
@@ -105,26 +104,13 @@ def scores(rgb: Tensor, target: Tensor, mask: np.ndarray, perceptual: Perceptual
     return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, mask))
 
 
-def _image_width(run: Path) -> int | None:
-    """The width that the run was trained at, None for that of the images."""
-    path = run / CONFIG
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))["data"]["size"]
-    except OSError as error:
-        problem = f"{error.strerror}; RUN must be the folder of a run of `msdgs-train fit DATA RUN`"
-        raise RunInvalid(path, problem) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise RunInvalid(path, f"isn't the configuration of a run: {error!r}") from None
-
-
 def _data_folder(run: Path, data: Path | None) -> Path:
     if data is not None:
         return data.absolute()
     record = read_record(run)
     if record is None:
-        raise RunInvalid(
-            run / RECORD, f"no such file, so the dataset has to be given: msdgs-train eval {run} --data DATA"
-        )
+        problem = f"no such file, so the dataset has to be given: msdgs-train eval {run} --data DATA"
+        raise RunInvalid(run / RECORD, problem)
     if not record.data.is_dir():
         where = f"if it is elsewhere now: msdgs-train eval {run} --data DATA"
         raise DatasetInvalid(record.data, "folder", f"does not exist; {where}")
@@ -133,6 +119,6 @@ def _data_folder(run: Path, data: Path | None) -> Path:
 
 def _frames(scene: SceneData, data: Path, split: str) -> list[Frame]:
     if not scene.splits.get(split):
-        there = [f"`{name}` with {len(frames)}" for name, frames in scene.splits.items() if frames]
-        raise DatasetInvalid(data, split, f"has no images; there are {', '.join(there)}")
+        others = [f"`{name}` with {len(frames)}" for name, frames in scene.splits.items() if frames]
+        raise DatasetInvalid(data, split, f"has no images; there are {', '.join(others)}")
     return scene.splits[split]

@@ -1,10 +1,12 @@
 """The files of an evaluation in RUN/eval: numbers as JSON, a Markdown table and a contact sheet."""
 
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets.common.files import write_text
@@ -58,16 +60,24 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 def as_markdown(evaluation: Evaluation) -> str:
     """Tables of the means of each model and of its images, with notes."""
-    rows = [[*_names(evaluated), *cells(evaluation, evaluated.mean)] for evaluated in evaluation.models]
+    rows = [
+        [m.name, FILES[m.name], f"{m.loaded.step:,}", f"{len(m.loaded.model.gaussians):,}", *cells(evaluation, m.mean)]
+        for m in evaluation.models
+    ]
     parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} images of {evaluation.data}"]
-    parts += [_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
+    parts += [markdown_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
     for evaluated in evaluation.models:
         images = [
             [frame.name, f"{frame.t:.4g}", *cells(evaluation, scores), f"{100 * mask.mean():.1f} %"]
             for frame, scores, mask in zip(evaluation.frames, evaluated.images, evaluation.masks, strict=True)
         ]
-        parts += [f"## {evaluated.name}", _table(["image", "t", *HEADINGS.values(), "moving region"], images)]
+        parts += [f"## {evaluated.name}", markdown_table(["image", "t", *HEADINGS.values(), "moving region"], images)]
     return "\n\n".join(parts) + "\n"
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *rows])
 
 
 def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
@@ -99,10 +109,8 @@ def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
     each model and its error, with the moving region outlined. Atomic."""
     models = distinct_models(evaluation)
     by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: evaluation.models[0].images[index].psnr)
-    count = min(SHEET_ROWS, len(by_psnr))
-    chosen = [by_psnr[round(place)] for place in np.linspace(0, len(by_psnr) - 1, count)]
-    rows = [_row(evaluation, models, index) for index in chosen]
-    shown = "" if count == len(by_psnr) else f"{count} of "
+    rows = [_row(evaluation, models, by_psnr[place]) for place in _evenly_spaced(len(by_psnr))]
+    shown = "" if len(rows) == len(by_psnr) else f"{len(rows)} of "
     names = " and ".join(f"{evaluated.name} (step {evaluated.loaded.step:,})" for evaluated in models)
     title = f"{evaluation.split}, {shown}{len(by_psnr)} frames, worst first: {names}"
     draw_sheet(path, title, rows, ColorScale("error", "0", f"≥ {FULL_ERROR}", COLOR_MAP))
@@ -116,15 +124,20 @@ def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
     if any([frame.name for frame in other.frames] != names for other in others):
         raise InvalidInput("RUN", "runs on the same images", "others")
     rows = []
-    for index in dict.fromkeys(round(place) for place in np.linspace(0, len(names) - 1, min(SHEET_ROWS, len(names)))):
+    for index in _evenly_spaced(len(names)):
         frame = first.frames[index]
-        row = [Panel(_fitted(to_bytes(first.models[0].image(frame).numpy())), f"{frame.name}, t = {frame.t:.3g}")]
+        row = [_panel(first.models[0].image(frame), f"{frame.name}, t = {frame.t:.3g}")]
         for run, evaluation in runs.items():
             last = evaluation.models[0]
-            rendering = _fitted(to_bytes(last.render(evaluation.frames[index]).numpy()))
-            row.append(Panel(rendering, f"{Path(run).name}: {last.images[index].psnr:.1f} dB"))
+            caption = f"{Path(run).name}: {last.images[index].psnr:.1f} dB"
+            row.append(_panel(last.render(evaluation.frames[index]), caption))
         rows.append(row)
     draw_sheet(path, f"{first.split}, {len(rows)} of {len(names)} frames: {', '.join(runs)}", rows)
+
+
+def _evenly_spaced(count: int) -> list[int]:
+    """Up to `SHEET_ROWS` of the first `count` numbers."""
+    return [round(place) for place in np.linspace(0, count - 1, min(SHEET_ROWS, count))]
 
 
 def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:
@@ -135,14 +148,14 @@ def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:
 
 def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int) -> list[Panel]:
     frame, mask = evaluation.frames[index], evaluation.masks[index]
-    target = models[0].image(frame).numpy()
-    row = [Panel(_fitted(to_bytes(target)), f"{frame.name}, t = {frame.t:.3g}")]
+    target = models[0].image(frame)
+    row = [_panel(target, f"{frame.name}, t = {frame.t:.3g}")]
     for evaluated in models:
-        scores, rgb = evaluated.images[index], evaluated.render(frame).numpy()
+        scores, rgb = evaluated.images[index], evaluated.render(frame)
         moving = "" if scores.moving_psnr is None else f", moving {scores.moving_psnr:.1f}"
-        error = color(np.abs(rgb - target).mean(axis=-1) / FULL_ERROR, COLOR_MAP)
+        error = color((rgb - target).abs().mean(dim=-1).numpy() / FULL_ERROR, COLOR_MAP)
         error[_outline(mask)] = OUTLINE
-        row.append(Panel(_fitted(to_bytes(rgb)), f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
+        row.append(_panel(rgb, f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
         row.append(Panel(_fitted(error), "error" + (", moving region outlined" if mask.any() else "")))
     return row
 
@@ -151,6 +164,10 @@ def _outline(mask: np.ndarray) -> np.ndarray:
     """[H, W] bool: pixels outside of the mask that border it, so that the inside isn't covered."""
     padded = np.pad(mask, 1)
     return ~mask & (padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
+
+
+def _panel(rgb: Tensor, caption: str) -> Panel:
+    return Panel(_fitted(to_bytes(rgb.numpy())), caption)
 
 
 def _fitted(pixels: np.ndarray) -> np.ndarray:
@@ -175,17 +192,3 @@ def _model_as_json(evaluation: Evaluation, evaluated: EvaluatedModel) -> dict[st
         "mean": evaluated.mean._asdict(),
         "images": images,
     }
-
-
-def _names(evaluated: EvaluatedModel) -> list[str]:
-    return [
-        evaluated.name,
-        FILES[evaluated.name],
-        f"{evaluated.loaded.step:,}",
-        f"{len(evaluated.loaded.model.gaussians):,}",
-    ]
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -10,7 +10,6 @@ import math
 import threading
 import time
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
@@ -78,9 +77,7 @@ class Viewer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def open(self, view: SceneView) -> None:

@@ -1,26 +1,18 @@
 """The common form of all datasets: splits of frames, each with a camera and a time."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from msdgs_serve.scene import Camera, InvalidInput, MsdgsError
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.distortion import Distortion, undistort
-from msdgs_train.datasets.common.images import ImageSize, ImageUnreadable, read_rgba, read_size, resize_area
+from msdgs_train.datasets.common.images import read_rgba, resize_area
 
 SPLITS = ("train", "val", "test")
 HELD_OUT = 8
 """Every 8th frame is a test frame if a dataset names none, as in Mip-NeRF 360 and 3D Gaussian Splatting."""
-
-
-class DatasetInvalid(MsdgsError):
-    """A dataset is incomplete or inconsistent; `file` and `field` name the place."""
-
-    def __init__(self, file: Path | str, field: str, problem: str) -> None:
-        super().__init__(f"{file}: `{field}` {problem}")
-        self.file = str(file)
-        self.field = field
 
 
 @dataclass(frozen=True)
@@ -38,10 +30,7 @@ class Frame:
 
         Raises `DatasetInvalid` if the file can't be read.
         """
-        try:
-            rgba = read_rgba(self.image_path)
-        except ImageUnreadable as error:
-            raise DatasetInvalid(self.image_path, "image", f"can't be read: {error}") from None
+        rgba = read_rgba(self.image_path)
         if self.distortion is not None:
             height, width, _ = rgba.shape
             rgba = undistort(rgba, self.camera.resized(width, height), self.distortion)
@@ -53,18 +42,15 @@ class SceneData:
     """A dataset ready for training. World axes are those of the dataset; cameras are OpenCV."""
 
     splits: dict[str, list[Frame]]  # "train" has one frame or more; "val" and "test" may be empty
-    time_range: tuple[float, float]  # first and last time of any frame of any split; equal in a static scene
     scene_half_size: float  # half the side of the cube around the origin that holds the scene, in scene units
     points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
     point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None if `points` have no colors
 
-
-def image_size(path: Path) -> ImageSize:
-    """The size in an image's header. Raises `DatasetInvalid` if it can't be read."""
-    try:
-        return read_size(path)
-    except ImageUnreadable as error:
-        raise DatasetInvalid(path, "image", f"can't be read: {error}") from None
+    @cached_property
+    def time_range(self) -> tuple[float, float]:
+        """First and last time of the frames of all splits; equal in a static scene."""
+        times = [frame.t for frames in self.splits.values() for frame in frames]
+        return min(times), max(times)
 
 
 def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:

@@ -12,6 +12,7 @@ running: 1.2 GB for 300 frames of 1352×1014. Their names depend on the video's 
 import hashlib
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -19,7 +20,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from msdgs_train.datasets.common.files import replacing
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame
+from msdgs_train.datasets.common.readers import DatasetInvalid
+from msdgs_train.datasets.common.scene_data import Frame
 
 
 class VideoInfo(NamedTuple):
@@ -49,16 +51,12 @@ class VideoFrame(Frame):
 
 def read_info(video: Path) -> VideoInfo:
     """Count and size of the frames, without decoding any. Raises `DatasetInvalid` naming the file."""
-    av = _av(video)
-    try:
-        with av.open(str(video)) as container:
-            if not container.streams.video:
-                raise _invalid(video, "has no video stream")
-            stream = container.streams.video[0]
-            width, height = stream.codec_context.width, stream.codec_context.height
-            count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
-    except av.FFmpegError as error:
-        raise _invalid(video, f"can't be read: {error.strerror}") from None
+    with _opened(video) as container:
+        if not container.streams.video:
+            raise _invalid(video, "has no video stream")
+        stream = container.streams.video[0]
+        width, height = stream.codec_context.width, stream.codec_context.height
+        count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
     if count < 1:
         raise _invalid(video, "has no frames")
     return VideoInfo(count, width, height)
@@ -71,22 +69,14 @@ def open_frames(video: Path, wanted: VideoInfo) -> np.ndarray:
     or its frames can't be stored.
     """
     cached = _cache_file(video, wanted)
-    frames = _mapped(cached, wanted)
-    if frames is None:
-        _decode_to(cached, video, wanted)
-        frames = _mapped(cached, wanted)
-    if frames is None:
-        raise _invalid(video, f"was decoded into {cached}, which can't be read back")
-    return frames
-
-
-def _mapped(file: Path, wanted: VideoInfo) -> np.ndarray | None:
     try:
-        frames = np.load(file, mmap_mode="r", allow_pickle=False)
+        frames = np.load(cached, mmap_mode="r", allow_pickle=False)
+        if frames.shape == (wanted.count, wanted.height, wanted.width, 3) and frames.dtype == np.uint8:
+            return frames
     except (OSError, ValueError, EOFError):  # missing or truncated
-        return None
-    shape = (wanted.count, wanted.height, wanted.width, 3)
-    return frames if frames.shape == shape and frames.dtype == np.uint8 else None
+        pass
+    _decode_to(cached, video, wanted)
+    return np.load(cached, mmap_mode="r", allow_pickle=False)
 
 
 def _cache_file(video: Path, wanted: VideoInfo) -> Path:
@@ -132,28 +122,29 @@ def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
     Each new pixel is the mean over the area it covers, within 0.5 of 255 of `resize_area` on average. FFmpeg's default
     at the full size and at half of it skips half of the chroma and differs by 1.4 to 5.
     """
-    av = _av(video)
-    kinds = av.video.reformatter.Interpolation
-    area = kinds.AREA | kinds.ACCURATE_RND | kinds.FULL_CHR_H_INT
-    try:
-        with av.open(str(video)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for frame in container.decode(stream):
-                yield np.ascontiguousarray(
-                    frame.to_ndarray(format="rgb24", width=wanted.width, height=wanted.height, interpolation=area)
-                )
-    except av.FFmpegError as error:
-        raise _invalid(video, f"can't be decoded: {error.strerror}") from None
+    with _opened(video) as container:
+        from av.video.reformatter import Interpolation
+
+        area = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        for frame in container.decode(stream):
+            size = {"width": wanted.width, "height": wanted.height}
+            yield np.ascontiguousarray(frame.to_ndarray(format="rgb24", interpolation=area, **size))
 
 
-def _av(video: Path) -> Any:
+@contextmanager
+def _opened(video: Path) -> Iterator[Any]:
+    """The container of the video, in PyAV. Its errors in the block are raised as `DatasetInvalid`."""
     try:
         import av  # an optional dependency
-        import av.video.reformatter
     except ModuleNotFoundError as error:
         raise _invalid(video, f"needs {error.name} to be read: pip install 'msdgs[train]'") from None
-    return av
+    try:
+        with av.open(str(video)) as container:
+            yield container
+    except av.FFmpegError as error:
+        raise _invalid(video, f"can't be read: {error.strerror}") from None
 
 
 def _invalid(video: Path, problem: str) -> DatasetInvalid:

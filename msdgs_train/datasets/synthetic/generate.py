@@ -7,8 +7,7 @@ image per time, each from another camera. The same arguments give the same bytes
 
 import json
 import math
-import os
-import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -149,19 +148,15 @@ def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
 
 @contextmanager
 def _replaced_when_complete(out: Path) -> Iterator[Path]:
-    """A folder beside `out`, which it replaces on leaving without an exception."""
+    """A folder beside `out`, which it replaces at the end of the block, unless an exception is raised."""
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / TRAJECTORIES).exists())):
         raise InvalidInput("out", "a new or empty folder, or a dataset made by this command", out)
     out = out.absolute()
-    partial, old = (out.with_name(f".{out.name}.{os.getpid()}.{word}") for word in ("partial", "old"))
-    for leftover in (partial, old):
-        shutil.rmtree(leftover, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as temporary:
+        new, old = Path(temporary, "new"), Path(temporary, "old")
+        new.mkdir()
+        yield new
         if out.exists():
             out.rename(old)
-        partial.rename(out)
-    finally:
-        for leftover in (partial, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        new.rename(out)

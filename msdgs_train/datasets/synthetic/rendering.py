@@ -53,17 +53,6 @@ def render(camera: Camera, t: float) -> np.ndarray:
     return np.floor(255 * rgba + 0.5).astype(np.uint8)
 
 
-def first_hits(origins: np.ndarray, directions: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rays [N, 3] + s · [N, 3] (unit): distance s to the first surface, inf without one, and its row in `OBJECTS`."""
-    motion = motion_at(t)
-    hits = [
-        _first_hit(motion, *map(float, (*origin, *direction)))
-        for origin, direction in zip(origins, directions, strict=True)
-    ]
-    distances = np.array([distance if shape != NO_OBJECT else np.inf for distance, shape in hits])
-    return distances, np.array([shape for _, shape in hits])
-
-
 @kernel
 def _render_rows(motion: Motion, view: np.ndarray, intrinsics: tuple, out: np.ndarray, start: int, stop: int) -> None:
     fx, fy, cx, cy = intrinsics
@@ -76,7 +65,7 @@ def _render_rows(motion: Motion, view: np.ndarray, intrinsics: tuple, out: np.nd
                 dx = (view[0, 0] * x + view[0, 1] * y + view[0, 2]) / length
                 dy = (view[1, 0] * x + view[1, 1] * y + view[1, 2]) / length
                 dz = (view[2, 0] * x + view[2, 1] * y + view[2, 2]) / length
-                distance, shape = _first_hit(motion, view[0, 3], view[1, 3], view[2, 3], dx, dy, dz)
+                distance, shape = first_hit(motion, view[0, 3], view[1, 3], view[2, 3], dx, dy, dz)
                 if shape != NO_OBJECT:
                     px, py, pz = view[0, 3] + distance * dx, view[1, 3] + distance * dy, view[2, 3] + distance * dz
                     red, green, blue = _shade(motion, shape, px, py, pz, dx, dy, dz)
@@ -87,7 +76,8 @@ def _render_rows(motion: Motion, view: np.ndarray, intrinsics: tuple, out: np.nd
 
 
 @kernel
-def _first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, int]:
+def first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, int]:
+    """Distance along a unit ray to the first surface and its row in `OBJECTS`, or `NO_OBJECT`."""
     nearest, shape = _MISS, NO_OBJECT
     top = (GROUND_Z - oz) / dz if dz < 0 else -1.0
     on_top = top > 0 and math.hypot(ox + top * dx, oy + top * dy) < GROUND_RADIUS - GROUND_ROUNDING

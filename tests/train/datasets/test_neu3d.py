@@ -132,7 +132,7 @@ def test_a_video_that_is_cut_off_is_refused_and_leaves_nothing(tmp_path: Path, c
     path = tmp_path / "cam01.mp4"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frame = load_scene(tmp_path).splits["train"][0]
-    with pytest.raises(DatasetInvalid, match=r"cam01\.mp4: `video` (has 7 frames by its header, but|can't be decoded)"):
+    with pytest.raises(DatasetInvalid, match=r"cam01\.mp4: `video` (has 7 frames by its header, but|can't be read)"):
         frame.load_rgba()
     assert not list(cache.iterdir())
 

@@ -17,8 +17,8 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli import main as cli
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 from msdgs_train.comparison.pools import RunEnd, processes
-from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
-from msdgs_train.comparison.results import CurvePoint, Result, Spread
+from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, mean_and_deviation, table
+from msdgs_train.comparison.results import CurvePoint, Result
 from msdgs_train.comparison.runner import train_all
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.systems.registry import preset
@@ -142,10 +142,8 @@ RESULTS = [
 
 
 def test_spread_is_the_sample_standard_deviation() -> None:
-    assert Spread.of([1.0, 2.0, 3.0]) == (2.0, 1.0)
-    assert Spread.of([1.0, 2.0, 3.0]).shown(2) == "2.00 ± 1.00"
-    assert Spread.of([5.0]) == (5.0, None)
-    assert Spread.of([1234.5]).shown(1) == "1,234.5"
+    assert mean_and_deviation([1.0, 2.0, 3.0], 2) == "2.00 ± 1.00"
+    assert mean_and_deviation([1234.5], 1) == "1,234.5"
 
 
 def test_the_table_has_a_row_for_each_system_and_scene() -> None:
