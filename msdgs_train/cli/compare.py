@@ -43,7 +43,7 @@ class Compare:
     """Optimizer steps of each run, instead of the preset's. Schedules in fractions of a run scale with it; those in
     steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
     minutes: float | None = None
-    """Time limit of each run. Learning rates decay over --steps, which the limit should just allow."""
+    """Time limit of each run. Learning rates decay over --steps: choose as many as fit in the limit."""
     size: int | None = None
     """Width of all images in pixels."""
     init_num_pts: int | None = None

@@ -95,7 +95,7 @@ class Fit:
 
 
 def parse_fit(arguments: Sequence[str]) -> Fit:
-    """Options change the settings of the preset, or of the run that is resumed; --help shows those settings."""
+    """Parse the arguments of `fit`. Options change the settings of the preset, or of the run that is resumed."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset")
     name = early.parse_known_args(arguments)[0].preset

@@ -21,8 +21,10 @@ PLAIN_LINE_SECONDS = 10.0  # between lines if the output is not a terminal
 
 
 class FitProgress(Observer):
-    """A bar with loss, PSNR, Gaussians and speed; lines if the output is not a terminal. The first Ctrl-C stops the run
-    after the current step, the second one at once."""
+    """Shows a bar with loss, PSNR, Gaussians and speed, or prints lines if the output is not a terminal.
+
+    The first Ctrl-C stops the run after the current step, the second one at once.
+    """
 
     def __init__(self, console: Console, steps: int) -> None:
         self._console = console

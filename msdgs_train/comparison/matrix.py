@@ -17,7 +17,7 @@ LOG_LINES = 100
 
 @dataclass(frozen=True)
 class Budget:
-    """Settings that all systems share. None: the system's own."""
+    """Settings that all systems share; None keeps the system's own."""
 
     steps: int
     minutes: float | None = None
@@ -27,7 +27,7 @@ class Budget:
     max_gaussians: int | None = None
 
     def settings(self) -> dict[str, Any]:
-        """As settings of `TrainConfig`."""
+        """Return the settings of `TrainConfig`."""
         every = max(self.steps // EVALUATIONS, 1)
         given = {
             "steps": self.steps,
@@ -66,7 +66,7 @@ class Run:
 
 
 def read_systems(sources: Sequence[str], budget: Budget) -> list[ComparedSystem]:
-    """Systems from names of presets and from TOML files, where each table is one: a `preset` and changed settings.
+    """Read systems from names of presets and from TOML files, each table of which is a `preset` and changed settings.
 
     Raises `InvalidInput` naming the file, the system and the invalid setting.
     """
@@ -77,7 +77,8 @@ def read_systems(sources: Sequence[str], budget: Budget) -> list[ComparedSystem]
 
 
 def make_runs(systems: Sequence[ComparedSystem], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
-    """Seed by seed, so that a comparison that is stopped early has results of every system."""
+    """Return one run per system, scene and seed, ordered by seed: if the comparison is stopped early, it has results of
+    every system."""
     _require_unique("scene", (scene.resolve().name for scene in scenes))
     _require_unique("seed", map(str, seeds))
     return [

@@ -31,7 +31,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
         return True
     interrupted = threading.Event()
     with pool as trainers:
-        # after Ray, which installs a handler of its own
+        # set here, after Ray has installed its own handler
         old = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
         try:
             while waiting or len(trainers):

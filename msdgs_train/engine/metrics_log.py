@@ -27,7 +27,7 @@ class MetricsLog:
     """
 
     def __init__(self, run: Path, *, keep_until: int = 0, tensorboard: bool = False) -> None:
-        """Appends to the lines up to step `keep_until`; later ones are dropped."""
+        """Keep the lines up to step `keep_until` and drop later ones."""
         self._run, self._tensorboard = run, tensorboard
         self._events: SummaryWriter | None = None
         self.rewind(keep_until)
@@ -124,5 +124,5 @@ def _stem(evaluated: EvaluatedFrame) -> str:
 
 
 def to_bytes(rgb: np.ndarray) -> np.ndarray:
-    """uint8 of sRGB values in [0, 1], rounded."""
+    """Round sRGB values in [0, 1] to uint8."""
     return np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)

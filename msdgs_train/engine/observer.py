@@ -1,4 +1,4 @@
-"""The callbacks of a run: what happens is reported to them, and they may pause or stop it."""
+"""The callbacks of a run, which may also pause or stop it."""
 
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.evaluation.metrics import ImageMetrics
@@ -8,23 +8,23 @@ class Observer:
     """Callbacks that do nothing; subclasses override those that they need. Called between steps, from one thread."""
 
     def on_train_start(self, trainer: Trainer) -> None:
-        """Before the first step, of a resumed run too."""
+        """Called before the first step, also of a resumed run."""
 
     def step(self, result: StepResult, seconds: float) -> None:
-        """After every step; `seconds` of training so far."""
+        """Called after every step; `seconds` is the training time so far."""
 
     def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
-        """After a split has been evaluated."""
+        """Called after a split has been evaluated."""
 
     def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
-        """Training has diverged and returned to `step`; learning rates are those of the settings times `lr_factor`."""
+        """Called when training has diverged and returned to `step`; learning rates are multiplied by `lr_factor`."""
 
     def should_stop(self) -> bool:
-        """Asked after every step; if true, the run saves a checkpoint and returns."""
+        """Called after every step; if true, the run saves a checkpoint and returns."""
         return False
 
     def is_paused(self) -> bool:
-        """Asked after every step; while true, the run waits and asks again."""
+        """Called after every step; while true, the run waits and calls it again."""
         return False
 
 

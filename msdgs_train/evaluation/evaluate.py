@@ -112,8 +112,8 @@ def _data_folder(run: Path, data: Path | None) -> Path:
         problem = f"no such file, so the dataset has to be given: msdgs-train eval {run} --data DATA"
         raise RunInvalid(run / RECORD, problem)
     if not record.data.is_dir():
-        where = f"if it is elsewhere now: msdgs-train eval {run} --data DATA"
-        raise DatasetInvalid(record.data, "folder", f"does not exist; {where}")
+        problem = f"does not exist; if it is elsewhere now: msdgs-train eval {run} --data DATA"
+        raise DatasetInvalid(record.data, "folder", problem)
     return record.data
 
 

@@ -20,7 +20,7 @@ SHEET_ROWS = 8
 MAX_PANEL = 320  # pixels of width; smaller images are enlarged to MIN_PANEL or more
 MIN_PANEL = 200
 COLOR_MAP = "magma"
-FULL_ERROR = 0.25  # mean over the channels; fixed, so that sheets can be compared
+FULL_ERROR = 0.25  # mean over the channels that gets the last color; fixed, so that sheets can be compared
 OUTLINE = (0, 220, 255)
 
 HEADINGS = {
@@ -44,7 +44,7 @@ def write_evaluation(run: Path, evaluation: Evaluation) -> list[Path]:
 
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain values; an unavailable score is null."""
+    """Return the evaluation as plain values for JSON; an unavailable score is null."""
     return {
         "data": str(evaluation.data),
         "split": evaluation.split,
@@ -171,7 +171,7 @@ def _panel(rgb: Tensor, caption: str) -> Panel:
 
 
 def _fitted(pixels: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3] enlarged or downscaled to the width of a panel."""
+    """Enlarge or downscale uint8 [H, W, 3] to the width of a panel."""
     height, width, _ = pixels.shape
     if width <= MAX_PANEL:
         times = -(-MIN_PANEL // width)

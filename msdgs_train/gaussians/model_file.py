@@ -80,7 +80,7 @@ def load_model(path: str | Path) -> LoadedModel:
 
 
 def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
-    """A model of this configuration and these tensors; RuntimeError names missing and unexpected ones."""
+    """Build a model from its configuration and tensors. Raises `RuntimeError` naming missing and unexpected ones."""
     prefix = "gaussians."
     gaussians = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
     for layer in config.layers:

@@ -73,7 +73,7 @@ def _add_scaled(weight: float, source: np.ndarray, target: np.ndarray) -> None:
 
 @kernel
 def _blur_along_row(taps: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
-    """One symmetric 11-tap blur of a row [W * 3] with 5 pixels of zeros on both sides; one load a tap, one store."""
+    """One symmetric 11-tap blur of a row [W * 3] with 5 pixels of zeros on both sides; one load per tap, one store."""
     n = len(out)
     w0, w1, w2, w3, w4, w5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     # slices, not offsets: numba's check for negative indices would keep the loop from being vectorised (7x slower)

@@ -23,7 +23,7 @@ def rasterize_cuda(
     options: RasterizerOptions,
     info: "RasterizationInfo",
 ) -> tuple[Tensor, Tensor]:
-    """rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
+    """Return rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
     try:
         import gsplat
     except ModuleNotFoundError as error:

@@ -19,7 +19,7 @@ class RasterizationInfo:
     """Radii and gradients of one rendering, for density control."""
 
     radii: Tensor
-    """[N] larger half-extent of the footprint in pixels, 0 where not drawn."""
+    """[N] larger half-extent of the footprint in pixels; 0 for Gaussians that are not drawn."""
     means2d_grads: Tensor | None = None
     """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
 
@@ -60,7 +60,8 @@ def rasterize(
 
 
 BACKGROUND = 5
-"""Its index among the arguments; its gradient, as slow as half of the rest for a large image, is computed on demand."""
+"""Index of `background` among the arguments. Its gradient is only computed on demand: for a large image it takes half
+as long as all others."""
 
 
 class _Rasterize(torch.autograd.Function):

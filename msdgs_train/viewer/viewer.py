@@ -50,7 +50,7 @@ class Wanted(NamedTuple):
 class _Browser:
     wanted: Wanted | None = None
     changed: float = 0.0  # time of the last change of `wanted`
-    drawn: tuple[Wanted, Snapshot, bool] | None = None  # and whether it was the large image
+    drawn: tuple[Wanted, Snapshot, bool] | None = None  # what was drawn last; True for the large image
 
 
 class Viewer:
@@ -203,8 +203,8 @@ def camera_of_browser(wxyz: np.ndarray, position: np.ndarray, fov_y: float, widt
         wxyz: [4] quaternion, rotates OpenCV camera axes (x right, y down, z forward) into world axes.
         position: [3] world space.
         fov_y: vertical field of view in radians.
-        width: of the image in pixels.
-        height: of the image in pixels.
+        width: width of the image in pixels.
+        height: height of the image in pixels.
     """
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = quaternion.to_matrix(quaternion.normalize(wxyz))
@@ -226,5 +226,5 @@ def _serve(host: str, port: int) -> Any:
 
 
 def _silence() -> contextlib.AbstractContextManager[Any]:
-    """viser prints its address and its end unconditionally."""
+    """Suppress standard output: viser prints its address and its end unconditionally."""
     return contextlib.redirect_stdout(io.StringIO())

@@ -41,7 +41,7 @@ class VideoFrame(Frame):
     count: int  # of the whole video
 
     def load_rgba(self) -> np.ndarray:
-        """[height, width, 4] uint8, sRGB, opaque, downscaled to the camera's size. The first call decodes it all."""
+        """[height, width, 4] uint8, sRGB, opaque, downscaled to the camera's size. The first call decodes the video."""
         width, height = self.camera.width, self.camera.height
         frames = open_frames(self.video, VideoInfo(self.count, width, height))
         rgba = np.full((height, width, 4), 255, np.uint8)
@@ -50,7 +50,7 @@ class VideoFrame(Frame):
 
 
 def read_info(video: Path) -> VideoInfo:
-    """Count and size of the frames, without decoding any. Raises `DatasetInvalid` naming the file."""
+    """Read the count and size of the frames, without decoding any. Raises `DatasetInvalid` naming the file."""
     with _opened(video) as container:
         if not container.streams.video:
             raise _invalid(video, "has no video stream")
@@ -104,7 +104,7 @@ def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
 
 
 def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
-    """Written, not memory-mapped: a full disk raises an error in a write, and kills a process that writes to a map."""
+    """Write the frames as a stream: on a full disk this raises an error, but a memory map would kill the process."""
     shape = (wanted.count, wanted.height, wanted.width, 3)
     np.lib.format.write_array_header_1_0(output, {"descr": "|u1", "fortran_order": False, "shape": shape})
     count = 0
@@ -117,10 +117,11 @@ def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
 
 
 def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
-    """Contiguous uint8 RGB [height, width, 3], by the color matrix that the video names, or else BT.601 as in FFmpeg.
+    """Yield the frames as contiguous uint8 RGB [height, width, 3].
 
-    Each new pixel is the mean over the area it covers, within 0.5 of 255 of `resize_area` on average. FFmpeg's default
-    at the full size and at half of it skips half of the chroma and differs by 1.4 to 5.
+    Colors are converted with the matrix that the video names, or with BT.601 if it names none, as FFmpeg does. Each new
+    pixel is the mean over the area that it covers, and differs from `resize_area` by less than 0.5 of 255 on average.
+    FFmpeg's default skips half of the chroma at the full size and at half of it, and differs by 1.4 to 5.
     """
     with _opened(video) as container:
         from av.video.reformatter import Interpolation

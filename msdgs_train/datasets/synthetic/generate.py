@@ -1,8 +1,8 @@
 """A small synthetic moving scene, ray-marched into D-NeRF layout, with exactly known motion.
 
-A ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly squashes, twists and bends, a
-pendulum on a thin rod swings in a frame of thin bars, all on a static, tiled ground. As in D-NeRF there is one
-image per time, each from another camera. The same arguments give the same bytes.
+On a static, tiled ground a ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly
+squashes, twists and bends, and a pendulum on a thin rod swings in a frame of thin bars. As in D-NeRF there is one image
+per time, each from another camera. The same arguments give the same bytes.
 """
 
 import json
@@ -26,7 +26,7 @@ CAMERA_DISTANCE = 4.0
 LOWEST, HIGHEST = 6.0, 75.0  # elevation of training cameras, degrees
 TEST_ELEVATION = 25.0
 R2_SEQUENCE = (0.7548776662466927, 0.5698402909980532)
-"""Two-dimensional golden ratio (M. Roberts, 2018): steps that cover azimuth and elevation evenly."""
+"""Steps of the R2 sequence (M. Roberts, 2018), which cover azimuth and elevation evenly."""
 
 MAX_SIZE = 4096
 TRAJECTORIES = "trajectories.json"
@@ -62,7 +62,7 @@ def generate(
         size: width and height of the images in pixels.
         train_frames: images at evenly spaced times in [0, 1], cameras spread over the upper hemisphere.
         test_frames: images at intermediate times, from one smooth turn around the scene.
-        seed: of the camera positions; the motion is always the same.
+        seed: seed of the camera positions; the motion is always the same.
         progress: called with (done, total) after every image.
     """
     for name, value, least in (("train_frames", train_frames, 1), ("test_frames", test_frames, 0)):
@@ -138,7 +138,7 @@ def _thumbnail(rgba: np.ndarray) -> np.ndarray:
 
 
 def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
-    """Up to 24 evenly spaced images, in rows."""
+    """Arrange up to 24 evenly spaced images in rows."""
     count = min(len(thumbnails), CONTACT_COLUMNS * CONTACT_ROWS)
     chosen = [thumbnails[index * len(thumbnails) // count] for index in range(count)]
     columns = min(count, CONTACT_COLUMNS)
