@@ -19,12 +19,19 @@ LOG_LINES = 100
 class Budget:
     """Settings that all systems share; None keeps the system's own."""
 
-    steps: int
+    steps: int = 3000
+    """Optimizer steps of each run, instead of the preset's. Schedules in fractions of a run scale with it; those in
+    steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
     minutes: float | None = None
+    """Time limit of each run. Learning rates decay over --steps: choose as many as fit in the limit."""
     size: int | None = None
-    threads: int = 1
+    """Width of all images in pixels."""
     init_num_pts: int | None = None
+    """Initial Gaussians of all systems; their own settings if not given."""
     max_gaussians: int | None = None
+    """Maximum Gaussians of all systems; their own settings if not given."""
+    threads: int = 1
+    """CPU threads of each run."""
 
     def settings(self) -> dict[str, Any]:
         """Return the settings of `TrainConfig`."""

@@ -5,7 +5,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
@@ -118,34 +118,30 @@ class _Flag:
         return self._is_set
 
 
-class _FlagObserver(Observer):
-    def __init__(self, flag: Any) -> None:
-        self._flag = flag
-        self._asked = 0.0
+class _StopObserver(Observer):
+    """Stops a run when `is_stopped` returns true; it is called every `POLL_SECONDS`."""
+
+    def __init__(self, is_stopped: Callable[[], bool]) -> None:
+        self._is_stopped, self._called = is_stopped, 0.0
 
     def should_stop(self) -> bool:
-        import ray  # pyright: ignore[reportMissingImports]
-
         now = time.monotonic()
-        if now < self._asked + POLL_SECONDS:
+        if now < self._called + POLL_SECONDS:
             return False
-        self._asked = now
-        return ray.get(self._flag.is_set.remote())
-
-
-class _ParentObserver(Observer):
-    def should_stop(self) -> bool:
-        return _is_orphan() or (_stop is not None and _stop.is_set())
+        self._called = now
+        return self._is_stopped()
 
 
 def _train_on_ray(flag: list[Any], folder: Path, run: Run) -> RunEnd:
     """Train one run; relative paths are those of `folder`, in which the command was given."""
+    import ray  # pyright: ignore[reportMissingImports]
+
     there = dataclasses.replace(run, folder=folder / run.folder, data=folder / run.data)
-    return _train(there, _FlagObserver(flag[0]))
+    return _train(there, lambda: ray.get(flag[0].is_set.remote()))
 
 
 def _train_here(run: Run) -> RunEnd:
-    ended = _train(run, _ParentObserver())
+    ended = _train(run, lambda: _is_orphan() or (_stop is not None and _stop.is_set()))
     if _is_orphan():
         os._exit(1)  # the executor would wait for more work forever
     return ended
@@ -156,12 +152,13 @@ def _is_orphan() -> bool:
     return parent is not None and not parent.is_alive()
 
 
-def _train(run: Run, observer: Observer) -> RunEnd:
-    """Train one run, from its checkpoint if there is one."""
+def _train(run: Run, is_stopped: Callable[[], bool]) -> RunEnd:
+    """Train one run, from its checkpoint if there is one, until `is_stopped`."""
     os.environ[THREADS_VARIABLE] = str(run.config.run.threads)
     run.folder.mkdir(parents=True, exist_ok=True)
+    resume = (run.folder / CHECKPOINT).exists()
     try:
-        result = fit(run.config, run.data, run.folder, resume=(run.folder / CHECKPOINT).exists(), observer=observer)
+        result = fit(run.config, run.data, run.folder, resume=resume, observer=_StopObserver(is_stopped))
     except MsdgsError as error:
         return RunEnd("failed", str(error))
     return RunEnd(result.status)

@@ -20,12 +20,9 @@ in it."""
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
-def load_dnerf(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras, times and image sizes of a D-NeRF scene; val and test may be missing.
-
-    `size` is the width of the images in pixels. Raises `DatasetInvalid` naming file and field.
-    """
-    entries = {split: _read_split(Path(folder), split) for split in SPLITS}
+def load_dnerf(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras, times and image sizes of a D-NeRF scene, as `load_scene` does; val and test may be missing."""
+    entries = {split: _read_split(folder, split) for split in SPLITS}
     check_times([entry for split in SPLITS for entry in entries[split]])
     return SceneData({split: [_frame(entry, size) for entry in entries[split]] for split in SPLITS}, SCENE_HALF_SIZE)
 

@@ -49,13 +49,11 @@ class _World(NamedTuple):
         return (positions - self.center) * self.scale
 
 
-def load_hypernerf(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras, times, splits and sparse points of a HyperNeRF scene.
+def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras, times, splits and sparse points of a HyperNeRF scene, as `load_scene` does.
 
-    `size` is the width of the images in pixels: the smallest copy that is wide enough is downscaled, or with None the
-    largest copy is used. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
+    The smallest copy of the images at least `size` pixels wide is downscaled; without `size` the largest copy is used.
     """
-    folder = Path(folder)
     dataset = read_json(folder / DATASET_FILE)
     ids = {"train": dataset.names("train_ids"), "val": [], "test": dataset.names("val_ids")}
     if not ids["train"]:

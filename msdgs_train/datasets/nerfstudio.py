@@ -28,13 +28,9 @@ TRANSFORMS_FILE = "transforms.json"
 CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
-def load_nerfstudio(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras, times, splits and sparse points of a nerfstudio scene.
-
-    `size` is the width of the images in pixels. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for
-    an unusable `size`.
-    """
-    content = read_json(Path(folder) / TRANSFORMS_FILE)
+def load_nerfstudio(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras, times, splits and sparse points of a nerfstudio scene, as `load_scene` does."""
+    content = read_json(folder / TRANSFORMS_FILE)
     entries = sorted(entries_of(content), key=file_path)
     check_times(entries)
     frames = [_frame(entry, size) for entry in entries]

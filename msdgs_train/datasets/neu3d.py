@@ -41,13 +41,8 @@ class _Source(NamedTuple):
     images: list[Path]
 
 
-def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras of a Neu3D scene and, from a `.ply` file if there is one, its sparse points.
-
-    `size` is the width of the images in pixels. Videos are decoded later, by `Frame.load_rgba`. Raises `DatasetInvalid`
-    naming file and field, and `InvalidInput` for an unusable `size`.
-    """
-    folder = Path(folder)
+def load_neu3d(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras and, if there is a `.ply` file, the sparse points of a Neu3D scene, as `load_scene` does."""
     sources, file = _find_sources(folder), folder / POSES_FILE
     poses = read_table(file, 17)
     if len(poses) != len(sources):

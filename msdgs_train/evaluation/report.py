@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from torch import Tensor
 
 from msdgs_serve.scene.errors import InvalidInput
@@ -13,13 +14,12 @@ from msdgs_train.datasets.common.files import write_text
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.evaluate import FILES, EvaluatedModel, Evaluation, Scores
-from msdgs_train.evaluation.sheets import ColorScale, Panel, color, draw_sheet
+from msdgs_train.evaluation.sheets import Panel, draw_sheet
 
 FOLDER = "eval"
 SHEET_ROWS = 8
 MAX_PANEL = 320  # pixels of width; smaller images are enlarged to MIN_PANEL or more
 MIN_PANEL = 200
-COLOR_MAP = "magma"
 FULL_ERROR = 0.25  # mean over the channels that gets the last color; fixed, so that sheets can be compared
 OUTLINE = (0, 220, 255)
 
@@ -113,7 +113,7 @@ def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
     shown = "" if len(rows) == len(by_psnr) else f"{len(rows)} of "
     names = " and ".join(f"{evaluated.name} (step {evaluated.loaded.step:,})" for evaluated in models)
     title = f"{evaluation.split}, {shown}{len(by_psnr)} frames, worst first: {names}"
-    draw_sheet(path, title, rows, ColorScale("error", "0", f"≥ {FULL_ERROR}", COLOR_MAP))
+    draw_sheet(path, f"{title}. Error: black 0, yellow ≥ {FULL_ERROR}", rows)
 
 
 def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
@@ -153,7 +153,8 @@ def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int) -> li
     for evaluated in models:
         scores, rgb = evaluated.images[index], evaluated.render(frame)
         moving = "" if scores.moving_psnr is None else f", moving {scores.moving_psnr:.1f}"
-        error = color((rgb - target).abs().mean(dim=-1).numpy() / FULL_ERROR, COLOR_MAP)
+        relative = (rgb - target).abs().mean(dim=-1).numpy() / FULL_ERROR
+        error = colormaps["magma"](np.clip(relative, 0, 1), bytes=True)[..., :3]
         error[_outline(mask)] = OUTLINE
         row.append(_panel(rgb, f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
         row.append(Panel(_fitted(error), "error" + (", moving region outlined" if mask.any() else "")))

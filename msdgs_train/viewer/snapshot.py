@@ -12,7 +12,6 @@ from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import LoadedModel
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 
 Channel = Literal["rgb", "alpha", "depth"]
@@ -57,11 +56,6 @@ def snapshot_of_training(trainer: Trainer) -> Snapshot:
     model.config = replace(model.config, eps2d=schedule.eps2d(step))
     background = trainer.config.data.evaluation_background
     return Snapshot(model, background, schedule.deforms(step), schedule.sh_degree(step))
-
-
-def snapshot_of_file(loaded: LoadedModel) -> Snapshot:
-    """The model of a `model.pt` or `best.pt`."""
-    return Snapshot(loaded.model, loaded.scene.background)
 
 
 def _image_of(rendering: Rendering, channel: Channel) -> np.ndarray:

@@ -18,7 +18,7 @@ from msdgs_serve.scene import Camera, InvalidInput, MsdgsError, quaternion
 from msdgs_train.engine.extras import ExtraMissing
 from msdgs_train.gaussians.model_file import LoadedModel
 from msdgs_train.viewer.scene_view import SceneView, view_of_file
-from msdgs_train.viewer.snapshot import Channel, Snapshot, snapshot_of_file
+from msdgs_train.viewer.snapshot import Channel, Snapshot
 
 POLL_SECONDS = 1 / 30  # between polls of the browsers
 IDLE_SECONDS = 0.2  # without a change before the large image is drawn
@@ -193,7 +193,7 @@ def show_model(viewer: Viewer, loaded: LoadedModel, name: str) -> None:
     """Show the model of a file."""
     viewer.set_status(f"**{name}**  \nstep {loaded.step:,}, {len(loaded.model.gaussians):,} Gaussians")
     viewer.open(view_of_file(loaded))
-    viewer.show(snapshot_of_file(loaded))
+    viewer.show(Snapshot(loaded.model, loaded.scene.background))
 
 
 def camera_of_browser(wxyz: np.ndarray, position: np.ndarray, fov_y: float, width: int, height: int) -> Camera:

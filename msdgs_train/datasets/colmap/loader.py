@@ -29,13 +29,11 @@ SPARSE = "sparse"
 LAST_NUMBER = re.compile(r"(\d+)\D*$")
 
 
-def load_colmap(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras, times and sparse points of a COLMAP scene.
+def load_colmap(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras, times and sparse points of a COLMAP scene, as `load_scene` does.
 
-    `size` is the width of the images in pixels. If all images have the same number in their names, the scene is static,
-    t = 0. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
+    If all images have the same number in their names, the scene is static, t = 0.
     """
-    folder = Path(folder)
     files = _model_files(folder)
     read = colmap_binary if files[0].suffix == ".bin" else colmap_text
     cameras = dict(read.read_cameras(files[0]))

@@ -27,20 +27,19 @@ CONTACT = 0.1
 SQUASH = 4 * BOUNCE_HEIGHT * CONTACT / ((1 - CONTACT) * math.pi * BALL_RADIUS)
 """Depth of the squash as a fraction of the radius, so that the velocity is continuous at contact."""
 
+
+def _box(half_x: float, half_y: float, bottom: float, top: float) -> list[list[float]]:
+    return [[-half_x, -half_y, bottom], [half_x, half_y, top]]
+
+
 REST_BOXES = np.array(
     [
-        [[-GROUND_RADIUS, -GROUND_RADIUS, -GROUND_THICKNESS], [GROUND_RADIUS, GROUND_RADIUS, 0]],
-        [
-            [-FRAME_HALF_WIDTH - BAR_RADIUS, -BAR_RADIUS, -BAR_RADIUS],
-            [FRAME_HALF_WIDTH + BAR_RADIUS, BAR_RADIUS, PIVOT_Z - GROUND_Z + BAR_RADIUS],
-        ],
-        [[-BALL_RADIUS] * 3, [BALL_RADIUS] * 3],
-        [
-            [-RING_RADIUS - RING_TUBE, -RING_RADIUS - RING_TUBE, -RING_TUBE],
-            [RING_RADIUS + RING_TUBE, RING_RADIUS + RING_TUBE, RING_TUBE],
-        ],
-        [[-JELLY_HALF_WIDTH, -JELLY_HALF_WIDTH, 0], [JELLY_HALF_WIDTH, JELLY_HALF_WIDTH, JELLY_HEIGHT]],
-        [[-BOB_RADIUS, -BOB_RADIUS, -ROD_LENGTH - BOB_RADIUS], [BOB_RADIUS, BOB_RADIUS, 2 * ROD_RADIUS]],
+        _box(GROUND_RADIUS, GROUND_RADIUS, -GROUND_THICKNESS, 0),
+        _box(FRAME_HALF_WIDTH + BAR_RADIUS, BAR_RADIUS, -BAR_RADIUS, PIVOT_Z - GROUND_Z + BAR_RADIUS),
+        _box(BALL_RADIUS, BALL_RADIUS, -BALL_RADIUS, BALL_RADIUS),
+        _box(RING_RADIUS + RING_TUBE, RING_RADIUS + RING_TUBE, -RING_TUBE, RING_TUBE),
+        _box(JELLY_HALF_WIDTH, JELLY_HALF_WIDTH, 0, JELLY_HEIGHT),
+        _box(BOB_RADIUS, BOB_RADIUS, -ROD_LENGTH - BOB_RADIUS, 2 * ROD_RADIUS),
     ]
 )
 """[objects, 2, 3] opposite corners of a box around each object at rest."""
