@@ -11,7 +11,7 @@ from msdgs_train.cli.console import console, frame_progress, rich_table
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Eval:
     """Evaluate the last and the best model of runs on held-out images: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR of the
     moving region, since a static background hides errors of the motion.
 

@@ -5,10 +5,10 @@ import contextlib
 import inspect
 import io
 import sys
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
@@ -18,9 +18,6 @@ from msdgs_train.cli.parts import PARTS
 from msdgs_train.cli.view import open_viewer
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import DEFAULT, preset, systems
-
-if TYPE_CHECKING:
-    from msdgs_train.viewer.training_view import TrainingView
 
 HELP_ALL = "--help-all"
 COMMON = {
@@ -71,19 +68,25 @@ class Fit:
     def execute(self) -> int:
         """Train with a progress bar; returns the exit code."""
         from msdgs_train.cli.fit_progress import FitProgress, print_result
-        from msdgs_train.engine.observer import Observer, Observers
+        from msdgs_train.engine.observer import Observers
         from msdgs_train.engine.run import fit
 
+        progress = FitProgress(console, self.config.run.steps)
         with contextlib.ExitStack() as stack:
-            view = stack.enter_context(_training_view(self)) if self.viewer else None
-            with FitProgress(console, self.config.run.steps) as progress:
-                observers: list[Observer] = [progress, view] if view else [progress]
+            view, observer = None, progress
+            if self.viewer:
+                from msdgs_train.viewer.training_view import TrainingView
+
+                viewer = stack.enter_context(open_viewer(self.viewer_host, self.viewer_port))
+                view = TrainingView(viewer, self.config.run.steps)
+                observer = Observers(progress, view)
+            with progress:
                 result = fit(
                     self.config,
                     self.data,
                     self.run,
                     resume=self.resume,
-                    observer=Observers(*observers),
+                    observer=observer,
                     tensorboard=self.tensorboard,
                 )
             print_result(console, result, self.data, self.run)
@@ -167,11 +170,3 @@ def _hiding(options: Any, shown: Container[str], **replaced: Any) -> Any:
     ]
     short = make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True, namespace={"__doc__": kind.__doc__})
     return short(**values)
-
-
-@contextlib.contextmanager
-def _training_view(command: Fit) -> Iterator["TrainingView"]:
-    from msdgs_train.viewer.training_view import TrainingView
-
-    with open_viewer(command.viewer_host, command.viewer_port) as viewer:
-        yield TrainingView(viewer, command.config.run.steps)

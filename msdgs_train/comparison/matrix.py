@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,8 +134,6 @@ def _require_unique(kind: str, given: Iterable[str]) -> None:
     names = list(given)
     if not names:
         raise InvalidInput(kind, "given, one or more", "none")
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise InvalidInput(kind, "named once", f"`{name}` twice")
-        seen.add(name)
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise InvalidInput(kind, "named once", f"`{name}` twice")

@@ -10,7 +10,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from msdgs_serve.ray_tasks import RayTasks, ray_cluster
 from msdgs_serve.scene.errors import MsdgsError
@@ -31,69 +31,35 @@ class RunEnd(NamedTuple):
     message: str = ""
 
 
-class Pool(Protocol):
-    """Trains `jobs` runs at a time."""
+class Processes:
+    """Trains up to `jobs` runs at a time, one process of this machine per run."""
 
-    jobs: int
-
-    def __len__(self) -> int:
-        """The number of runs that haven't ended."""
-        ...
-
-    def submit(self, run: Run) -> None:
-        """Start a run, or continue it."""
-        ...
-
-    def ended(self, timeout: float | None = None) -> Iterator[tuple[Run, RunEnd]]:
-        """The runs that have ended; waits for the first of them, up to `timeout` seconds."""
-        ...
-
-    def stop(self) -> None:
-        """Make all runs save their checkpoint and end."""
-        ...
-
-
-@contextmanager
-def processes(jobs: int) -> Iterator[Pool]:
-    """One process of this machine per run."""
-    context = multiprocessing.get_context("spawn")
-    stop = context.Event()
-    with ProcessPoolExecutor(jobs, context, _prepare, (stop,)) as executor:
-        yield _Processes(jobs, executor, stop)
-
-
-@contextmanager
-def ray_tasks(address: str, threads: int, jobs: int | None) -> Iterator[Pool]:
-    """Tasks of a Ray cluster, `threads` cores each; as many as its cores allow if `jobs` is None.
-
-    Data and runs must be at the same paths on all its machines. A run whose machine is lost continues on another one
-    from its last checkpoint.
-    """
-    with ray_cluster(address) as cores:
-        yield _RayPool(jobs or max(1, cores // threads), threads)
-
-
-class _Processes:
     def __init__(self, jobs: int, executor: ProcessPoolExecutor, stop: Event) -> None:
         self.jobs = jobs
         self._executor, self._stop = executor, stop
         self._going: dict[Future[RunEnd], Run] = {}
 
     def __len__(self) -> int:
+        """The number of runs that haven't ended."""
         return len(self._going)
 
     def submit(self, run: Run) -> None:
+        """Start a run, or continue it."""
         self._going[self._executor.submit(_train_here, run)] = run
 
     def ended(self, timeout: float | None = None) -> Iterator[tuple[Run, RunEnd]]:
+        """The runs that have ended; waits for the first of them, up to `timeout` seconds."""
         for future in wait(self._going, timeout=timeout, return_when=FIRST_COMPLETED).done:
             yield self._going.pop(future), future.result()
 
     def stop(self) -> None:
+        """Make all runs save their checkpoint and end."""
         self._stop.set()
 
 
-class _RayPool(RayTasks[Run, RunEnd]):
+class RayPool(RayTasks[Run, RunEnd]):
+    """Trains up to `jobs` runs at a time, as tasks of a Ray cluster."""
+
     def __init__(self, jobs: int, threads: int) -> None:
         import ray  # pyright: ignore[reportMissingImports]  # an extra
 
@@ -102,7 +68,31 @@ class _RayPool(RayTasks[Run, RunEnd]):
         super().__init__(_train_on_ray, [self._flag], Path.cwd(), cores=threads)
 
     def stop(self) -> None:
+        """Make all runs save their checkpoint and end."""
         self._flag.set.remote()
+
+
+Pool = Processes | RayPool
+
+
+@contextmanager
+def processes(jobs: int) -> Iterator[Processes]:
+    """A pool of processes of this machine."""
+    context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    with ProcessPoolExecutor(jobs, context, _prepare, (stop,)) as executor:
+        yield Processes(jobs, executor, stop)
+
+
+@contextmanager
+def ray_tasks(address: str, threads: int, jobs: int | None) -> Iterator[RayPool]:
+    """A pool of tasks of a Ray cluster, `threads` cores each; as many as its cores allow if `jobs` is None.
+
+    Data and runs must be at the same paths on all its machines. A run whose machine is lost continues on another one
+    from its last checkpoint.
+    """
+    with ray_cluster(address) as cores:
+        yield RayPool(jobs or max(1, cores // threads), threads)
 
 
 class _Flag:

@@ -19,8 +19,8 @@ model, where k3 follows p2. `Frame.load_rgba` removes the distortion; the camera
 """
 
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -39,14 +39,8 @@ FIELDS = {"camera.fx": "focal_length", "camera.fy": "pixel_aspect_ratio", "camer
 """The value of a file that makes a field of its camera invalid; all other fields come from `orientation`."""
 
 
-class _World(NamedTuple):
-    """The transform from the file's world to the scene's."""
-
-    center: np.ndarray  # [3]
-    scale: float
-
-    def apply(self, positions: np.ndarray) -> np.ndarray:
-        return (positions - self.center) * self.scale
+Transform = Callable[[np.ndarray], np.ndarray]
+"""Maps positions in the files' world, [..., 3], to the scene's."""
 
 
 def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
@@ -59,15 +53,16 @@ def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
     if not ids["train"]:
         raise dataset.invalid("train_ids", "must name one frame or more")
     times = _read_times(folder / METADATA_FILE, [id_ for split in ids.values() for id_ in split])
-    world = _read_world(folder / SCENE_FILE)
+    to_scene = _read_transform(folder / SCENE_FILE)
     copies = _find_copy(folder / "rgb", ids["train"][0], size)
     splits = {
         split: [
-            _frame(folder / "camera" / f"{id_}.json", copies / f"{id_}.png", times[id_], world, size) for id_ in members
+            _frame(folder / "camera" / f"{id_}.json", copies / f"{id_}.png", times[id_], to_scene, size)
+            for id_ in members
         ]
         for split, members in ids.items()
     }
-    points = _read_points(folder / POINTS_FILE, world)
+    points = _read_points(folder / POINTS_FILE, to_scene)
     cameras = [frame.camera for frames in splits.values() for frame in frames]
     return SceneData(splits, scene_half_size(points, cameras), points)
 
@@ -87,12 +82,13 @@ def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
     return {id_: number / last for id_, number in numbers.items()}
 
 
-def _read_world(file: Path) -> _World:
+def _read_transform(file: Path) -> Transform:
     scene = read_json(file)
     scale = scene.number("scale")
     if scale <= 0:
         raise scene.invalid("scale", f"must be above 0, got {scale:g}")
-    return _World(scene.numbers("center", 3), scale)
+    center = scene.numbers("center", 3)
+    return lambda positions: (positions - center) * scale
 
 
 def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
@@ -107,16 +103,16 @@ def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
     return wide_enough[-1] if wide_enough else copies[0]
 
 
-def _frame(file: Path, image_path: Path, t: float, world: _World, size: int | None) -> Frame:
+def _frame(file: Path, image_path: Path, t: float, to_scene: Transform, size: int | None) -> Frame:
     values = read_json(file)
-    camera = _camera(values, world, read_size(image_path))
+    camera = _camera(values, to_scene, read_size(image_path))
     k1, k2, k3 = values.numbers("radial_distortion", 3).tolist()
     p1, p2 = values.numbers("tangential" if "tangential" in values.values else "tangential_distortion", 2).tolist()
     distortion = checked_distortion(Distortion(k1, k2, p1, p2, k3), camera, file, "radial_distortion")
     return Frame(image_path.stem, reduced(camera, size, image_path), t, image_path, distortion)
 
 
-def _camera(values: JsonObject, world: _World, image: ImageSize) -> Camera:
+def _camera(values: JsonObject, to_scene: Transform, image: ImageSize) -> Camera:
     """The camera, in pixels of the stored image."""
     if values.number("skew") != 0:
         raise values.invalid("skew", f"must be 0, got {values.get('skew')}")
@@ -127,15 +123,15 @@ def _camera(values: JsonObject, world: _World, image: ImageSize) -> Camera:
     cx, cy = values.numbers("principal_point", 2)
     pose = np.eye(4)
     pose[:3, :3] = values.numbers("orientation", 3, 3).T
-    pose[:3, 3] = world.apply(values.numbers("position", 3))
+    pose[:3, 3] = to_scene(values.numbers("position", 3))
     try:
         return Camera(focal, focal * aspect, cx, cy, *stated, pose).resized(*image)
     except InvalidInput as error:
         raise values.invalid(FIELDS.get(error.field, "orientation"), f"is not a valid camera: {error}") from None
 
 
-def _read_points(file: Path, world: _World) -> np.ndarray | None:
+def _read_points(file: Path, to_scene: Transform) -> np.ndarray | None:
     if not file.exists():
         return None
     points = read_table(file, 3)
-    return world.apply(points) if len(points) else None
+    return to_scene(points) if len(points) else None

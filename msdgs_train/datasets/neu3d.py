@@ -11,7 +11,6 @@ are synchronized: all have F frames, and frame i is at t = i / (F - 1). The firs
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -30,26 +29,18 @@ CAMERAS = "cam0*"
 POINTS_FILES = ("points3D_downsample*.ply", "points3d.ply", "points3D.ply")
 """The first that exists is read; of several downsampled ones the last by name, which is the smallest."""
 
+VIDEO = ".mp4"
 CAMERA_NAME = re.compile(r"cam\d+")
-
-
-class _Source(NamedTuple):
-    """The images of a camera: a video, or files in the order of time."""
-
-    name: str
-    video: Path | None
-    images: list[Path]
 
 
 def load_neu3d(folder: Path, size: int | None = None) -> SceneData:
     """Read the cameras and, if there is a `.ply` file, the sparse points of a Neu3D scene, as `load_scene` does."""
-    sources, file = _find_sources(folder), folder / POSES_FILE
+    cameras, file = _find_cameras(folder), folder / POSES_FILE
     poses = read_table(file, 17)
-    if len(poses) != len(sources):
-        names = " ".join(source.name for source in sources)
-        problem = f"are {len(poses)}, but there are {len(sources)} cameras: {names}. There must be one row per camera, "
-        raise DatasetInvalid(file, "rows", problem + "in the order of their names")
-    views = [_view(file, row, *pair, size) for row, pair in enumerate(zip(sources, poses, strict=True))]
+    if len(poses) != len(cameras):
+        problem = f"are {len(poses)}, but there are {len(cameras)} cameras: {' '.join(cameras)}. There must be one row "
+        raise DatasetInvalid(file, "rows", problem + "per camera, in the order of their names")
+    views = [_view(file, row, name, cameras[name], poses[row], size) for row, name in enumerate(cameras)]
     first = views[0]
     for view in views:
         if len(view) != len(first):
@@ -60,25 +51,25 @@ def load_neu3d(folder: Path, size: int | None = None) -> SceneData:
     return SceneData(splits, scene_half_size(points, [view[0].camera for view in views]), points, colors)
 
 
-def _find_sources(folder: Path) -> list[_Source]:
+def _find_cameras(folder: Path) -> dict[str, list[Path]]:
+    """By name, the images of each camera in the order of time, or its video."""
     names = {path.stem for path in folder.iterdir() if CAMERA_NAME.fullmatch(path.stem)}
-    sources = [_source(folder, name) for name in sorted(names, key=_natural)]
-    if len(sources) < 2:
-        problem = f"must be two or more, got {len(sources)}: cam00 for testing, cam01 and on for training"
+    if len(names) < 2:
+        problem = f"must be two or more, got {len(names)}: cam00 for testing, cam01 and on for training"
         raise DatasetInvalid(folder, "cameras", problem)
-    return sources
+    return {name: _find_files(folder, name) for name in sorted(names, key=_natural)}
 
 
-def _source(folder: Path, name: str) -> _Source:
+def _find_files(folder: Path, name: str) -> list[Path]:
     for place in (folder / name / "images", folder / name):
         files = [path for path in place.glob("*") if path.suffix.lower() in EXTENSIONS and path.is_file()]
         if files:
-            return _Source(name, None, sorted(files, key=lambda path: _natural(path.name)))
-    video = folder / f"{name}.mp4"
+            return sorted(files, key=lambda path: _natural(path.name))
+    video = folder / f"{name}{VIDEO}"
     if not video.is_file():
         problem = f"are missing: there is no {video.name} and no {'|'.join(EXTENSIONS)}"
         raise DatasetInvalid(folder / name, "frames", problem)
-    return _Source(name, video, [])
+    return [video]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -86,30 +77,22 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def _view(file: Path, row: int, source: _Source, pose: np.ndarray, size: int | None) -> list[Frame]:
+def _view(file: Path, row: int, name: str, files: list[Path], pose: np.ndarray, size: int | None) -> list[Frame]:
     """All frames of one camera, in the order of time."""
-    if source.video is not None:
-        video, info = source.video, read_info(source.video)
-        camera = reduced(_camera(file, row, pose, ImageSize(info.width, info.height)), size, video)
+    first = files[0]
+    if first.suffix == VIDEO:
+        count, *image = read_info(first)
+        camera = reduced(_camera(file, row, pose, ImageSize(*image)), size, first)
         return [
-            VideoFrame(
-                f"{source.name}_{index:06d}",
-                camera,
-                t,
-                video / f"{index:06d}",
-                video=video,
-                index=index,
-                count=info.count,
-            )
-            for index, t in enumerate(_times(info.count))
+            VideoFrame(f"{name}_{i:06d}", camera, t, first / f"{i:06d}", video=first, index=i, count=count)
+            for i, t in enumerate(_times(count))
         ]
-    first, image = source.images[0], read_size(source.images[0])
-    for path in source.images:
+    image = read_size(first)
+    for path in files:
         if read_size(path) != image:
             raise DatasetInvalid(path, "image", f"is {read_size(path)}, but {first} is {image}")
     camera = reduced(_camera(file, row, pose, image), size, first)
-    paths_and_times = zip(source.images, _times(len(source.images)), strict=True)
-    return [Frame(f"{source.name}_{path.stem}", camera, t, path) for path, t in paths_and_times]
+    return [Frame(f"{name}_{path.stem}", camera, t, path) for path, t in zip(files, _times(len(files)), strict=True)]
 
 
 def _times(count: int) -> list[float]:

@@ -69,11 +69,7 @@ def evaluate_run(
 ) -> Evaluation:
     """Evaluate `model.pt` and, if there is one, `best.pt` of the run in folder `run` on a split.
 
-    Args:
-        run: the folder of a run of `msdgs-train fit`.
-        data: the dataset; by default the one that the run was trained on.
-        split: "test", "val" or "train".
-        progress: called with (done, total) images.
+    The arguments are the options of `msdgs-train eval`; `progress` is called with (done, total) images.
 
     Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
     """

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from torch import Tensor
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets.common.files import write_text
@@ -123,15 +122,8 @@ def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
     names = [frame.name for frame in first.frames]
     if any([frame.name for frame in other.frames] != names for other in others):
         raise InvalidInput("RUN", "runs on the same images", "others")
-    rows = []
-    for index in _evenly_spaced(len(names)):
-        frame = first.frames[index]
-        row = [_panel(first.models[0].image(frame), f"{frame.name}, t = {frame.t:.3g}")]
-        for run, evaluation in runs.items():
-            last = evaluation.models[0]
-            caption = f"{Path(run).name}: {last.images[index].psnr:.1f} dB"
-            row.append(_panel(last.render(evaluation.frames[index]), caption))
-        rows.append(row)
+    models = [evaluation.models[0]._replace(name=Path(run).name) for run, evaluation in runs.items()]
+    rows = [_row(first, models, index, errors=False) for index in _evenly_spaced(len(names))]
     draw_sheet(path, f"{first.split}, {len(rows)} of {len(names)} frames: {', '.join(runs)}", rows)
 
 
@@ -146,18 +138,20 @@ def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:
     return [last, *(evaluated for evaluated in others if evaluated.loaded.step != last.loaded.step)]
 
 
-def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int) -> list[Panel]:
+def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int, errors: bool = True) -> list[Panel]:
+    """The image of a frame and its rendering by each model, each with its error if `errors`."""
     frame, mask = evaluation.frames[index], evaluation.masks[index]
-    target = models[0].image(frame)
-    row = [_panel(target, f"{frame.name}, t = {frame.t:.3g}")]
+    target = models[0].image(frame).numpy()
+    row = [_panel(to_bytes(target), f"{frame.name}, t = {frame.t:.3g}")]
     for evaluated in models:
-        scores, rgb = evaluated.images[index], evaluated.render(frame)
+        scores, rgb = evaluated.images[index], evaluated.render(frame).numpy()
         moving = "" if scores.moving_psnr is None else f", moving {scores.moving_psnr:.1f}"
-        relative = (rgb - target).abs().mean(dim=-1).numpy() / FULL_ERROR
-        error = colormaps["magma"](np.clip(relative, 0, 1), bytes=True)[..., :3]
-        error[_outline(mask)] = OUTLINE
-        row.append(_panel(rgb, f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
-        row.append(Panel(_fitted(error), "error" + (", moving region outlined" if mask.any() else "")))
+        row.append(_panel(to_bytes(rgb), f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
+        if errors:
+            relative = np.abs(rgb - target).mean(axis=-1) / FULL_ERROR
+            error = colormaps["magma"](np.clip(relative, 0, 1), bytes=True)[..., :3]
+            error[_outline(mask)] = OUTLINE
+            row.append(_panel(error, "error" + (", moving region outlined" if mask.any() else "")))
     return row
 
 
@@ -167,18 +161,14 @@ def _outline(mask: np.ndarray) -> np.ndarray:
     return ~mask & (padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
 
 
-def _panel(rgb: Tensor, caption: str) -> Panel:
-    return Panel(_fitted(to_bytes(rgb.numpy())), caption)
-
-
-def _fitted(pixels: np.ndarray) -> np.ndarray:
-    """Enlarge or downscale uint8 [H, W, 3] to the width of a panel."""
+def _panel(pixels: np.ndarray, caption: str) -> Panel:
+    """A panel with uint8 [H, W, 3], enlarged or downscaled to its width."""
     height, width, _ = pixels.shape
     if width <= MAX_PANEL:
         times = -(-MIN_PANEL // width)
-        return pixels.repeat(times, axis=0).repeat(times, axis=1)
+        return Panel(pixels.repeat(times, axis=0).repeat(times, axis=1), caption)
     opaque = np.concatenate([pixels, np.full((height, width, 1), 255, np.uint8)], axis=2)
-    return resize_area(opaque, MAX_PANEL, max(1, round(height * MAX_PANEL / width)))[..., :3]
+    return Panel(resize_area(opaque, MAX_PANEL, max(1, round(height * MAX_PANEL / width)))[..., :3], caption)
 
 
 def _model_as_json(evaluation: Evaluation, evaluated: EvaluatedModel) -> dict[str, Any]:

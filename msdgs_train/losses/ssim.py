@@ -21,13 +21,8 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 
-def _gaussian_window() -> np.ndarray:
-    x = np.arange(-RADIUS, RADIUS + 1)
-    weights = np.exp(-(x**2) / (2 * SIGMA**2))
-    return weights / weights.sum()
-
-
-_TAPS = _gaussian_window()
+_WEIGHTS = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
+_TAPS = _WEIGHTS / _WEIGHTS.sum()
 
 
 def ssim(rgb: Tensor, target: Tensor) -> Tensor:

@@ -77,9 +77,6 @@ class Viewer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def open(self, view: SceneView) -> None:
         """Add the controls, move all cameras to the first view, and begin to draw."""
         self._view = view
@@ -124,7 +121,7 @@ class Viewer:
         """Block until Ctrl-C, which is raised."""
         self._closing.wait()
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop the server."""
         self._closing.set()
         if self._thread.is_alive():
@@ -197,14 +194,10 @@ def show_model(viewer: Viewer, loaded: LoadedModel, name: str) -> None:
 
 
 def camera_of_browser(wxyz: np.ndarray, position: np.ndarray, fov_y: float, width: int, height: int) -> Camera:
-    """The pinhole camera of a browser, from viser's values.
+    """Return the pinhole camera of a browser, from viser's values.
 
-    Args:
-        wxyz: [4] quaternion, rotates OpenCV camera axes (x right, y down, z forward) into world axes.
-        position: [3] world space.
-        fov_y: vertical field of view in radians.
-        width: width of the image in pixels.
-        height: height of the image in pixels.
+    The quaternion `wxyz` rotates OpenCV camera axes (x right, y down, z forward) into world axes. `position` is in
+    world space, the vertical field of view `fov_y` in radians, `width` and `height` in pixels.
     """
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = quaternion.to_matrix(quaternion.normalize(wxyz))

@@ -60,10 +60,8 @@ def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
     """
     if size is None or size == camera.width:
         return camera
-    if size < 1:
-        raise InvalidInput("size", "a width of 1 pixel or more", size)
-    if size > camera.width:
-        raise InvalidInput("size", f"at most {camera.width}, the width of {image_path}", size)
+    if not 1 <= size <= camera.width:
+        raise InvalidInput("size", f"in [1, {camera.width}], up to the width of {image_path}", size)
     return camera.resized(size, max(1, round(camera.height * size / camera.width)))
 
 

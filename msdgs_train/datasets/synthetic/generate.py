@@ -58,12 +58,7 @@ def generate(
     The dataset is built beside `out` and moved there when complete; an interrupted call leaves `out` unchanged. An
     earlier dataset of this function is replaced, any other content is refused with `InvalidInput`.
 
-    Args:
-        size: width and height of the images in pixels.
-        train_frames: images at evenly spaced times in [0, 1], cameras spread over the upper hemisphere.
-        test_frames: images at intermediate times, from one smooth turn around the scene.
-        seed: seed of the camera positions; the motion is always the same.
-        progress: called with (done, total) after every image.
+    The arguments are the options of `msdgs-train synthetic`; `progress` is called with (done, total) after every image.
     """
     for name, value, least in (("train_frames", train_frames, 1), ("test_frames", test_frames, 0)):
         if value < least:
