@@ -56,10 +56,7 @@ def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
     to_scene = _read_transform(folder / SCENE_FILE)
     copies = _find_copy(folder / "rgb", ids["train"][0], size)
     splits = {
-        split: [
-            _frame(folder / "camera" / f"{id_}.json", copies / f"{id_}.png", times[id_], to_scene, size)
-            for id_ in members
-        ]
+        split: [_frame(folder, copies / f"{id_}.png", times[id_], to_scene, size) for id_ in members]
         for split, members in ids.items()
     }
     points = _read_points(folder / POINTS_FILE, to_scene)
@@ -103,7 +100,8 @@ def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
     return wide_enough[-1] if wide_enough else copies[0]
 
 
-def _frame(file: Path, image_path: Path, t: float, to_scene: Transform, size: int | None) -> Frame:
+def _frame(folder: Path, image_path: Path, t: float, to_scene: Transform, size: int | None) -> Frame:
+    file = folder / "camera" / f"{image_path.stem}.json"
     values = read_json(file)
     camera = _camera(values, to_scene, read_size(image_path))
     k1, k2, k3 = values.numbers("radial_distortion", 3).tolist()
