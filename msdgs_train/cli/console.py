@@ -8,7 +8,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 EXIT_INVALID = 2
-EXIT_INTERRUPTED = 130  # as a shell reports a program that Ctrl-C has stopped
+EXIT_INTERRUPTED = 130  # the exit code of a shell for a program that Ctrl-C has stopped
 
 console = Console()
 

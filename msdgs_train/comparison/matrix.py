@@ -12,7 +12,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
-EVALUATIONS = 10  # of held-out images during training
+EVALUATIONS = 10  # number of evaluations of held-out images during training
 LOG_LINES = 100
 
 

@@ -21,7 +21,7 @@ from msdgs_train.engine.run import fit
 from msdgs_train.engine.run_record import CHECKPOINT
 
 POLL_SECONDS = 0.5
-_stop: Event | None = None  # of a worker process, set by its parent
+_stop: Event | None = None  # set in a worker process by its parent
 
 
 class RunEnd(NamedTuple):

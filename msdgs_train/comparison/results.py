@@ -42,7 +42,7 @@ class Result:
     deformation_parameters: int
     modulation_parameters: int  # embeddings included
     gaussians: int
-    seconds: float  # of training, evaluations included
+    seconds: float  # training time, evaluations included
     skipped: int
     frame_ms: float  # deforming and rendering one held-out view, median
     curve: list[CurvePoint]

@@ -52,7 +52,7 @@ def load_neu3d(folder: Path, size: int | None = None) -> SceneData:
 
 
 def _find_cameras(folder: Path) -> dict[str, list[Path]]:
-    """By name, the images of each camera in the order of time, or its video."""
+    """Find the images of each camera in the order of time, or its video; by the camera's name."""
     names = {path.stem for path in folder.iterdir() if CAMERA_NAME.fullmatch(path.stem)}
     if len(names) < 2:
         problem = f"must be two or more, got {len(names)}: cam00 for testing, cam01 and on for training"

@@ -25,7 +25,7 @@ from msdgs_train.gaussians.model import PosedGaussians
 from msdgs_train.gaussians.model_file import LoadedModel
 from msdgs_train.rendering.rasterize import rasterize
 
-MIN_CHANGE = 0.1  # of the range of a channel
+MIN_CHANGE = 0.1  # as a fraction of the range of a channel
 MIN_TRAVEL = 1.0  # pixels
 TIMES = 9
 FIXED_TIMES = 3  # a camera with images at this many times is fixed

@@ -93,7 +93,7 @@ def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
 
 
 def _refuse_not_finite(path: str | Path, state: dict[str, Tensor]) -> None:
-    # as float32, since float64 values may be beyond it
+    # compared as float32: a finite float64 may be infinite in it
     counts = {name: int((~torch.isfinite(tensor.to(torch.float32))).sum()) for name, tensor in state.items()}
     bad = [f"{name} ({count:,} of {state[name].numel():,})" for name, count in counts.items() if count]
     if bad:

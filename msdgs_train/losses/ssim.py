@@ -15,7 +15,7 @@ from torch import Tensor
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.scene.errors import InvalidInput
 
-RADIUS = 5  # of the window, 11 pixels wide
+RADIUS = 5  # pixels; the window is 11 pixels wide
 SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2

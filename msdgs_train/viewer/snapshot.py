@@ -26,13 +26,13 @@ class Snapshot:
     model: DynamicGaussians
     background: tuple[float, float, float]  # sRGB in [0, 1]
     deform: bool = True  # False in the static phase, before layers are trained
-    sh_degree: int | None = None  # of the bands in use; None: all
+    sh_degree: int | None = None  # highest degree in use; None: all
     _posed: tuple[tuple[float, int], Gaussians] | None = field(default=None, init=False)
 
     def draw(self, camera: Camera, t: float, layers: int, channel: Channel = "rgb") -> np.ndarray:
-        """[H, W, 3] uint8 at time `t`, after `layers` of the deformation.
+        """Draw [H, W, 3] uint8 at time `t`, after `layers` of the deformation; alpha 1 and the nearest depth are white.
 
-        White is an alpha of 1 and the nearest depth. Raises `InvalidInput` if Gaussians aren't finite.
+        Raises `InvalidInput` if Gaussians aren't finite.
         """
         posed, options = self._pose(t, layers), self.model.rasterizer
         drawn = rasterize(posed, camera, background=self.background, depth=channel == "depth", options=options)
@@ -40,7 +40,7 @@ class Snapshot:
 
     @torch.no_grad()
     def _pose(self, t: float, layers: int) -> Gaussians:
-        """Cached for one time and number of layers: a moving camera needs the same Gaussians for each frame."""
+        """Deform the Gaussians. The last result is kept, since a moving camera needs the same Gaussians for each frame."""
         if self._posed is None or self._posed[0] != (t, layers):
             posed = self.model.pose(t, num_layers=layers, deform=self.deform, sh_degree=self.sh_degree)
             self._posed = (t, layers), Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))

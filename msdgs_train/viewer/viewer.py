@@ -22,7 +22,7 @@ from msdgs_train.viewer.snapshot import Channel, Snapshot
 
 POLL_SECONDS = 1 / 30  # between polls of the browsers
 IDLE_SECONDS = 0.2  # without a change before the large image is drawn
-MOVING_PART = 0.5  # of the large image's sides, during changes
+MOVING_PART = 0.5  # scale of the image during changes
 JPEG_QUALITY = 90
 LONGEST_SIDE = 640  # pixels; initial value of the slider
 
@@ -39,11 +39,14 @@ class Wanted(NamedTuple):
     layers: int
     channel: Channel
 
-    def camera(self, part: float) -> Camera:
-        """The camera, with `part` of the large image's sides."""
-        longest = part * min(self.longest, max(self.canvas))
+    def camera(self, scale: float) -> Camera:
+        """The camera of the rendering, whose sides are `scale` times those of the large image."""
+        longest = scale * min(self.longest, max(self.canvas))
         width, height = (max(1, round(longest * side / max(self.canvas))) for side in self.canvas)
-        return camera_of_browser(np.array(self.wxyz), np.array(self.position), self.fov_y, width, height)
+        camera_to_world = np.eye(4)
+        camera_to_world[:3, :3] = quaternion.to_matrix(quaternion.normalize(np.array(self.wxyz)))
+        camera_to_world[:3, 3] = self.position
+        return Camera.from_fov(camera_to_world, width, height, math.degrees(self.fov_y))
 
 
 @dataclass
@@ -191,18 +194,6 @@ def show_model(viewer: Viewer, loaded: LoadedModel, name: str) -> None:
     viewer.set_status(f"**{name}**  \nstep {loaded.step:,}, {len(loaded.model.gaussians):,} Gaussians")
     viewer.open(view_of_file(loaded))
     viewer.show(Snapshot(loaded.model, loaded.scene.background))
-
-
-def camera_of_browser(wxyz: np.ndarray, position: np.ndarray, fov_y: float, width: int, height: int) -> Camera:
-    """Return the pinhole camera of a browser, from viser's values.
-
-    The quaternion `wxyz` rotates OpenCV camera axes (x right, y down, z forward) into world axes. `position` is in
-    world space, the vertical field of view `fov_y` in radians, `width` and `height` in pixels.
-    """
-    camera_to_world = np.eye(4)
-    camera_to_world[:3, :3] = quaternion.to_matrix(quaternion.normalize(wxyz))
-    camera_to_world[:3, 3] = position
-    return Camera.from_fov(camera_to_world, width, height, math.degrees(fov_y))
 
 
 def _serve(host: str, port: int) -> Any:

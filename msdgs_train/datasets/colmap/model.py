@@ -31,7 +31,7 @@ class ModelCamera(NamedTuple):
 
     width: int
     height: int
-    values: dict[str, float]  # of `PARAMETERS`, pixels but for k and p
+    values: dict[str, float]  # by the names in `PARAMETERS`; all but k and p in pixels
 
 
 class ModelImage(NamedTuple):

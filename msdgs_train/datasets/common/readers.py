@@ -25,7 +25,7 @@ class JsonObject(NamedTuple):
 
     file: Path
     values: Mapping[str, Any]
-    prefix: str = ""  # of the names of fields in error messages
+    prefix: str = ""  # put before the keys in error messages
 
     def invalid(self, key: str, problem: str) -> DatasetInvalid:
         """The error for an invalid value."""

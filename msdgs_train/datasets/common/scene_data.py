@@ -23,7 +23,7 @@ class Frame:
     camera: Camera  # a pinhole of the size that `load_rgba` returns
     t: float
     image_path: Path
-    distortion: Distortion | None = None  # of the lens, in the file; `load_rgba` removes it
+    distortion: Distortion | None = None  # of the stored image; `load_rgba` removes it
 
     def load_rgba(self) -> np.ndarray:
         """[height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.

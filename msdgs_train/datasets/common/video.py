@@ -38,7 +38,7 @@ class VideoFrame(Frame):
 
     video: Path
     index: int
-    count: int  # of the whole video
+    count: int  # number of frames in the video
 
     def load_rgba(self) -> np.ndarray:
         """[height, width, 4] uint8, sRGB, opaque, downscaled to the camera's size. The first call decodes the video."""
