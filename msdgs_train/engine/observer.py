@@ -1,5 +1,7 @@
 """The callbacks of a run, which may also pause or stop it."""
 
+from collections.abc import Callable
+
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.evaluation.metrics import ImageMetrics
 
@@ -32,26 +34,10 @@ class Observers(Observer):
     """Several observers, called in order; each may pause or stop the run."""
 
     def __init__(self, *observers: Observer) -> None:
-        self.observers = observers
+        for name in ("on_train_start", "step", "evaluation", "rolled_back", "should_stop", "is_paused"):
+            setattr(self, name, _call_all([getattr(observer, name) for observer in observers]))
 
-    def on_train_start(self, trainer: Trainer) -> None:
-        for observer in self.observers:
-            observer.on_train_start(trainer)
 
-    def step(self, result: StepResult, seconds: float) -> None:
-        for observer in self.observers:
-            observer.step(result, seconds)
-
-    def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
-        for observer in self.observers:
-            observer.evaluation(step, split, metrics)
-
-    def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
-        for observer in self.observers:
-            observer.rolled_back(reason, step, lr_factor)
-
-    def should_stop(self) -> bool:
-        return any(observer.should_stop() for observer in self.observers)
-
-    def is_paused(self) -> bool:
-        return any(observer.is_paused() for observer in self.observers)
+def _call_all(callbacks: list[Callable[..., bool | None]]) -> Callable[..., bool]:
+    """Combine callbacks into one, which returns true if any of them does; those that return nothing are all called."""
+    return lambda *arguments: any(callback(*arguments) for callback in callbacks)

@@ -106,8 +106,9 @@ def notes(evaluation: Evaluation) -> list[str]:
 def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
     """One row per frame, from the worst of the last model to its best, evenly spaced: the image, then the rendering of
     each model and its error, with the moving region outlined. Atomic."""
-    models = distinct_models(evaluation)
-    by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: evaluation.models[0].images[index].psnr)
+    last, *others = evaluation.models
+    models = [last, *(best for best in others if best.loaded.step != last.loaded.step)]
+    by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: last.images[index].psnr)
     rows = [_row(evaluation, models, by_psnr[place]) for place in _evenly_spaced(len(by_psnr))]
     shown = "" if len(rows) == len(by_psnr) else f"{len(rows)} of "
     names = " and ".join(f"{evaluated.name} (step {evaluated.loaded.step:,})" for evaluated in models)
@@ -130,12 +131,6 @@ def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
 def _evenly_spaced(count: int) -> list[int]:
     """Up to `SHEET_ROWS` of the first `count` numbers."""
     return [round(place) for place in np.linspace(0, count - 1, min(SHEET_ROWS, count))]
-
-
-def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:
-    """The models without the best one if it is also the last one."""
-    last, *others = evaluation.models
-    return [last, *(evaluated for evaluated in others if evaluated.loaded.step != last.loaded.step)]
 
 
 def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int, errors: bool = True) -> list[Panel]:

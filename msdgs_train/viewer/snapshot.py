@@ -40,7 +40,7 @@ class Snapshot:
 
     @torch.no_grad()
     def _pose(self, t: float, layers: int) -> Gaussians:
-        """Deform the Gaussians. The last result is kept, since a moving camera needs the same Gaussians for each frame."""
+        """Deform the Gaussians. The last result is kept: a moving camera needs the same Gaussians for each frame."""
         if self._posed is None or self._posed[0] != (t, layers):
             posed = self.model.pose(t, num_layers=layers, deform=self.deform, sh_degree=self.sh_degree)
             self._posed = (t, layers), Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
