@@ -96,11 +96,11 @@ def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
             _write(output, video, wanted)
     except OSError as error:
         gigabytes = 3e-9 * wanted.count * wanted.width * wanted.height
-        raise _invalid(
-            video,
-            f"can't be stored decoded in {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the "
-            f"environment variable XDG_CACHE_HOME to a folder with space, or train at a smaller size",
-        ) from None
+        problem = (
+            f"can't be decoded into {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the environment "
+        )
+        problem += "variable XDG_CACHE_HOME to a folder with space, or train at a smaller size"
+        raise _invalid(video, problem) from None
 
 
 def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:

@@ -119,7 +119,7 @@ def test_a_cache_that_cant_be_written_is_named(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "occupied").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "occupied"))
     frame = load_scene(write_neu3d_videos(tmp_path)).splits["test"][0]
-    with pytest.raises(DatasetInvalid, match=r"cam00\.mp4: `video` can't be stored decoded in .*XDG_CACHE_HOME"):
+    with pytest.raises(DatasetInvalid, match=r"cam00\.mp4: `video` can't be decoded into .*XDG_CACHE_HOME"):
         frame.load_rgba()
 
 
