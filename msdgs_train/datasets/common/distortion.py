@@ -1,11 +1,11 @@
 """Lens distortion by the Brown–Conrady model, coefficients as in OpenCV, COLMAP and nerfstudio, and its removal."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
+from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
@@ -47,23 +47,49 @@ def undistort(rgba: np.ndarray, camera: Camera, distortion: Distortion) -> np.nd
     `camera` has the intrinsics of the distorted image and its size, H×W. Pixels are interpolated bilinearly,
     colors weighted by alpha. Points outside of the image take the nearest pixel of its border.
     """
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    u, v = distorted(x[None, :], y[:, None], distortion)
-    pixels = np.stack([camera.fy * v + camera.cy - 0.5, camera.fx * u + camera.cx - 0.5])
-    weighted = rgba.astype(np.float64)
-    weighted[..., :3] *= weighted[..., 3:]
-    channels = [map_coordinates(weighted[..., i], pixels, order=1, mode="nearest") for i in range(4)]
-    alpha = channels[3]
-    colors = [channel / np.where(alpha > 0, alpha, 1) for channel in channels[:3]]
-    return np.floor(np.stack([*colors, alpha], axis=-1) + 0.5).astype(np.uint8)
+    result = np.empty_like(rgba)
+    _resample(np.ascontiguousarray(rgba), (camera.fx, camera.fy, camera.cx, camera.cy), distortion, result)
+    return result
 
 
-def distorted(x: np.ndarray, y: np.ndarray, distortion: Distortion) -> tuple[np.ndarray, np.ndarray]:
-    """Distort the points (x, y) of the plane z = 1 in camera axes."""
+def distorted(x: Any, y: Any, distortion: Distortion) -> tuple[Any, Any]:
+    """Distort the points (x, y) of the plane z = 1 in camera axes; scalars or arrays."""
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     return u, v
+
+
+_distorted = kernel(distorted)
+
+
+@kernel
+def _resample(source: np.ndarray, intrinsics: tuple, distortion: tuple, out: np.ndarray) -> None:
+    fx, fy, cx, cy = intrinsics
+    height, width, _ = source.shape
+    for row in range(height):
+        for column in range(width):
+            x, y = _distorted((column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, distortion)
+            x = min(max(fx * x + cx - 0.5, 0.0), width - 1.0)
+            y = min(max(fy * y + cy - 0.5, 0.0), height - 1.0)
+            left, top = int(x), int(y)
+            right, bottom = min(left + 1, width - 1), min(top + 1, height - 1)
+            across, down = x - left, y - top
+            a = (1 - across) * (1 - down) * source[top, left, 3]
+            b = across * (1 - down) * source[top, right, 3]
+            c = (1 - across) * down * source[bottom, left, 3]
+            d = across * down * source[bottom, right, 3]
+            alpha = a + b + c + d
+            out[row, column, 3] = int(alpha + 0.5)
+            for channel in range(3):
+                mean = 0.0
+                if alpha > 0:
+                    mean = (
+                        a * source[top, left, channel]
+                        + b * source[top, right, channel]
+                        + c * source[bottom, left, channel]
+                        + d * source[bottom, right, channel]
+                    ) / alpha
+                out[row, column, channel] = int(mean + 0.5)
