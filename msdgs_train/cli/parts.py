@@ -22,10 +22,10 @@ OPTIONS: dict[type, tuple[str, Mapping[str, type]]] = {
     LayerConfig: ("layers", LAYERS),
     SupportConfig: ("support", SUPPORTS),
 }
-"""Option and kinds of each base class."""
+"""By base class, the option and the kinds that it accepts."""
 
 PARTS = ConstructorRegistry()
-"""How tyro parses and prints them."""
+"""The rules by which tyro parses and prints layers and supports."""
 
 
 @PARTS.primitive_rule
