@@ -26,10 +26,14 @@ def rasterize_cuda(
         raise RuntimeError("training on CUDA renders with gsplat: pip install gsplat, or train on the CPU") from error
     if options._replace(near_plane=GSPLAT.near_plane, eps2d=GSPLAT.eps2d) != GSPLAT:
         raise InvalidInput("options", "gsplat's alpha and transmittance limits on CUDA", options)
-    means, *_, sh = gaussians
+    means, quats, scales, opacities, sh = gaussians
     intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32)
     rgb, alpha, meta = gsplat.rasterization(
-        *gaussians,
+        means,
+        quats,
+        scales,
+        opacities,
+        sh,
         torch.tensor(camera.world_to_camera, dtype=torch.float32, device=means.device)[None],
         intrinsics.to(means.device)[None],
         camera.width,

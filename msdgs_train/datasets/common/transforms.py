@@ -4,7 +4,6 @@ Cameras have the size of the stored image: if it is a downscaled copy of `w`×`h
 """
 
 import math
-from collections import ChainMap
 from pathlib import Path
 
 from msdgs_serve.scene import Camera, InvalidInput
@@ -28,7 +27,7 @@ def entries_of(content: JsonObject, may_be_empty: bool = False) -> list[JsonObje
         if not isinstance(values, dict):
             raise content.invalid(f"frames[{index}]", "must be a JSON object")
     return [
-        JsonObject(content.file, ChainMap(values, content.values), f"frames[{index}].")
+        JsonObject(content.file, {**content.values, **values}, f"frames[{index}].")
         for index, values in enumerate(frames)
     ]
 

@@ -139,12 +139,13 @@ def _opened(video: Path) -> Iterator[Any]:
     """The container of the video, in PyAV. Its errors in the block are raised as `DatasetInvalid`."""
     try:
         import av  # an optional dependency
+        from av.error import FFmpegError
     except ModuleNotFoundError as error:
         raise _invalid(video, f"needs {error.name} to be read: pip install 'msdgs[train]'") from None
     try:
         with av.open(str(video)) as container:
             yield container
-    except av.FFmpegError as error:
+    except FFmpegError as error:
         raise _invalid(video, f"can't be read: {error.strerror}") from None
 
 
