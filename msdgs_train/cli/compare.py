@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, rich_table
+from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, progress_bar, rich_table
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Compare:
 def _progress(total: int) -> "Iterator[Callable[[Run, RunEnd], None]]":
     """A bar over the runs; yields a function that advances it and prints a line about an ended run."""
     columns = BarColumn(None), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with progress_bar(*columns) as bar:
         task = bar.add_task("runs", total=total)
 
         def on_end(run: Run, end: "RunEnd") -> None:

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, ProgressColumn
 from rich.table import Table
 
 EXIT_INVALID = 2
@@ -25,9 +25,14 @@ def rich_table(
     return shown
 
 
+def progress_bar(*columns: ProgressColumn) -> Progress:
+    """A progress bar, with rich's own columns if none are given; hidden if the output is not a terminal."""
+    return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
 @contextlib.contextmanager
 def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
     """A bar over frames; yields a function of (done, total)."""
-    with Progress(console=console, disable=not console.is_terminal) as bar:
+    with progress_bar() as bar:
         task = bar.add_task("frames", total=total)
         yield lambda done, of: bar.update(task, completed=done, total=of)

@@ -71,7 +71,7 @@ class Fit:
         from msdgs_train.engine.observer import Observers
         from msdgs_train.engine.run import fit
 
-        progress = FitProgress(console, self.config.run.steps)
+        progress = FitProgress(self.config.run.steps)
         with contextlib.ExitStack() as stack:
             view, observer = None, progress
             if self.viewer:
@@ -89,7 +89,7 @@ class Fit:
                     observer=observer,
                     tensorboard=self.tensorboard,
                 )
-            print_result(console, result, self.data, self.run)
+            print_result(result, self.data, self.run)
             if view is not None and result.status != "interrupted":
                 with contextlib.suppress(KeyboardInterrupt):
                     console.print("the viewer shows the last model; Ctrl-C closes it")

@@ -50,14 +50,6 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class ComparedSystem:
-    """A system with a name and its settings."""
-
-    name: str
-    config: TrainConfig
-
-
-@dataclass(frozen=True)
 class Run:
     """One cell of the matrix."""
 
@@ -73,34 +65,28 @@ class Run:
         return f"{self.system}, {self.scene}, seed {self.seed}"
 
 
-def read_systems(sources: Sequence[str], budget: Budget) -> list[ComparedSystem]:
-    """Read systems from names of presets and from TOML files, each table of which is a `preset` and changed settings.
+def read_systems(sources: Sequence[str], budget: Budget) -> dict[str, TrainConfig]:
+    """Read the settings of systems from names of presets and from TOML files, each table of which is a system: a
+    `preset` and changed settings.
 
     Raises `InvalidInput` naming the file, the system and the invalid setting.
     """
     tables = [pair for source in sources for pair in _tables(source)]
-    systems = [ComparedSystem(name, _config(name, table, budget)) for name, table in tables]
-    _require_unique("system", (system.name for system in systems))
-    return systems
+    configs = [(name, _config(name, table, budget)) for name, table in tables]
+    _require_unique("system", (name for name, _ in configs))
+    return dict(configs)
 
 
-def make_runs(systems: Sequence[ComparedSystem], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
+def make_runs(systems: Mapping[str, TrainConfig], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
     """Return one run per system, scene and seed, ordered by seed: if the comparison is stopped early, it has results of
     every system."""
     _require_unique("scene", (scene.resolve().name for scene in scenes))
     _require_unique("seed", map(str, seeds))
     return [
-        Run(
-            system.name,
-            scene.resolve().name,
-            seed,
-            scene.resolve(),
-            out / system.name / f"{scene.resolve().name}_{seed}",
-            system.config.updated(seed=seed),
-        )
+        Run(name, data.name, seed, data, out / name / f"{data.name}_{seed}", config.updated(seed=seed))
         for seed in seeds
-        for scene in scenes
-        for system in systems
+        for data in map(Path.resolve, scenes)
+        for name, config in systems.items()
     ]
 
 

@@ -55,7 +55,7 @@ def systems_file(tmp_path: Path) -> Path:
 
 
 def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) -> None:
-    systems = {system.name: system.config for system in read_systems(["deformgs", str(systems_file)], BUDGET)}
+    systems = read_systems(["deformgs", str(systems_file)], BUDGET)
     assert list(systems) == ["deformgs", "static", "k1", "k2 w=1"]
     assert systems["deformgs"] == preset("deformgs").updated(**BUDGET.settings())
     assert systems["static"].model.layers == ()
@@ -70,7 +70,7 @@ def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) 
 def test_tables_of_systems_in_the_repository_can_be_compared(name: str) -> None:
     file = ROOT / "benchmarks" / "training" / name
     systems = read_systems([str(file)], Budget(steps=6, init_num_pts=4000, max_gaussians=5000))
-    assert len({json.dumps(system.config.to_dict()) for system in systems}) == len(systems) > 10
+    assert len({json.dumps(config.to_dict()) for config in systems.values()}) == len(systems) > 10
 
 
 def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
     runs = make_runs(systems, [Path("a/one"), Path("b/two")], [3, 5], tmp_path)
     assert len({run.folder for run in runs}) == len(runs) == 12
     assert {(run.system, run.scene, run.seed) for run in runs[:6]} == {
-        (system.name, scene, 3) for system in systems for scene in ("one", "two")
+        (system, scene, 3) for system in systems for scene in ("one", "two")
     }
     assert all(run.config.run.seed == run.seed for run in runs)
 
