@@ -1,4 +1,4 @@
-"""A model's own eps2d goes with it: whoever draws it, in training, judging, exporting and serving, draws the same."""
+"""A model's own eps2d goes with it: training, evaluation, export and service draw with the same."""
 
 from dataclasses import replace
 from pathlib import Path
