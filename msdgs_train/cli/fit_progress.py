@@ -98,10 +98,8 @@ def print_result(result: RunResult, data: Path, run: Path) -> None:
         console.print(f"{split:>5}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
     console.print(f"model: {run / MODEL}", soft_wrap=True)
     if result.best is not None:
-        best = result.best
-        console.print(
-            f"best:  {run / BEST}, {best.split} PSNR {best.psnr:.2f} dB at step {best.step:,}", soft_wrap=True
-        )
+        best = f"{result.best.split} PSNR {result.best.psnr:.2f} dB at step {result.best.step:,}"
+        console.print(f"best:  {run / BEST}, {best}", soft_wrap=True)
     if result.status != "finished":
         more = " --max-minutes None" if result.status == "out of time" else ""
         console.print(f"continue with: msdgs-train fit {data} {run} --resume{more}", soft_wrap=True)

@@ -32,9 +32,6 @@ from msdgs_train.datasets.common.readers import DatasetInvalid, JsonObject, read
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, reduced
 
 DATASET_FILE = "dataset.json"
-METADATA_FILE = "metadata.json"
-SCENE_FILE = "scene.json"
-POINTS_FILE = "points.npy"
 FIELDS = {"camera.fx": "focal_length", "camera.fy": "pixel_aspect_ratio", "camera.width": "image_size"}
 """The value of a file that makes a field of its camera invalid; all other fields come from `orientation`."""
 
@@ -52,14 +49,14 @@ def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
     ids = {"train": dataset.names("train_ids"), "val": [], "test": dataset.names("val_ids")}
     if not ids["train"]:
         raise dataset.invalid("train_ids", "must name one frame or more")
-    times = _read_times(folder / METADATA_FILE, [id_ for split in ids.values() for id_ in split])
-    to_scene = _read_transform(folder / SCENE_FILE)
+    times = _read_times(folder / "metadata.json", [id_ for split in ids.values() for id_ in split])
+    to_scene = _read_transform(folder / "scene.json")
     copies = _find_copy(folder / "rgb", ids["train"][0], size)
     splits = {
         split: [_frame(folder, copies / f"{id_}.png", times[id_], to_scene, size) for id_ in members]
         for split, members in ids.items()
     }
-    points = _read_points(folder / POINTS_FILE, to_scene)
+    points = _read_points(folder / "points.npy", to_scene)
     cameras = [frame.camera for frames in splits.values() for frame in frames]
     return SceneData(splits, scene_half_size(points, cameras), points)
 

@@ -1,15 +1,11 @@
 """Rendering by gsplat for CUDA tensors. Its kernels fix the alpha and transmittance limits of `GSPLAT`."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, InvalidInput
-
-if TYPE_CHECKING:
-    from msdgs_train.rendering.rasterize import RasterizationInfo
+from msdgs_train.rendering.rasterize import RasterizationInfo
 
 
 def rasterize_cuda(
@@ -17,7 +13,7 @@ def rasterize_cuda(
     camera: Camera,
     background: Tensor,
     options: RasterizerOptions,
-    info: "RasterizationInfo",
+    info: RasterizationInfo,
 ) -> tuple[Tensor, Tensor]:
     """Return rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
     try:

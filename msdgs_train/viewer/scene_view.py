@@ -53,7 +53,5 @@ def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[fl
     up = -np.mean([camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
     if np.linalg.norm(up) < 1e-3 or np.linalg.norm(np.cross(up, forward)) < 1e-3:
         up = -first.camera_to_world[:3, 1]
-    fov_y = 2 * math.atan(first.height / (2 * first.fy))
-    return SceneView(
-        time_range, layers, first.position, first.position + distance * forward, up / np.linalg.norm(up), fov_y
-    )
+    up, fov_y = up / np.linalg.norm(up), 2 * math.atan(first.height / (2 * first.fy))
+    return SceneView(time_range, layers, first.position, first.position + distance * forward, up, fov_y)

@@ -129,7 +129,7 @@ class Viewer:
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join()
-        with _silence():
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints its end
             self.server.stop()
 
     def _run(self) -> None:
@@ -203,12 +203,7 @@ def _serve(host: str, port: int) -> Any:
         raise ExtraMissing("the viewer", "viser", "viewer") from None
     if not 0 <= port <= 65535:
         raise InvalidInput("viewer_port", "in [0, 65535]", port)
-    with _silence():
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints its address
         server = viser.ViserServer(host=host, port=port, label="msdgs", verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
-
-
-def _silence() -> contextlib.AbstractContextManager[Any]:
-    """Suppress standard output: viser prints its address and its end unconditionally."""
-    return contextlib.redirect_stdout(io.StringIO())
