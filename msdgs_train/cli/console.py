@@ -16,7 +16,7 @@ console = Console()
 def rich_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], *, names: int, title: str | None = None
 ) -> Table:
-    """The first `names` columns are left-aligned, the others right-aligned."""
+    """Return a table whose first `names` columns are left-aligned, and the others right-aligned."""
     shown = Table(title=title)
     for i, heading in enumerate(headings):
         shown.add_column(heading, justify="left" if i < names else "right")
@@ -26,7 +26,7 @@ def rich_table(
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:
-    """A progress bar, with rich's own columns if none are given; hidden if the output is not a terminal."""
+    """Return a progress bar, with rich's own columns if none are given; hidden if the output is not a terminal."""
     return Progress(*columns, console=console, disable=not console.is_terminal)
 
 

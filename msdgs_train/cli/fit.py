@@ -140,7 +140,7 @@ def _cli(arguments: Sequence[str], default: Fit) -> Fit:
 
 
 def _invalid_setting(end: SystemExit) -> InvalidInput | None:
-    """The error of a setting for which tyro exits; None if it exits for another reason."""
+    """Return the error of a setting for which tyro exits; None if it exits for another reason."""
     cause: BaseException | None = end
     while cause is not None and not isinstance(cause, InvalidInput):
         cause = cause.__context__
@@ -148,7 +148,7 @@ def _invalid_setting(end: SystemExit) -> InvalidInput | None:
 
 
 def _short_help(command: Fit) -> Any:
-    """The same command, of a type that hides rarely used options in its help."""
+    """Return the same command, of a type that hides rarely used options in its help."""
     config = command.config
     groups = {item.name: _hiding(getattr(config, item.name), COMMON.get(item.name, ())) for item in fields(config)}
     kinds = [(name, type(group)) for name, group in groups.items()]
@@ -158,8 +158,8 @@ def _short_help(command: Fit) -> Any:
 
 
 def _hiding(options: Any, shown: Container[str], **replaced: Any) -> Any:
-    """A copy of a dataclass, of a type whose other fields aren't in the help; fields in `replaced` change their type
-    and value."""
+    """Return a copy of a dataclass, of a type that hides all fields but `shown` in the help; fields in `replaced` get
+    another type and value."""
     kind = type(options)
     values = {item.name: getattr(options, item.name) for item in fields(kind)} | replaced
     changed = [(name, Annotated[type(value), tyro.conf.arg(name="")], tyro.MISSING) for name, value in replaced.items()]

@@ -40,7 +40,7 @@ class Processes:
         self._going: dict[Future[RunEnd], Run] = {}
 
     def __len__(self) -> int:
-        """The number of runs that haven't ended."""
+        """Return the number of runs that haven't ended."""
         return len(self._going)
 
     def submit(self, run: Run) -> None:
@@ -48,7 +48,7 @@ class Processes:
         self._going[self._executor.submit(_train_here, run)] = run
 
     def ended(self, timeout: float | None = None) -> Iterator[tuple[Run, RunEnd]]:
-        """The runs that have ended; waits for the first of them, up to `timeout` seconds."""
+        """Yield the runs that have ended, after waiting for the first of them, up to `timeout` seconds."""
         for future in wait(self._going, timeout=timeout, return_when=FIRST_COMPLETED).done:
             yield self._going.pop(future), future.result()
 

@@ -47,7 +47,7 @@ def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list
 
 
 def table(results: Sequence[Result]) -> list[list[str]]:
-    """One row per system and scene, in the order of `HEADINGS`: mean ± sample standard deviation over seeds."""
+    """Return one row per system and scene, in the order of `HEADINGS`: mean ± sample standard deviation over seeds."""
     return [_row(group) for group in _groups(results, attrgetter("run.system", "run.scene")).values()]
 
 
@@ -68,13 +68,13 @@ def _row(group: list[Result]) -> list[str]:
 
 
 def mean_and_deviation(values: Sequence[float], digits: int) -> str:
-    """Mean ± sample standard deviation as text; of a single value only the value."""
+    """Format mean ± sample standard deviation; of a single value only the value."""
     deviation = f" ± {statistics.stdev(values):,.{digits}f}" if len(values) > 1 else ""
     return f"{statistics.fmean(values):,.{digits}f}{deviation}"
 
 
 def as_markdown(results: Sequence[Result], missing: int) -> str:
-    """The table and the conditions of the measurement."""
+    """Return the table and the conditions of the measurement as Markdown."""
     run = results[0].run.config.run
     limit = f", at most {run.max_minutes:g} minutes per run" if run.max_minutes is not None else ""
     conditions = f"{run.steps:,} steps{limit}; {run.threads} thread(s) per run; held-out images of "
@@ -90,7 +90,7 @@ def as_markdown(results: Sequence[Result], missing: int) -> str:
 
 
 def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
-    """All numbers of all runs."""
+    """Return all numbers of all runs as plain values for JSON."""
 
     def plain(result: Result) -> dict[str, Any]:
         values = {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
@@ -101,7 +101,7 @@ def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
 
 
 def draw_time(results: Sequence[Result]) -> Figure:
-    """Error on held-out images against training time: one panel per scene, one line per system (mean over seeds)."""
+    """Plot error on held-out images against training time: a panel per scene, a line per system (mean over seeds)."""
     figure, panels = _panels(results, "seconds of training")
     styles = _styles(_groups(results, _system))
     for axes, of_scene in panels:
@@ -117,8 +117,8 @@ def draw_time(results: Sequence[Result]) -> Figure:
 
 
 def draw_layers(results: Sequence[Result]) -> Figure:
-    """Error against K, one panel per scene. Systems that differ only in their number of equal layers are joined by a
-    line; bars reach from the best seed to the worst."""
+    """Plot error against K, one panel per scene. Systems that differ only in their number of equal layers are joined by
+    a line; bars reach from the best seed to the worst."""
     figure, panels = _panels(results, "K, layers of the deformation")
     families = list(_groups(results, _family))
     styles = _styles(families)
@@ -137,7 +137,7 @@ def draw_layers(results: Sequence[Result]) -> Figure:
 
 
 def rms_error(psnr: np.ndarray) -> np.ndarray:
-    """Root mean square error of pixels in [0, 1] of a PSNR in dB."""
+    """Convert a PSNR in dB to the root mean square error of pixels in [0, 1]."""
     return 10 ** (-psnr / 20)
 
 
@@ -149,7 +149,7 @@ def _family(result: Result) -> str:
 
 
 def _panels(results: Sequence[Result], label: str) -> tuple[Figure, list[tuple[Axes, list[Result]]]]:
-    """A figure with one panel per scene, and the results of each."""
+    """Return a figure with one panel per scene, and the results of each."""
     scenes = _groups(results, attrgetter("run.scene"))
     figure = Figure(figsize=(2.5 + 5.5 * len(scenes), 5.5), layout="constrained")
     panels: list[Axes] = list(np.ravel(figure.subplots(1, len(scenes), squeeze=False)))
@@ -173,7 +173,7 @@ def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def _groups(results: Sequence[Result], key: Callable[[Result], Any]) -> dict[Any, list[Result]]:
-    """Results by key, in the order of the first result of each."""
+    """Group results by key, in the order of the first result of each."""
     groups: dict[Any, list[Result]] = {}
     for result in results:
         groups.setdefault(key(result), []).append(result)

@@ -49,7 +49,7 @@ class Result:
 
 
 def collect(runs: Sequence[Run]) -> list[Result]:
-    """Results of the finished runs; frames are timed one after the other."""
+    """Collect the results of the finished runs; frames are timed one after the other."""
     return [_result(run) for run in runs if is_finished(run)]
 
 
@@ -83,7 +83,7 @@ def _modulation_parameters(loaded: LoadedModel) -> int:
 
 
 def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
-    """Median frame time over some of the model's cameras, after one untimed frame, with `threads` of torch."""
+    """Return the median frame time over some of its cameras, after an untimed frame, with `threads` of torch."""
     torch.set_num_threads(threads)
     times = []
     for i, entry in enumerate([loaded.scene.cameras[0], *loaded.scene.cameras[:TIMED_FRAMES]]):

@@ -57,7 +57,7 @@ def is_finished(run: Run) -> bool:
 
 
 def final_metrics(run: Run) -> dict[str, Any] | None:
-    """The metrics that `fit` writes at its end; None if it hasn't ended."""
+    """Return the metrics that `fit` writes at its end; None if it hasn't ended."""
     try:
         return json.loads((run.folder / FINAL_METRICS).read_text(encoding="utf-8"))
     except FileNotFoundError:

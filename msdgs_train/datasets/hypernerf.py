@@ -62,7 +62,7 @@ def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
 
 
 def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
-    """Times in [0, 1]; all are 0 if the largest time_id is 0."""
+    """Read times in [0, 1]; all are 0 if the largest time_id is 0."""
     metadata, numbers = read_json(file), {}
     for id_ in ids:
         entry = metadata.child(id_)
@@ -86,7 +86,7 @@ def _read_transform(file: Path) -> Transform:
 
 
 def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
-    """The folder of the smallest copies at least `size` pixels wide, or of the largest copies."""
+    """Find the folder of the smallest copies at least `size` pixels wide, or of the largest copies."""
     copies = [path for path in folder.glob("*x") if re.fullmatch(r"\d+x", path.name) and path.is_dir()]
     if not copies:
         raise DatasetInvalid(folder, "folder", "must have the images in 1x, 2x or the like, found none")
@@ -108,7 +108,7 @@ def _frame(folder: Path, image_path: Path, t: float, to_scene: Transform, size: 
 
 
 def _camera(values: JsonObject, to_scene: Transform, image: ImageSize) -> Camera:
-    """The camera, in pixels of the stored image."""
+    """Return the camera, in pixels of the stored image."""
     if values.number("skew") != 0:
         raise values.invalid("skew", f"must be 0, got {values.get('skew')}")
     stated = ImageSize(*map(round, values.numbers("image_size", 2)))

@@ -73,12 +73,12 @@ def _find_files(folder: Path, name: str) -> list[Path]:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A sorting key that orders numbers by value, with or without leading zeros."""
+    """Return a sorting key that orders numbers by value, with or without leading zeros."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _view(file: Path, row: int, name: str, files: list[Path], pose: np.ndarray, size: int | None) -> list[Frame]:
-    """All frames of one camera, in the order of time."""
+    """Read all frames of one camera, in the order of time."""
     first = files[0]
     if first.suffix == VIDEO:
         count, *image = read_info(first)

@@ -72,7 +72,7 @@ class MetricsLog:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`, without an incomplete last one; none if there is no such file."""
+    """Read the lines of a run's `metrics.jsonl`, without an incomplete last one; none if there is no such file."""
     path = run / METRICS
     lines = []
     for text in path.read_text().splitlines() if path.exists() else ():

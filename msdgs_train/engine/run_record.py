@@ -41,7 +41,7 @@ class RunRecord:
 
 
 def read_record(run: Path) -> RunRecord | None:
-    """The contents of `run.json`, None if there is no such file. Raises `RunInvalid`."""
+    """Read the contents of `run.json`, None if there is no such file. Raises `RunInvalid`."""
     path = run / RECORD
     if not path.exists():
         return None
@@ -59,7 +59,7 @@ def write_record(run: Path, record: RunRecord) -> None:
 
 
 def read_config(run: Path) -> TrainConfig:
-    """The settings of a run. Raises `RunInvalid` if there are none, or those of another version."""
+    """Read the settings of a run. Raises `RunInvalid` if there are none, or those of another version."""
     path = run / CONFIG
     try:
         return TrainConfig.from_dict(json.loads(path.read_text(encoding="utf-8")))
@@ -71,7 +71,7 @@ def read_config(run: Path) -> TrainConfig:
 
 
 def stored_config(run: Path) -> TrainConfig:
-    """The settings of a run that can be resumed. Raises `InvalidInput` if the folder holds none, and `RunInvalid`."""
+    """Return the settings of a run that can be resumed. Raises `InvalidInput` if there is none, and `RunInvalid`."""
     if not (run / CONFIG).exists() or not (run / CHECKPOINT).exists():
         raise InvalidInput("run", "the folder of a run with a checkpoint, to resume it", run)
     return read_config(run)

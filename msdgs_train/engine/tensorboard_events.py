@@ -22,7 +22,7 @@ def require_tensorboard() -> None:
 
 
 def open_events(folder: Path, lines: list[dict[str, Any]], keep_until: int) -> "SummaryWriter":
-    """A writer of event files in a folder. TensorBoard drops the steps after `keep_until` of earlier files.
+    """Open a writer of event files in a folder. TensorBoard drops the steps after `keep_until` of earlier files.
 
     A new folder gets `lines`, those of `metrics.jsonl` up to that step: a resumed run may turn TensorBoard on.
     """

@@ -43,11 +43,11 @@ class EvaluatedModel(NamedTuple):
         return Scores(*(statistics.fmean(column) if column else None for column in columns))  # type: ignore[arg-type]
 
     def render(self, frame: Frame) -> Tensor:
-        """[H, W, 3] in [0, 1], rendered with the camera and time of the frame."""
+        """Render [H, W, 3] in [0, 1] with the camera and time of the frame."""
         return self.loaded.render(frame.camera, frame.t).clamp(0, 1)
 
     def image(self, frame: Frame) -> Tensor:
-        """[H, W, 3] in [0, 1], over the background that the model was trained with."""
+        """Read the image of the frame, [H, W, 3] in [0, 1], over the background that the model was trained with."""
         return torch.from_numpy(composite(frame.load_rgba(), self.loaded.scene.background))
 
 
@@ -94,7 +94,7 @@ def evaluate_run(
 
 
 def scores(rgb: Tensor, target: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
-    """The scores of one rendering and its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
+    """Score a rendering against its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
     psnr, ssim = image_metrics(rgb, target)
     others = {name: metric(rgb, target) for name, metric in perceptual.metrics.items()}
     return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, mask))

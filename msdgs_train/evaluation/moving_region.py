@@ -40,8 +40,8 @@ class MovingRegion(NamedTuple):
 
 
 def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -> MovingRegion:
-    """The moving region, from the images if each camera of the split has images at `FIXED_TIMES` times or more in any
-    split, otherwise from the models."""
+    """Determine the moving region, from the images if each camera of the split has images at `FIXED_TIMES` or more
+    times in any split, otherwise from the models."""
     groups: dict[bytes, list[Frame]] = defaultdict(list)
     for frame in (frame for frames in scene.splits.values() for frame in frames):
         groups[_identity(frame.camera)].append(frame)
@@ -76,7 +76,7 @@ def _model_region(loaded: LoadedModel, time_range: tuple[float, float]) -> Calla
 
 
 def travels(centers: list[Tensor], camera: Camera) -> Tensor:
-    """[N] bool: whether the projections of each center span more than `MIN_TRAVEL` pixels.
+    """Return [N] bool, whether the projections of each center span more than `MIN_TRAVEL` pixels.
 
     `centers` has [N, 3] for each of several times; times at which a center is behind the camera are ignored.
     """
@@ -93,7 +93,7 @@ def travels(centers: list[Tensor], camera: Camera) -> Tensor:
 
 
 def _median(frames: list[Frame], background: tuple[float, float, float]) -> np.ndarray:
-    """[H, W, 3] the median over the images of one camera."""
+    """Return the median, [H, W, 3], over the images of one camera."""
     in_time = sorted(frames, key=lambda frame: frame.t)
     places = np.linspace(0, len(in_time) - 1, min(len(in_time), MEDIAN_IMAGES)).round().astype(int)
     return np.median([composite(in_time[place].load_rgba(), background) for place in places], axis=0)
@@ -104,6 +104,6 @@ def _differs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _identity(camera: Camera) -> bytes:
-    """A key that is equal for cameras that agree to six decimals."""
+    """Return a key that is equal for cameras that agree to six decimals."""
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
     return (np.concatenate([intrinsics, camera.camera_to_world.ravel()]).round(6) + 0.0).tobytes()

@@ -25,7 +25,7 @@ class PerceptualMetrics(NamedTuple):
 
 
 def perceptual_metrics() -> PerceptualMetrics:
-    """`lpips` and `flip`, each as a metric or with the reason why it is unavailable."""
+    """Load `lpips` and `flip`, each as a metric or with the reason why it is unavailable."""
     found = PerceptualMetrics({}, {})
     for name, load in (("lpips", _load_lpips), ("flip", _load_flip)):
         try:

@@ -58,7 +58,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def as_markdown(evaluation: Evaluation) -> str:
-    """Tables of the means of each model and of its images, with notes."""
+    """Return Markdown tables of the means of each model and of its images, with notes."""
     rows = [
         [m.name, FILES[m.name], f"{m.loaded.step:,}", f"{len(m.loaded.model.gaussians):,}", *cells(evaluation, m.mean)]
         for m in evaluation.models
@@ -75,12 +75,12 @@ def as_markdown(evaluation: Evaluation) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *rows])
 
 
 def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
-    """The scores as text, in the order of `HEADINGS`."""
+    """Format the scores, in the order of `HEADINGS`."""
     digits = {"psnr": 2, "moving_psnr": 2}
     return [
         f"{value:.{digits.get(name, 4)}f}"
@@ -91,7 +91,7 @@ def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
 
 
 def notes(evaluation: Evaluation) -> list[str]:
-    """The notes below the table."""
+    """Return the lines below the table."""
     source = {"images": "the images", "model": "the models"}[evaluation.region_source]
     percent = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
     lines = [f"moving region: {percent:.1f} % of the pixels, determined from {source}; the same for all models."]
@@ -104,7 +104,7 @@ def notes(evaluation: Evaluation) -> list[str]:
 
 
 def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
-    """One row per frame, from the worst of the last model to its best, evenly spaced: the image, then the rendering of
+    """Draw one row per frame, evenly spaced from the last model's worst to its best: the image, then the rendering of
     each model and its error, with the moving region outlined. Atomic."""
     last, *others = evaluation.models
     models = [last, *(best for best in others if best.loaded.step != last.loaded.step)]
@@ -129,12 +129,12 @@ def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
 
 
 def _evenly_spaced(count: int) -> list[int]:
-    """Up to `SHEET_ROWS` of the first `count` numbers."""
+    """Return up to `SHEET_ROWS` evenly spaced numbers from 0 to `count` - 1."""
     return [round(place) for place in np.linspace(0, count - 1, min(SHEET_ROWS, count))]
 
 
 def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int, errors: bool = True) -> list[Panel]:
-    """The image of a frame and its rendering by each model, each with its error if `errors`."""
+    """Return panels of the image of a frame and its rendering by each model, each with its error if `errors`."""
     frame, mask = evaluation.frames[index], evaluation.masks[index]
     target = models[0].image(frame).numpy()
     row = [_panel(to_bytes(target), f"{frame.name}, t = {frame.t:.3g}")]
@@ -151,13 +151,13 @@ def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int, error
 
 
 def _outline(mask: np.ndarray) -> np.ndarray:
-    """[H, W] bool: pixels outside of the mask that border it, so that the inside isn't covered."""
+    """Return [H, W] bool, the pixels outside of the mask that border it, so that the inside isn't covered."""
     padded = np.pad(mask, 1)
     return ~mask & (padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
 
 
 def _panel(pixels: np.ndarray, caption: str) -> Panel:
-    """A panel with uint8 [H, W, 3], enlarged or downscaled to its width."""
+    """Return a panel with uint8 [H, W, 3], enlarged or downscaled to its width."""
     height, width, _ = pixels.shape
     if width <= MAX_PANEL:
         times = -(-MIN_PANEL // width)

@@ -26,7 +26,7 @@ _TAPS = _WEIGHTS / _WEIGHTS.sum()
 
 
 def ssim(rgb: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity, a scalar, differentiable in `rgb`.
+    """Return the mean structural similarity, a scalar, differentiable in `rgb`.
 
     Window 11, σ = 1.5, data range 1, and zeros beyond the border, as the 3D Gaussian projects compute it.
     """
@@ -95,7 +95,7 @@ def _blur_row(maps: np.ndarray, taps: np.ndarray, i: int, padded: np.ndarray, ou
 
 @kernel
 def _ssim_sum_and_derivatives(x: np.ndarray, y: np.ndarray, taps: np.ndarray) -> tuple[float, np.ndarray]:
-    """The sum of SSIM over [H, W * 3] images, and its derivatives [3, H, W * 3] in blur(x), blur(x²), blur(xy)."""
+    """Return SSIM summed over [H, W * 3] images, and its derivatives [3, H, W * 3] in blur(x), blur(x²), blur(xy)."""
     height, width = x.shape
     c1, c2 = x.dtype.type(C1), x.dtype.type(C2)
     one, two = x.dtype.type(1), x.dtype.type(2)

@@ -27,14 +27,14 @@ class SceneView(NamedTuple):
 
 
 def view_of_data(scene: SceneData, layers: int) -> SceneView:
-    """The camera of the first training image."""
+    """Return the view of the camera of the first training image."""
     middle = np.zeros(3) if scene.points is None or not len(scene.points) else np.median(scene.points, axis=0)
     cameras = [frame.camera for frame in scene.splits["train"]]
     return _seen_by(cameras, middle, scene.time_range, layers)
 
 
 def view_of_file(loaded: LoadedModel) -> SceneView:
-    """The first camera in the model, or one from the side with z up if it has none."""
+    """Return the view of the first camera in the model, or one from the side with z up if it has none."""
     low, high = np.array(loaded.scene.bounds)
     cameras = [camera_of(entry, entry["width"]) for entry in loaded.scene.cameras]
     if not cameras:
@@ -45,7 +45,7 @@ def view_of_file(loaded: LoadedModel) -> SceneView:
 
 
 def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[float, float], layers: int) -> SceneView:
-    """The first camera; the target is the point of its optical axis nearest to `middle`, [3]."""
+    """Return the view of the first camera; the target is the point of its optical axis nearest to `middle`, [3]."""
     first = cameras[0]
     forward = first.camera_to_world[:3, 2]
     ahead = float((middle - first.position) @ forward)

@@ -48,7 +48,7 @@ class Snapshot:
 
 
 def snapshot_of_training(trainer: Trainer) -> Snapshot:
-    """A copy of the model as it would be evaluated and saved now. Must not be called during a step."""
+    """Copy the model as it would be evaluated and saved now. Must not be called during a step."""
     system, step = trainer.system, trainer.step_count
     if not isinstance(system, GaussianSplatting):
         raise InvalidInput("viewer", "off for this system, which isn't made of Gaussians", trainer.config.run.system)
@@ -70,7 +70,7 @@ def _image_of(rendering: Rendering, channel: Channel) -> np.ndarray:
 
 
 def _nearness(depth: np.ndarray) -> np.ndarray:
-    """[H, W] in [0, 1] of depths, infinite for empty pixels; 1 is nearest."""
+    """Map depths, [H, W] and infinite for empty pixels, to [0, 1]; 1 is nearest."""
     seen = np.isfinite(depth)
     if not seen.any():
         return np.zeros_like(depth)

@@ -40,7 +40,7 @@ class Wanted(NamedTuple):
     channel: Channel
 
     def camera(self, scale: float) -> Camera:
-        """The camera of the rendering, whose sides are `scale` times those of the large image."""
+        """Return the camera of the rendering, whose sides are `scale` times those of the large image."""
         longest = scale * min(self.longest, max(self.canvas))
         width, height = (max(1, round(longest * side / max(self.canvas))) for side in self.canvas)
         camera_to_world = np.eye(4)

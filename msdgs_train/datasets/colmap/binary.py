@@ -44,7 +44,7 @@ class _Stream:
         self.file, self.content, self.offset = file, read_bytes(file), 0
 
     def records(self, kind: str) -> Iterator[str]:
-        """The names of the records that the number at this place announces."""
+        """Read the number of records; returns their names for error messages."""
         (count,) = self.take("Q", kind)
         return (f"{kind}[{index}]" for index in range(count))
 
@@ -54,7 +54,7 @@ class _Stream:
         return struct.unpack_from("<" + layout, self.content, self.offset - size)
 
     def text(self, field: str) -> str:
-        """The string up to the next zero byte."""
+        """Read the string up to the next zero byte."""
         start, end = self.offset, self.content.find(b"\0", self.offset)
         self.skip((end if end >= 0 else len(self.content)) + 1 - start, field)
         return self.content[start:end].decode("utf-8", errors="replace")

@@ -49,7 +49,7 @@ def load_colmap(folder: Path, size: int | None = None) -> SceneData:
 
 
 def _model_files(folder: Path) -> list[Path]:
-    """The existing files `cameras`, `images` and `points3D`."""
+    """Find the files `cameras`, `images` and `points3D`."""
     for place in (folder / SPARSE / "0", folder / SPARSE):
         for ending in (".bin", ".txt"):
             files = [place / f"{part}{ending}" for part in ("cameras", "images", "points3D")]
@@ -81,7 +81,7 @@ def _frame(
 
 
 def _pinhole(files: list[Path], image: ModelImage, camera: ModelCamera) -> Camera:
-    """The camera, in pixels of the image that COLMAP was run on."""
+    """Return the camera, in pixels of the image that COLMAP was run on."""
     values = camera.values
     fx, fy = (values.get(key, values.get("f", math.nan)) for key in ("fx", "fy"))
     pose = _camera_to_world(files[1], image)
@@ -106,7 +106,7 @@ def _camera_to_world(file: Path, image: ModelImage) -> np.ndarray:
 
 
 def _times(file: Path, images: list[ModelImage]) -> list[float]:
-    """The time of each image, in [0, 1]."""
+    """Return the time of each image, in [0, 1]."""
     numbers = []
     for image in images:
         number = LAST_NUMBER.search(PurePosixPath(image.name).stem)
@@ -118,7 +118,7 @@ def _times(file: Path, images: list[ModelImage]) -> list[float]:
 
 
 def _points(file: Path, rows: list[tuple[float, ...]]) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Positions and colors, from x y z and 8-bit red green blue; None without points."""
+    """Return positions and colors of rows of x y z and 8-bit red green blue; None without points."""
     if not rows:
         return None, None
     values = finite_rows(file, "points3D[{}]", np.array(rows, dtype=np.float64))

@@ -44,7 +44,7 @@ class ModelImage(NamedTuple):
 
 
 def parameter_names(file: Path, field: str, model: str) -> tuple[str, ...]:
-    """The parameters of a camera model. Raises `DatasetInvalid` naming file and field if it is unsupported."""
+    """Return the parameters of a camera model. Raises `DatasetInvalid` naming file and field if it is unsupported."""
     if model not in PARAMETERS:
         problem = f"is {model}, but only {', '.join(PARAMETERS)} are supported: undistort the images with COLMAP"
         raise DatasetInvalid(file, field, problem)
@@ -54,7 +54,7 @@ def parameter_names(file: Path, field: str, model: str) -> tuple[str, ...]:
 def make_camera(
     file: Path, field: str, model: str, width: int, height: int, parameters: tuple[float, ...]
 ) -> ModelCamera:
-    """A camera. Raises `DatasetInvalid` naming file and field if the parameters don't fit its model."""
+    """Build a camera. Raises `DatasetInvalid` naming file and field if the parameters don't fit its model."""
     keys = parameter_names(file, field, model)
     if len(parameters) != len(keys):
         raise DatasetInvalid(file, field, f"must have {len(keys)} parameters for {model}, got {len(parameters)}")

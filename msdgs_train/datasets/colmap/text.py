@@ -40,7 +40,7 @@ def read_points(file: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, without comments; empty lines are kept, since an image may have no observations."""
+    """Yield lines with their numbers, without comments; empty ones are kept: an image may have no observations."""
     try:
         text = read_bytes(file).decode()
     except UnicodeDecodeError as error:

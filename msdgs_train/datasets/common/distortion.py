@@ -23,7 +23,7 @@ class Distortion(NamedTuple):
 
 
 def checked_distortion(distortion: Distortion, camera: Camera, file: Path, field: str) -> Distortion | None:
-    """`distortion`, or None if all its coefficients are 0.
+    """Return `distortion`, or None if all its coefficients are 0.
 
     Raises `DatasetInvalid` if two points of the pinhole image of `camera` map to the same point of the distorted image.
     No lens does so: the coefficients are wrong, or were fitted to a part of the image.

@@ -27,7 +27,7 @@ class ImageSize(NamedTuple):
 
 
 def read_size(path: Path) -> ImageSize:
-    """The size in an image's header. Raises `DatasetInvalid`."""
+    """Read the size in an image's header. Raises `DatasetInvalid`."""
     reader = _open(path)
     spec = reader.spec()
     reader.close()
@@ -35,7 +35,7 @@ def read_size(path: Path) -> ImageSize:
 
 
 def read_rgba(path: Path) -> np.ndarray:
-    """[H, W, 4] uint8, straight alpha; gray becomes RGB, images without alpha are opaque. Raises `DatasetInvalid`."""
+    """Read [H, W, 4] uint8, straight alpha; gray becomes RGB, without alpha it is opaque. Raises `DatasetInvalid`."""
     reader = _open(path)
     pixels = reader.read_image("uint8")
     problem = reader.geterror()
@@ -87,7 +87,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
-    """[count, …] means over `count` equal cells of float64 [length, …]; cell borders may split rows.
+    """Average float64 [length, …] over `count` equal cells, [count, …]; cell borders may split rows.
 
     Computed as differences of cumulative sums, at a cost that doesn't depend on the cell size.
     """

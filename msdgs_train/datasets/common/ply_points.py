@@ -11,7 +11,7 @@ POSITION, COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 
 def read_ply_points(file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Points, [M, 3] float64 in the axes and units of the file, and their colors, [M, 3] float64 in [0, 1].
+    """Read points, [M, 3] float64 in the axes and units of the file, and their colors, [M, 3] float64 in [0, 1].
 
     Both are None if the file has no points, colors also if its vertices have no red, green and blue. Integer colors are
     divided by the largest value of their type. Raises `DatasetInvalid` naming file and field.

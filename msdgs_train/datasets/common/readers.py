@@ -28,22 +28,22 @@ class JsonObject(NamedTuple):
     prefix: str = ""  # put before the keys in error messages
 
     def invalid(self, key: str, problem: str) -> DatasetInvalid:
-        """The error for an invalid value."""
+        """Return the error for an invalid value."""
         return DatasetInvalid(self.file, self.prefix + key, problem)
 
     def get(self, key: str) -> Any:
-        """The value; None if there is none."""
+        """Return the value; None if there is none."""
         return self.values.get(key)
 
     def required(self, key: str) -> Any:
-        """The value, which must be there."""
+        """Return the value, which is required."""
         value = self.get(key)
         if value is None:
             raise self.invalid(key, "is missing")
         return value
 
     def numbers(self, key: str, *shape: int) -> np.ndarray:
-        """Finite float64 numbers of this shape."""
+        """Return finite float64 numbers of this shape."""
         value = self.required(key)
         try:
             array = np.array(value)
@@ -55,18 +55,18 @@ class JsonObject(NamedTuple):
         return array.astype(np.float64)
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number; `default`, if given, replaces a missing one."""
+        """Return a finite number; `default`, if given, replaces a missing one."""
         return default if default is not None and self.get(key) is None else float(self.numbers(key))
 
     def names(self, key: str) -> list[str]:
-        """A list of names."""
+        """Return a list of names."""
         value = self.required(key)
         if not isinstance(value, list) or not all(isinstance(name, str | int) for name in value):
             raise self.invalid(key, "must be a list of names")
         return [str(name) for name in value]
 
     def child(self, key: str) -> "JsonObject":
-        """An object inside this one."""
+        """Return an object inside this one."""
         value = self.required(key)
         if not isinstance(value, dict):
             raise self.invalid(key, "must be a JSON object")
@@ -74,7 +74,7 @@ class JsonObject(NamedTuple):
 
 
 def read_bytes(file: Path) -> bytes:
-    """The content of a file. Raises `DatasetInvalid` if it can't be read."""
+    """Read the content of a file. Raises `DatasetInvalid` if it can't be read."""
     try:
         return file.read_bytes()
     except OSError as error:
@@ -82,7 +82,7 @@ def read_bytes(file: Path) -> bytes:
 
 
 def read_json(file: Path) -> JsonObject:
-    """The object in a JSON file. Raises `DatasetInvalid` if there is none."""
+    """Read the object in a JSON file. Raises `DatasetInvalid` if there is none."""
     try:
         content = json.loads(read_bytes(file))
     except (ValueError, RecursionError) as error:
@@ -93,7 +93,7 @@ def read_json(file: Path) -> JsonObject:
 
 
 def read_table(file: Path, columns: int) -> np.ndarray:
-    """[M, columns] float64, finite, from a `.npy` file; M may be 0. Raises `DatasetInvalid` naming file and row."""
+    """Read [M, columns] finite numbers from a `.npy` file; M may be 0. Raises `DatasetInvalid` naming file and row."""
     try:
         table = np.lib.format.read_array(io.BytesIO(read_bytes(file)), allow_pickle=False)
     except ValueError as error:
@@ -104,7 +104,7 @@ def read_table(file: Path, columns: int) -> np.ndarray:
 
 
 def finite_rows(file: Path, field: str, table: np.ndarray) -> np.ndarray:
-    """`table` as float64. Raises `DatasetInvalid` for its first row that isn't finite; `field` formats its number."""
+    """Return `table` as float64. Raises `DatasetInvalid` for a row that isn't finite; `field` formats its number."""
     bad = ~np.isfinite(table).all(axis=1)
     if bad.any():
         raise DatasetInvalid(file, field.format(int(bad.argmax())), "must be finite")

@@ -26,7 +26,7 @@ class Frame:
     distortion: Distortion | None = None  # of the stored image; `load_rgba` removes it
 
     def load_rgba(self) -> np.ndarray:
-        """[height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.
+        """Read [height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.
 
         Raises `DatasetInvalid` if the file can't be read.
         """
@@ -54,7 +54,7 @@ class SceneData:
 
 
 def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
-    """`camera` for images `size` pixels wide, height in proportion; unchanged if `size` is None.
+    """Return `camera` for images `size` pixels wide, height in proportion; unchanged if `size` is None.
 
     Raises `InvalidInput` if `size` is not in [1, width of the image].
     """
@@ -66,7 +66,7 @@ def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
 
 
 def hold_out(frames: list[Frame]) -> dict[str, list[Frame]]:
-    """Splits with the first and every 8th frame after it as test frames; a single frame is a training frame."""
+    """Split frames: the first and every 8th after it are test frames; a single frame is a training frame."""
     test = frames[::HELD_OUT] if len(frames) > 1 else []
     train = [frame for index, frame in enumerate(frames) if index % HELD_OUT or not test]
     return {"train": train, "val": [], "test": test}

@@ -16,7 +16,7 @@ FIELDS = {"camera.fx": "fl_x", "camera.fy": "fl_y", "camera.width": "w", "camera
 
 
 def entries_of(content: JsonObject, may_be_empty: bool = False) -> list[JsonObject]:
-    """The frames in the content of one JSON file, each with the values that the file gives for all frames.
+    """Return the frames in the content of one JSON file, each with the values that the file gives for all frames.
 
     Only their type is checked. Raises `DatasetInvalid` naming file and field.
     """
@@ -40,7 +40,7 @@ def check_times(entries: list[JsonObject]) -> None:
 
 
 def file_path(entry: JsonObject) -> str:
-    """The frame's `file_path`. Raises `DatasetInvalid`."""
+    """Return the frame's `file_path`. Raises `DatasetInvalid`."""
     name = entry.required("file_path")
     if not isinstance(name, str) or not name:
         raise entry.invalid("file_path", f"must be a file name, got {name!r}")
@@ -48,7 +48,7 @@ def file_path(entry: JsonObject) -> str:
 
 
 def read_frame(entry: JsonObject, size: int | None) -> Frame:
-    """The frame, distortion ignored, for images `size` pixels wide; t = 0 if it has no `time`.
+    """Read the frame, distortion ignored, for images `size` pixels wide; t = 0 if it has no `time`.
 
     Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
     """
@@ -85,7 +85,7 @@ def _camera(entry: JsonObject, image: ImageSize) -> Camera:
 
 
 def _focal_length(entry: JsonObject, key: str, length: int) -> float:
-    """Focal length in pixels, from the field of view of `length` pixels."""
+    """Return the focal length in pixels, from the field of view of `length` pixels."""
     if entry.get(key) is None:
         raise entry.invalid(key, "is missing, and so is fl_x")
     angle = entry.number(key)

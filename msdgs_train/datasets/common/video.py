@@ -41,7 +41,7 @@ class VideoFrame(Frame):
     count: int  # number of frames in the video
 
     def load_rgba(self) -> np.ndarray:
-        """[height, width, 4] uint8, sRGB, opaque, downscaled to the camera's size. The first call decodes the video."""
+        """Read [height, width, 4] uint8, sRGB, opaque, of the camera's size. The first call decodes the video."""
         width, height = self.camera.width, self.camera.height
         frames = open_frames(self.video, VideoInfo(self.count, width, height))
         rgba = np.full((height, width, 4), 255, np.uint8)
@@ -63,7 +63,7 @@ def read_info(video: Path) -> VideoInfo:
 
 
 def open_frames(video: Path, wanted: VideoInfo) -> np.ndarray:
-    """[count, height, width, 3] uint8 RGB, read-only and memory-mapped, downscaled to the wanted size.
+    """Return [count, height, width, 3] uint8 RGB, read-only and memory-mapped, downscaled to the wanted size.
 
     Decodes the video unless it is cached. Raises `DatasetInvalid` if it has another number of frames, can't be decoded,
     or its frames can't be stored.

@@ -84,7 +84,7 @@ def generate(
 
 
 def training_views(count: int, size: int, seed: int) -> list[View]:
-    """One camera per time, over the upper hemisphere; successive cameras are far apart, as in D-NeRF."""
+    """Return one camera per time, over the upper hemisphere; successive cameras are far apart, as in D-NeRF."""
     shift = np.random.default_rng(seed).uniform(size=2)
     across, up = ((shift + np.arange(count)[:, None] * R2_SEQUENCE) % 1).T
     low, high = math.sin(math.radians(LOWEST)), math.sin(math.radians(HIGHEST))
@@ -94,7 +94,7 @@ def training_views(count: int, size: int, seed: int) -> list[View]:
 
 
 def held_out_views(count: int, size: int, seed: int) -> list[View]:
-    """One smooth turn around the scene, at the centers of `count` equal intervals of time."""
+    """Return cameras on one smooth turn around the scene, at the centers of `count` equal intervals of time."""
     parts = (np.arange(count) + 0.5) / max(count, 1)
     shift = np.random.default_rng(seed).uniform()
     return _views(size, 360 * (shift + parts), np.full(count, TEST_ELEVATION), parts)

@@ -61,7 +61,7 @@ class Motion(NamedTuple):
 
 
 def motion_at(t: float) -> Motion:
-    """The whole scene at time t; the scene spans [0, 1]."""
+    """Return the state of the whole scene at time t in [0, 1]."""
     placements = _placements(t)
     boxes = REST_BOXES[:, :1] + _UNIT_GRID * (REST_BOXES[:, 1:] - REST_BOXES[:, :1])
     outlines = np.stack([_place(placement, box) for placement, box in zip(placements, boxes, strict=True)])
@@ -72,7 +72,7 @@ def motion_at(t: float) -> Motion:
 
 
 def world_positions(name: str, local: np.ndarray, t: float) -> np.ndarray:
-    """World positions at time t of points of object `name`, given at rest, [..., 3]: the ground truth of the motion."""
+    """Return the true world positions at time t of points of object `name`, which are given at rest, [..., 3]."""
     return _place(_placements(t)[OBJECTS.index(name)], np.asarray(local, float))
 
 
@@ -83,7 +83,7 @@ class _Placement(NamedTuple):
 
 
 def _placements(t: float) -> tuple[_Placement, ...]:
-    """The placement of each of `OBJECTS` at time t."""
+    """Return the placement of each of `OBJECTS` at time t."""
     no_warp = np.zeros(3)
     ground = _Placement(np.array([0.0, 0.0, GROUND_Z]), np.eye(3), no_warp)
     jelly = _Placement(np.array([0.6, 0.34, GROUND_Z]), *_jelly(t))
@@ -101,7 +101,7 @@ def _place(placement: _Placement, local: np.ndarray) -> np.ndarray:
 
 
 def _ball(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Offset and matrix: it bounces along an arc and spins; on the ground it is squashed at constant volume."""
+    """Return offset and matrix: it bounces along an arc and spins; on the ground it is squashed at constant volume."""
     phase = (t * BOUNCES + 0.5) % 1.0
     height, flat = BALL_RADIUS, 1.0
     if phase < CONTACT:
@@ -117,13 +117,13 @@ def _ball(t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ring(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Offset and matrix: it floats, and rotates around the vertical and around its own axis."""
+    """Return offset and matrix: it floats, and rotates around the vertical and around its own axis."""
     offset = np.array([-0.6, 0.34, 0.06 + 0.06 * math.sin(2 * math.pi * t)])
     return offset, _rotation(2, 2 * math.pi * t) @ _rotation(0, 1.15) @ _rotation(2, -2 * math.pi * t)
 
 
 def _jelly(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and warp: it stretches and squashes at constant volume, twists and bends; its base stays on the ground."""
+    """Return matrix and warp: it stretches at constant volume, twists and bends; its base stays on the ground."""
     stretch = 1 + 0.32 * math.sin(4 * math.pi * t)
     warp = np.array([2.4 * math.sin(3 * math.pi * t), 0.7 * math.sin(2 * math.pi * t + 1), 0.5 * math.cos(4 * t)])
     return np.diag([stretch**-0.5, stretch**-0.5, stretch]), warp
@@ -137,7 +137,7 @@ def _shrinks(matrices: np.ndarray, warps: np.ndarray) -> np.ndarray:
 
 
 def _rotation(axis: int, angle: float) -> np.ndarray:
-    """Right-handed rotation around a coordinate axis, [3, 3]."""
+    """Return the right-handed rotation around a coordinate axis, [3, 3]."""
     rotation = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     rotation[i, i] = rotation[j, j] = math.cos(angle)

@@ -39,7 +39,7 @@ _MISS = 1e9
 
 
 def render(camera: Camera, t: float) -> np.ndarray:
-    """The scene at time t: [H, W, 4] uint8, sRGB, straight alpha, color 0 for rays that hit nothing."""
+    """Render the scene at time t: [H, W, 4] uint8, sRGB, straight alpha, color 0 for rays that hit nothing."""
     motion = motion_at(t)
     linear = np.zeros((camera.height, camera.width, 4))
     view = np.ascontiguousarray(camera.camera_to_world)
@@ -77,7 +77,7 @@ def _render_rows(motion: Motion, view: np.ndarray, intrinsics: tuple, out: np.nd
 
 @kernel
 def first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, int]:
-    """Distance along a unit ray to the first surface and its row in `OBJECTS`, or `NO_OBJECT`."""
+    """Return the distance along a unit ray to the first surface and its row in `OBJECTS`, or `NO_OBJECT`."""
     nearest, shape = _MISS, NO_OBJECT
     top = (GROUND_Z - oz) / dz if dz < 0 else -1.0
     on_top = top > 0 and math.hypot(ox + top * dx, oy + top * dy) < GROUND_RADIUS - GROUND_ROUNDING
@@ -103,7 +103,7 @@ def first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: fl
 def _through_sphere(
     motion: Motion, index: int, margin: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float]:
-    """Entry and exit distance of a ray in the bounding sphere of an object plus a margin; start > end if it misses."""
+    """Return the distances at which a ray enters and leaves an object's bounding sphere plus a margin, or 1, 0."""
     x = ox - motion.centers[index, 0]
     y = oy - motion.centers[index, 1]
     z = oz - motion.centers[index, 2]
@@ -118,7 +118,7 @@ def _through_sphere(
 
 @kernel
 def _to_rest(motion: Motion, index: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The inverse of `motion.world_positions`."""
+    """Map a world position to the object at rest, the inverse of `motion.world_positions`."""
     x, y, z = x - motion.offsets[index, 0], y - motion.offsets[index, 1], z - motion.offsets[index, 2]
     m = motion.inverses[index]
     u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
@@ -152,7 +152,7 @@ def _normal(motion: Motion, index: int, x: float, y: float, z: float) -> tuple[f
 def _shade(
     motion: Motion, index: int, x: float, y: float, z: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float, float]:
-    """Linear RGB that a surface point sends back along the ray."""
+    """Return the linear RGB that a surface point sends back along the ray."""
     u, v, w = _to_rest(motion, index, x, y, z)
     albedo = _PALETTE_LINEAR[color_at_rest(index, u, v, w)]
     nx, ny, nz = _normal(motion, index, x, y, z)
@@ -175,7 +175,7 @@ def _shade(
 
 @kernel
 def _light_arriving(motion: Motion, x: float, y: float, z: float) -> float:
-    """1 in full light, 0 in full shadow: from the narrowest gap along the shadow ray relative to its distance."""
+    """Return 1 in light to 0 in shadow, from the narrowest gap along the shadow ray relative to its distance."""
     arriving = 1.0
     for index in range(len(OBJECTS)):
         if index == GROUND:  # it is below the light and all other objects
@@ -193,7 +193,7 @@ def _light_arriving(motion: Motion, x: float, y: float, z: float) -> float:
 
 @kernel
 def _openness(motion: Motion, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> float:
-    """Ambient occlusion: 1 under the open sky, less in corners, from distances to surfaces along the normal."""
+    """Return ambient occlusion: 1 under the open sky, less in corners, from distances to surfaces along the normal."""
     closed, weight = 0.0, 1.0
     for step in OCCLUSION_STEPS:
         px, py, pz = x + step * nx, y + step * ny, z + step * nz

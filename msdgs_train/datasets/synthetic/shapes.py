@@ -34,7 +34,7 @@ PALETTE = np.array(
 
 @kernel
 def distance_at_rest(shape: int, x: float, y: float, z: float) -> float:
-    """Signed distance from a point to object `shape` at rest, in scene units; negative inside."""
+    """Return the signed distance from a point to object `shape` at rest, in scene units; negative inside."""
     if shape == GROUND:
         return _rounded_disc(x, y, z)
     if shape == FRAME:
@@ -78,7 +78,7 @@ def color_at_rest(shape: int, x: float, y: float, z: float) -> int:
 
 @kernel
 def _tile(x: float, y: float) -> int:
-    """The pattern of the ground: square tiles, a few of them colored, inside a ring."""
+    """Return the color of the ground: square tiles, a few of them colored, inside a ring."""
     radius = math.hypot(x, y)
     if radius > 0.97:
         return 2
@@ -111,12 +111,12 @@ def _rounded_box(x: float, y: float, z: float) -> float:
 
 @kernel
 def _bar(x: float, y: float, along: float, length: float, radius: float) -> float:
-    """A round bar with round ends, from 0 to `length`."""
+    """Return the signed distance to a round bar with round ends, from 0 to `length`."""
     beyond = along - min(max(along, 0.0), length)
     return math.sqrt(x * x + y * y + beyond * beyond) - radius
 
 
 @kernel
 def _to_lattice(value: float, spacing: float) -> float:
-    """Distance to the nearest of the points spacing · (k + 1/2)."""
+    """Return the distance to the nearest of the points spacing · (k + 1/2)."""
     return abs(value - spacing * (math.floor(value / spacing) + 0.5))

@@ -23,7 +23,7 @@ def surface_points(name: str, count: int, seed: int = 0) -> np.ndarray:
 
 
 def surface_colors(name: str, local: np.ndarray) -> np.ndarray:
-    """[N, 3] sRGB albedo in [0, 1] at points of object `name` at rest."""
+    """Return [N, 3] sRGB albedo in [0, 1] at points of object `name` at rest."""
     return PALETTE[[color_at_rest(OBJECTS.index(name), *point) for point in local]]
 
 
