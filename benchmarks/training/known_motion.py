@@ -15,9 +15,10 @@ from torch import Tensor
 
 from benchmarks.measuring import machine
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.comparison.matrix import Budget, ComparedSystem, read_systems
+from msdgs_train.comparison.matrix import Budget, read_systems
 from msdgs_train.datasets.synthetic.motion import OBJECTS, world_positions
 from msdgs_train.datasets.synthetic.trajectories import surface_points
+from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -60,20 +61,20 @@ def main(
         return 1
     torch.set_num_threads(1)
     table = Table("system", *MOVING, "all", "± over seeds", box=None, title=f"1/1000 scene units, rms, {steps:,} steps")
-    followed = [system for system in known if system.config.model.layers]
-    for system in track(followed, "systems", console=Console(stderr=True)):
-        errors = np.array([errors_of(system, seed, points) for seed in seeds])
+    deformed = [(name, config) for name, config in known.items() if config.model.layers]
+    for name, config in track(deformed, "systems", console=Console(stderr=True)):
+        errors = np.array([errors_of(config, seed, points) for seed in seeds])
         overall = np.sqrt((errors**2).mean(axis=1))
         spread = statistics.stdev(overall) if len(seeds) > 1 else 0.0
-        table.add_row(system.name, *(f"{e:.1f}" for e in (*errors.mean(axis=0), overall.mean())), f"{spread:.1f}")
+        table.add_row(name, *(f"{e:.1f}" for e in (*errors.mean(axis=0), overall.mean())), f"{spread:.1f}")
     console.print(machine(), table)
     return 0
 
 
-def errors_of(system: ComparedSystem, seed: int, points: int) -> np.ndarray:
+def errors_of(config: TrainConfig, seed: int, points: int) -> np.ndarray:
     """[objects] rms distance of a trained model's points to where they are, thousandths of a scene unit."""
     local = [surface_points(name, points, seed) for name in MOVING]
-    model, config = _new_model(system, seed, _places(local, 0.5)), system.config
+    model = _new_model(config, seed, _places(local, 0.5))
     schedule, groups = Schedule.from_config(config), model.motion_groups()
     optimizer = make_optimizer(groups, schedule)
     random = np.random.default_rng(seed)
@@ -92,8 +93,8 @@ def errors_of(system: ComparedSystem, seed: int, points: int) -> np.ndarray:
     return 1e3 * np.sqrt(squares)
 
 
-def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicGaussians:
-    sizes, generator = system.config.model, torch.Generator().manual_seed(seed)
+def _new_model(config: TrainConfig, seed: int, canonical: Tensor) -> DynamicGaussians:
+    sizes, generator = config.model, torch.Generator().manual_seed(seed)
     gray = torch.full_like(canonical, 0.5)
     gaussians = CanonicalGaussians.from_points(canonical, gray, sizes.sh_degree, generator, sizes.attributes())
     for name in ("means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"):
@@ -111,7 +112,7 @@ def _places(local: list[np.ndarray], t: float) -> Tensor:
 def self_test() -> int:
     """Errors before training are those of points at rest in the middle of their way."""
     torch.set_num_threads(1)
-    (before,), (after,) = (read_systems(["msdgs-small"], Budget(steps)) for steps in (1, 150))
+    before, after = (read_systems(["msdgs-small"], Budget(steps))["msdgs-small"] for steps in (1, 150))
     at_rest = []
     for name in MOVING:
         local = surface_points(name, 20, 0)
