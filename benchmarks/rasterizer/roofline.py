@@ -12,8 +12,9 @@ from msdgs_serve.rasterizer.lanes_memory import load, store
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
 FLOPS_A_PAIR = 37
-"""Operations of one splat in one pixel, an fma counted twice: dx, dy 2; root times that 4; squares and log2 of the opacity 4;
-2^x 13 (rounding 3, polynomial of degree 5: 10); two thresholds 2; transmittance 3, end test 1; three colors and depth 8."""
+"""Operations of one splat in one pixel, an fma counted twice: dx, dy 2; root times that 4; squares and log2 of the
+opacity 4; 2^x 13 (rounding 3, polynomial of degree 5: 10); two thresholds 2; transmittance 3, end test 1; three colors
+and depth 8."""
 
 CHAINS = 8
 ROUNDS = 200_000

@@ -1,5 +1,5 @@
-"""How well the systems of a comparison can follow motion at all: their layers are trained on the
-known trajectories of points of the synthetic scene instead of images."""
+"""How well the systems of a comparison represent motion: their layers are trained on known trajectories of points of
+the synthetic scene instead of images."""
 
 import statistics
 import sys
@@ -36,19 +36,19 @@ def main(
     points: int = 400,
     check: bool = False,
 ) -> int:
-    """Train each system on the trajectories of points, and print how far from them it ends.
+    """Train each system on the trajectories of points, and print its final distance from them.
 
     python -m benchmarks.training.known_motion benchmarks/training/ablation.toml --steps 1200 --seeds 0 1 2
 
-    The canonical means are the points at the middle of time; learning rates are those of the system's training, all of
-    time takes part from the start. A step is one time and all points.
+    The canonical means are the points at the middle of the time range. Learning rates are those of the system's
+    training, and all times are used from the start. A step is one time and all points.
 
     Args:
         systems: Presets, or files as `msdgs-train compare` takes them.
-        steps: Of the optimiser.
-        seeds: Of the layers' weights and the order of the times.
-        points: Of each of the objects that move.
-        check: Only see that this works: a model that isn't trained stays in the middle, one that is comes nearer.
+        steps: Optimizer steps.
+        seeds: Seeds of the layers' weights and the order of the times.
+        points: Points of each moving object.
+        check: Test this benchmark: an untrained model stays in the middle, a trained one comes closer.
     """
     if check:
         return self_test()
@@ -60,8 +60,8 @@ def main(
         return 1
     torch.set_num_threads(1)
     table = Table("system", *MOVING, "all", "± over seeds", box=None, title=f"1/1000 scene units, rms, {steps:,} steps")
-    followed = [system for system in known if system.config.model.layers]
-    for system in track(followed, "systems", console=Console(stderr=True)):
+    moving = [system for system in known if system.config.model.layers]
+    for system in track(moving, "systems", console=Console(stderr=True)):
         errors = np.array([errors_of(system, seed, points) for seed in seeds])
         overall = np.sqrt((errors**2).mean(axis=1))
         spread = statistics.stdev(overall) if len(seeds) > 1 else 0.0
@@ -71,7 +71,7 @@ def main(
 
 
 def errors_of(system: ComparedSystem, seed: int, points: int) -> np.ndarray:
-    """[objects] rms distance of a trained model's points to where they are, thousandths of a scene unit."""
+    """[objects] RMS distance of a trained model's points from their trajectories, thousandths of a scene unit."""
     local = [surface_points(name, points, seed) for name in MOVING]
     model, config = _new_model(system, seed, _places(local, 0.5)), system.config
     schedule, groups = Schedule.from_config(config), model.motion_groups()
@@ -103,13 +103,13 @@ def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicG
 
 
 def _places(local: list[np.ndarray], t: float) -> Tensor:
-    """[objects · points, 3] of all objects at a time."""
+    """[objects · points, 3] positions of the points of all objects at a time."""
     places = [world_positions(name, points, t) for name, points in zip(MOVING, local, strict=True)]
     return torch.from_numpy(np.concatenate(places)).float()
 
 
 def self_test() -> int:
-    """Errors before training are those of points at rest in the middle of their way."""
+    """Errors before training are those of points at rest at the middle of the time range."""
     torch.set_num_threads(1)
     (before,), (after,) = (read_systems(["msdgs-small"], Budget(steps)) for steps in (1, 150))
     at_rest = []
