@@ -5,7 +5,7 @@ import zipfile
 from pathlib import Path
 
 from export.importers.errors import ImportFailed
-from export.importers.runs.model import RUNS
+from export.importers.runs.model import RUNS, run_format
 from export.importers.splats.formats import READERS, splat_format
 from msdgs_serve.scene.errors import InvalidInput
 
@@ -69,7 +69,4 @@ def _model(path: Path) -> str | None:
 def _folder(path: Path) -> str | None:
     if (path / "model.pt").is_file():
         return "model"
-    runs = [name for name, importer in RUNS.items() if importer.detects(path)]
-    if runs:
-        return runs[0]
-    return "sequence" if len(frame_files(path)) > 1 else None
+    return run_format(path) or ("sequence" if len(frame_files(path)) > 1 else None)
