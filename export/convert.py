@@ -8,13 +8,7 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     folder = Path(__file__).resolve().parent
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
-try:
-    import tyro
-    from rich.console import Console
-except ModuleNotFoundError as error:
-    raise SystemExit(f"convert.py needs {error.name}, which serving alone does not: pip install '.[export]'") from None
-
-from msdgs_serve.scene.errors import MsdgsError
+from export.command_line import Console, run, tyro
 
 
 def main(
@@ -50,18 +44,13 @@ def main(
         min_psnr: PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and
             Visionary and 60 for others, which are lossless.
     """
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
-    try:
+
+    def converted(console: Console) -> None:
         with console.status("loading"):
-            from export.exporters.command import Settings, convert  # heavy: not before --help
+            from export.exporters.command import Settings, convert  # slow to import: not before --help
         convert(Settings(scene, out, t, frames, min_psnr), console)
-    except KeyboardInterrupt:
-        console.print("stopped; existing files are complete", markup=False)
-        return 130
-    except (MsdgsError, OSError) as error:
-        console.print(f"error: {error}", style="red", markup=False)
-        return 1
-    return 0
+
+    return run(converted, "stopped; existing files are complete")
 
 
 if __name__ == "__main__":

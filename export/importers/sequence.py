@@ -21,6 +21,7 @@ from export.importers.scene import UP, metadata_of
 from export.importers.splats.base import Splats
 from export.importers.splats.formats import read_splats
 from export.jobs.bake import Baked, Moving
+from export.measure.poses import half_diagonal
 from export.plans.scene_graph import activated, finished, new_graph
 from export.trajectories.sampling import give_one_sign
 from export.trajectories.splines import design
@@ -208,7 +209,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
     baked = Baked(scene, Moving(means, scales, quats), ())
     graph = new_graph(baked)
     low, high = np.array(metadata.bounds)
-    parked = (low + high) / 2 - PARKED_AT * max(float(np.linalg.norm(high - low)) / 2, 1e-3) * UP
+    parked = (low + high) / 2 - PARKED_AT * max(half_diagonal(metadata.bounds), 1e-3) * UP
 
     half = graph.constant("frames.half", np.array([0.5], np.float32))
     last = graph.constant("frames.last", np.array([len(frames) - 1], np.float32))

@@ -1,4 +1,4 @@
-"""Points of a work-precision diagram: how long a frame takes against how far it is from the exact one."""
+"""Points of a work-precision diagram: time of a frame and error against the exact one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,14 +15,13 @@ DEFAULT_RASTERIZER = "default"
 class QuickEstimate:
     """A quick estimate of a candidate: the error of some of its frames, and the processor time of one.
 
-    Processor time is added up over threads; unlike time on the clock it hardly depends on what else a machine does.
+    Processor time is summed over threads; unlike elapsed time it hardly depends on other programs.
     """
 
     candidate: Candidate
-    rasterizer: str
-    cpu: float  # milliseconds a frame, the least of a few
-    cpu_deformation: float  # of these
-    worst_db: float  # PSNR of the worst frame looked at
+    cpu: float  # milliseconds per frame, the minimum of a few
+    cpu_deformation: float  # milliseconds of these
+    worst_db: float  # PSNR of the worst of these frames
 
     def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
         """Whether it is faster and has a smaller error than another, by more than the margins."""
@@ -32,7 +31,7 @@ class QuickEstimate:
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
         quick = {"cpu_milliseconds": self.cpu, "psnr_worst": self.worst_db}
-        return named(self.candidate, self.rasterizer) | {"quick_estimate": quick}
+        return named(self.candidate, DEFAULT_RASTERIZER) | {"quick_estimate": quick}
 
 
 @dataclass(frozen=True, eq=False)

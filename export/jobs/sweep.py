@@ -1,5 +1,5 @@
-"""The sweep: plans × pruning × SH degree × rasterizer options, dominated ones left after a quick estimate, the rest
-measured in full."""
+"""The sweep: plans × pruning × SH degree × rasterizer options. Dominated ones are dropped after a quick estimate, the
+rest is measured in full."""
 
 import math
 import time
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from export.measure.images import HeldOutImages
 
 MAX_RELATIVE_COST = 4.0
-"""A plan that runs layers isn't tried if they take so many times the whole frame of a plan that is good enough."""
+"""A plan that runs layers isn't tried if its layers take this many times the whole frame of a plan within the error."""
 
 PRUNING_STEPS = (20.0, 10.0, 5.0, 1.0, -5.0, -10.0, -15.0)
 """dB above or below `min_psnr` at which pruning is tried."""
@@ -31,8 +31,8 @@ MIN_PRUNING_DB, MIN_USEFUL_DB = 25.0, 20.0
 """Pruning isn't tried below the first; candidates below the second are dropped."""
 
 HEADROOM = (2.0, -3.0)
-"""With pruning to so many dB goes the fastest plan that unvaried is better by the first, and the one by the second; of
-those that are about as fast, the smallest."""
+"""dB. Each pruning is tried with the fastest plan whose error with mild pruning is better than it by the first value, and
+by the second; of about equally fast ones, with the smallest file."""
 
 ESTIMATE_STRIDE, ESTIMATE_REPEATS = 6, 3
 """A quick estimate compares every 6th frame and takes the minimum of 3 timings."""
@@ -111,7 +111,7 @@ class Sweep:
         error = self.job.error(candidate, every=ESTIMATE_STRIDE)
         deformation, _, total = (min(run[part] for run in runs) for part in range(3))
         candidate.close()
-        self.estimates.append(QuickEstimate(candidate, DEFAULT_RASTERIZER, total, deformation, error.psnr_worst))
+        self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst))
         return self.estimates[-1]
 
     def _too_expensive(self, plan: str, pruning_db: float | None) -> str | None:
@@ -129,7 +129,7 @@ class Sweep:
         if expected < MAX_RELATIVE_COST * fastest.cpu:
             return None
         taken = f"{fastest.candidate.plan} takes {fastest.cpu:.0f} ms for the whole frame"
-        return f"not tried: its layers would take about {expected:.0f} ms of processor time, where {taken}"
+        return f"not tried: its layers would take about {expected:.0f} ms of processor time; {taken}"
 
     def _reachable(self, estimate: QuickEstimate | None) -> None:
         if estimate is None:  # its layers can't be run in float32; fitted plans may still work
@@ -141,7 +141,7 @@ class Sweep:
             raise TargetNotReached("min_psnr", expected, self.min_psnr)
 
     def _pairs(self, unvaried: list[QuickEstimate], level: float) -> set[tuple[str, float]]:
-        """The plans worth trying with pruning to `level` dB."""
+        """The plans to try with pruning to `level` dB."""
         pairs = set()
         for headroom in HEADROOM:
             enough = [estimate for estimate in unvaried if estimate.worst_db >= level + headroom]

@@ -45,7 +45,7 @@ def quaternion_fidelity(model: DynamicGaussians, info: SceneInfo) -> Loss:
         largest = max(largest, deviation)
     note = (
         f"the run's renderer uses quaternions of any norm (largest difference from 1: {largest:.3g}), a scene file "
-        f"unit quaternions: frames are {np.mean(psnrs):.1f} dB from the run's, the worst of {FRAMES} {min(psnrs):.1f} dB"
+        f"unit ones: frames are {np.mean(psnrs):.1f} dB from the run's, the worst of {FRAMES} {min(psnrs):.1f} dB"
     )
     what = "lengths of quaternions, which shear shapes, and signs of scales"
     return Loss("quaternion_fidelity", what, len(model.gaussians), min(psnrs), note)
