@@ -1,7 +1,6 @@
 """The conversion of a scene file, as `convert.py` runs it."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,16 +21,15 @@ from export.plans.registry import PLANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.datasets.common.files import replacing
+from msdgs_train.datasets.common.files import replacing, write_text
 
 LOSSLESS, LOSSY = 60.0, 45.0
-"""Default floors of PSNR of a written file against the scene, dB."""
+"""Default minimum PSNR of a written file against the scene, dB."""
 
 VISIONARY = ".visionary.onnx"
 SINGLE = (".ply", ".spz", ".glb")
 USD = (".usdc", ".usda", ".usd")
-FILMS = (".mp4", ".webm")
+VIDEOS = (".mp4", ".webm")
 COMPARED = 5
 """Number of times at which a moving scene is compared."""
 
@@ -46,33 +44,39 @@ class Settings:
     frames: int
     min_psnr: float | None  # dB
 
+    def require(self, psnr: float, default: float, what: str) -> None:
+        """Raise `ConversionFailed` if `psnr` is below the option, or else the default."""
+        require(psnr, default if self.min_psnr is None else self.min_psnr, what)
+
 
 def convert(settings: Settings, console: Console) -> None:
     """Write, read back, compare. Raises `InvalidInput`, `SceneFileInvalid` and `ConversionFailed`; a file below the
-    floor of PSNR doesn't replace an old one."""
+    minimum PSNR doesn't replace an old one."""
     out = settings.out
-    if out.suffix in FILMS:
-        raise InvalidInput("out", f"other than a film: msdgs-render {settings.scene} {out} writes one", out.name)
+    if out.suffix in VIDEOS:
+        raise InvalidInput("out", f"other than a video: msdgs-render {settings.scene} {out} writes one", out.name)
     session = DeformationSession(settings.scene)
     if out.name.endswith(VISIONARY):
-        _visionary(session, settings, console)
+        written = _visionary(session, settings, console)
     elif out.suffix in USD:
-        _usd(session, settings, console)
+        written = _usd(session, settings, console)
     elif out.suffix in SINGLE:
         t0, _ = session.scene.metadata.time_range
-        psnr = _one(session, out, t0 if settings.t is None else settings.t, settings.min_psnr)
-        console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {psnr:.1f} dB from the scene", markup=False)
+        worst = _one(session, settings, out, t0 if settings.t is None else settings.t)
+        written = f"{_megabytes(out)}, {worst:.1f} dB"
     elif not out.suffix:
-        _sequence(session, settings, console)
+        written = _sequence(session, settings, console)
     else:
         raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD))} or {VISIONARY}", out.name)
+    console.print(f"{out}: {written} against the scene", markup=False)
     eps2d = session.scene.metadata.eps2d
     if eps2d != GSPLAT.eps2d:
         drawn = "softer" if eps2d < GSPLAT.eps2d else "harder"
         console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
 
 
-def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | None) -> float:
+def _one(session: DeformationSession, settings: Settings, file: Path, t: float) -> float:
+    """Write a file of one time; returns its PSNR against the scene, dB."""
     metadata = session.scene.metadata
     gaussians = of_the_moment(session.gaussians(t), metadata.plan)
     with replacing(file) as temporary:
@@ -80,72 +84,78 @@ def _one(session: DeformationSession, file: Path, t: float, min_psnr: float | No
             write_spz(temporary, gaussians, metadata.antialiasing)
         else:
             (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
-        default = LOSSY if file.suffix == ".spz" else LOSSLESS
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
         psnr = RoundTrip(session).psnr(written, t)
-        require(psnr, default if min_psnr is None else min_psnr, file.name)
+        settings.require(psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
     return psnr
 
 
-def _sequence(session: DeformationSession, settings: Settings, console: Console) -> None:
+def _sequence(session: DeformationSession, settings: Settings, console: Console) -> str:
+    """Write a folder of PLY files."""
     if settings.t is not None:
-        raise InvalidInput("t", "left out for a folder; --frames says how many", settings.t)
-    if settings.frames < 2:
-        raise InvalidInput("frames", "2 or more", settings.frames)
-    times = np.linspace(*session.scene.metadata.time_range, settings.frames).tolist()
-    out, digits = settings.out, len(str(settings.frames - 1))
+        raise InvalidInput("t", "left out for a folder; --frames is the number of files", settings.t)
+    out, times = settings.out, _times(session, settings)
     out.mkdir(parents=True, exist_ok=True)
     if any(each.suffix == ".ply" for each in out.iterdir()):
         raise InvalidInput("out", "a folder without PLY files", str(out))
+    digits = len(str(len(times) - 1))
     worst = min(
-        _one(session, out / f"{settings.scene.stem}_{number:0{digits}}.ply", t, settings.min_psnr)
+        _one(session, settings, out / f"{settings.scene.stem}_{number:0{digits}}.ply", t)
         for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
     )
-    console.print(f"{out}: {len(times)} files, the worst {worst:.1f} dB from the scene", markup=False)
+    return f"{len(times)} files, the worst {worst:.1f} dB"
 
 
-def _usd(session: DeformationSession, settings: Settings, console: Console) -> None:
-    """The scene's whole time range, or one time."""
-    out, (t0, t1) = settings.out, session.scene.metadata.time_range
+def _usd(session: DeformationSession, settings: Settings, console: Console) -> str:
+    """Write the scene's whole time range, or one time."""
+    out, metadata = settings.out, session.scene.metadata
     moves = session.scene.moving_count and settings.t is None
-    plan = session.scene.metadata.plan
-    if moves and is_switched(plan):
+    if moves and is_switched(metadata.plan):
         raise InvalidInput("t", "given: frames of this scene are switched, and USD would blend them", "nothing")
-    if moves and settings.frames < 2:
-        raise InvalidInput("frames", "2 or more", settings.frames)
-    times = np.linspace(t0, t1, settings.frames).tolist() if moves else [t0 if settings.t is None else settings.t]
+    single = metadata.time_range[0] if settings.t is None else settings.t
+    times = _times(session, settings) if moves else [single]
     check = RoundTrip(session)
     with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
         task = progress.add_task("writing frames", total=len(times))
-        write_usd(temporary, lambda t: of_the_moment(session.gaussians(t), plan), times, lambda: progress.advance(task))
+        write_usd(
+            temporary,
+            lambda t: of_the_moment(session.gaussians(t), metadata.plan),
+            times,
+            lambda: progress.advance(task),
+        )
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
         worst = min(check.psnr(shown(number), times[number]) for number in compared)
-        require(worst, LOSSLESS if settings.min_psnr is None else settings.min_psnr, out.name)
-    size = out.stat().st_size / 1e6
-    console.print(f"{out}: {len(times)} frames, {size:.2f} MB, {worst:.1f} dB from the scene", markup=False)
+        settings.require(worst, LOSSLESS, out.name)
+    return f"{len(times)} frames, {_megabytes(out)}, {worst:.1f} dB"
 
 
-def _visionary(session: DeformationSession, settings: Settings, console: Console) -> None:
+def _times(session: DeformationSession, settings: Settings) -> list[float]:
+    if settings.frames < 2:
+        raise InvalidInput("frames", "2 or more", settings.frames)
+    return np.linspace(*session.scene.metadata.time_range, settings.frames).tolist()
+
+
+def _visionary(session: DeformationSession, settings: Settings, console: Console) -> str:
+    """Write a model for Visionary, and the scene.json of its editor."""
     out, metadata = settings.out, session.scene.metadata
-    model = visionary_model(settings.scene)
+    model, check = visionary_model(settings.scene), RoundTrip(session, mip=False)
+    times = np.linspace(*metadata.time_range, COMPARED if session.scene.moving_count else 1).astype(np.float32)
     with replacing(out) as temporary:
         temporary.write_bytes(model.SerializeToString())
-        worst = _worst(session, visionary_of(temporary))
-        require(worst, LOSSY if settings.min_psnr is None else settings.min_psnr, out.name)
+        shown = visionary_of(temporary)
+        worst = min(check.psnr(shown(t), t) for t in times.tolist())
+        settings.require(worst, LOSSY, out.name)
     scene_json = out.with_name(f"{out.name.removesuffix(VISIONARY)}.scene.json")
-    with replacing(scene_json) as temporary:
-        temporary.write_text(json.dumps(visionary_scene(out.name, metadata), indent=2) + "\n")
-    console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {worst:.1f} dB from the scene", markup=False)
+    write_text(scene_json, json.dumps(visionary_scene(out.name, metadata), indent=2) + "\n")
     console.print(f"{scene_json}: the scene.json of a folder for Visionary's editor", markup=False)
     if metadata.antialiasing == "mip":
-        console.print("its anti-aliasing isn't in this format: thin parts come out brighter")
+        console.print("its anti-aliasing isn't in this format: thin parts are brighter")
     plan = PLANS.get(metadata.plan.partition(":")[0])
     if session.scene.moving_count and plan is not None and not plan.fitted:
-        console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a scene that is cheaper")
+        console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a faster scene")
+    return f"{_megabytes(out)}, {worst:.1f} dB"
 
 
-def _worst(session: DeformationSession, shown: Callable[[float], Gaussians]) -> float:
-    check = RoundTrip(session, mip=False)
-    times = np.linspace(*session.scene.metadata.time_range, COMPARED if session.scene.moving_count else 1)
-    return min(check.psnr(shown(float(np.float32(t))), float(np.float32(t))) for t in times)
+def _megabytes(file: Path) -> str:
+    return f"{file.stat().st_size / 1e6:.2f} MB"

@@ -1,4 +1,4 @@
-"""Visionary's rules for an ONNX model that it plays, checked."""
+"""A check of Visionary's rules for ONNX models."""
 
 import numpy as np
 import onnx
@@ -9,12 +9,12 @@ from msdgs_serve.scene.errors import MsdgsError
 
 OPSET = 17
 MULTIPLE = 256
-"""Rows are padded to a whole number of these, by Gaussians of opacity 0."""
+"""Rows are padded to a multiple of this with Gaussians of opacity 0."""
 
 COLUMNS, COLOR_COLUMNS, OPACITY = 10, 48, 3
 GAUSSIANS, COLORS, COUNT = "gaussian_f32", "color_f16", "num_points"
 GAUSSIAN_TYPES = {GAUSSIANS: TensorProto.FLOAT, "gaussian_f16": TensorProto.FLOAT16}
-"""Either is allowed; float32 is what is written here."""
+"""Both are allowed; this project writes float32."""
 
 CONTROL_FLOW = {"If", "Loop", "Scan", "SequenceMap"}
 QUANTISED = {"QuantizeLinear", "DequantizeLinear"}
@@ -25,11 +25,11 @@ RESERVED = ("sh", "color", "rgb")
 
 
 class VisionaryInvalid(MsdgsError):
-    """A model breaks a rule of Visionary's."""
+    """A model breaks a rule of Visionary."""
 
 
 def check_visionary(model: onnx.ModelProto) -> None:
-    """Raise `VisionaryInvalid` listing every rule of Visionary's that a model breaks."""
+    """Raise `VisionaryInvalid` listing all rules that a model breaks."""
     problems = [*_interface_problems(model), *_graph_problems(model)]
     if not problems:
         problems = _padding_problems(model)
@@ -80,7 +80,7 @@ def _graph_problems(model: onnx.ModelProto) -> list[str]:
         if not (each.name in to_outputs | outputs and each.data_type == TensorProto.FLOAT16):
             problems += _type_problems(f"constant `{each.name}`", each.data_type)
         if each.data_location == TensorProto.EXTERNAL:
-            problems.append(f"constant `{each.name}` lies in another file")
+            problems.append(f"constant `{each.name}` is stored in another file")
         elif not np.isfinite(numpy_helper.to_array(each).astype(np.float64)).all():
             problems.append(f"constant `{each.name}` holds NaN or infinity")
     return problems
@@ -91,7 +91,7 @@ def _type_problems(what: str, kind: int) -> list[str]:
 
 
 def _padding_problems(model: onnx.ModelProto) -> list[str]:
-    """Run once: rows from `num_points` on must show nothing."""
+    """Run the model once: rows from `num_points` on must have opacity 0."""
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     gaussians = next(each.name for each in model.graph.output if each.name in GAUSSIAN_TYPES)
     rows, count = (np.asarray(a) for a in session.run([gaussians, COUNT], {"time": np.zeros(1, np.float32)}))

@@ -87,7 +87,7 @@ def write_imported(
     on_time: Callable[[], object] = lambda: None,
     rows: Callable[[float], slice] = lambda t: slice(None),
 ) -> BakedScene:
-    """Write a scene file beside `output`, compare it at some times with the imported files, and only then move it there.
+    """Write a scene file beside `output`, compare it at some times with the imported files, then move it there.
 
     `rows` are the rows of the scene that `expected` returns. The largest differences are stored in the metadata: of
     means relative to the half diagonal of the bounds or, further out, to the largest coordinate; of entries of rotation

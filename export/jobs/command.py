@@ -14,13 +14,14 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, ExportJob, TargetNotReached, Track
+from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
 from export.jobs.sweep import Sweep
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
 from export.plans.registry import parse
+from export.progress import Track
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.evaluation.metrics import MAX_PSNR

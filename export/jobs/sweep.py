@@ -31,8 +31,8 @@ MIN_PRUNING_DB, MIN_USEFUL_DB = 25.0, 20.0
 """Pruning isn't tried below the first; candidates below the second are dropped."""
 
 HEADROOM = (2.0, -3.0)
-"""dB. Each pruning is tried with the fastest plan whose error with mild pruning is better than it by the first value, and
-by the second; of about equally fast ones, with the smallest file."""
+"""dB. Each level of pruning is tried with the fastest plan whose error, mildly pruned, is better than the level by the
+first value, and by the second. Of plans that are about as fast, the one with the smallest file counts."""
 
 ESTIMATE_STRIDE, ESTIMATE_REPEATS = 6, 3
 """A quick estimate compares every 6th frame and takes the minimum of 3 timings."""
