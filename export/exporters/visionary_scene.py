@@ -15,8 +15,8 @@ VERSION = 1
 def visionary_scene(model: str, metadata: SceneMetadata) -> dict[str, Any]:
     """A scene of one model, the name of a file beside it.
 
-    The model is rotated so that up is y, as in three.js, and the target of its cameras is moved to the origin. Angles are
-    intrinsic Euler angles XYZ in radians. The keys are those of Visionary's example.
+    The model is rotated so that up is y, as in three.js, and the target of its cameras is moved to the origin.
+    Rotations are Euler angles in radians, intrinsic, in the order XYZ. The keys are those of Visionary's example.
     """
     view = framing(metadata)
     turn = Rotation.align_vectors([[0.0, 1.0, 0.0]], view.up[None])[0]
