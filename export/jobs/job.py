@@ -16,8 +16,7 @@ from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.registry import build, plan_of
 from export.progress import Track, no_progress
 from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
-from export.pruning.bake import bake_pruned
-from export.pruning.mask import rows, unpruned, with_sh_degree
+from export.pruning.mask import bake_pruned, rows, unpruned, with_sh_degree
 from export.trajectories.sampling import Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
