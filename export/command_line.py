@@ -1,4 +1,4 @@
-"""What the commands of this folder share: the check for packages that serving doesn't need, and errors as messages."""
+"""Common parts of the commands: a check for packages that serving doesn't need, and messages for errors."""
 
 import sys
 from collections.abc import Callable

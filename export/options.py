@@ -1,4 +1,4 @@
-"""The options of `to_onnx.py`. Without torch, so that `--help` is printed at once."""
+"""The options of `to_onnx.py`, without importing torch, so that `--help` is printed at once."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -66,7 +66,7 @@ class ExportOptions:
 
     @property
     def scene_file(self) -> Path:
-        """Where the scene file is written."""
+        """The path of the scene file."""
         return self.model.with_suffix(".onnx") if self.output is None else self.output
 
     @property

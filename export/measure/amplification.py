@@ -1,4 +1,4 @@
-"""How much a chain of layers amplifies an error, and the error of float32 that follows from it.
+"""The amplification of errors by a chain of layers, and the error of float32 that follows from it.
 
 Layer k moves a Gaussian by x_k = x_{k-1} + w_k f_k(x_{k-1}, t) (equation 8). A small error before layer k is multiplied
 by the product of the later Jacobians, J_K … J_{k+1} with J = I + ∂(w f)/∂x. Each is 3 × 3 per Gaussian, and the rows

@@ -27,7 +27,7 @@ EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALL
 
 
 def frame_memory(paths: Sequence[Path], view: SceneCamera) -> list[int | None]:
-    """Peak bytes of loading each file and drawing a frame of it, above those of the process before."""
+    """Peak bytes of loading each file and drawing one of its frames, above the memory of the process before."""
     request = {"paths": [str(path) for path in paths], "view": view.to_plain()}
     command = [sys.executable, str(Path(__file__).resolve())]
     done = subprocess.run(
@@ -41,7 +41,7 @@ def main() -> None:
     request: dict[str, Any] = json.load(sys.stdin)
     view = SceneCamera.from_plain(request["view"])
     for path in request["paths"][:1]:
-        _draw(path, view)  # libraries and kernels that are loaded once don't count
+        _draw(path, view)  # loads libraries and kernels
     print(json.dumps([_peak(path, view) for path in request["paths"]]))
 
 
@@ -52,7 +52,7 @@ def _peak(path: str, view: SceneCamera) -> int | None:
         before = _status("VmRSS")
         _draw(path, view)
         return max(0, _status("VmHWM") - before)
-    except (OSError, KeyError):  # another system than Linux
+    except (OSError, KeyError):  # not Linux
         return None
 
 
@@ -62,7 +62,7 @@ def _draw(path: str, view: SceneCamera) -> None:
 
 
 def _status(name: str) -> int:
-    """Bytes of a line of the process's status."""
+    """Bytes in a line of the process's status."""
     lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
     return 1024 * int(lines[name].split()[0])
 

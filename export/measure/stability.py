@@ -1,6 +1,6 @@
 """Whether a model's layers may be computed in float32 when a frame is served.
 
-Measured in frames, and predicted from how much the layers amplify errors.
+It is measured in frames, and predicted from the amplification of errors by the layers.
 """
 
 import math

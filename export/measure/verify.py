@@ -18,7 +18,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 TOLERANCE = 1e-4
 TIMES = 50
 GAUSSIANS_PER_TIME = 5_000
-"""In a larger scene every n-th Gaussian is compared, starting with another one at each time."""
+"""In larger scenes every n-th Gaussian is compared, with another start at each time."""
 
 UNSTABLE = 0.25
 """A Gaussian is unstable if the model in float32 differs from float64 by more than this fraction of the tolerance: a

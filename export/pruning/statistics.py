@@ -110,7 +110,7 @@ class PruningStatistics:
         return worst
 
     def motion(self, network: NetworkMask) -> FloatArray:
-        """[N] largest displacement of the ends of a Gaussian's axes from its mean pose, pixels in the nearest camera."""
+        """[N] largest displacement of the ends of a Gaussian's axes from its mean pose, pixels."""
         poses = self.poses(network)
         mean_axes = half_axes(poses.static)
         furthest = np.zeros(len(poses.static), np.float32)
@@ -148,8 +148,8 @@ class PruningStatistics:
         return Poses(with_network(self.model, network), sorted({view.t for view in self._views}))
 
     def _visibility(self) -> tuple[FloatArray, FloatArray]:
-        """[N] the largest fraction that a Gaussian contributes to a pixel at its center, and the largest number of pixels
-        that it contributes, over the views."""
+        """[N] the largest contribution of a Gaussian to a pixel at its center, in [0, 1], and the largest sum of its
+        contributions to a view."""
         poses = self.poses(self._whole[0])
         peaks, amounts = np.zeros((2, len(poses.static)), np.float32)
         for view in self._views if len(peaks) else ():

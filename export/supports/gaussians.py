@@ -6,12 +6,12 @@ from export.supports.base import SupportInputs
 
 
 class GaussiansExport:
-    """Of `GaussiansSupport`."""
+    """Exports `GaussiansSupport`."""
 
     heads_are_removable = True
     bytes_per_gaussian = 0
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
-        """Of the chain itself."""
+        """The deltas of the chain itself."""
         used = used_heads(inputs.layers)
         return summed_deltas(graph, inputs.layers, inputs.means, inputs.time, inputs.steps, used)

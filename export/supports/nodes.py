@@ -18,7 +18,7 @@ IDENTITY = np.array([1, 0, 0, 0], np.float32)
 
 
 class NodesExport:
-    """Of `NodesSupport`."""
+    """Exports `NodesSupport`."""
 
     heads_are_removable = False
     bytes_per_gaussian = MAX_NEAREST * (4 + 1)  # a weight in float32 and an id in 8 bits for each node
@@ -37,7 +37,7 @@ class NodesExport:
 
 
 def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
-    """[M, 16] `NodesSupport.motions`."""
+    """[nodes, 16] the motions of the nodes, as `NodesSupport.motions` computes them."""
     support = cast(NodesSupport, inputs.support)
     positions = to_numpy(support.nodes)
     nodes = graph.constant("nodes", positions)
@@ -112,7 +112,7 @@ def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
 
 
 def _moved(graph: GraphBuilder, matrices: str, offsets: str, means: str) -> str:
-    """[M, 3] by how much means move."""
+    """[M, 3] deltas of means."""
     three = graph.node("Concat", [means, means, means], "skinning.means.tiled", axis=1)
     rotated = _row_sums(
         graph, "skinning.means.rotated", graph.node("Mul", [matrices, three], "skinning.means.products")
@@ -123,7 +123,7 @@ def _moved(graph: GraphBuilder, matrices: str, offsets: str, means: str) -> str:
 
 
 def _stretched(graph: GraphBuilder, matrices: str, quats: str) -> str:
-    """[M, 3] logarithms of how much longer a Gaussian's axes are, columns of its rotation, times its matrix."""
+    """[M, 3] deltas of log-scales: logarithms of the lengths of a Gaussian's unit axes after its matrix is applied."""
     axes = _products(graph, "skinning.axes", matrices, _matrices(graph, "skinning.axes.canonical", quats))
     columns = graph.constant("skinning.axes.columns", np.tile(np.eye(3, dtype=np.float32), (3, 1)))
     squares = graph.node("Mul", [axes, axes], "skinning.axes.squares")
@@ -135,13 +135,13 @@ def _stretched(graph: GraphBuilder, matrices: str, quats: str) -> str:
 
 
 def _row_sums(graph: GraphBuilder, name: str, products: str) -> str:
-    """[·, 9] → [·, 3]: of three at a time."""
+    """[·, 9] → [·, 3]: sums of three columns at a time."""
     threes = graph.constant(f"{name}.threes", np.kron(np.eye(3), np.ones((3, 1))).astype(np.float32))
     return graph.node("MatMul", [products, threes], name)
 
 
 def _rotated(graph: GraphBuilder, rots: str, quats: str) -> str:
-    """[M, 4] by how much quaternions change when `rots`, made unit, rotate them."""
+    """[M, 4] deltas of quaternions that are rotated by `rots`, normalized first."""
     rots = _unit(graph, "skinning.rots.unit", rots)
     left = graph.constant("skinning.left", np.repeat(np.arange(4), 4))
     right = graph.constant("skinning.right", np.tile(np.arange(4), 4))
@@ -160,7 +160,7 @@ def _rotated(graph: GraphBuilder, rots: str, quats: str) -> str:
 
 
 def _unit(graph: GraphBuilder, name: str, quats: str) -> str:
-    """Quaternions [·, 4] of unit length, as training makes them."""
+    """Normalize quaternions, [·, 4], as training does."""
     ones = graph.constant(f"{name}.four", np.ones((4, 4), np.float32))
     least = graph.constant(f"{name}.least", np.array(MIN_NORM, np.float32))
     sums = graph.node("MatMul", [graph.node("Mul", [quats, quats], f"{name}.squares"), ones], f"{name}.sums")

@@ -1,4 +1,4 @@
-"""What a scene file can't hold of a run, and the PSNR that this costs.
+"""Properties of a run that a scene file can't hold, and the PSNR that this costs.
 
 The rasterizer of Deformable-3D-Gaussians doesn't normalize quaternions: if the norm isn't 1, the matrix is no rotation
 and shears the Gaussian, and the sign of a scale is lost in its square. The result is still an ellipsoid.
