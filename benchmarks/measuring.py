@@ -1,4 +1,4 @@
-"""What the benchmarks share: times of functions measured in turns, PSNR, tables, and the machine's name."""
+"""Common parts of the benchmarks: times of functions that take turns, PSNR, tables, and the machine's name."""
 
 import platform
 import sys

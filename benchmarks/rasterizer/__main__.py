@@ -1,4 +1,4 @@
-"""How fast the rasterizer is and where its time goes: stages, work, memory, the machine's limits."""
+"""The speed of the rasterizer: times of its stages, work, memory, and the limits of the machine."""
 
 import json
 import sys

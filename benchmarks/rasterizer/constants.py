@@ -62,7 +62,7 @@ VARIANTS = {
     **{("degree of 2^x", f"{degree}"): partial(draw, exp2_degree=degree) for degree in (3, 4, 6, 7)},
     **{("degree of harmonics", f"{degree}"): partial(draw, sh_degree=degree) for degree in (2, 1, 0)},
 }
-"""By constant and value."""
+"""Ways to draw, by constant and value."""
 
 
 def as_float64(gaussians: Gaussians) -> Gaussians:

@@ -27,7 +27,7 @@ LONG_ENOUGH = 0.03
 """Seconds that each renderer draws a case in a turn: minima over a few frames of 1 ms vary too much."""
 
 NEAREST = {
-    # F3D adds 0.3 / size² to a covariance in clip space, where the image is 2 wide and not 1. It has no threshold of
+    # F3D adds 0.3 / size² to a covariance in clip space, in which the image is 2 wide and not 1. It has no threshold of
     # alpha or transmittance, but ends a splat at 3 sigma.
     "F3D": GSPLAT._replace(eps2d=0.3 / 4)
 }

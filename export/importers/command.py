@@ -19,7 +19,7 @@ from msdgs_serve.scene.errors import InvalidInput
 
 @contextmanager
 def model_or_import(path: Path, file_format: str, output: Path, console: Console) -> Iterator[Path | None]:
-    """The model.pt to export: `path` itself, or one made from another trainer's run for the block.
+    """The model.pt to export: `path` itself, or a temporary one that is made from another trainer's run.
 
     Splats and sequences are written as scene files directly; the result is then None. `file_format` is one of `FORMATS`, or
     "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.

@@ -143,7 +143,7 @@ def _one_stream(file: Path, stream: _Plain | _Gzip) -> tuple[Header, list[bytes]
 
 
 def _streams(file: Path, header: Header, contents: bytes) -> list[bytes]:
-    """The parts of version 4: 32 bytes of header with the offset of a table; the table, two sizes per stream; streams."""
+    """The parts of version 4: a header of 32 bytes with the offset of a table, two sizes per stream, then the streams."""
     if len(contents) < 32:
         raise cut_off(file, "the header", 32, len(contents))
     (table,) = struct.unpack_from("<I", contents, 16)
