@@ -21,8 +21,8 @@ from msdgs_serve.scene.errors import InvalidInput
 def model_or_import(path: Path, file_format: str, output: Path, console: Console) -> Iterator[Path | None]:
     """The model.pt to export: `path` itself, or a temporary one that is made from another trainer's run.
 
-    Splats and sequences are written as scene files directly; the result is then None. `file_format` is one of `FORMATS`, or
-    "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
+    Splats and sequences are written as scene files directly; the result is then None. `file_format` is one of
+    `FORMATS`, or "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
     """
     if file_format == "detect":
         file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)

@@ -1,7 +1,6 @@
 """SOG version 2: a folder, or a zip of it, with meta.json and lossless WebP textures of one pixel per Gaussian."""
 
 import json
-import math
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -106,13 +105,10 @@ class _Meta:
 
     def numbers(self, name: str, count: int) -> np.ndarray:
         value = self.get(name)
-        good = isinstance(value, list) and len(value) == count and all(type(each) in (int, float) for each in value)
-        if not good or not all(math.isfinite(float(each)) for each in value if abs(each) < 1e300):
+        good = isinstance(value, list) and len(value) == count
+        if not good or not all(type(each) in (int, float) and abs(each) < 1e300 for each in value):
             raise self.wrong(name, f"a list of {count} numbers")
-        array = np.array([float(each) if abs(each) < 1e300 else np.nan for each in value])
-        if not np.isfinite(array).all():
-            raise self.wrong(name, f"a list of {count} numbers")
-        return array
+        return np.array(value, np.float64)
 
     def files(self, name: str, count: int) -> list[str]:
         value = self.get(f"{name}.files")

@@ -1,5 +1,6 @@
 """`.spz`, versions 2 and 3 (one gzip stream) and 4 (a zstd stream per attribute). Axes are right, up, back."""
 
+import itertools
 import struct
 import zlib
 from pathlib import Path
@@ -49,71 +50,13 @@ def read_spz(file: Path, *, turned: bool = True) -> Splats:
     """
     contents = file.read_bytes()
     if contents.startswith(GZIP):
-        header, parts = _one_stream(file, _Gzip(file, contents))
+        header, body = _unzipped(file, contents)
     elif contents.startswith(MAGIC):
-        header = _header(file, contents[: HEADER.size])
-        if header.version == 4:
-            parts = _streams(file, header, contents)
-        else:
-            header, parts = _one_stream(file, _Plain(file, contents))
+        header, body = _header(file, contents[: HEADER.size]), contents[HEADER.size :]
     else:
         raise ImportFailed(file, "isn't an SPZ file: it begins neither as gzip nor with NGSP")
+    parts = _streams(file, header, contents) if header.version == 4 else _parts(file, header, body)
     return _decoded(file, header, parts, turned)
-
-
-class _Plain:
-    """Reads uncompressed bytes."""
-
-    def __init__(self, file: Path, contents: bytes) -> None:
-        self._file, self._contents, self._at = file, contents, 0
-
-    def possible(self) -> int:
-        """The largest possible number of bytes."""
-        return len(self._contents)
-
-    def take(self, count: int, what: str) -> bytes:
-        found = self._contents[self._at : self._at + count]
-        self._at += len(found)
-        if len(found) < count:
-            raise cut_off(self._file, what, count, len(found))
-        return found
-
-    def finish(self) -> None:
-        """Check the end of the stream: there is nothing to check."""
-
-
-class _Gzip:
-    """Reads a gzip stream, and decompresses only the bytes that are asked for."""
-
-    def __init__(self, file: Path, contents: bytes) -> None:
-        self._file, self._packed, self._unpacker = file, contents, zlib.decompressobj(wbits=31)
-
-    def possible(self) -> int:
-        return DEFLATE_LIMIT * len(self._packed)
-
-    def take(self, count: int, what: str) -> bytes:
-        found = bytearray()
-        try:
-            while len(found) < count and not self._unpacker.eof:
-                piece = self._unpacker.decompress(self._packed, count - len(found))
-                self._packed = self._unpacker.unconsumed_tail
-                if not piece and not self._packed:
-                    break
-                found += piece
-        except zlib.error as error:
-            raise ImportFailed(self._file, f"has a damaged gzip stream: {error}") from error
-        if len(found) < count:
-            raise cut_off(self._file, what, count, len(found))
-        return bytes(found)
-
-    def finish(self) -> None:
-        """Check that the end of the stream, which has its checksum, exists; more data may come before it."""
-        try:
-            more = self._unpacker.decompress(self._packed, 1)
-        except zlib.error as error:
-            raise ImportFailed(self._file, f"has a damaged gzip stream: {error}") from error
-        if not more and not self._unpacker.eof:
-            raise ImportFailed(self._file, "is cut off: its gzip stream has no end")
 
 
 def _header(file: Path, start: bytes) -> Header:
@@ -131,19 +74,35 @@ def _header(file: Path, start: bytes) -> Header:
     return Header(version, count, sh_degree, fractional_bits, flags, streams)
 
 
-def _one_stream(file: Path, stream: _Plain | _Gzip) -> tuple[Header, list[bytes]]:
-    header = _header(file, stream.take(HEADER.size, "the header"))
-    if header.version == 4:
-        raise ImportFailed(file, "is SPZ version 4 inside gzip, but version 4 has its own streams")
-    if sum(header.sizes) > stream.possible():
-        raise cut_off(file, f"{header.count:,} Gaussians", sum(header.sizes), stream.possible())
-    parts = [stream.take(size, f"{header.count:,} Gaussians") for size in header.sizes]
-    stream.finish()
-    return header, parts
+def _unzipped(file: Path, contents: bytes) -> tuple[Header, bytes]:
+    """Decompress the header, and then as many bytes as it states."""
+    unpacker = zlib.decompressobj(wbits=31)
+    try:
+        header = _header(file, unpacker.decompress(contents, HEADER.size))
+        if header.version == 4:
+            raise ImportFailed(file, "is SPZ version 4 inside gzip, but version 4 has its own streams")
+        needed, possible = sum(header.sizes), DEFLATE_LIMIT * len(contents)
+        if needed > possible:
+            raise cut_off(file, f"{header.count:,} Gaussians", needed, possible)
+        body = unpacker.decompress(unpacker.unconsumed_tail, needed) if needed else b""
+        more = len(body) < needed or unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum at the end
+    except zlib.error as error:
+        raise ImportFailed(file, f"has a damaged gzip stream: {error}") from error
+    if not more and not unpacker.eof:
+        raise ImportFailed(file, "is cut off: its gzip stream has no end")
+    return header, body
+
+
+def _parts(file: Path, header: Header, body: bytes) -> list[bytes]:
+    """The parts of versions 2 and 3, one after the other."""
+    if len(body) < sum(header.sizes):
+        raise cut_off(file, f"{header.count:,} Gaussians", sum(header.sizes), len(body))
+    ends = list(itertools.accumulate(header.sizes))
+    return [body[end - size : end] for end, size in zip(ends, header.sizes, strict=True)]
 
 
 def _streams(file: Path, header: Header, contents: bytes) -> list[bytes]:
-    """The parts of version 4: a header of 32 bytes with the offset of a table, two sizes per stream, then the streams."""
+    """The parts of version 4: a header of 32 bytes with the offset of a table of sizes, the table, the streams."""
     if len(contents) < 32:
         raise cut_off(file, "the header", 32, len(contents))
     (table,) = struct.unpack_from("<I", contents, 16)
