@@ -10,9 +10,10 @@ import tyro
 from rich.console import Console
 
 from benchmarks.measuring import machine
-from export.exporters.command import LOSSY, Settings, convert
+from export.exporters.command import LOSSY, convert
 from export.exporters.round_trip import RoundTrip, require
 from export.importers import read_splats
+from export.options import ConvertOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 
@@ -41,7 +42,7 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
         with tempfile.TemporaryDirectory() as folder:
             for suffix in WRITTEN:
                 ours, theirs = Path(folder) / f"ours{suffix}", Path(folder) / f"theirs{suffix}.ply"
-                convert(Settings(scene, ours, t0, 1, None), Console(quiet=True))
+                convert(ConvertOptions(scene, ours, t0), Console(quiet=True))
                 turn = TURN if suffix == ".spz" else []
                 subprocess.run(["npx", "--yes", package, "-w", ours, *turn, theirs], check=True, capture_output=True)
                 read = read_splats(theirs)

@@ -1,7 +1,6 @@
 """The conversion of a scene file, as `convert.py` runs it."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
 from export.importers.sequence import is_switched, of_the_moment
 from export.importers.splats.formats import read_splats
+from export.options import ConvertOptions
 from export.plans.registry import PLANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
@@ -34,38 +34,23 @@ COMPARED = 5
 """Number of times at which a moving scene is compared."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Options of the command line."""
-
-    scene: Path
-    out: Path
-    t: float | None
-    frames: int
-    min_psnr: float | None  # dB
-
-    def require(self, psnr: float, default: float, what: str) -> None:
-        """Raise `ConversionFailed` if `psnr` is below the option, or else the default."""
-        require(psnr, default if self.min_psnr is None else self.min_psnr, what)
-
-
-def convert(settings: Settings, console: Console) -> None:
+def convert(options: ConvertOptions, console: Console) -> None:
     """Write, read back, compare. Raises `InvalidInput`, `SceneFileInvalid` and `ConversionFailed`; a file below the
     minimum PSNR doesn't replace an old one."""
-    out = settings.out
+    out = options.out
     if out.suffix in VIDEOS:
-        raise InvalidInput("out", f"other than a video: msdgs-render {settings.scene} {out} writes one", out.name)
-    session = DeformationSession(settings.scene)
+        raise InvalidInput("out", f"other than a video: msdgs-render {options.scene} {out} writes one", out.name)
+    session = DeformationSession(options.scene)
     if out.name.endswith(VISIONARY):
-        written = _visionary(session, settings, console)
+        written = _visionary(session, options, console)
     elif out.suffix in USD:
-        written = _usd(session, settings, console)
+        written = _usd(session, options, console)
     elif out.suffix in SINGLE:
         t0, _ = session.scene.metadata.time_range
-        worst = _one(session, settings, out, t0 if settings.t is None else settings.t)
+        worst = _one(session, options, out, t0 if options.t is None else options.t)
         written = f"{_megabytes(out)}, {worst:.1f} dB"
     elif not out.suffix:
-        written = _sequence(session, settings, console)
+        written = _sequence(session, options, console)
     else:
         raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD))} or {VISIONARY}", out.name)
     console.print(f"{out}: {written} against the scene", markup=False)
@@ -75,7 +60,7 @@ def convert(settings: Settings, console: Console) -> None:
         console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
 
 
-def _one(session: DeformationSession, settings: Settings, file: Path, t: float) -> float:
+def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: float) -> float:
     """Write a file of one time; returns its PSNR against the scene, dB."""
     metadata = session.scene.metadata
     gaussians = of_the_moment(session.gaussians(t), metadata.plan)
@@ -86,34 +71,34 @@ def _one(session: DeformationSession, settings: Settings, file: Path, t: float) 
             (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
         psnr = RoundTrip(session).psnr(written, t)
-        settings.require(psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
+        _require(options, psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
     return psnr
 
 
-def _sequence(session: DeformationSession, settings: Settings, console: Console) -> str:
+def _sequence(session: DeformationSession, options: ConvertOptions, console: Console) -> str:
     """Write a folder of PLY files."""
-    if settings.t is not None:
-        raise InvalidInput("t", "left out for a folder; --frames is the number of files", settings.t)
-    out, times = settings.out, _times(session, settings)
+    if options.t is not None:
+        raise InvalidInput("t", "left out for a folder; --frames is the number of files", options.t)
+    out, times = options.out, _times(session, options)
     out.mkdir(parents=True, exist_ok=True)
     if any(each.suffix == ".ply" for each in out.iterdir()):
         raise InvalidInput("out", "a folder without PLY files", str(out))
     digits = len(str(len(times) - 1))
     worst = min(
-        _one(session, settings, out / f"{settings.scene.stem}_{number:0{digits}}.ply", t)
+        _one(session, options, out / f"{options.scene.stem}_{number:0{digits}}.ply", t)
         for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
     )
     return f"{len(times)} files, the worst {worst:.1f} dB"
 
 
-def _usd(session: DeformationSession, settings: Settings, console: Console) -> str:
+def _usd(session: DeformationSession, options: ConvertOptions, console: Console) -> str:
     """Write the scene's whole time range, or one time."""
-    out, metadata = settings.out, session.scene.metadata
-    moves = session.scene.moving_count and settings.t is None
+    out, metadata = options.out, session.scene.metadata
+    moves = session.scene.moving_count and options.t is None
     if moves and is_switched(metadata.plan):
         raise InvalidInput("t", "given: frames of this scene are switched, and USD would blend them", "nothing")
-    single = metadata.time_range[0] if settings.t is None else settings.t
-    times = _times(session, settings) if moves else [single]
+    single = metadata.time_range[0] if options.t is None else options.t
+    times = _times(session, options) if moves else [single]
     check = RoundTrip(session)
     with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
         task = progress.add_task("writing frames", total=len(times))
@@ -126,26 +111,26 @@ def _usd(session: DeformationSession, settings: Settings, console: Console) -> s
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
         worst = min(check.psnr(shown(number), times[number]) for number in compared)
-        settings.require(worst, LOSSLESS, out.name)
+        _require(options, worst, LOSSLESS, out.name)
     return f"{len(times)} frames, {_megabytes(out)}, {worst:.1f} dB"
 
 
-def _times(session: DeformationSession, settings: Settings) -> list[float]:
-    if settings.frames < 2:
-        raise InvalidInput("frames", "2 or more", settings.frames)
-    return np.linspace(*session.scene.metadata.time_range, settings.frames).tolist()
+def _times(session: DeformationSession, options: ConvertOptions) -> list[float]:
+    if options.frames < 2:
+        raise InvalidInput("frames", "2 or more", options.frames)
+    return np.linspace(*session.scene.metadata.time_range, options.frames).tolist()
 
 
-def _visionary(session: DeformationSession, settings: Settings, console: Console) -> str:
+def _visionary(session: DeformationSession, options: ConvertOptions, console: Console) -> str:
     """Write a model for Visionary, and the scene.json of its editor."""
-    out, metadata = settings.out, session.scene.metadata
-    model, check = visionary_model(settings.scene), RoundTrip(session, mip=False)
+    out, metadata = options.out, session.scene.metadata
+    model, check = visionary_model(options.scene), RoundTrip(session, mip=False)
     times = np.linspace(*metadata.time_range, COMPARED if session.scene.moving_count else 1).astype(np.float32)
     with replacing(out) as temporary:
         temporary.write_bytes(model.SerializeToString())
         shown = visionary_of(temporary)
         worst = min(check.psnr(shown(t), t) for t in times.tolist())
-        settings.require(worst, LOSSY, out.name)
+        _require(options, worst, LOSSY, out.name)
     scene_json = out.with_name(f"{out.name.removesuffix(VISIONARY)}.scene.json")
     write_text(scene_json, json.dumps(visionary_scene(out.name, metadata), indent=2) + "\n")
     console.print(f"{scene_json}: the scene.json of a folder for Visionary's editor", markup=False)
@@ -155,6 +140,10 @@ def _visionary(session: DeformationSession, settings: Settings, console: Console
     if session.scene.moving_count and plan is not None and not plan.fitted:
         console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a faster scene")
     return f"{_megabytes(out)}, {worst:.1f} dB"
+
+
+def _require(options: ConvertOptions, psnr: float, default: float, what: str) -> None:
+    require(psnr, default if options.min_psnr is None else options.min_psnr, what)
 
 
 def _megabytes(file: Path) -> str:

@@ -63,20 +63,16 @@ def _camera(stored: dict) -> Camera:
 
 
 def _around(info: SceneInfo, cameras: Sequence[tuple[str, Camera]]) -> list[tuple[str, Camera]]:
+    """Cameras on a circle around the scene that are like the first of `cameras`, if there is one."""
     low, high = np.array(info.bounds, float)
     center, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    like, distance = Camera.from_fov(np.eye(4), ADDED_SIZE, ADDED_SIZE, ADDED_FOV), 2.5 * reach
     up = np.array([0.0, 0.0, 1.0])
-    distance, like = 2.5 * reach, None
     if cameras:
         like = cameras[0][1]
         distance = max(float(np.linalg.norm(like.position - center)), 1e-3 * reach)
         up = -like.camera_to_world[:3, 1]
-    added = []
-    for i in range(ADDED_CAMERAS):
-        pose = orbit(center, distance, 360 * i / ADDED_CAMERAS, ADDED_ELEVATION if i % 2 else 0.0, up)
-        if like is None:
-            camera = Camera.from_fov(pose, ADDED_SIZE, ADDED_SIZE, ADDED_FOV)
-        else:
-            camera = Camera(like.fx, like.fy, like.cx, like.cy, like.width, like.height, pose)
-        added.append((f"added {i}", camera))
-    return added
+    elevations = (ADDED_ELEVATION if i % 2 else 0.0 for i in range(ADDED_CAMERAS))
+    poses = [orbit(center, distance, 360 * i / ADDED_CAMERAS, e, up) for i, e in enumerate(elevations)]
+    intrinsics = like.fx, like.fy, like.cx, like.cy, like.width, like.height
+    return [(f"added {i}", Camera(*intrinsics, pose)) for i, pose in enumerate(poses)]

@@ -15,7 +15,7 @@ from onnx import TensorProto, numpy_helper
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from export.exporters.command import LOSSLESS, LOSSY, Settings, convert
+from export.exporters.command import LOSSLESS, LOSSY, convert
 from export.exporters.gltf import EXTENSION, read_gltf
 from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
@@ -23,6 +23,7 @@ from export.exporters.visionary import visionary_model
 from export.importers import read_splats
 from export.importers.sequence import read_sequence, sequence_scene
 from export.jobs.bake import bake
+from export.options import ConvertOptions
 from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
@@ -45,7 +46,7 @@ def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
 
 
 def run(scene: Path, out: Path, t: float | None = None, frames: int = 30, min_psnr: float | None = None) -> None:
-    convert(Settings(scene, out, t, frames, min_psnr), QUIET)
+    convert(ConvertOptions(scene, out, t, frames, min_psnr), QUIET)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -111,7 +112,7 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
 def test_who_converts_is_told_how_others_draw_it(tmp_path: Path, eps2d: float, said: str):
     printed = StringIO()
     scene = scene_file(tmp_path, eps2d=eps2d)
-    convert(Settings(scene, tmp_path / "a.ply", 0.0, 30, None), Console(file=printed, soft_wrap=True))
+    convert(ConvertOptions(scene, tmp_path / "a.ply", 0.0, 30, None), Console(file=printed, soft_wrap=True))
     assert ("draw it" in printed.getvalue()) == bool(said)
     assert said in printed.getvalue()
 
