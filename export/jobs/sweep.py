@@ -3,7 +3,7 @@ rest is measured in full."""
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -79,17 +79,17 @@ class Sweep:
         self._reachable(self.baseline)
         # the mildest pruning that removes anything: plans are then fitted to moving Gaussians only
         mildest = next((level for level in levels if self.job.pruned(level).left_out), None)
-        self._tell("candidates: fitted plans", [(self._estimate, (text, mildest)) for text in self._texts(fitted=True)])
-        self._tell("candidates: network", [(self._estimate, (BASELINE, level)) for level in levels])
-        self._tell("candidates: other plans", [(self._estimate, (text, mildest)) for text in self._texts(fitted=False)])
+        self._estimate_all("fitted plans", [(text, mildest) for text in self._texts(fitted=True)])
+        self._estimate_all("network", [(BASELINE, level) for level in levels])
+        self._estimate_all("other plans", [(text, mildest) for text in self._texts(fitted=False)])
         unvaried = [estimate for estimate in self.estimates if estimate.candidate.pruning_db == mildest]
         pairs = [pair for level in levels if level != mildest for pair in self._pairs(unvaried, level)]
-        self._tell("candidates: plans with pruning", [(self._estimate, pair) for pair in pairs])
-        self._tell("candidates: SH degree", [(self._estimate, what) for what in self._degrees()])
+        self._estimate_all("plans with pruning", pairs)
+        self._estimate_all("SH degree", self._degrees())
         return self._measured()
 
     def _texts(self, fitted: bool) -> list[str]:
-        """Candidates that the plans propose for this model."""
+        """The names that the plans propose for this model."""
         plans = [plan for plan in PLANS.values() if plan.fitted == fitted]
         return [text for plan in plans for text in plan.candidates(len(self.job.model.deformation))]
 
@@ -113,6 +113,13 @@ class Sweep:
         candidate.close()
         self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst))
         return self.estimates[-1]
+
+    def _estimate_all(self, what: str, candidates: Sequence[tuple]) -> None:
+        """Estimate candidates, given as the arguments of `_estimate`."""
+        on_estimate = self.job.progress(f"candidates: {what}", len(candidates))
+        for candidate in candidates:
+            self._estimate(*candidate)
+            on_estimate()
 
     def _too_expensive(self, plan: str, pruning_db: float | None) -> str | None:
         """Why a plan that runs layers isn't tried; None if it is."""
@@ -207,9 +214,3 @@ class Sweep:
 
     def _images_psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
         return self.images.psnr(pose, options) if self.images else None
-
-    def _tell(self, what: str, calls: list[tuple[Callable[..., object], tuple]]) -> None:
-        on_call = self.job.progress(what, len(calls))
-        for function, arguments in calls:
-            function(*arguments)
-            on_call()

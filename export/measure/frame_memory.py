@@ -1,6 +1,6 @@
 """Memory of one frame of a scene file, measured in a process that loads only what serving needs.
 
-`frame_memory` runs this file as that process: it reads a request on standard input and prints a list of bytes.
+`frame_memory` runs this module as that process, which reads a request on standard input and prints a list of bytes.
 """
 
 import gc
@@ -11,10 +11,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-if __name__ == "__main__":
-    folder = Path(__file__).resolve().parent
-    sys.path[:] = [str(folder.parents[1]), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained, rasterize
@@ -28,10 +24,15 @@ EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALL
 
 def frame_memory(paths: Sequence[Path], view: SceneCamera) -> list[int | None]:
     """Peak bytes of loading each file and drawing one of its frames, above the memory of the process before."""
-    request = {"paths": [str(path) for path in paths], "view": view.to_plain()}
-    command = [sys.executable, str(Path(__file__).resolve())]
+    request = {"paths": [str(path.resolve()) for path in paths], "view": view.to_plain()}
     done = subprocess.run(
-        command, input=json.dumps(request), env=os.environ | EAGER, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "export.measure.frame_memory"],
+        input=json.dumps(request),
+        cwd=Path(__file__).resolve().parents[2],
+        env=os.environ | EAGER,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     return json.loads(done.stdout) if done.returncode == 0 else [None] * len(paths)
 
