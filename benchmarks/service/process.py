@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,18 +95,22 @@ class Running(NamedTuple):
         return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
-@contextmanager
-def service(*scenes: Path, **flags: Any) -> Iterator[Running]:
+def service(*scenes: Path, **flags: Any) -> AbstractContextManager[Running]:
     """Run `msdgs-serve` with these scenes; `flag=value` stands for `--flag value`, `flag=True` for `--flag`."""
     port = free_port()
     options = [
         text for name, value in flags.items()
         for text in (f"--{name.replace('_', '-')}", *([] if value is True else [str(value)]))
     ]  # fmt: skip
-    command = [sys.executable, "-c", PROGRAM, *map(str, scenes), "--port", str(port), *options]
+    return _running([sys.executable, "-c", PROGRAM, *map(str, scenes), "--port", str(port), *options], port)
+
+
+@contextmanager
+def _running(command: Sequence[str], port: int) -> Iterator[Running]:
+    """A process that is ready at a port, terminated at the end of the block."""
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        running = Running(port, process)
         try:
+            running = Running(port, process)
             wait_until_ready(running)
             yield running
         finally:
@@ -127,7 +131,7 @@ def wait_until_ready(running: Running) -> None:
 
 @contextmanager
 def proxy(running: Sequence[Running], work: Path) -> Iterator[int]:
-    """The port of nginx with docker/'s settings before these services; it needs `nginx` (Debian: nginx-light)."""
+    """The port of nginx with docker/'s settings in front of these services; needs `nginx` (Debian: nginx-light)."""
     program = shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin")
     if program is None:
         raise SystemExit("nginx is not installed; on Debian: apt-get install nginx-light")
@@ -138,13 +142,8 @@ def proxy(running: Sequence[Running], work: Path) -> Iterator[int]:
     (folder / "replicas.conf").write_text("".join(f"server 127.0.0.1:{each.port} max_fails=0;\n" for each in running))
     user = "user root;" if os.geteuid() == 0 else ""  # or the worker couldn't enter `work`
     command = [program, "-c", str(folder / "nginx.conf"), "-g", f"daemon off; {user}"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        try:
-            wait_until_ready(Running(port, process))
-            yield port
-        finally:
-            process.terminate()
-            process.wait()
+    with _running(command, port):
+        yield port
 
 
 def make_scenes(folder: Path, scene: Path) -> Path:
