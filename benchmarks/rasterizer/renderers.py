@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 import OpenImageIO as oiio
@@ -104,17 +104,25 @@ def in_a_process(
     name: str, python: Path | str, case: Case, file: Path, checkout: Path | None = None
 ) -> Iterator[Renderer]:
     """F3D, Open3D or a checkout of this project, which draws `file` through renderer_worker.py."""
+    camera, pose = case.camera, case.camera.camera_to_world
     with tempfile.TemporaryDirectory() as temporary, tempfile.TemporaryFile("w+") as errors:
         image = Path(temporary, "frame.npy" if checkout else "frame.png")
-        job = {"renderer": "msdgs" if checkout else name, "file": str(file), "image": str(image), **_view(case)}
+        job = {
+            "renderer": "msdgs" if checkout else name,
+            "file": str(file),
+            "image": str(image),
+            "size": [camera.width, camera.height],
+            "position": pose[:3, 3].tolist(),
+            "focal_point": (pose[:3, 3] + pose[:3, 2]).tolist(),
+            "view_up": (-pose[:3, 1]).tolist(),
+            "view_angle": float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
+        }
         process = subprocess.Popen(
             [str(python), str(WORKER), json.dumps(job)],
             env={**os.environ, "PYTHONPATH": str(checkout)} if checkout else None,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
         )  # fmt: skip
-        assert process.stdin
-        assert process.stdout
-        orders, answers = process.stdin, process.stdout
+        orders, answers = cast(IO[str], process.stdin), cast(IO[str], process.stdout)
 
         def ask(order: str, key: str) -> Any:
             with contextlib.suppress(BrokenPipeError):  # its standard error has the reason
@@ -137,17 +145,6 @@ def in_a_process(
             process.communicate()
 
 
-def _view(case: Case) -> dict[str, Any]:
-    camera, pose = case.camera, case.camera.camera_to_world
-    return {
-        "size": [camera.width, camera.height],
-        "position": pose[:3, 3].tolist(),
-        "focal_point": (pose[:3, 3] + pose[:3, 2]).tolist(),
-        "view_up": (-pose[:3, 1]).tolist(),
-        "view_angle": float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
-    }
-
-
 def in_turns(renderers: dict[str, Renderer], repeats: int) -> dict[str, Times]:
     """Each renderer draws the case for a while, in alternating order; the first turn loads and compiles."""
     times: dict[str, Times] = {}
@@ -161,8 +158,8 @@ def in_turns(renderers: dict[str, Renderer], repeats: int) -> dict[str, Times]:
     return times
 
 
-def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterator[dict[str, Any]]:
-    """Rows of one case: this rasterizer, then the others."""
+def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterator[list[str]]:
+    """Rows of the table for one case: this rasterizer, then the others."""
     pythons = {"F3D": options.f3d_python, "Open3D": options.open3d_python}
     checkouts = {"this checkout": ROOT, "the other": options.against.resolve()} if options.against else {}
     with contextlib.ExitStack() as stack:
@@ -182,19 +179,18 @@ def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterat
 
 def _rows(
     case: Case, others: dict[str, Renderer], repeats: int, alpha_min: float = GSPLAT.alpha_min
-) -> Iterator[dict[str, Any]]:
-    if not others:
-        return
-    times = in_turns({"msdgs": ours(case), **others}, repeats)
+) -> Iterator[list[str]]:
+    times = in_turns({"msdgs": ours(case), **others}, repeats) if others else {}
     for name, taken in times.items():
-        base = "this checkout" if name == "the other" else "msdgs"
-        ratio = taken.minimum("total") / times[base].minimum("total")
-        row = {"name": name, "case": case, "milliseconds": taken.milliseconds(), "ratio": ratio}
+        base, milliseconds = times["this checkout" if name == "the other" else "msdgs"], taken.milliseconds()
+        ratio, title, agreement = f"{taken.minimum('total') / base.minimum('total'):.2f}", name, ""
+        cells = [minimum_and_median(milliseconds[stage]) if stage in milliseconds else "" for stage in STAGES]
         if name in others:
             nearest = NEAREST.get(name, GSPLAT)._replace(alpha_min=alpha_min)
-            image = rasterize(case.gaussians, case.camera, options=nearest).rgb
-            row |= {"psnr": psnr(image, others[name].image()), "name": f"{name} {others[name].version}".strip()}
-        yield row
+            db = psnr(rasterize(case.gaussians, case.camera, options=nearest).rgb, others[name].image())
+            title = f"{name} {others[name].version}".strip()
+            agreement = "same" if db == float("inf") else f"{db:.1f} dB"
+        yield [title, case.title(), case.size(), *cells, ratio, agreement]
 
 
 def main(options: Compare) -> int:
@@ -208,13 +204,10 @@ def main(options: Compare) -> int:
         raise SystemExit("nothing to compare with: --avx512, --against, --f3d-python or --open3d-python")
     if options.avx512 and (reason := why_not()):
         raise SystemExit(f"the renderer for AVX-512 can't run: {reason}")
-    with Avx512Renderer() if options.avx512 else contextlib.nullcontext() as hand:
-        rows = [row for case in cases for row in rows_of(case, options, hand)]
     made = table("Milliseconds, minimum (median)", "renderer", "scene", "size", *STAGES, "× ours", "PSNR to ours")
-    for row in rows:
-        cells = [minimum_and_median(row["milliseconds"][n]) if n in row["milliseconds"] else "" for n in STAGES]
-        agreement = ("same" if row["psnr"] == float("inf") else f"{row['psnr']:.1f} dB") if "psnr" in row else ""
-        made.add_row(row["name"], row["case"].title(), row["case"].size(), *cells, f"{row['ratio']:.2f}", agreement)
+    with Avx512Renderer() if options.avx512 else contextlib.nullcontext() as hand:
+        for row in (row for case in cases for row in rows_of(case, options, hand)):
+            made.add_row(*row)
     report_console().print(machine(), made)
     return 0
 
@@ -223,9 +216,8 @@ def check() -> int:
     """Compare this checkout with itself: the images are bit-identical."""
     options = Compare((300,), ("64x48",), repeats=1, against=ROOT, avx512=why_not() is None)
     (case,) = seeded_cases(options.counts, options.sizes, 0)
-    rows = {row["name"].split(" /")[0]: row for row in rows_of(case, options, None)}
-    assert {"msdgs", "this checkout", "the other"} == set(rows)
-    assert rows["the other"]["psnr"] == rows["this checkout"]["psnr"] == float("inf")
+    agreement = {row[0].split(" /")[0]: row[-1] for row in rows_of(case, options, None)}
+    assert agreement == {"msdgs": "", "this checkout": "same", "the other": "same"}
     return main(options)
 
 
