@@ -41,7 +41,7 @@ def main(
     The exit status is 1 if a file can't be imported or its frame is empty.
 
     Args:
-        inputs: Files and folders; of a folder that is no scene itself, everything that is recognised.
+        inputs: Files and folders; of a folder that is no scene itself, everything that is recognized.
         output: The image to write.
         size: Width and height of each frame in pixels.
         check: Test this benchmark on two small files.

@@ -29,7 +29,7 @@ from benchmarks.service.process import Answer, Connection, Running, make_scenes,
 from benchmarks.service.requests import Offline, Wanted, digest, images, mixed
 from tests.support.scene_files import write_scene
 
-CLIENTS, NEIGHBOURS = 16, 8
+CLIENTS, NEIGHBORS = 16, 8
 CATALOGUE, BATCH, BATCH_BESIDE, FILM = 48, 12, 200, 8
 COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 MOST_WAIT = 5.0
@@ -94,22 +94,22 @@ def shares(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
     p99 = {path: 1000 * float(np.quantile(took, 0.99)) for path, took in times.items()}
     ratio = p99["/render/batch"] / p99["/render"]
     measured = f"{ratio:.2f}: {p99['/render/batch']:.0f} and {p99['/render']:.0f} ms, of {[*map(len, times.values())]}"
-    what = f"a frame's p99 beside {NEIGHBOURS} clients of batches, relative to {NEIGHBOURS} clients of frames"
+    what = f"a frame's p99 beside {NEIGHBORS} clients of batches, relative to {NEIGHBORS} clients of frames"
     yield Row(what, "<= 3", measured, ratio <= 3)
 
 
 def _beside(running: list[Running], seconds: float, frame: Any, path: str, body: Any) -> list[float]:
-    """Seconds of each frame of one client while its neighbours call without a pause."""
+    """Seconds of each frame of one client while its neighbors call without a pause."""
     stop, took = threading.Event(), list[float]()
 
-    def neighbour(number: int) -> None:
+    def neighbor(number: int) -> None:
         client = Client(number, running[0].port)
         while not stop.is_set():
             client.post(path, body)
         client.close()
 
-    with ThreadPoolExecutor(NEIGHBOURS) as pool:
-        asked = [pool.submit(neighbour, number) for number in range(1, NEIGHBOURS + 1)]
+    with ThreadPoolExecutor(NEIGHBORS) as pool:
+        asked = [pool.submit(neighbor, number) for number in range(1, NEIGHBORS + 1)]
         client, ends = Client(0, running[0].port), time.monotonic() + seconds
         time.sleep(min(2.0, seconds / 5))
         while time.monotonic() < ends:

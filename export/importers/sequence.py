@@ -132,12 +132,12 @@ def _why_not_blended(frames: tuple[Gaussians, ...], dropped: bool) -> str | None
             if np.abs(getattr(frame, name) - getattr(first, name)).max() > CONSTANT:
                 return f"{name} change, by frame {number}, and a scene file holds them as constants"
     for number in range(len(frames) - 1):
-        if not _neighbours_stay(frames[number].means, frames[number + 1].means):
+        if not _neighbors_stay(frames[number].means, frames[number + 1].means):
             return f"the n-th Gaussian of frame {number} isn't the n-th of the next"
     return None
 
 
-def _neighbours_stay(now: np.ndarray, later: np.ndarray) -> bool:
+def _neighbors_stay(now: np.ndarray, later: np.ndarray) -> bool:
     """Whether neighbors stay neighbors in the next frame, which they don't if Gaussians are reordered."""
     if len(now) < 2:
         return True

@@ -126,7 +126,7 @@ def times_to_verify(t0: float, t1: float, count: int) -> list[float]:
     golden = (math.sqrt(5) - 1) / 2
     inner = sorted((i * golden) % 1 for i in range(1, count - 1))
     times = [t0 + (t1 - t0) * f for f in [0.0, *inner, 1.0]]
-    # t0 and t1 themselves are kept: their float32 neighbours may lie outside the range
+    # t0 and t1 themselves are kept: their float32 neighbors may lie outside the range
     return [t0, *(float(np.float32(t)) for t in times[1:-1]), t1]
 
 

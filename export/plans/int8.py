@@ -46,8 +46,8 @@ def int8(baked: Baked) -> onnx.ModelProto:
             weight_type=QuantType.QInt8,
             calibrate_method=CalibrationMethod.MinMax,
         )
-        quantised = onnx.load(path)
-    return _plain(quantised)
+        quantized = onnx.load(path)
+    return _plain(quantized)
 
 
 def _plain(model: onnx.ModelProto) -> onnx.ModelProto:

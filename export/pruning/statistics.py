@@ -167,9 +167,9 @@ def blending_weights(gaussians: Gaussians, view: View, options: RasterizerOption
     means, quats, scales, opacities = (
         torch.from_numpy(array) for array in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     )
-    grey = torch.zeros(len(means), 1, 3, requires_grad=True)
-    rgb, _, _ = rasterize(means, quats, scales, opacities, grey, view.camera, torch.zeros(3), options)
-    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), grey)
+    gray = torch.zeros(len(means), 1, 3, requires_grad=True)
+    rgb, _, _ = rasterize(means, quats, scales, opacities, gray, view.camera, torch.zeros(3), options)
+    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), gray)
     return (gradient[:, 0, 0] / SH_C0).numpy()
 
 

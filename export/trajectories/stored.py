@@ -72,12 +72,12 @@ def at_time(graph: GraphBuilder, poses: GriddedPoses, time_range: tuple[float, f
     """
     counts = [stored.points.shape[1] for _, stored in poses.grids]
     cells, weights = time_weights(graph, "poses.clock", time_range, counts)
-    neighbours = graph.constant("poses.neighbours", np.arange(4, dtype=np.int64))
+    neighbors = graph.constant("poses.neighbours", np.arange(4, dtype=np.int64))
     shape = graph.constant("poses.shape", np.array([-1, POSE], np.int64))
     parts = []
     for g, (_, stored) in enumerate(poses.grids):
         name, which = f"poses.grid{g}", graph.constant(f"poses.grid{g}.which", np.array([g], np.int64))
-        times = graph.node("Add", [graph.node("Gather", [cells, which], f"{name}.cell"), neighbours], f"{name}.times")
+        times = graph.node("Add", [graph.node("Gather", [cells, which], f"{name}.cell"), neighbors], f"{name}.times")
         points = stored.points.transpose(1, 0, 2).reshape(counts[g], -1)
         near = graph.node("Gather", [graph.constant(f"{name}.points", points), times], f"{name}.near")
         near = graph.node("Cast", [near], f"{name}.float", to=TensorProto.FLOAT)  # [4, M · 10]
