@@ -94,10 +94,7 @@ def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:
 def posed(sequence: Frames, number: int) -> Gaussians:
     """The Gaussians of one frame in the order of the scene, without those of other frames if they are switched."""
     g = sequence.gaussians[number]
-    if not sequence.blended:
-        return g
-    order = np.concatenate(_parts(sequence))
-    return Gaussians(g.means[order], g.quats[order], g.scales[order], g.opacities[order], g.sh[order])
+    return _rows(g, np.concatenate(_parts(sequence))) if sequence.blended else g
 
 
 def shown_rows(sequence: Frames, number: int) -> slice:
@@ -117,8 +114,11 @@ def of_the_moment(gaussians: Gaussians, plan: str) -> Gaussians:
     """The Gaussians of the frame that is shown, without those of other frames in a scene of the plan `frames:n`."""
     if not is_switched(plan):
         return gaussians
-    here = np.flatnonzero((gaussians.scales > MIN_SCALE).any(axis=1))
-    return Gaussians(*(getattr(gaussians, part)[here] for part in ("means", "quats", "scales", "opacities", "sh")))
+    return _rows(gaussians, np.flatnonzero((gaussians.scales > MIN_SCALE).any(axis=1)))
+
+
+def _rows(gaussians: Gaussians, ids: np.ndarray) -> Gaussians:
+    return Gaussians(**{name: array[ids] for name, array in vars(gaussians).items()})
 
 
 def _why_not_blended(frames: tuple[Gaussians, ...], dropped: bool) -> str | None:
