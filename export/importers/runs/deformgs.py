@@ -102,6 +102,7 @@ def _fill(model: DynamicGaussians, state: State) -> None:
         _set(layer.time_hidden, torch.cat([eye, -eye]), torch.zeros(2 * features))
         _set(layer.time_output, torch.cat([eye, -eye], dim=1), torch.zeros(features))
     for i, linear in enumerate([layer.first, *layer.trunk]):
+        assert isinstance(linear, nn.Linear)
         state.fill(linear, f"linear.{i}")
         if i in (0, layer.skip):
             linear.weight[:, : len(inputs)] = linear.weight[:, inputs]
