@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullLocator
 
-from export.jobs.points import DEFAULT_RASTERIZER
+from export.jobs.sweep import DEFAULT_RASTERIZER
 from export.plans.registry import PLANS
 
 DB_STEP = 10

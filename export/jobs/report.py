@@ -8,8 +8,7 @@ from typing import Any
 
 from export.jobs.figure import draw
 from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, SELECTION_TIMES, ExportJob
-from export.jobs.points import DEFAULT_RASTERIZER, front
-from export.jobs.sweep import SweepResult
+from export.jobs.sweep import DEFAULT_RASTERIZER, SweepResult, front
 from export.measure.machine import processor
 from export.plans.base import BASELINE
 from msdgs_serve import __version__

@@ -4,14 +4,13 @@ rest is measured in full."""
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
-from export.jobs.points import DEFAULT_RASTERIZER, Point, QuickEstimate, choose
 from export.measure.frame_memory import frame_memory
 from export.measure.rendered_error import Pose, RenderedError
-from export.measure.timing import REPEATS, time_frame, time_frames
+from export.measure.timing import REPEATS, FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
 from msdgs_serve.rasterizer import RasterizerOptions
@@ -44,8 +43,90 @@ LOWER_DEGREES = 3
 
 TIMED_VIEWS = 3
 
+DEFAULT_RASTERIZER = "default"
 RASTERIZERS = {"alpha ≥ 2/255": {"alpha_min": 2 / 255}, "ends at 1 %": {"transmittance_min": 1e-2}}
-"""Tried on the chosen point, to show what they would gain."""
+"""Other rasterizer options, tried on the chosen point to show what they would gain."""
+
+
+@dataclass(frozen=True, eq=False)
+class QuickEstimate:
+    """A quick estimate of a candidate: the error of some of its frames, and the processor time of one.
+
+    Processor time is summed over threads; unlike elapsed time it hardly depends on other programs.
+    """
+
+    candidate: Candidate
+    cpu: float  # milliseconds per frame, the minimum of a few
+    cpu_deformation: float  # milliseconds of these
+    worst_db: float  # PSNR of the worst of these frames
+
+    def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
+        """Whether it is faster and has a smaller error than another, by more than the margins."""
+        faster = self.cpu * time_margin < other.cpu
+        return faster and self.worst_db > other.worst_db + db_margin
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        quick = {"cpu_milliseconds": self.cpu, "psnr_worst": self.worst_db}
+        return named(self.candidate, DEFAULT_RASTERIZER) | {"quick_estimate": quick}
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A candidate, measured in full."""
+
+    candidate: Candidate
+    rasterizer: str
+    time: FrameTime
+    error: RenderedError
+    memory: int | None  # bytes at the peak of a frame
+    images_psnr: float | None
+
+    @property
+    def milliseconds(self) -> float:
+        """Minimum over the repeats of a whole frame."""
+        return self.time.total.min
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        scene = self.candidate.session.scene
+        return named(self.candidate, self.rasterizer) | {
+            "moving": scene.moving_count,
+            "static": scene.static_count,
+            "layers": len(scene.metadata.layers),
+            "bytes": self.candidate.size,
+            "memory_bytes": self.memory,
+            "milliseconds": self.time.to_plain(),
+            "error": self.error.to_plain(),
+            "images_psnr": self.images_psnr,
+            "left_out": list(scene.metadata.left_out),
+        }
+
+
+def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
+    """The keys that identify a point."""
+    c = candidate
+    return {"plan": c.plan, "pruning_db": c.pruning_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
+
+
+def front(points: Sequence[Point]) -> list[int]:
+    """Indices of the points on the Pareto front of time and error, the fastest first.
+
+    Only those with default rasterizer options, since a file can't ask for others.
+    """
+    usual = [i for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
+    best, kept = -1.0, []
+    for i in sorted(usual, key=lambda i: (points[i].milliseconds, -points[i].error.psnr_worst)):
+        if points[i].error.psnr_worst > best:
+            best = points[i].error.psnr_worst
+            kept.append(i)
+    return kept
+
+
+def choose(points: Sequence[Point], min_psnr: float) -> int | None:
+    """The index of the fastest point whose worst frame is within `min_psnr` dB, which lies on the front."""
+    within = [i for i in front(points) if points[i].error.psnr_worst >= min_psnr]
+    return within[0] if within else None
 
 
 class SweepResult(NamedTuple):

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from export.jobs.job import ExportJob
-from export.jobs.points import DEFAULT_RASTERIZER, Point, QuickEstimate, choose, front
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.jobs.sweep import Sweep, SweepResult
+from export.jobs.sweep import DEFAULT_RASTERIZER, Point, QuickEstimate, Sweep, SweepResult, choose, front
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
 from export.options import ExportOptions
