@@ -10,10 +10,9 @@ import torch
 import tyro
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
-from benchmarks.measuring import machine
+from benchmarks.measuring import machine, report_console, table
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Budget, ComparedSystem, read_systems
 from msdgs_train.datasets.synthetic.motion import OBJECTS, world_positions
@@ -52,21 +51,20 @@ def main(
     """
     if check:
         return self_test()
-    console = Console(soft_wrap=True, highlight=False)
     try:
         known = read_systems(systems, Budget(steps))
     except InvalidInput as error:
-        console.print(f"error: {error}", style="red", markup=False)
+        report_console().print(f"error: {error}", style="red", markup=False)
         return 1
     torch.set_num_threads(1)
-    table = Table("system", *MOVING, "all", "± over seeds", box=None, title=f"1/1000 scene units, rms, {steps:,} steps")
+    made = table(f"RMS in 1/1000 scene units, {steps:,} steps", "system", *MOVING, "all", "± over seeds")
     moving = [system for system in known if system.config.model.layers]
     for system in track(moving, "systems", console=Console(stderr=True)):
         errors = np.array([errors_of(system, seed, points) for seed in seeds])
         overall = np.sqrt((errors**2).mean(axis=1))
         spread = statistics.stdev(overall) if len(seeds) > 1 else 0.0
-        table.add_row(system.name, *(f"{e:.1f}" for e in (*errors.mean(axis=0), overall.mean())), f"{spread:.1f}")
-    console.print(machine(), table)
+        made.add_row(system.name, *(f"{e:.1f}" for e in (*errors.mean(axis=0), overall.mean())), f"{spread:.1f}")
+    report_console().print(machine(), made)
     return 0
 
 
