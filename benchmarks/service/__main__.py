@@ -173,11 +173,10 @@ def main(scene: Path = SCENE, only: tuple[Part, ...] = (), minutes: float = 0.7,
         folder = make_scenes(Path(work) / "scenes", scene)
         settings = Settings(scene, folder, 60 * minutes, overload_seconds, Path(work))
         for name in only or PARTS:
-            started = time.monotonic()
+            print(f"{name}: {(PARTS[name].__doc__ or '').splitlines()[0]}", flush=True)
             for row in PARTS[name](settings):
                 rows.append(row)
                 print(f"  {row.what}: {row.measured} (bound: {row.bound})", flush=True)
-            print(f"{name}: {time.monotonic() - started:.0f} s", flush=True)
     return 0 if print_rows(rows) else 1
 
 
