@@ -179,7 +179,8 @@ def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
     baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving]), ())
     graph = new_graph(baked)
-    activated(graph, of_ids(graph, GriddedPoses.on_one(StoredPoses.of(control)), metadata.time_range))
+    stored = GriddedPoses(((np.arange(len(control)), StoredPoses.of(control)),))
+    activated(graph, of_ids(graph, stored, metadata.time_range))
     return finished(graph, baked, f"keyframes:{count + 2}")
 
 

@@ -50,11 +50,6 @@ class GriddedPoses:
 
     grids: tuple[tuple[npt.NDArray[np.int64], StoredPoses], ...]  # indices among the H, and their poses
 
-    @classmethod
-    def on_one(cls, stored: StoredPoses) -> "GriddedPoses":
-        """Poses on a single grid."""
-        return cls(((np.arange(len(stored.points)), stored),))
-
     def __len__(self) -> int:
         return sum(len(rows) for rows, _ in self.grids)
 
