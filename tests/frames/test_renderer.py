@@ -21,8 +21,8 @@ POSE_BYTES = 2 * 10 * 4  # two Gaussians: means, quats, scales
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> DeformationSession:
-    return DeformationSession(write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx"))
+def session(scene: Path) -> DeformationSession:
+    return DeformationSession(scene)
 
 
 def level_camera(width: int = SIZE, height: int = SIZE) -> Camera:

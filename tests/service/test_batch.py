@@ -13,9 +13,7 @@ import pytest
 from msdgs_serve.api.errors import MAX_BODY_BYTES
 from msdgs_serve.renderer import Renderer
 from tests.support.scene_files import write_scene
-from tests.support.service import serving
-
-FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
+from tests.support.service import FRAME, serving
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import asyncio
 import threading
 import weakref
 from collections.abc import AsyncGenerator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, aclosing
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from msdgs_serve.api.app import create_app
 from msdgs_serve.api.errors import Refused
 from msdgs_serve.api.routes import batch, video
 from msdgs_serve.api.schemas import VideoRequest
-from msdgs_serve.api.server import Server
 from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.turns import PART_TURN, Turns
@@ -25,11 +23,8 @@ from msdgs_serve.imaging import Image
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 from msdgs_serve.watch import Watch
-from tests.support.scene_files import write_scene
-from tests.support.service import in_this_process, serving
+from tests.support.service import FRAME, ORBIT, serving
 
-ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
-FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 MANY = 40
 
 
@@ -126,48 +121,6 @@ def test_parts_keep_their_place_until_the_call_and_its_work_have_ended(queue: Wo
     queue.shut_down()
     queue._executor.shutdown(wait=True)
     assert queue.waiting == queue.running == 0
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
-
-
-@in_this_process
-def test_one_client_cant_take_the_places_of_another(scene: Path):
-    """Addresses are those that a proxy on this machine names."""
-    renderer, entered, go_on = Renderer(), threading.Semaphore(0), threading.Event()
-    original = renderer.render
-
-    def render(*arguments: Any) -> Image:
-        if arguments[2] == 0.5:
-            entered.release()
-            assert go_on.wait(20)
-        return original(*arguments)
-
-    renderer.render = render  # pyright: ignore[reportAttributeAccessIssue]
-    servers: list[Server] = []
-    with (
-        serving(scene, renderer=renderer, server=servers, concurrent_renders=1, queued_renders=3) as client,
-        ThreadPoolExecutor(4) as pool,
-    ):
-
-        def ask(address: str, path: str = "/render", body: Any = FRAME) -> httpx.Response:
-            return client.post(path, json=body, headers={"X-Forwarded-For": address})
-
-        frames = [pool.submit(ask, "10.0.0.1") for _ in range(2)]
-        assert entered.acquire(timeout=20)
-        while servers[0].service.queue.waiting != 1:
-            threading.Event().wait(0.005)
-        refused = ask("10.0.0.1")
-        assert (refused.status_code, refused.headers["Retry-After"].isdecimal()) == (503, True)
-        assert "2 places" in refused.json()["detail"]
-        assert ask("10.0.0.1", "/render/batch", {"frames": [FRAME]}).status_code == 503
-        frames.append(pool.submit(ask, "10.0.0.2"))
-        while servers[0].service.queue.waiting != 2:
-            threading.Event().wait(0.005)
-        go_on.set()
-        assert [frame.result(20).status_code for frame in frames] == [200] * 3
 
 
 @pytest.fixture

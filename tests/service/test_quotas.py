@@ -11,23 +11,11 @@ import pytest
 
 from msdgs_serve.api import uploads
 from msdgs_serve.api.server import Server
-from tests.service.test_api_poison import check_problem
 from tests.support.scene_files import write_scene
-from tests.support.service import in_this_process, serving
+from tests.support.service import check_problem, in_this_process, serving
 
 ONE, TWO = "one-0123456789abcdef", "two-0123456789abcdef"
 MIB = 1 << 20
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "scenes").mkdir()
-    return tmp_path / "scenes"
-
-
-@pytest.fixture
-def file(tmp_path: Path) -> bytes:
-    return write_scene(tmp_path / "walk.onnx").read_bytes()
 
 
 @pytest.fixture

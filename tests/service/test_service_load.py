@@ -1,11 +1,12 @@
 """More than the service can do: refused in time and with advice, while what was accepted is finished."""
 
+import json
 import math
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,14 +20,9 @@ from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.watch import Interrupted, Watch
-from tests.service.test_api_poison import check_problem
-from tests.support.service import serving
+from tests.support.service import AT_MOST, FRAME, check_problem, connect, eventually, serving
 
 pytestmark = pytest.mark.slow
-
-ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
-AT_MOST = 60.0  # seconds, whatever else the machine does
-FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 
 
 class SlowPoses(PoseCache):
@@ -48,7 +44,7 @@ class SlowPoses(PoseCache):
             self.begun += 1
             assert self.go_on.wait(AT_MOST)
             if self.begun >= self.last:
-                until(lambda: has_stopped(watch))
+                eventually(lambda: has_stopped(watch))
         return session.gaussians(t)
 
 
@@ -63,14 +59,6 @@ def renderer_with(poses: SlowPoses) -> Renderer:
     renderer = Renderer()
     renderer.cache = poses
     return renderer
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for it."""
-    deadline = time.monotonic() + AT_MOST
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def has_stopped(watch: Watch) -> bool:
@@ -88,22 +76,31 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
         ThreadPoolExecutor(5) as pool,
     ):
         poses.slow = True
-        # addresses as a proxy names them: each client has its share
-        addresses = [{"X-Forwarded-For": f"10.0.0.{number}"} for number in range(5)]
-        accepted = [pool.submit(client.post, "/render", json=FRAME, headers=address) for address in addresses]
         queue = server[0].service.queue
-        until(lambda: (queue.running, queue.waiting) == (2, 3))
-        for _ in range(3):
-            response = client.post("/render", json=FRAME)
-            assert response.status_code == 503
-            check_problem(response)
+
+        def ask(number: int) -> httpx.Response:
+            """As the client of an address that a proxy names."""
+            return client.post("/render", json=FRAME, headers={"X-Forwarded-For": f"10.0.0.{number}"})
+
+        def check_refused(response: httpx.Response) -> None:
+            check_problem(response, 503)
             assert 1 <= int(response.headers["Retry-After"]) <= 60
+
+        accepted = [pool.submit(ask, 0), pool.submit(ask, 0)]
+        eventually(lambda: queue.running == 2)
+        refused = ask(0)
+        check_refused(refused)
+        assert "2 places" in refused.json()["detail"], "the share of one client"
+        accepted += [pool.submit(ask, number) for number in (1, 2, 3)]
+        eventually(lambda: (queue.running, queue.waiting) == (2, 3))
+        for _ in range(3):
+            check_refused(client.post("/render", json=FRAME))
         assert client.post("/render/batch", json={"frames": [FRAME]}).status_code == 503
         assert client.post("/render", json={**FRAME, "width": 0}).status_code == 503, "a body is not even looked at"
         have = client.post("/render", json=FRAME, headers={"If-None-Match": "*"})
         assert have.status_code == 304, "what the client has costs no place"
-        assert client.get("/live").status_code == 200
-        assert client.get("/ready").status_code == 200
+        for path in ("/live", "/ready", "/scenes/balls"):
+            assert client.get(path).status_code == 200
         poses.go_on.set()
         assert [future.result(AT_MOST).status_code for future in accepted] == [200] * 5
         assert client.post("/render", json=FRAME).status_code == 200
@@ -118,26 +115,24 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
         started = time.monotonic()
         response = client.post("/render", json=FRAME)
         assert time.monotonic() - started >= 0.3
-        assert response.status_code == 504
-        check_problem(response)
+        check_problem(response, 504)
         assert server[0].service.queue.running == 1, "the place is taken as long as the thread is"
         waiting = client.post("/render", json=FRAME)
         assert waiting.status_code == 504, "the time in line counts"
         poses.slow = False
         poses.go_on.set()
-        until(lambda: server[0].service.queue.running == 0)
+        eventually(lambda: server[0].service.queue.running == 0)
         assert client.post("/render", json=FRAME).status_code == 200
 
 
 def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
-    """A request on a connection of its own; whoever closes that is gone."""
-    request = client.build_request("POST", path, json=body)
-    request.read()
-    host = client.base_url.host
-    assert client.base_url.port
-    connection = socket.create_connection((host, client.base_url.port))
-    head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\n"
-    connection.sendall(f"{head}Content-Length: {len(request.content)}\r\n\r\n".encode() + request.content)
+    """Send a request on a connection of its own, which its client leaves by closing it."""
+    content = json.dumps(body)
+    head = (
+        f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(content)}\r\n\r\n"
+    )
+    connection = connect(client)
+    connection.sendall((head + content).encode())
     return connection
 
 
@@ -151,10 +146,10 @@ def test_work_for_a_client_that_is_gone_ends(scene: Path, poses: SlowPoses, path
         poses.slow, poses.last = True, part * samples
         poses.go_on.set()
         connection = leave(client, {"frames": [body, {**body, "t": 0.6}]} if path.endswith("batch") else body, path)
-        until(lambda: poses.begun >= poses.last)
+        eventually(lambda: poses.begun >= poses.last)
         connection.close()
         queue = server[0].service.queue
-        until(lambda: queue.running == queue.waiting == 0)
+        eventually(lambda: queue.running == queue.waiting == 0)
         assert poses.begun < samples
 
 
@@ -167,11 +162,11 @@ def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: Sl
         queue = server[0].service.queue
         poses.slow = True
         first = pool.submit(client.post, "/render", json=FRAME)
-        until(lambda: queue.running == 1)
+        eventually(lambda: queue.running == 1)
         connection = leave(client, FRAME)
-        until(lambda: queue.waiting == 1)
+        eventually(lambda: queue.waiting == 1)
         connection.close()
-        until(lambda: queue.waiting == 0)
+        eventually(lambda: queue.waiting == 0)
         poses.go_on.set()
         assert first.result(AT_MOST).status_code == 200
         assert poses.begun == 1
@@ -187,7 +182,7 @@ def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses
         poses.slow = True
         frames = [pool.submit(client.post, "/render", json=FRAME) for _ in range(8)]
         queue = server[0].service.queue
-        until(lambda: queue.running + queue.waiting == 8)
+        eventually(lambda: queue.running + queue.waiting == 8)
         server[0].handle_exit(signal.SIGTERM, None)
         assert other.get("/ready").status_code == 503
         assert other.get("/live").status_code == 200
@@ -196,13 +191,12 @@ def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses
         assert refused.headers["Retry-After"]
         poses.go_on.set()
         assert [frame.result(AT_MOST).status_code for frame in frames] == [200] * 8
-        until(lambda: not server[0].started or not _listens(client))
+        eventually(lambda: not server[0].started or not _listens(client))
 
 
 def _listens(client: httpx.Client) -> bool:
-    assert client.base_url.port
     try:
-        socket.create_connection((client.base_url.host, client.base_url.port), timeout=1).close()
+        connect(client).close()
     except OSError:
         return False
     return True
