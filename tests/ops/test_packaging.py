@@ -86,13 +86,6 @@ def test_training_and_export_name_the_extra_that_they_need(environment: Path, co
     assert "Traceback" not in told.stderr
 
 
-def test_help_teaches(environment: Path) -> None:
-    program = environment / "bin" / "msdgs-serve"
-    told = subprocess.check_output([program, "--help"], cwd=environment, env=clean_environment(), text=True)
-    assert "onnx" in told
-    assert "--port" in told
-
-
 def test_it_serves_a_scene(environment: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     for name in set(os.environ) - set(clean_environment()):

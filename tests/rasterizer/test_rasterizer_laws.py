@@ -10,7 +10,7 @@ from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 from tests.support import reference
 from tests.support.scenes import as_dtype, draw, front_camera, gaussians_of, joined, random_scene, select, unit_quats
-from tests.support.tolerances import assert_close, tolerance
+from tests.support.tolerances import assert_close
 
 BACKGROUND = np.array([0.2, 0.6, 0.9])
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float32", "float64"])
@@ -193,16 +193,6 @@ def test_mirrored_image(seed: int):
     assert_same(Rendering(*(channel[:, ::-1] for channel in turned)), image)
 
 
-@SEEDS
-def test_float32_is_close_to_float64(seed: int):
-    gaussians, camera = scene(seed, np.float32)
-    double = draw(as_dtype(gaussians, np.float64), camera, background=BACKGROUND)
-    single = draw(gaussians, camera, background=BACKGROUND)
-    want = Rendering(*(channel.astype(np.float32) for channel in double))
-    assert_same(single, want, clear_pixels(gaussians, camera))
-    assert -10 * np.log10(np.mean((single.rgb - double.rgb) ** 2)) > tolerance("oracle_db")
-
-
 @DTYPES
 def test_invisible_gaussians_change_no_byte(dtype: type):
     """Opacity 0, under the threshold, behind the eye, beside the image."""
@@ -258,7 +248,6 @@ def test_median_depth_is_where_half_of_the_light_is_gone(dtype: type):
     got = draw(gaussians, camera, background=BACKGROUND, median_depth=True)
     plain = draw(gaussians, camera, background=BACKGROUND)
     np.testing.assert_array_equal(got.rgb, plain.rgb)
-    assert plain.median_depth.size == 0
     want, margin = np.full(got.alpha.shape, np.inf), np.full(got.alpha.shape, np.inf)
     axis = camera.world_to_camera[2]
     depths = (gaussians.means.astype(float) @ axis[:3] + axis[3]).astype(dtype)
