@@ -35,6 +35,7 @@ from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
+Change = Callable[[onnx.ModelProto], object]
 
 
 def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
@@ -215,35 +216,26 @@ def test_visionary_pads_with_nothing(tmp_path: Path):
     assert len(visionary_of(tmp_path / "a.onnx")(0.5)) == 300
 
 
-def with_output_for_colors(model: onnx.ModelProto) -> None:
-    model.graph.output.append(helper.make_tensor_value_info("means_rgb", TensorProto.FLOAT, [1]))
-
-
 def with_camera(model: onnx.ModelProto) -> None:
     model.opset_import[0].version = 18
     model.graph.input.append(helper.make_tensor_value_info("camera", TensorProto.FLOAT, [4, 4]))
 
 
-def with_300_rows(model: onnx.ModelProto) -> None:
-    model.graph.output[0].type.tensor_type.shape.dim[0].dim_value = 300
+def with_output(name: str) -> Change:
+    return lambda model: model.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]))
 
 
-def with_a_loop(model: onnx.ModelProto) -> None:
-    model.graph.node[0].op_type = "Loop"
+def with_rows(count: int) -> Change:
+    return lambda model: setattr(model.graph.output[0].type.tensor_type.shape.dim[0], "dim_value", count)
+
+
+def with_node(operator: str, inputs: list[str], output: str, **attributes: Any) -> Change:
+    return lambda model: model.graph.node.append(helper.make_node(operator, inputs, [output], **attributes))
 
 
 def with_a_function(model: onnx.ModelProto) -> None:
     made = helper.make_function("own", "Twice", ["x"], ["y"], [], [helper.make_opsetid("", 17)])
     model.functions.append(made)
-
-
-def with_half_precision_inside(model: onnx.ModelProto) -> None:
-    model.graph.node.append(helper.make_node("Cast", ["time"], ["half"], to=TensorProto.FLOAT16))
-
-
-def with_a_double(model: onnx.ModelProto) -> None:
-    value = numpy_helper.from_array(np.zeros(2))
-    model.graph.node.append(helper.make_node("Constant", [], ["two"], value=value))
 
 
 def with_infinity(model: onnx.ModelProto) -> None:
@@ -260,18 +252,21 @@ def with_padding_that_shows(model: onnx.ModelProto) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (with_output_for_colors, r"`means_rgb` would be taken for colors"),
+        (with_output("means_rgb"), r"`means_rgb` would be taken for colors"),
         (with_camera, r"instead of 17 alone; its input must be `time`"),
-        (with_300_rows, r"300 rows are no multiple of 256"),
-        (with_a_loop, r"Loop is control flow"),
+        (with_rows(300), r"300 rows are no multiple of 256"),
+        (with_node("Loop", [], "twice"), r"Loop is control flow"),
         (with_a_function, r"function `Twice` is its own"),
-        (with_half_precision_inside, r"Cast to `half` is FLOAT16, not float32"),
-        (with_a_double, r"constant `two` is DOUBLE, not float32"),
+        (with_node("Cast", ["time"], "half", to=TensorProto.FLOAT16), r"Cast to `half` is FLOAT16, not float32"),
+        (
+            with_node("Constant", [], "two", value=numpy_helper.from_array(np.zeros(2))),
+            r"constant `two` is DOUBLE, not float32",
+        ),
         (with_infinity, r"constant `far` holds NaN or infinity"),
         (with_padding_that_shows, r"its padding has opacities other than 0"),
     ],
 )
-def test_rules_of_visionary_are_checked(tmp_path: Path, change: Callable[[onnx.ModelProto], None], message: str):
+def test_rules_of_visionary_are_checked(tmp_path: Path, change: Change, message: str):
     model = visionary_model(scene_file(tmp_path))
     change(model)
     with pytest.raises(VisionaryInvalid, match=message):
