@@ -275,6 +275,11 @@ def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
     assert after == ahead
 
 
+def test_kernels_run_without_the_compiler() -> None:
+    """As plain Python their tests pass as well, and reach nearly all of their lines."""
+    run_python("import sys; from tests.rasterizer.kernel_coverage import main; sys.exit(main())")
+
+
 def test_compiling_says_where_the_kernels_are() -> None:
     printed = run_python("from msdgs_serve.api.cli import main; main(['--compile'])", NUMBA_CACHE_DIR="")
     folder = Path(printed.rsplit(" in ", 1)[1].strip())

@@ -38,20 +38,17 @@ def test_bad_background_is_refused_by_name(background: npt.ArrayLike):
     assert error.value.field == "background"
 
 
+BAD_OPTIONS = {
+    "near_plane": (0.0, np.nan),
+    "eps2d": (-0.1, np.inf),
+    "alpha_min": (0.0, np.nan),
+    "alpha_max": (1.0, 0.001),
+    "transmittance_min": (-1e-4, 1.0),
+}
+
+
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("near_plane", 0.0),
-        ("near_plane", np.nan),
-        ("eps2d", -0.1),
-        ("eps2d", np.inf),
-        ("alpha_min", 0.0),
-        ("alpha_min", np.nan),
-        ("alpha_max", 1.0),
-        ("alpha_max", 0.001),
-        ("transmittance_min", -1e-4),
-        ("transmittance_min", 1.0),
-    ],
+    ("field", "value"), [(field, value) for field, values in BAD_OPTIONS.items() for value in values]
 )
 def test_bad_options_are_refused_by_name(field: str, value: float):
     with pytest.raises(InvalidInput) as error:

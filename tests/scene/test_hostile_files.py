@@ -102,6 +102,7 @@ WIRE_TRICKS = {
     "a text for a number": lambda model: field(1, b"\x0a") + model.SerializeToString()[2:],
     "training": with_more(field(20, b"")),
     "sparse constants": with_more_in_the_graph(field(15, b"")),
+    "metadata that aren't UTF-8": with_more(field(14, field(1, b"plan") + field(2, b"\xff"))),
     "a name that isn't UTF-8": with_more_in_the_graph(field(5, field(8, b"\xff"))),
     "a name with a line break": with_more_in_the_graph(field(5, field(8, b"a\nb"))),
     "a name of 10,000 letters": with_more_in_the_graph(field(5, field(8, b"a" * 10_000))),

@@ -21,7 +21,7 @@ def run_python(code: str, *arguments: object, **environment: str) -> str:
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600, check=False
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr
     return done.stdout
 
 
