@@ -23,9 +23,9 @@ from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
-from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.viewer.snapshot import snapshot_of_file
-from tests.support.models import CAMERA, SCENE, export_scene, random_model, small_config
+from tests.support.models import CAMERA, SCENE, export_scene, random_model, saved, small_config
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import MOTION_BASES, write_scene
 from tests.support.training_scene import small_config as training_config
@@ -45,8 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.no_grad():
         model.gaussians.log_scales.sub_(1.5)  # under a pixel, where it is eps2d that is seen
         model.gaussians.raw_opacities.add_(2.0)
-    save_model(folder / "model.pt", model, SCENE, 1)
-    export_scene(folder / "model.pt", folder / "scene.onnx")
+    export_scene(saved(folder, model), folder / "scene.onnx")
     return folder
 
 

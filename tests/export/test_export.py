@@ -21,19 +21,14 @@ from export.to_onnx import main
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
-from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model
+from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model, saved
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
-
-
-def saved(folder: Path, model: DynamicGaussians) -> Path:
-    save_model(folder / "model.pt", model, SCENE, 1)
-    return folder / "model.pt"
 
 
 @pytest.fixture(scope="module")

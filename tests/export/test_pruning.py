@@ -1,7 +1,7 @@
 """Pruning: only what moves stays in the graph, each rule can be switched off, and the error allowed is kept."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,11 +15,11 @@ from export.pruning import RULES
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
-from msdgs_serve.scene.camera import Camera
+from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from msdgs_train.gaussians.model_file import SceneInfo
 from tests.support.images import psnr
-from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model
+from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model, saved
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -29,16 +29,15 @@ GAUSSIAN_BYTES = 40 + 4
 
 
 def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> ExportJob:
-    save_model(folder / "model.pt", model, info, 1)
     (folder / "candidates").mkdir()
-    return ExportJob(folder / "model.pt", folder / "candidates", **settings)
+    return ExportJob(saved(folder, model, info), folder / "candidates", **settings)
 
 
 def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: SceneInfo) -> float:
     """PSNR of the worst of frames at times that the export has not looked at, the model in float64."""
     double, worst = model.double(), np.inf
     session, (t0, t1) = DeformationSession(candidate.path), info.time_range
-    camera = Camera(**{**cast(dict[str, Any], CAMERA), "camera_to_world": np.array(CAMERA["camera_to_world"])})
+    camera = camera_of(CAMERA, CAMERA["width"])
     for t in t0 + (t1 - t0) * np.random.default_rng(7).uniform(size=12):
         with torch.no_grad():
             posed = double.pose(float(np.float32(t)))

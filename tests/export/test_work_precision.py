@@ -24,8 +24,7 @@ from export.options import ExportOptions
 from export.plans.registry import PLANS
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
-from msdgs_train.gaussians.model_file import save_model
-from tests.support.models import GROUND, OBJECT, SCENE, moving_object, random_model
+from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that it sweeps once
 
@@ -101,9 +100,8 @@ def few_candidates() -> Iterator[None]:
 
 
 def new_job(folder: Path) -> ExportJob:
-    save_model(folder / "model.pt", moving_object(), SCENE, 1)
     (folder / "candidates").mkdir()
-    return ExportJob(folder / "model.pt", folder / "candidates", min_psnr=45.0)
+    return ExportJob(saved(folder, moving_object()), folder / "candidates", min_psnr=45.0)
 
 
 def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_the_error(
@@ -194,13 +192,8 @@ def test_the_report_holds_what_it_promises(swept: tuple[ExportJob, SweepResult],
         assert len(np.unique(np.asarray(image).reshape(-1, 4), axis=0)) > 10
 
 
-def saved(folder: Path, **changes: Any) -> Path:
-    save_model(folder / "model.pt", random_model(60, **changes), SCENE, 1)
-    return folder / "model.pt"
-
-
 def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = saved(tmp_path)
+    path = saved(tmp_path, random_model(60))
     assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0)) == 1
     shown = capsys.readouterr().err
     assert "at most" in shown
@@ -231,14 +224,13 @@ def test_wrong_wishes_are_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
 ):
     wishes: dict[str, Any] = {"output": tmp_path / "s.onnx"} | settings
-    assert main(ExportOptions(saved(tmp_path), **wishes)) == 1
+    assert main(ExportOptions(saved(tmp_path, random_model(60)), **wishes)) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "s.onnx").exists()
 
 
 def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
-    assert main(ExportOptions(tmp_path / "model.pt", min_psnr=45.0, keep_sh=True)) == 0
+    assert main(ExportOptions(saved(tmp_path, moving_object()), min_psnr=45.0, keep_sh=True)) == 0
     shown = capsys.readouterr().err
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene
@@ -261,7 +253,7 @@ def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.Monke
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    checkpoint = saved(tmp_path)
+    checkpoint = saved(tmp_path, random_model(60))
     old = {name: f"an older {name}".encode() for name in ("model.onnx", "model.report.json")}
     for name, contents in old.items():
         (tmp_path / name).write_bytes(contents)
@@ -272,9 +264,8 @@ def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_switched_off_on_the_command_line(tmp_path: Path):
-    save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
     off: dict[str, Any] = {"keep_static": True, "keep_invisible": True, "keep_layers": True}
-    assert main(ExportOptions(tmp_path / "model.pt", quick=True, **off)) == 0
+    assert main(ExportOptions(saved(tmp_path, moving_object()), quick=True, **off)) == 0
     scene = DeformationSession(tmp_path / "model.onnx").scene
     assert (scene.moving_count, scene.static_count) == (GROUND + OBJECT, 0)
     assert scene.metadata.layers == ("mlp", "mlp")

@@ -217,42 +217,20 @@ def test_kernels_use_only_what_their_stamp_follows(file: Path):
                     assert origin.rpartition(".")[0] in followed, f"{function.name} uses {name} of {origin}"
 
 
-KERNELS_AFTER = """
-import importlib, json, pkgutil, sys
-from numba.core.dispatcher import Dispatcher
-import msdgs_serve.rasterizer as rasterizer
+FRAMES = """
+import dataclasses, json, sys
+from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer.ahead import compile_kernels
+from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
+from tests.rasterizer.test_rasterizer_threads import kernels
 
 def compiled():
-    names = [f"{rasterizer.__name__}.{module.name}" for module in pkgutil.iter_modules(rasterizer.__path__)]
-    return {
-        f"{name}.{kernel}": sorted(map(str, value.signatures))
-        for name in names
-        for kernel, value in vars(importlib.import_module(name)).items()
-        if isinstance(value, Dispatcher)
-    }
+    return {f"{kernel.__module__}.{kernel.__name__}": sorted(map(str, kernel.signatures)) for kernel in kernels()}
 
 compile_kernels()
 ahead = compiled()
-"""
-
-FRAMES = (
-    KERNELS_AFTER
-    + """
-import dataclasses
-from pathlib import Path
-from msdgs_serve.api.cameras import resolve_camera
-from msdgs_serve.api.schemas import RenderRequest
-from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
-from msdgs_serve.store import SceneStore
-
-served = SceneStore([Path(sys.argv[1])]).get("toybench")
-session = served.session
-request = RenderRequest.model_validate(
-    {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 40, "height": 30}
-)
-camera = resolve_camera(request, served)
-renderer = Renderer()
+session, renderer = DeformationSession(sys.argv[1]), Renderer()
+camera = session.scene.metadata.cameras[0].camera.resized(40, 30)
 for model in ("pinhole", "orthographic", "fisheye"):
     view = dataclasses.replace(camera, model=model)
     for options in (
@@ -265,7 +243,6 @@ for model in ("pinhole", "orthographic", "fisheye"):
         renderer.render(session, view, 0.5, options)
 print(json.dumps([ahead, compiled()]))
 """
-)
 
 
 def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
