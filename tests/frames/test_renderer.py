@@ -1,4 +1,4 @@
-"""Scene, camera and time to an image; posing is done once for those who ask together."""
+"""Rendering of a scene at a time, and the cache of its poses."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -26,12 +26,12 @@ def session(scene: Path) -> DeformationSession:
 
 
 def level_camera(width: int = SIZE, height: int = SIZE) -> Camera:
-    """Five units away, at the height of the origin; z is up."""
+    """Return a camera five units away, at the height of the origin; z is up."""
     return Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), width, height, 40.0)
 
 
 class CountingSession(DeformationSession):
-    """Stands for a scene: says how often and with which times it was posed, and can be made slow or to fail."""
+    """A scene that records the times at which it is posed, and that can wait or fail."""
 
     def __init__(self, gaussians: Gaussians, scene: BakedScene) -> None:
         self.scene = scene

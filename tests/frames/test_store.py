@@ -16,7 +16,7 @@ from tests.support.scene_files import write_scene
 
 
 def change(path: Path, **changes: Any) -> None:
-    """Put a new scene in the place of an old one, at once, as a careful writer does."""
+    """Replace a scene file atomically."""
     new = path.with_suffix(".new")
     write_scene(new, **changes)
     os.replace(new, path)
@@ -170,7 +170,7 @@ def test_paths_that_are_no_scenes_are_refused_with_a_reason(tmp_path: Path, name
 
 
 def incoming(store: SceneStore, **changes: Any) -> Path:
-    """A scene file on its way in."""
+    """Write a scene file as an upload does before it is added."""
     return write_scene(store.incoming("token"), **changes)
 
 

@@ -29,7 +29,7 @@ ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0, "distance": 5, "fov_y": 
 
 
 def nerfstudio(count: int = 3, **changes: Any) -> dict[str, Any]:
-    """A path as nerfstudio writes it: one pose, OpenGL axes, row by row."""
+    """Return a camera path in nerfstudio's format: one pose, OpenGL axes, row by row."""
     camera = {"camera_to_world": (POSE @ OPENGL_TO_OPENCV).ravel().tolist(), "fov": 40.0, "aspect": 1.0}
     path = {"camera_path": [dict(camera) for _ in range(count)], "fps": 12, "seconds": 1}
     return {**path, "render_width": SIZE, "render_height": SIZE, **changes}

@@ -1,4 +1,4 @@
-"""What must hold for every scene, without knowing the right image."""
+"""Laws that hold for every scene, tested without a reference image."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def scene(seed: int, dtype: type, count: int = 150) -> tuple[Gaussians, Camera]:
 
 
 def assert_same(got: Rendering, want: Rendering, clear: np.ndarray | None = None):
-    """Within the rounding of their dtype, where `clear` (everywhere by default)."""
+    """Check that images agree within the rounding of their dtype at the pixels of `clear` (all by default)."""
     row = got.rgb.dtype.name
     clear = np.ones(got.alpha.shape, bool) if clear is None else clear
     assert clear.mean() > 0.9
@@ -40,7 +40,7 @@ def assert_identical(got: Rendering, want: Rendering):
 
 
 def clear_pixels(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Where rounding can't tip a decision."""
+    """Return at which pixels rounding can't change a decision."""
     return reference.render(gaussians, camera, BACKGROUND).slack == 0
 
 
@@ -80,7 +80,7 @@ def test_what_is_asked_for_besides_changes_nothing_else(dtype: type):
 
 
 def rotated(gaussians: Gaussians, camera: Camera, turn: np.ndarray) -> tuple[Gaussians, Camera]:
-    """World and camera moved rigidly: harmonics too, by fitting the turned function in its own band."""
+    """Move world and camera rigidly; harmonics are rotated by a fit."""
     directions = np.random.default_rng(0).normal(size=(100, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     before, after = (reference.sh_basis(d, 3) for d in (directions @ turn, directions))

@@ -1,4 +1,4 @@
-"""Contract `msdgs/1`: a scene file that breaks it anywhere is refused by the name of what is wrong."""
+"""Contract `msdgs/1`: a scene file that violates it is refused, and the error names the field."""
 
 import json
 from collections.abc import Callable
@@ -31,7 +31,7 @@ Change = Callable[[onnx.ModelProto], object]
 
 
 def refusal(path: Path, change: Change, contents: bytes = SCENE_BYTES) -> SceneFileInvalid:
-    """The error that the changed file is refused with."""
+    """Return the error with which the changed file is refused."""
     model = onnx.load_from_string(contents)
     change(model)
     path.write_bytes(model.SerializeToString())

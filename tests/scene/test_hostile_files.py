@@ -1,4 +1,4 @@
-"""Scene files that were made to do harm are refused by name, before any library sees them."""
+"""Hostile scene files are refused before any library reads them, and the error names the reason."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +33,7 @@ def sound(tmp_path: Path) -> onnx.ModelProto:
 
 @pytest.fixture
 def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails a test that gives onnxruntime a file."""
+    """Fail a test in which onnxruntime is given a file."""
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("onnxruntime was given a file")
@@ -56,7 +56,7 @@ def test_attacks_are_refused_by_name_before_onnxruntime_sees_them(
 def test_onnxruntime_itself_hands_out_other_files(
     tmp_path: Path, sound: onnx.ModelProto, attack: Callable[[onnx.ModelProto, Path], bytes]
 ):
-    """The reason for our own reader: onnxruntime alone renders the bytes of the file as positions."""
+    """This is why we read scene files ourselves: onnxruntime alone returns the bytes of the file as positions."""
     (tmp_path / "secret").write_bytes(b"root:x:0:0:root:/root:/bin")
     (tmp_path / "attack.onnx").write_bytes(attack(sound, Path("secret")))
     session = onnxruntime.InferenceSession(tmp_path / "attack.onnx")
@@ -74,17 +74,17 @@ def test_poisoned_metadata_is_refused_by_its_field(sound: onnx.ModelProto, what:
 
 
 def with_more(content: bytes) -> Callable[[onnx.ModelProto], bytes]:
-    """Bytes after those of the model."""
+    """Append bytes to those of the model."""
     return lambda model: model.SerializeToString() + content
 
 
 def with_more_in_the_graph(content: bytes) -> Callable[[onnx.ModelProto], bytes]:
-    """Bytes after those of its graph."""
+    """Append bytes to those of the graph."""
     return lambda model: with_graph(model, model.graph.SerializeToString() + content)
 
 
 def with_empty_constant(*lengths: int) -> Callable[[onnx.ModelProto], bytes]:
-    """A float32 constant of these lengths without values."""
+    """Append a float32 constant with these dimensions and no values."""
     dims = b"".join(field(1, length) for length in lengths)
     return with_more_in_the_graph(field(5, dims + field(2, 1) + field(8, b"x")))
 

@@ -1,4 +1,4 @@
-"""The table of operators: what exporters emit, no more, and docs/contract.md says the same."""
+"""The table of allowed operators is exactly what exporters emit and what docs/contract.md lists."""
 
 import re
 from pathlib import Path
@@ -38,7 +38,7 @@ def test_the_graph_that_is_written_again_computes_the_same_bits(name: str):
 
 
 def emitted() -> dict[str, dict[str, set[int]]]:
-    """Operators of all sound scenes and their attributes."""
+    """Return the operators of all sound scenes and their attributes."""
     found: dict[str, dict[str, set[int]]] = {}
     for contents in SCENES.values():
         for node in onnx.load_from_string(contents).graph.node:
@@ -56,7 +56,7 @@ def test_the_table_has_what_exporters_emit_and_no_more():
 
 
 def row(name: str, operator: Operator) -> str:
-    """As docs/contract.md has it."""
+    """Return the row of an operator in docs/contract.md."""
     inputs = []
     for operand in operator.operands:
         elements = "/".join(element_name(each) for each in operand.elements)

@@ -1,4 +1,4 @@
-"""`Gaussians.validate`: what is refused, and by which name."""
+"""`Gaussians.validate` refuses invalid arrays by name."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,13 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def changed(field: str, value: object) -> Gaussians:
-    """Five valid Gaussians with one array replaced."""
+    """Return five valid Gaussians with one array replaced."""
     gaussians, _ = random_scene(0, 5)
     return Gaussians(**{**{name: getattr(gaussians, name) for name in FIELDS}, field: value})
 
 
 def poisoned(field: str, value: object) -> Gaussians:
-    """Five valid Gaussians, the third with `value` in one array."""
+    """Return five Gaussians, the third with `value` in one array."""
     array = getattr(random_scene(0, 5)[0], field).copy()
     array[2] = value
     return changed(field, array)

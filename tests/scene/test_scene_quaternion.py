@@ -1,4 +1,4 @@
-"""Laws of rotations, and quaternions that have no direction."""
+"""Rotation matrices of quaternions, and quaternions that have no direction."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.support.tolerances import assert_close
 
 
 def samples() -> np.ndarray:
-    """[*, 4] Random rotations, and those near a division by zero: none, half turns, almost half turns."""
+    """Return random rotations [N, 4] and those near a division by zero: identity, half turns, almost half turns."""
     half_turns = np.eye(4)[1:]
     near_half_turns = half_turns + np.array([1e-9, 0, 1e-10, 0])
     tiny = np.array([[1, 1e-9, 0, 0], [1, 0, -1e-16, 1e-16]])

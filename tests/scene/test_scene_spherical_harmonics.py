@@ -11,7 +11,7 @@ from tests.support.tolerances import assert_close
 
 
 def directions(count: int = 200) -> np.ndarray:
-    """Random ones, and along the axes."""
+    """Return random directions and those along the axes."""
     random = np.random.default_rng(0).normal(size=(count, 3))
     return np.concatenate([random / np.linalg.norm(random, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
 

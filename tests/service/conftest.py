@@ -1,4 +1,4 @@
-"""What the tests of uploads share."""
+"""Fixtures of the tests of uploads."""
 
 from pathlib import Path
 
@@ -9,12 +9,12 @@ from tests.support.scene_files import write_scene
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder for scenes, empty, in an empty one."""
+    """Return an empty folder for scenes."""
     (tmp_path / "scenes").mkdir()
     return tmp_path / "scenes"
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> bytes:
-    """The contents of a valid scene file."""
+    """Return the contents of a valid scene file."""
     return write_scene(tmp_path / "scene.onnx").read_bytes()

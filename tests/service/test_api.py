@@ -1,4 +1,4 @@
-"""The service over HTTP: responses are decoded and their pixels looked at."""
+"""The service over HTTP: responses are decoded and their pixels compared."""
 
 import itertools
 import re
@@ -32,12 +32,12 @@ def client(scene: Path) -> Iterator[httpx.Client]:
 
 
 def level_pose() -> np.ndarray:
-    """Where `LEVEL` is."""
+    """Return the pose of the camera `LEVEL`."""
     return orbit(np.zeros(3), 5.0, 0, 0, UP)
 
 
 def render(client: httpx.Client, **changes: Any) -> np.ndarray:
-    """The pixels of `FRAME` with some keys changed."""
+    """Return the pixels of `FRAME` with some keys changed."""
     body = {**FRAME, **changes}
     response = client.post("/render", json=body)
     assert response.status_code == 200, response.text
@@ -101,7 +101,7 @@ def test_one_view_said_in_four_ways(client: httpx.Client):
 
 
 def test_cameras_of_other_models(client: httpx.Client):
-    """At five units, the middle of the image is where a pinhole has it; away from it they differ."""
+    """All models agree at the center of the image and differ away from it."""
     pose = level_pose()
     matrix = {"type": "matrix", "camera_to_world": pose.tolist(), "fx": 100.0}
     pinhole = render(client, camera=matrix).astype(int)
@@ -220,7 +220,7 @@ def test_a_scene_broken_from_the_start_is_unavailable_without_saying_where_it_li
 
 
 def examples(client: httpx.Client) -> dict[str, Any]:
-    """Of `POST /render` in the OpenAPI document."""
+    """Return the examples of `POST /render` in the OpenAPI document."""
     call = client.get("/openapi.json").json()["paths"]["/render"]["post"]
     return call["requestBody"]["content"]["application/json"]["examples"]
 

@@ -28,7 +28,7 @@ def client(scene: Path) -> Iterator[httpx.Client]:
 
 
 def refused(client: httpx.Client, body: Any, status: int = 422, path: str = "/render") -> list[str]:
-    """The names of the fields that the answer complains about."""
+    """Return the fields that the response to an invalid body names."""
     content = body if isinstance(body, bytes) else json.dumps(body).encode()
     response = client.post(path, content=content, headers={"content-type": "application/json"})
     check_problem(response, status)
@@ -36,7 +36,7 @@ def refused(client: httpx.Client, body: Any, status: int = 422, path: str = "/re
 
 
 def changed(field: str, value: Any) -> dict[str, Any]:
-    """A valid body but for one field; a field of a camera goes to a camera of the type that has it."""
+    """Return a valid body with one field changed; a camera's field is changed in a camera of the type that has it."""
     cameras = {"eye": LOOK_AT, "target": LOOK_AT, "up": LOOK_AT, "camera_to_world": MATRIX}
     cameras |= dict.fromkeys(("fx", "fy", "cx", "cy", "axes"), MATRIX)
     cameras |= dict.fromkeys(("index", "name"), SCENE)
@@ -57,7 +57,7 @@ NO_TIME_OR_NUMBER = [(field, value) for field in NUMBERS for value in NOT_NUMBER
 
 @pytest.mark.parametrize(("field", "value"), NO_TIME_OR_NUMBER, ids=lambda value: repr(value)[:12])
 def test_what_is_not_a_usable_number(client: httpx.Client, field: str, value: Any):
-    """A list of times is one."""
+    """`[1]` is a valid list of times."""
     assert refused(client, changed(field, value))[0].startswith(field)
 
 

@@ -1,4 +1,4 @@
-"""Many frames in one call: each its own answer, equal ones drawn once."""
+"""Batches: each frame has a response of its own, and equal frames are rendered once."""
 
 import base64
 import email
@@ -31,7 +31,7 @@ def client(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Iter
 
 
 def batch(client: httpx.Client, frames: list[Any]) -> list[dict[str, Any]]:
-    """The lines of the answer, in the order of the frames."""
+    """Return the lines of the response in the order of the frames."""
     response = client.post("/render/batch", json={"frames": frames})
     assert response.status_code == 200, response.text
     assert response.headers["Content-Type"] == "application/x-ndjson"

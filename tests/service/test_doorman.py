@@ -1,4 +1,4 @@
-"""Calls that are refused before they are parsed: when that is, and that nobody can tell the difference."""
+"""Requests that are rejected before they are parsed: when that happens, and that the response is the same."""
 
 import logging
 import socket
@@ -27,7 +27,7 @@ REFUSED = 'msdgs_problems_total{kind="overloaded"}', 'msdgs_requests_total{metho
 
 @contextmanager
 def full(queue: WorkQueue, places: int) -> Iterator[None]:
-    """All places are taken by calls that do nothing."""
+    """Take places of the queue by calls that do nothing."""
     with ExitStack() as calls:
         for number in range(places):
             calls.enter_context(queue.admitted(str(number)))
@@ -36,7 +36,7 @@ def full(queue: WorkQueue, places: int) -> Iterator[None]:
 
 @pytest.fixture
 def queue() -> Iterator[WorkQueue]:
-    """Of two places."""
+    """Yield a queue of two places."""
     queue = WorkQueue(workers=1, waiting=1, seconds=20)
     yield queue
     queue.shut_down()
@@ -44,7 +44,7 @@ def queue() -> Iterator[WorkQueue]:
 
 @pytest.fixture
 def doorman(queue: WorkQueue) -> Doorman:
-    """Of that queue."""
+    """Return the early rejection of that queue."""
     renderer = Renderer()
     return Doorman(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
 
@@ -103,7 +103,7 @@ def sent(connection: socket.socket, data: bytes) -> tuple[int, dict[str, str], b
 
 @in_this_process
 def test_nobody_can_tell_the_difference(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """The same answer, line in the log and counts as the application's; the connection is as good as before."""
+    """Response, log line and counts are those of the application, and the connection stays usable."""
     write_scene(tmp_path / "ball.onnx")
     slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # a header that the doorman doesn't know
     named = HEAD + b"X-Request-ID: mine\r\n\r\n" + BODY

@@ -1,4 +1,4 @@
-"""Who has how many places in the queue, and whose work is done next."""
+"""How many places in the queue each client has, and whose work is done next."""
 
 import asyncio
 import threading
@@ -70,7 +70,7 @@ def queue() -> Iterator[WorkQueue]:
 
 
 def places(queue: WorkQueue, calls: ExitStack, client: str, *, streamed: bool = False) -> int:
-    """How many a client gets, before it is refused."""
+    """Return how many places a client gets before it is rejected."""
     before = queue.waiting
 
     def take_all() -> None:
@@ -132,7 +132,7 @@ def service(scene: Path) -> Iterator[Service]:
 
 @pytest.fixture
 def images(service: Service, monkeypatch: pytest.MonkeyPatch) -> list[weakref.ref[Image]]:
-    """Every image that was drawn."""
+    """Return a list that references to all rendered images are added to."""
     drawn: list[weakref.ref[Image]] = []
     original = service.renderer.render
 
@@ -161,7 +161,7 @@ def lines(service: Service) -> AsyncGenerator[Any]:
 
 @pytest.mark.parametrize("made", [film, lines])
 def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images: list[weakref.ref[Image]], made: Any):
-    """A film and a batch have one frame at a time in memory, and none is drawn before the last was taken."""
+    """A video or batch has one frame in memory, and renders none before the previous one is sent."""
 
     async def take() -> None:
         taken = 0
@@ -200,7 +200,7 @@ def test_a_film_fails_in_time_to_say_so_or_is_cut_off(scene: Path):
 
 
 def test_a_list_of_times_is_drawn_in_parts(service: Service, scene: Path):
-    """So that it can't keep a thread for all of its frames."""
+    """Otherwise one request would occupy a thread for all of its frames."""
     parts = []
     original = service.queue.run
 

@@ -1,4 +1,4 @@
-"""Hostile scene files at a running service: refused, or listed as broken, while the scene beside them is served."""
+"""Hostile scene files at a running service are refused or listed as broken, and another scene is still served."""
 
 import json
 import sys
@@ -139,7 +139,7 @@ with serving(folder, uploads=True) as client:
 
 
 PLACES = ("HOME", "TMPDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR")
-"""Variables that name the folders in which programs keep files."""
+"""Variables that name folders in which programs store files."""
 
 
 def test_a_service_writes_no_file_besides_its_scenes(tmp_path: Path, folder: Path, scene: Path):

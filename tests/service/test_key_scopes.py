@@ -133,6 +133,6 @@ def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
 
 
 def test_a_variable_that_is_empty_is_as_if_it_were_not_there(monkeypatch: pytest.MonkeyPatch):
-    """A composition sets it whether or not there are keys."""
+    """docker/compose.yaml sets it even if there are no keys."""
     monkeypatch.setenv("MSDGS_API_KEYS_FILE", "")
     assert Settings().api_keys_file is None

@@ -33,7 +33,7 @@ SEEDED: dict[str, Any] = {
 ALLOWED = {501, 503, 504, 507}
 JSON = {"Content-Type": "application/json"}
 HUGE, DEEP, DEEPER = "@huge@", "@deep@", "@deeper@"
-"""Stand for values that Python can't write as JSON."""
+"""Placeholders of values that Python can't write as JSON."""
 
 WRITTEN = {HUGE: "1e999", DEEP: "[" * 400 + "]" * 400, DEEPER: "[" * 3000 + "]" * 3000}
 # fields that have a meaning only beside others
@@ -62,7 +62,7 @@ QUERY_POISON = [
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """A client of a service that still draws a good frame in the end."""
+    """Yield a client; at the end the service must still render a valid frame."""
     folder = tmp_path_factory.mktemp("scenes")
     write_scene(folder / "balls.onnx", steps=True, measured_error={"rendered": {"psnr_worst": 45.0}})
     limits = {"max_pixels": 64 * 64, "max_samples": 8, "max_batch": 4, "max_video_frames": 4}
@@ -135,7 +135,7 @@ def resolved(schema: Document, document: Document) -> Document:
 
 
 def instances(schema: Document, document: Document) -> Iterator[Any]:
-    """Good values of a schema: every branch, and every optional field, one at a time, beside the required ones."""
+    """Yield valid values of a schema: every branch, and every optional field beside the required ones."""
     schema = resolved(schema, document)
     yield from schema.get("examples", [])[:1]
     for union in ("anyOf", "oneOf"):
@@ -160,7 +160,7 @@ def instances(schema: Document, document: Document) -> Iterator[Any]:
 
 
 def leaves(value: Any, at: Leaf = ()) -> Iterator[Leaf]:
-    """Paths of all parts of a value, at any depth."""
+    """Yield the paths of all parts of a value, at any depth."""
     if at:
         yield at
     parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -177,7 +177,7 @@ def replaced(value: Any, at: Leaf, new: Any) -> Any:
 
 
 def bodies(document: Document) -> list[tuple[str, Any, Leaf]]:
-    """Path, body and leaf for each leaf of each body that a call takes; frames of a batch are those of single calls."""
+    """Return path, body and leaf for each leaf of the valid bodies of all calls."""
     found = []
     for path, calls in document["paths"].items():
         content = calls.get("post", {}).get("requestBody", {}).get("content", {})
@@ -207,14 +207,14 @@ def text_of(body: Any, *, twice: bool) -> bytes:
 
 
 def named(field: str, leaf: Leaf) -> bool:
-    """Whether an error's field is the leaf, what holds it, or lies within it."""
+    """Return whether an error's field is the leaf, a parent of it, or inside it."""
     got, wanted = field.split("."), [str(part) for part in leaf]
     length = min(len(got), len(wanted))
     return got[:length] == wanted[:length]
 
 
 def problems(response: httpx.Response, path: str) -> list[dict[str, Any]]:
-    """The problems that an answer states; those of its frames for a batch."""
+    """Return the problems in a response; for a batch, those of its frames."""
     if response.status_code != 200:
         check_problem(response)
         return [response.json()]

@@ -1,4 +1,4 @@
-"""How much clients may store, in all and each key, and that they never fill the disk."""
+"""Quotas of uploads, in all and by key, and the space that they leave on the disk."""
 
 import errno
 import shutil

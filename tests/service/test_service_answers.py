@@ -1,4 +1,4 @@
-"""Channels and motion blur of a frame, and the rest of its answer: versions, times, ids, metrics."""
+"""Channels and motion blur of frames, and the rest of their responses: versions, timings, ids, metrics."""
 
 import io
 import json
@@ -155,7 +155,7 @@ def test_channels_come_in_the_order_asked_for(client: httpx.Client):
 
 
 def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
-    """White where nearest, `FARTHEST_GREY` where farthest, darker where it is thin, black where nothing is."""
+    """The nearest point is white, the farthest `FARTHEST_GREY`; low alpha is darker, and empty pixels are black."""
     depth, alpha = (array(client, channels=[name])[..., 0] for name in ("depth", "alpha"))
     seen = np.isfinite(depth)
     assert 0 < seen.mean() < 1
@@ -167,7 +167,7 @@ def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
 
 
 def test_gaussians_a_pixel_are_counted(client: httpx.Client):
-    """As numbers and as an image; tests of the rasterizer count them one by one."""
+    """As numbers and as an image; tests/rasterizer/test_rasterizer_counts.py counts them one by one."""
     counts = array(client, channels=["gaussians"])[..., 0]
     assert counts.max() >= 1
     np.testing.assert_array_equal(counts, counts.round())
@@ -221,7 +221,7 @@ def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixtur
         client.get("/scenes/nothing")
 
         def told() -> list[logging.LogRecord]:
-            """A line follows its answer, so that of a call before may still come."""
+            """A line is logged after its response, so that of an earlier request may come later."""
             return [record for record in caplog.records if "/scenes/nothing" in record.getMessage()]
 
         eventually(lambda: bool(told()))
@@ -243,7 +243,7 @@ def test_other_web_pages_may_call_only_where_they_are_named(scene: Path, client:
 
 
 def numbers(client: httpx.Client, name: str) -> dict[str, float]:
-    """The values of a metric by its labels."""
+    """Return the values of a metric by their labels."""
     lines = client.get("/metrics").text.splitlines()
     pairs = [line.rsplit(" ", 1) for line in lines if line.startswith((f"{name}{{", f"{name} "))]
     return {labels.removeprefix(name): float(value) for labels, value in pairs}

@@ -1,4 +1,4 @@
-"""More than the service can do: refused in time and with advice, while what was accepted is finished."""
+"""Overload: requests beyond the queue are rejected at once with Retry-After, and accepted ones are finished."""
 
 import json
 import math
@@ -26,9 +26,9 @@ pytestmark = pytest.mark.slow
 
 
 class SlowPoses(PoseCache):
-    """Poses that wait until they may go on, once `slow` is set, and are never remembered.
+    """A cache that keeps no poses; once `slow` is set, each pose waits for `go_on`.
 
-    From the `last` on that may begin, they wait until nobody wants them any more.
+    From pose number `last` on, each then waits until its request is cancelled.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
         queue = server[0].service.queue
 
         def ask(number: int) -> httpx.Response:
-            """As the client of an address that a proxy names."""
+            """Send a request as the client of an address, which a proxy names."""
             return client.post("/render", json=FRAME, headers={"X-Forwarded-For": f"10.0.0.{number}"})
 
         def check_refused(response: httpx.Response) -> None:
@@ -203,7 +203,7 @@ def _listens(client: httpx.Client) -> bool:
 
 
 def test_one_who_gives_up_does_not_spoil_the_pose_for_others(scene: Path):
-    """The pose that a stopped watch was computing is claimed by the next who waits for it."""
+    """A cancelled request leaves the poses of other requests in the cache."""
     cache, session = PoseCache(1 << 20), DeformationSession(scene)
     stopped = Watch()
     stopped.stop()

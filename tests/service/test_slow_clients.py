@@ -38,7 +38,7 @@ def begun(client: httpx.Client, first: bytes) -> socket.socket:
 
 
 def takes(connection: socket.socket, drip: bytes) -> bool:
-    """Whether more can be sent. If not it is closed, and its answer is lost: it came before what was sent since."""
+    """Return whether more can be sent. If not, the service has closed the connection, and its response is lost."""
     try:
         connection.sendall(drip)
     except OSError:
@@ -47,7 +47,7 @@ def takes(connection: socket.socket, drip: bytes) -> bool:
 
 
 def rest_of(connection: socket.socket) -> bytes:
-    """What comes until the other side closes."""
+    """Return all bytes until the service closes the connection."""
     received = b""
     try:
         while part := connection.recv(65536):

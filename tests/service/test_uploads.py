@@ -1,4 +1,4 @@
-"""Scenes that clients add and delete: whole or not at all, and nothing but scenes."""
+"""Uploads and deletions of scenes: each is complete or has no effect, and only valid scenes are stored."""
 
 import hashlib
 from collections.abc import Iterator
@@ -81,7 +81,7 @@ def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path)
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", [{}, {"body_seconds": 2}], ids=["leaves", "waits"])
 def test_a_file_that_stops_coming_leaves_nothing(folder: Path, limits: dict[str, Any]):
-    """Its client leaves, or is given up."""
+    """The client disconnects, or the service times out."""
     with serving(folder, uploads=True, **limits) as client:
         with connect(client) as connection:
             head = b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"

@@ -63,7 +63,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def page(browser: Browser) -> Iterator[Page]:
-    """An empty page that may not complain in its console, but of requests that found no service."""
+    """Yield an empty page; fail if its console shows an error other than a request that found no service."""
     with browser.new_context(viewport={"width": 820, "height": 420}, reduced_motion="reduce") as context:
         page = context.new_page()
         page.set_default_timeout(MILLISECONDS)
@@ -86,13 +86,13 @@ def opened(page: Page, client: httpx.Client) -> Page:
 
 
 def image(page: Page) -> np.ndarray:
-    """What the canvas holds, [H, W, 3] from 0 to 255."""
+    """Return the pixels of the canvas, [H, W, 3] from 0 to 255."""
     address = page.evaluate("document.getElementById('image').toDataURL('image/png')")
     return decode(base64.b64decode(address.split(",")[1]), "png")[0][..., :3]
 
 
 def bodies(page: Page) -> list[dict[str, Any]]:
-    """Of requests for frames; the list grows while the page asks."""
+    """Return a list that each later request for a frame adds its body to."""
     asked: list[dict[str, Any]] = []
 
     def note(request: Request) -> None:
@@ -345,12 +345,12 @@ def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_p
 
 
 def strongest_in_the_middle(image: np.ndarray) -> int:
-    """Which of red, green and blue."""
+    """Return the index of the strongest channel at the center of an image."""
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
 def in_time(page: Page, holds: Callable[[], bool]) -> bool:
-    """Whether it comes to be so within a minute."""
+    """Return whether a condition becomes true within a minute."""
     for _ in range(600):
         if holds():
             return True

@@ -1,4 +1,4 @@
-"""Scene files that were made to do harm, each from a sound one, and what their refusals say."""
+"""Hostile scene files, each made from a sound one, and the message of its refusal."""
 
 from collections.abc import Callable
 from functools import partial
@@ -11,11 +11,11 @@ from onnx import TensorProto, helper, numpy_helper, parser
 
 SECRET_BYTES = 24
 MANY = 1_500_000_000
-"""Numbers in float32 that take 6 GB."""
+"""Count of float32 numbers that take 6 GB."""
 
 
 class Attack(NamedTuple):
-    """What a file does, what its refusal says, and the file made from a sound scene and the path of a secret."""
+    """A hostile change of a scene file; `on` makes it from a sound model and the path of a secret file."""
 
     name: str
     message: str
@@ -26,7 +26,7 @@ class Attack(NamedTuple):
 
 
 def varint(value: int) -> bytes:
-    """A number in protobuf's wire format, as short as it can be."""
+    """Encode a number in protobuf's wire format."""
     digits = bytearray()
     while value >= 0x80:
         digits.append(value & 0x7F | 0x80)
@@ -35,14 +35,14 @@ def varint(value: int) -> bytes:
 
 
 def field(number: int, content: bytes | int) -> bytes:
-    """A field in protobuf's wire format: a number, or bytes with their length."""
+    """Encode a field in protobuf's wire format: a number, or bytes with their length."""
     if isinstance(content, int):
         return varint(number << 3) + varint(content)
     return varint(number << 3 | 2) + varint(len(content)) + content
 
 
 def with_graph(model: onnx.ModelProto, graph: bytes) -> bytes:
-    """The model with another graph, given as bytes."""
+    """Return the model with another graph, given as bytes."""
     rest = onnx.ModelProto()
     rest.CopyFrom(model)
     rest.ClearField("graph")
@@ -50,7 +50,7 @@ def with_graph(model: onnx.ModelProto, graph: bytes) -> bytes:
 
 
 def elsewhere(name: str, secret: Path, location: int = TensorProto.EXTERNAL) -> bytes:
-    """A tensor [8, 3] whose values are the first bytes of a file; `location` is the number that says so."""
+    """Return a tensor [8, 3] whose values are the first bytes of a file; `location` is its `data_location`."""
     tensor = onnx.TensorProto(name=name, data_type=TensorProto.UINT8, dims=[SECRET_BYTES // 3, 3])
     for key, value in {"location": str(secret), "offset": "0", "length": str(SECRET_BYTES)}.items():
         tensor.external_data.add(key=key, value=value)
@@ -58,17 +58,17 @@ def elsewhere(name: str, secret: Path, location: int = TensorProto.EXTERNAL) -> 
 
 
 def constant_elsewhere(secret: Path) -> onnx.NodeProto:
-    """A node whose output `bytes` is read from a file."""
+    """Return a node whose output `bytes` is read from a file."""
     value = onnx.TensorProto.FromString(elsewhere("value", secret))
     return helper.make_node("Constant", [], ["bytes"], value=value)
 
 
 AS_HEIGHTS = helper.make_node("Cast", ["bytes"], ["base"], to=TensorProto.FLOAT)
-"""Gives the bytes of the file as positions."""
+"""Returns the bytes of the file as positions."""
 
 
 def without_base(model: onnx.ModelProto) -> onnx.TensorProto:
-    """Take the positions out of the model's constants."""
+    """Remove the positions from the model's constants; return them."""
     base = next(each for each in model.graph.initializer if each.name == "base")
     model.graph.initializer.remove(base)
     return base
@@ -82,14 +82,14 @@ def put_first(model: onnx.ModelProto, *nodes: onnx.NodeProto) -> None:
 
 
 def truncated_location(model: onnx.ModelProto, secret: Path) -> bytes:
-    """2³² + 1 in 32 bits is 1: EXTERNAL."""
+    """Truncated to 32 bits, 2³² + 1 is 1: EXTERNAL."""
     without_base(model)
     put_first(model, AS_HEIGHTS)
     return with_graph(model, model.graph.SerializeToString() + field(5, elsewhere("bytes", secret, 2**32 + 1)))
 
 
 def location_alone(model: onnx.ModelProto, secret: Path) -> bytes:
-    """The same number in a file that is sound otherwise."""
+    """The same number in an otherwise sound file."""
     base = without_base(model).SerializeToString() + field(14, 2**32 + 1)
     return with_graph(model, model.graph.SerializeToString() + field(5, base))
 
@@ -112,7 +112,7 @@ def in_a_node(model: onnx.ModelProto, secret: Path) -> bytes:
 
 
 def with_factor(graph: str, model: onnx.ModelProto, secret: Path, **constants: np.ndarray) -> bytes:
-    """The scene whose motion is multiplied by the output of a graph, which is given in ONNX's text format."""
+    """Multiply the scene's motion by the output of a graph in ONNX's text format."""
     added = parser.parse_graph(f"added (float[1] t, float[1] one) => (float[1] factor) {graph}")
     constants |= {each.name: numpy_helper.to_array(each) for each in added.initializer}
     model.graph.initializer.extend(numpy_helper.from_array(values, name) for name, values in constants.items())
@@ -124,7 +124,7 @@ def with_factor(graph: str, model: onnx.ModelProto, secret: Path, **constants: n
 
 
 def beside_the_scene(nodes: str, **constants: np.ndarray) -> Callable[[onnx.ModelProto, Path], bytes]:
-    """Nodes that compute `largest`, which is multiplied by 0 and added to the factor of the scene's motion."""
+    """Add nodes that compute `largest`; times 0, it is added to the factor of the scene's motion."""
     small = f"int64[1] size = {{{MANY}}}, int64 start = {{0}}, int64 stop = {{{MANY}}}, int64 step = {{1}}"
     small += ", int64[1] first = {0}, int64[1] second = {1}, float[1] nothing = {0}"
     graph = f"<{small}> {{ {nodes} unseen = Mul(largest, nothing) factor = Add(one, unseen) }}"
@@ -132,13 +132,13 @@ def beside_the_scene(nodes: str, **constants: np.ndarray) -> Callable[[onnx.Mode
 
 
 def six_gigabytes(call: str) -> Attack:
-    """An array of 6 GB, made by an operator whose output is as large as numbers say."""
+    """Make an array of 6 GB by an operator whose inputs set the size of its output."""
     operator = call.partition("(")[0]
     nodes = f"vast = {call} few = Slice(vast, first, second) largest = Cast <to = 1> (few)"
     return Attack(f"six gigabytes by {operator}", f"the operator {operator}", beside_the_scene(nodes))
 
 
-# around t = 0.5 it runs 10¹⁵ times, at both ends of the scene's time not at all
+# the loop runs 10¹⁵ times around t = 0.5, and not at all at both ends of the time range
 LOOP = """
 <float[1] eight = {8}, float[1] huge = {1e15}, int64[0] none = {}, bool go = {1}> {
     rest = Sub(one, t)

@@ -1,4 +1,4 @@
-"""How much memory some work takes (Linux)."""
+"""Peak memory of a function (Linux)."""
 
 import ctypes
 from collections.abc import Callable
@@ -10,7 +10,7 @@ STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def measured(work: Callable[[], T]) -> tuple[T, float]:
-    """What the work returns, and by how many MB it raised the process's memory at its highest."""
+    """Return the result of a function and by how many MB it raised the peak memory of the process."""
     ctypes.CDLL(None).malloc_trim(0)  # what earlier work left free would hide this work's
     FORGET.write_text("5")  # the highest mark begins anew
     before = _memory("VmRSS")

@@ -60,7 +60,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
 
 
 def pick(rng: Rng, values: Iterable[Any]) -> Any:
-    """One of the values."""
+    """Return one of the values."""
     values = list(values)
     return values[int(rng.integers(len(values)))]
 
@@ -71,7 +71,7 @@ def _names(model: onnx.ModelProto) -> list[str]:
 
 
 def _messages(message: Message) -> Iterator[Message]:
-    """A message and all messages in it."""
+    """Yield a message and all messages in it."""
     yield message
     for field, value in message.ListFields():
         if field.message_type is not None:
@@ -80,7 +80,7 @@ def _messages(message: Message) -> Iterator[Message]:
 
 
 def _value(field: FieldDescriptor, model: onnx.ModelProto, rng: Rng) -> Any:
-    """A value for a field that is no message."""
+    """Return a value for a field that is not a message."""
     name = f"{field.containing_type.name}.{field.name}"
     if name in VALUES:
         return pick(rng, VALUES[name])
@@ -192,14 +192,14 @@ MUTATIONS: tuple[Mutation, ...] = (
     *[change_a_field] * 6, resize_a_constant, transpose_a_constant, move_a_constant_elsewhere, change_metadata,
 )  # fmt: skip
 SUBTLE: tuple[Mutation, ...] = (change_values, change_values, rewire, swap_operator, transpose_a_constant)
-"""Half of the changes: those that leave more files that onnxruntime sees."""
+"""Half of the changes: more of these files are valid and reach onnxruntime."""
 
 WIRE = 0.3
-"""Of the files, those that are changed in how they are written."""
+"""Share of the files whose encoding is changed."""
 
 
 def mutated(sound: bytes, rng: Rng) -> bytes:
-    """One to three changes of a sound file."""
+    """Return a sound file with one to three changes."""
     model = onnx.load_from_string(sound)
     only_wire = rng.random() < WIRE / 2
     for _ in range(0 if only_wire else int(rng.choice([1, 2, 3], p=[0.7, 0.2, 0.1]))):

@@ -19,11 +19,11 @@ from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 
 COUNT = 300
-"""More than one chunk of a compressed PLY."""
+"""Gaussians of a file: more than one chunk of a compressed PLY."""
 
 
 def some_gaussians(count: int = COUNT, sh_degree: int = 1, seed: int = 0) -> Gaussians:
-    """In a cube of one unit, every value different."""
+    """Return Gaussians in the cube [-1, 1]³ whose values all differ."""
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(count, 4))
     return Gaussians(
@@ -128,7 +128,7 @@ def ksplat_bytes(g: Gaussians) -> bytes:
 
 
 def spz3_bytes(g: Gaussians) -> bytes:
-    """`.spz` of our exporter."""
+    """Return a `.spz`, version 3, written by our exporter."""
     with tempfile.TemporaryDirectory() as folder:
         write_spz(Path(folder) / "a.spz", g, "dilate")
         return (Path(folder) / "a.spz").read_bytes()
@@ -197,13 +197,13 @@ def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
 
 
 def sog_bytes(g: Gaussians, palette: int | None = None) -> bytes:
-    """A SOG in a zip."""
+    """Return a SOG in a zip."""
     with tempfile.TemporaryDirectory() as folder:
         return zipped(write_sog(Path(folder) / "sog", g, palette))
 
 
 def zipped(folder: Path, compression: int = zipfile.ZIP_STORED) -> bytes:
-    """The files of a folder."""
+    """Return a zip of the files of a folder."""
     contents = io.BytesIO()
     with zipfile.ZipFile(contents, "w", compression) as archive:
         for file in sorted(folder.iterdir()):

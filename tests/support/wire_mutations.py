@@ -1,4 +1,4 @@
-"""Bytes of protobuf changed at random where their structure shows: fields, lengths and numbers, at any depth."""
+"""Random changes of protobuf's encoding: of fields, lengths and numbers, at any depth."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ FIXED = {1: 8, 5: 4}
 
 
 def changed_wire(message: bytes, rng: Rng, depth: int = 1) -> bytes:
-    """One change to a field of the message or of one inside it."""
+    """Return the message with one change to a field of it or of a message inside it."""
     parts = _parts(message)
     if not parts:
         return message[: int(rng.integers(len(message) + 1))]
@@ -70,7 +70,7 @@ def _changed(part: Part, rng: Rng) -> bytes:
 
 
 def _long(value: int) -> bytes:
-    """A number in one byte more than it needs."""
+    """Encode a number in one byte more than it needs."""
     short = varint(value)
     return short[:-1] + bytes([short[-1] | 0x80, 0])
 
@@ -83,7 +83,7 @@ def _written(part: Part) -> bytes:
 
 
 def _parts(message: bytes) -> list[Part] | None:
-    """The fields of a message; None for bytes that aren't one."""
+    """Return the fields of a message; None for bytes that aren't a message."""
     try:
         fields = UnknownFieldSet(Empty.FromString(message))
     except DecodeError:
