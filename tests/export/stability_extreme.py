@@ -39,7 +39,7 @@ MOVES, SCALES, IMAGE = "pose from the scene file", "scales from the file, relati
 
 
 def changed(change: Change = lambda model: None, count: int = COUNT, **config: Any) -> DynamicGaussians:
-    """A random model of one layer, changed."""
+    """Return a random model of one layer after a change."""
     model = random_model(count, **{"sh_degree": 0, "layers": (SMOOTH,), **config})
     with torch.no_grad():
         change(model)
@@ -47,7 +47,7 @@ def changed(change: Change = lambda model: None, count: int = COUNT, **config: A
 
 
 def exported(model: DynamicGaussians, scene: SceneInfo = SCENE) -> DeformationSession:
-    """The scene file that the export makes of a model, opened."""
+    """Export a model and open its scene file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder)
         save_model(path / "model.pt", model, scene, 1)
@@ -55,7 +55,7 @@ def exported(model: DynamicGaussians, scene: SceneInfo = SCENE) -> DeformationSe
 
 
 def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: DeformationSession | None = None) -> float:
-    """Largest error of the file's poses against the model in float64, at both ends and between, as
+    """Return the largest error of the file's poses against the model in float64, at both ends and between, as
     `export.measure.verify` measures it."""
     session = session or exported(model, scene)
     double, worst = in_format(model, FLOAT32).double(), 0.0
@@ -67,7 +67,7 @@ def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: Defor
 
 
 def image_error(gaussians: Gaussians, camera: Any) -> float:
-    """dB of the float32 image against the one of the float64 kernels, which the oracle holds to its loops."""
+    """Return the PSNR of the float32 image against that of the float64 kernels, in dB."""
     single, double = (rasterize(as_dtype(gaussians, d), camera, background=BACKGROUND).rgb for d in (np.float32, float))
     return compare(single, double).psnr
 
@@ -130,7 +130,7 @@ def _head_bias(columns: slice, value: float) -> Change:
 
 
 def _opaque_gradient() -> float:
-    """Largest difference of float32 gradients from float64 ones, where opacities are 1 to the last bit."""
+    """Return the largest difference of float32 gradients from float64 ones, where opacities are 1 to the last bit."""
     camera, gaussians = front_camera(), gaussians_of([[0, 0, 2], [0.1, 0, 3], [-0.1, 0.1, 4]])
     gradients = []
     for dtype in (torch.float32, torch.float64):
@@ -188,7 +188,7 @@ def extents() -> Iterator[Row]:
 
 
 def frames_error(model: DynamicGaussians, scene: SceneInfo, session: DeformationSession) -> tuple[int, float]:
-    """The most Gaussians in a frame, and dB of the file's worst frame against the model in float64, at times that the
+    """Return the most Gaussians in a frame, and the PSNR of the file's worst frame against the model in float64, at times that the
     assessment did not look at."""
     view, double = PoseRenderer(scene), in_format(model, FLOAT32).double()
     t0, t1 = scene.time_range
@@ -203,7 +203,7 @@ def frames_error(model: DynamicGaussians, scene: SceneInfo, session: Deformation
 
 
 def _scaled(kind: str, factor: float) -> tuple[DynamicGaussians, SceneInfo]:
-    """A scene, its cameras and all of its motion, `factor` times as large."""
+    """Return a scene whose size, cameras and motion are `factor` times as large."""
     like = changed(layers=(kind, kind))
     model = DynamicGaussians(like.config, like.gaussians, SceneBounds(1.3 * factor))
     own = ("cells", "first_time", "time_cells")
@@ -221,7 +221,7 @@ def _scaled(kind: str, factor: float) -> tuple[DynamicGaussians, SceneInfo]:
 
 
 def shapes() -> Iterator[Row]:
-    """Scales, needles, opacities at the ends of what there is."""
+    """Extreme scales, needles and opacities."""
     for exponent in (-20, -10, 10, 20):
         error = _scale_error(math.exp(exponent))
         yield measured(f"scales of e^{exponent}", SCALES, error, "float32.relative")
@@ -238,7 +238,7 @@ def shapes() -> Iterator[Row]:
 
 
 def poison() -> Iterator[Row]:
-    """NaN and inf in each tensor of a model's file, and in what it says of its scene."""
+    """NaN and inf in each tensor of a model file, and in its scene."""
     contents = _contents()
     for value in (math.nan, math.inf):
         missed, named = [], ""
@@ -270,7 +270,7 @@ def poison() -> Iterator[Row]:
 
 
 def _contents() -> dict[str, Any]:
-    """What the file of a small model with both kinds of layers holds."""
+    """Return the contents of a model file with both kinds of layers."""
     model = changed(count=3, layers=(replace(MLP, width=4), PlaneConfig(resolution=2, time_resolution=2, width=4)))
     with tempfile.TemporaryDirectory() as folder:
         save_model(Path(folder) / "model.pt", model, SCENE, 1)

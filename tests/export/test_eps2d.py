@@ -1,4 +1,4 @@
-"""A model's own eps2d goes with it: whoever draws it, in training, judging, exporting and serving, draws the same."""
+"""Training, evaluation, export and service all render with the model's own eps2d."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +39,7 @@ NARROW = GSPLAT._replace(eps2d=EPS2D)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With a model and its scene file."""
+    """Return a folder with a model and its scene file."""
     folder = tmp_path_factory.mktemp("narrow")
     model = random_model(count=60, eps2d=EPS2D)
     with torch.no_grad():
@@ -109,7 +109,7 @@ def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
 
 
 def test_training_may_begin_with_more(tmp_path: Path):
-    """What is saved says what it was trained with, early and late, and going on knows it too."""
+    """Saved models have the eps2d of their training step, also after a checkpoint is loaded."""
     sizes = replace(MOTION_BASES, eps2d=EPS2D)
     config = training_config(model=sizes, window_full_fraction=0.5, eps2d_init=0.4)
     trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))

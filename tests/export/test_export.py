@@ -1,4 +1,4 @@
-"""`export/to_onnx.py`: what the file holds, what it leaves behind, and that an old file outlives every failure."""
+"""`export/to_onnx.py`: the contents of the scene file, and that an old file survives every failure."""
 
 import hashlib
 import subprocess

@@ -1,4 +1,4 @@
-"""What is written for other viewers is the scene: read back, and held to the rules of each format."""
+"""Files for other viewers hold the scene when read back, and keep the rules of their format."""
 
 import json
 import struct
@@ -39,7 +39,7 @@ Change = Callable[[onnx.ModelProto], object]
 
 
 def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
-    """A moving scene of 300 Gaussians."""
+    """Write a moving scene of 300 Gaussians."""
     model = random_model(300, noise=0.02, layers=(replace(MLP, time_frequencies=2),) * 2, **config)
     file = folder / "scene.onnx"
     file.write_bytes(build(plan, bake(model, SCENE, "0" * 64)).SerializeToString())

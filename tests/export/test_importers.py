@@ -1,4 +1,4 @@
-"""Splat files of other programs: each format says what it holds, and what is wrong with it is said by name."""
+"""Import of splat files of other programs, and errors that name the faults of invalid ones."""
 
 import gzip
 import os
@@ -38,7 +38,7 @@ from tests.support.splat_files import (
 from tests.support.tolerances import tolerance
 
 REAL = os.environ.get("MSDGS_SPLATS")
-"""A folder with real files, where there is one."""
+"""A folder with real files, if there is one."""
 
 
 POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n"
@@ -228,7 +228,7 @@ def test_a_static_scene_is_the_file_and_can_be_drawn_without_saying_from_where(t
 
 
 def moving_frames(count: int) -> list[Gaussians]:
-    """One rigid motion; the last ten Gaussians stand still."""
+    """Return frames of a rigid motion in which the last ten Gaussians are static."""
     first, frames = some_gaussians(200, 0), []
     for i in range(count):
         means = first.means.copy()

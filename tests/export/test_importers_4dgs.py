@@ -1,4 +1,4 @@
-"""Runs of 4DGaussians: their network, said again here with grid_sample, and what becomes of it."""
+"""Import of 4DGaussians runs, compared with their network, which is written here with grid_sample."""
 
 import itertools
 import json
@@ -52,7 +52,7 @@ def their_state(scales: tuple[int, ...] = (1, 2)) -> dict[str, Tensor]:
 
 
 def their_deltas(state: dict[str, Tensor], x: Tensor, t: float) -> dict[str, Tensor]:
-    """Their network in float64: what each head says of positions [N, 3]."""
+    """Return the outputs of all heads of their network at positions [N, 3], in float64."""
     s = {name.removeprefix("deformation_net."): tensor.double() for name, tensor in state.items()}
     box = s["grid.aabb"]
     inside = (x.double() - box[0]) * (2 / (box[1] - box[0])) - 1
@@ -73,7 +73,7 @@ def their_deltas(state: dict[str, Tensor], x: Tensor, t: float) -> dict[str, Ten
 
 
 def write_run(folder: Path, state: dict[str, Tensor], switches: str = SWITCHES, lengths: float = 0.5) -> Path:
-    """Quaternions are 1 − `lengths` to 1 + `lengths` long."""
+    """Write a run whose quaternions have norms from 1 − `lengths` to 1 + `lengths`."""
     cloud = folder / "point_cloud" / "iteration_20000"
     cloud.mkdir(parents=True)
     columns = inria_columns(some_gaussians(COUNT, 3))

@@ -1,6 +1,6 @@
-"""Damaged files of every kind that is imported: an error by name or a finite image, in no more time and memory.
+"""Damaged files of every imported kind are refused or rendered finite, in bounded time and memory.
 
-`MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` takes so many of each kind, and larger ones.
+`MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` tests so many larger files of each kind.
 """
 
 import os
@@ -31,27 +31,27 @@ from tests.support.tolerances import tolerance
 pytestmark = pytest.mark.slow
 QUIET = Console(quiet=True)
 DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "30"))
-"""Files of each kind."""
+"""Damaged files of each kind."""
 
 COUNT = 300 if DAMAGED < 1000 else 1_000
-"""Gaussians a file."""
+"""Gaussians in a file."""
 
 PALETTE = 64
 """Sets of harmonics in a SOG."""
 
 ENDS = 1024
-"""Bytes at both ends, where headers and tables are and half of the damage is done."""
+"""Bytes at each end of a file, where headers and tables are; half of the damage is done there."""
 
 
 class Kind(NamedTuple):
-    """How to make one and how to look at it."""
+    """How files of a kind are written and read."""
 
-    make: Callable[[Path, Gaussians], list[Path]]  # in a folder that is empty; returns the files that may be damaged
+    make: Callable[[Path, Gaussians], list[Path]]  # in an empty folder; returns the files to damage
     read: Callable[[Path, list[Path]], Gaussians]  # of the folder and these files
 
 
 def one(file_format: str) -> Kind:
-    """A format of one file, which is detected from what is left of it."""
+    """Return the kind of a format of one file, which is detected from the damaged file."""
     return Kind(
         lambda folder, g: [write_splats(folder, file_format, g)],
         lambda folder, files: read_splats(files[0]).gaussians,
@@ -161,7 +161,7 @@ def refused_or_drawn(kind: Kind, folder: Path, files: list[Path]) -> Taken:
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
-    """Some bits turned, half of the time at the ends, and in one of three cases cut off."""
+    """Flip 1 to 7 bits, in half of the cases near the ends, and in a third of the cases cut the file off."""
     changed = bytearray(whole)
     at_ends = rng.random() < 0.5
     for _ in range(rng.integers(1, 8)):

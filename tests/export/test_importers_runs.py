@@ -1,4 +1,4 @@
-"""Runs of Deformable-3D-Gaussians: their network, said again here in a few lines, and what becomes of it."""
+"""Import of Deformable-3D-Gaussians runs, compared with their network, which is written here in a few lines."""
 
 import zipfile
 from pathlib import Path
@@ -54,7 +54,7 @@ def their_state(blender: bool, depth: int = 8, width: int = 64) -> dict[str, Ten
 
 
 def their_deltas(state: dict[str, Tensor], x: Tensor, t: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Their network in float64: deltas of positions, rotations and scales."""
+    """Return the deltas of positions, rotations and scales by their network in float64."""
     s = {name: tensor.double() for name, tensor in state.items()}
 
     def linear(name: str, value: Tensor) -> Tensor:
@@ -201,7 +201,7 @@ def test_a_checkpoint_that_unpacks_to_more_than_itself_is_refused(tmp_path: Path
 
 
 def on_which_device(monkeypatch: pytest.MonkeyPatch, importer: ModuleType) -> list[str]:
-    """Where the networks of models are from now on made; on `meta` they take no memory."""
+    """Return a list of the devices on which networks are made from now on; on `meta` they take no memory."""
     built: list[str] = []
 
     def model(*given: Any) -> DynamicGaussians:

@@ -242,7 +242,7 @@ def test_a_kind_of_layer_from_elsewhere_is_exported(
 
 
 class RigidConfig(SupportConfig):
-    """Of a kind that the package doesn't know."""
+    """Settings of a kind of support that the package doesn't have."""
 
     kind = "rigid"
 
@@ -251,7 +251,7 @@ class RigidConfig(SupportConfig):
 
 
 class Rigid(Support):
-    """All Gaussians move as the origin does."""
+    """All Gaussians move with the origin."""
 
     kind = "rigid"
     num_points = 1

@@ -25,7 +25,7 @@ from tests.support.tolerances import tolerance
 pytestmark = pytest.mark.slow
 
 GAUSSIAN_BYTES = 40 + 4
-"""Pose and opacity of a static Gaussian; its SH coefficients have 12 each."""
+"""Bytes of a static Gaussian's pose and opacity; an SH coefficient has 12 bytes."""
 
 
 def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> ExportJob:
@@ -34,7 +34,7 @@ def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **set
 
 
 def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: SceneInfo) -> float:
-    """PSNR of the worst of frames at times that the export has not looked at, the model in float64."""
+    """Return the PSNR of the worst frame, against the model in float64, at times that the export didn't use."""
     double, worst = model.double(), np.inf
     session, (t0, t1) = DeformationSession(candidate.path), info.time_range
     camera = camera_of(CAMERA, CAMERA["width"])
@@ -222,7 +222,7 @@ def test_layers_on_nodes_keep_all_heads(tmp_path: Path, kind: str):
 
 
 def with_hidden_one(model: DynamicGaussians) -> DynamicGaussians:
-    """The object's first Gaussian is behind all cameras."""
+    """Move the object's first Gaussian behind all cameras."""
     with torch.no_grad():
         model.gaussians.means[GROUND] = torch.tensor([0.0, 0.0, -50.0])
     return model

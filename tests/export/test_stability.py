@@ -1,4 +1,4 @@
-"""What the stability report says of models whose answer is known, and every row of the suite."""
+"""The stability report of models whose result is known, and every row of the suite."""
 
 import csv
 import json

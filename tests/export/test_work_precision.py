@@ -1,4 +1,4 @@
-"""The sweep and its report: dominated points are never chosen, errors repeat, wrong wishes are refused."""
+"""The sweep and its report: dominated points are never chosen, errors repeat, invalid options are refused."""
 
 import json
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ POINT_FIELDS = {
 
 
 def point(milliseconds: float, db: float, rasterizer: str = DEFAULT_RASTERIZER) -> Point:
-    """A point of which only time and error matter."""
+    """Return a point with this time and error."""
     times = FrameTime(*(Milliseconds(milliseconds, milliseconds),) * 3)
     error = RenderedError(db, db, None, 0.0, 0.0, 0.0, 1)
     return Point(cast(Any, SimpleNamespace()), rasterizer, times, error, None, None)
@@ -91,7 +91,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tup
 
 @pytest.fixture(scope="module", autouse=True)
 def few_candidates() -> Iterator[None]:
-    """As many as the tests estimate at."""
+    """Limit the sweep to few candidates."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.jobs.sweep.PRUNING_STEPS", (5.0, 1.0, -5.0))
         for name, texts in (("lowrank", []), ("keyframes", ["keyframes:2.0"])):

@@ -1,4 +1,4 @@
-"""From a trained model to a frame over HTTP: the service shows what the trainer saw."""
+"""From a trained model to a frame over HTTP: the service renders what the trainer renders."""
 
 from pathlib import Path
 

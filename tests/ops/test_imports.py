@@ -1,4 +1,4 @@
-"""Which room may import which: read from the sources by import-linter, and seen in fresh interpreters."""
+"""Which package may import which: checked in the sources by import-linter, and in fresh interpreters."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ for name in names:
 
 
 def modules_after(code: str) -> set[str]:
-    """Top-level modules that a fresh interpreter has loaded after running `code`."""
+    """Return the top-level modules that a fresh interpreter has loaded after running `code`."""
     report = "\nimport json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
     return set(json.loads(run_python(code + report)))
 

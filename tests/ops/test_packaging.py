@@ -1,4 +1,4 @@
-"""What `pip install .` alone brings: enough to serve a scene outside of the checkout, and no more than that."""
+"""`pip install .` alone is enough to serve a scene outside of the checkout, and installs nothing of training."""
 
 import json
 import os

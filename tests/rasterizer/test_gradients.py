@@ -17,11 +17,11 @@ from tests.support.tolerances import assert_close, tolerance
 
 BACKGROUND = (0.2, 0.6, 0.9)
 STEP = 1e-6
-"""Of the central differences: their error is STEP² f''' / 6, about 1e-10, and 1e-16 / STEP = 1e-10 from rounding."""
+"""Step of central differences: their error is STEP² f''' / 6, about 1e-10, plus 1e-16 / STEP = 1e-10 from rounding."""
 
 
 class Parameters(NamedTuple):
-    """What the rasterizer is differentiated by; quaternions are normalised on their way in."""
+    """Inputs that have gradients; quaternions are normalized before they are rendered."""
 
     means: torch.Tensor
     quats: torch.Tensor
@@ -71,7 +71,7 @@ def weighted(pixels: np.ndarray, seed: int = 0) -> Loss:
 
 
 def assert_gradients_agree(got: dict[str, np.ndarray], want: dict[str, np.ndarray], row: str):
-    """Kind by kind, relative to the largest entry of that kind; where that is nothing, to the largest of all."""
+    """Compare gradients relative to the largest entry of their kind; if that is about 0, to the largest of all."""
     largest = max(np.abs(want[kind]).max(initial=0) for kind in KINDS)
     for kind in KINDS:
         size = np.abs(want[kind]).max(initial=1e-6 * largest)
@@ -80,7 +80,7 @@ def assert_gradients_agree(got: dict[str, np.ndarray], want: dict[str, np.ndarra
 
 
 def central_differences(value: Callable[[], float], parameter: torch.Tensor) -> np.ndarray:
-    """d value / d parameter, entry by entry."""
+    """Return d value / d parameter, entry by entry."""
     flat = parameter.detach().view(-1)
     result = np.empty(flat.shape)
     for i in range(len(flat)):
@@ -94,7 +94,7 @@ def central_differences(value: Callable[[], float], parameter: torch.Tensor) -> 
 
 
 def small_scene(seed: int, options: RasterizerOptions = GSPLAT) -> tuple[Parameters, Camera, np.ndarray]:
-    """A few Gaussians over one another; and the pixels that are not at a threshold."""
+    """Return a few overlapping Gaussians, a camera, and the pixels that are not at a threshold."""
     gaussians, camera = random_scene(seed, 7, 21, 13)
     gaussians = as_dtype(gaussians, np.float64)
     clear = reference.render(gaussians, camera, BACKGROUND, options).slack == 0
@@ -130,7 +130,7 @@ def test_finite_differences(kind: str, seed: int, options: RasterizerOptions):
 
 
 def test_pixels_at_a_threshold_jump_by_no_more_than_stated():
-    """Where a step of the parameters tips a decision, the image departs from its gradient by at most the slack."""
+    """At a threshold the image departs from its gradient by at most the oracle's bound."""
     splat = gaussians_of([[0, 0, 2], [0.1, 0, 3]], scales=0.2, opacities=[0.6, 0.9], dtype=np.float64)
     camera, step = front_camera(21, 13), 2e-4
     want = reference.render(splat, camera, BACKGROUND)
@@ -152,7 +152,7 @@ def test_pixels_at_a_threshold_jump_by_no_more_than_stated():
 def assert_as_autograd(
     parameters: Parameters, camera: Camera, loss: Loss | None = None, options: RasterizerOptions = GSPLAT
 ):
-    """At all pixels unless the loss says otherwise: in float64 both renderers decide alike."""
+    """Compare all pixels unless the loss selects some: in float64 both renderers make the same decisions."""
     loss = loss or weighted(np.ones((camera.height, camera.width)))
     got = gradients(draw(parameters, camera, options), loss, parameters)
     want = gradients(draw_plainly(parameters, camera, options), loss, parameters)
@@ -183,7 +183,7 @@ def test_losses_on_one_output_or_one_pixel(loss: Loss):
 
 @pytest.mark.parametrize("opacity", [0.0, 0.9995, 1.0])
 def test_no_gradient_is_infinite_at_the_ends_of_opacity(opacity: float):
-    """Three of opacity 1 behind one another: 1 / (1 - alpha) is what a naive backward pass divides by."""
+    """Three Gaussians behind one another: a naive backward pass divides by 1 - alpha, which is 0."""
     gaussians = gaussians_of([[0, 0, 2], [0, 0, 2.5], [0, 0, 3]], scales=0.5, opacities=[opacity, 1.0, opacity])
     assert_as_autograd(parameters_of(gaussians), front_camera(9, 7))
 
@@ -268,7 +268,7 @@ def test_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("changed", ["image", "means"])
 def test_a_change_in_place_before_the_backward_pass_is_noticed(changed: str):
-    """As by torch's own functions: the gradient would belong to neither value."""
+    """As for torch's own functions: the gradient would be that of neither value."""
     parameters, camera, _ = small_scene(59)
     rgb, _ = draw(parameters, camera)
     with torch.no_grad():

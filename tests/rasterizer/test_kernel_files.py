@@ -1,4 +1,4 @@
-"""Machine code on disk: void when a source changes, mended where it is damaged, complete before the first request."""
+"""Cached machine code: compiled again if a source changes or a file is damaged, complete before the first request."""
 
 import ast
 import json
@@ -40,14 +40,14 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def compiled(room: Path) -> Path:
-    """A folder of machine code that a process has filled and another one has used."""
+    """Return a cache that one process has filled and another one has used."""
     assert call(room, room / "cache") == (42.0, True)
     assert call(room, room / "cache") == (42.0, False)
     return room / "cache"
 
 
 def call(room: Path, cache: Path | str) -> tuple[float, bool]:
-    """Result of the kernel in a process of its own, and whether that process compiled it."""
+    """Return the kernel's result in a new process, and whether that process compiled it."""
     value, misses = run_python(CALL, room, NUMBA_CACHE_DIR=str(cache)).split()
     return float(value), misses != "0"
 
@@ -123,7 +123,7 @@ def files_of(folder: Path, stamp: str = "now") -> CheckedFiles:
 
 
 def test_code_that_two_processes_store_at_once_is_not_mixed_up(tmp_path: Path):
-    """Each has seen an index without the other's code; whichever is written last, no type gets the other's."""
+    """Both processes read the index before the other stored its code; no type may get the other's code."""
     files_of(tmp_path).save("float32", "code for float32")
     index = (tmp_path / "room.kernel.nbi").read_bytes()
     (tmp_path / "room.kernel.nbi").unlink()
@@ -198,7 +198,7 @@ def kernel_files() -> list[Path]:
 
 @pytest.mark.parametrize("file", kernel_files(), ids=lambda file: file.stem)
 def test_kernels_use_only_what_their_stamp_follows(file: Path):
-    """From the package's own modules: the rasterizer, the scene's vocabulary, the kernel's own folder."""
+    """Kernels use modules of the rasterizer, the scene and their own folder only."""
     tree = ast.parse(file.read_text())
     own = ".".join(file.relative_to(ROOT).parent.parts)
     followed = ("msdgs_serve.rasterizer", "msdgs_serve.scene", own)
@@ -253,7 +253,7 @@ def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
 
 
 def test_kernels_run_without_the_compiler() -> None:
-    """As plain Python their tests pass as well, and reach nearly all of their lines."""
+    """Their tests also pass with the kernels as plain Python, and cover nearly all of their lines."""
     run_python("import sys; from tests.rasterizer.kernel_coverage import main; sys.exit(main())")
 
 

@@ -18,7 +18,7 @@ EXACT_DEPTHS = {"equal_depths"}
 
 
 def assert_same_image(got: Rendering, want: Reference, row: str, least_clean: float = 0.5):
-    """Tight where every decision is clear; bounded by the decisions' own effect in the band where it is not."""
+    """Compare tightly where no decision is in doubt; elsewhere allow the effect of the decision as well."""
     clean = want.slack == 0
     assert clean.mean() >= least_clean, "the comparison would be empty"
     for name in ("rgb", "alpha"):
@@ -77,7 +77,7 @@ def test_adversarial_scenes(name: str):
 
 @pytest.mark.slow
 def test_largest_image():
-    """8192 × 8192, in which a few splats are found where they belong, small, large and at the far corner."""
+    """A few splats, small, large and at the far corner, are at their places in 8192 × 8192 pixels."""
     side = 8192
     camera = front_camera(side, side, focal=6000.0)
     means = np.array([[0, 0, 3], [-1.2, 1.3, 2], [0.5, -1.0, 2.2], [1.36, 1.36, 2]])

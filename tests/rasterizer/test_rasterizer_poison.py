@@ -1,4 +1,4 @@
-"""Values that must be drawn correctly or refused by name, through `rasterize`."""
+"""Extreme values are rendered correctly by `rasterize`, and invalid ones are refused by name."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def poisoned(field: str, value: object) -> tuple[Gaussians, Camera]:
     ("field", "poison"), [*((field, np.nan) for field in FIELDS), ("quats", 0.0), ("scales", 0.0), ("opacities", 1.5)]
 )
 def test_gaussians_are_validated(field: str, poison: float):
-    """Every invalid value is in tests/scene/test_scene_gaussians.py."""
+    """All invalid values are tested in tests/scene/test_scene_gaussians.py."""
     with pytest.raises(InvalidInput) as error:
         draw(*poisoned(field, poison))
     assert error.value.field == f"gaussians.{field}"

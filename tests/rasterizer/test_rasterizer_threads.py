@@ -24,14 +24,14 @@ print(sum(sum(s.cache_hits.values()) for s in stats), sum(sum(s.cache_misses.val
 
 
 def kernels() -> list[Dispatcher]:
-    """Every numba function in the package's loaded modules."""
+    """Return every numba function in the package's loaded modules."""
     modules = [module for name, module in list(sys.modules.items()) if name.startswith("msdgs_serve")]
     found = {id(value): value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
     return list(found.values())
 
 
 def compiled() -> int:
-    """Versions of kernels in this process, one for each combination of argument types."""
+    """Return the number of compiled versions of kernels, one for each combination of argument types."""
     return sum(len(kernel.signatures) for kernel in kernels())
 
 
@@ -41,7 +41,7 @@ def bytes_of(image: Rendering) -> list[bytes]:
 
 @pytest.mark.parametrize("threads", ["1", "2", "3", "7"])
 def test_same_bytes_for_any_number_of_threads(threads: str, monkeypatch: pytest.MonkeyPatch):
-    """The pool is as large as it was first asked for; the work is split anew by each number."""
+    """The size of the pool is fixed by its first use; the work is split by the current number."""
     gaussians, camera = random_scene(41, 500, 150, 90)
     expected = bytes_of(draw(gaussians, camera))
     monkeypatch.setenv("MSDGS_THREADS", threads)
