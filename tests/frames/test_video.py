@@ -130,7 +130,7 @@ def test_an_animated_webp_shows_the_frames(tmp_path: Path):
         ({"frames": [{"camera": ORBIT, "t": 0}] * 11}, "frames"),
         ({"frames": [{"camera": ORBIT, "t": 0}] * 10, "width": 200, "height": 100}, "frames"),
         ({"path": nerfstudio(), "width": 10}, "width"),
-        ({"path": nerfstudio(), "width": 1, "height": 1}, "height"),
+        ({"path": nerfstudio(), "width": 1, "height": 1}, "width"),
         ({"path": nerfstudio(), "format": "gif"}, "format"),
     ],
     ids=lambda value: str(value)[:30],

@@ -86,12 +86,12 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
             check_problem(response, 503)
             assert 1 <= int(response.headers["Retry-After"]) <= 60
 
-        accepted = [pool.submit(ask, 0), pool.submit(ask, 0)]
-        eventually(lambda: queue.running == 2)
+        accepted = [pool.submit(ask, 0) for _ in range(3)]
+        eventually(lambda: (queue.running, queue.waiting) == (2, 1))
         refused = ask(0)
         check_refused(refused)
-        assert "2 places" in refused.json()["detail"], "the share of one client"
-        accepted += [pool.submit(ask, number) for number in (1, 2, 3)]
+        assert "3 places" in refused.json()["detail"], "the share of one client"
+        accepted += [pool.submit(ask, number) for number in (1, 2)]
         eventually(lambda: (queue.running, queue.waiting) == (2, 3))
         for _ in range(3):
             check_refused(client.post("/render", json=FRAME))
