@@ -11,11 +11,16 @@ STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 def measured(work: Callable[[], T]) -> tuple[T, float]:
     """Return the result of a function and by how many MB it raised the peak memory of the process."""
-    ctypes.CDLL(None).malloc_trim(0)  # what earlier work left free would hide this work's
-    FORGET.write_text("5")  # the highest mark begins anew
-    before = _memory("VmRSS")
+    before = resident_megabytes()  # freed memory of earlier work would hide that of this work
+    FORGET.write_text("5")  # resets the peak
     result = work()
     return result, _memory("VmHWM") - before
+
+
+def resident_megabytes() -> float:
+    """Return the memory in use, after glibc has returned what it keeps for later allocations."""
+    ctypes.CDLL(None).malloc_trim(0)
+    return _memory("VmRSS")
 
 
 def _memory(name: str) -> float:
