@@ -12,6 +12,7 @@ import onnx
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from onnx import TensorProto, numpy_helper
+from onnx.external_data_helper import uses_external_data
 
 from tests.support.hostile_scenes import POISON, elsewhere
 from tests.support.wire_mutations import changed_wire
@@ -145,7 +146,7 @@ def rewire(model: onnx.ModelProto, rng: Rng) -> None:
 
 
 def _changed_constant(model: onnx.ModelProto, rng: Rng, change: Callable[[np.ndarray], np.ndarray]) -> None:
-    constant = pick(rng, model.graph.initializer)
+    constant = pick(rng, [each for each in model.graph.initializer if not uses_external_data(each)])
     values = change(numpy_helper.to_array(constant).copy())
     constant.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(values), constant.name))
 
