@@ -175,7 +175,7 @@ def test_a_file_that_is_not_its_model_is_found_out(scene_file: Path, name: str):
 
 
 @pytest.mark.parametrize("count", [1, 30])
-def test_unstable_gaussians_are_counted_and_what_is_seen_of_them_is_judged_by_frames_alone(tmp_path: Path, count: int):
+def test_unstable_gaussians_are_counted_and_compared_in_frames(tmp_path: Path, count: int):
     model = random_model(300, layers=("mlp",))
     heads, raw_quats = model.get_submodule("deformation.layers.0.heads"), model.gaussians.raw_quats
     assert isinstance(heads, torch.nn.Linear)
@@ -199,7 +199,7 @@ def interrupt() -> None:
     ("settings", "error"),
     [({"tolerance": 0.0}, VerificationFailed), ({"on_time": interrupt}, KeyboardInterrupt)],
 )
-def test_an_old_file_outlives_what_goes_wrong(tmp_path: Path, settings: dict[str, Any], error: type):
+def test_an_old_file_survives_failures(tmp_path: Path, settings: dict[str, Any], error: type):
     output = tmp_path / "scene.onnx"
     output.write_bytes(b"an older scene")
     checkpoint = saved(tmp_path, random_model())

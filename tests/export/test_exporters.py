@@ -110,7 +110,7 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
 
 
 @pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it softer"), (0.3, ""), (0.5, "draw it harder")])
-def test_who_converts_is_told_how_others_draw_it(tmp_path: Path, eps2d: float, said: str):
+def test_differences_of_other_renderers_are_printed(tmp_path: Path, eps2d: float, said: str):
     printed = StringIO()
     scene = scene_file(tmp_path, eps2d=eps2d)
     convert(Settings(scene, tmp_path / "a.ply", 0.0, 30, None), Console(file=printed, soft_wrap=True))
@@ -166,7 +166,7 @@ def test_usd_has_a_sample_a_frame(tmp_path: Path, ending: str):
     assert_same(read_usd(tmp_path / f"still.{ending}")(0), session.gaussians(0.4))
 
 
-def test_what_is_not_close_enough_does_not_replace_a_file(tmp_path: Path):
+def test_a_failed_conversion_keeps_the_old_file(tmp_path: Path):
     scene, out = scene_file(tmp_path), tmp_path / "a.spz"
     out.write_text("old")
     with pytest.raises(ConversionFailed, match=r"99.5 dB were asked for"):
@@ -281,7 +281,7 @@ def test_visionary_may_have_gaussians_in_half_precision(tmp_path: Path):
     check_visionary(model)
 
 
-def test_a_quantised_plan_is_refused_with_what_to_do(tmp_path: Path):
+def test_a_quantised_plan_is_refused_with_an_alternative(tmp_path: Path):
     with pytest.raises(InvalidInput, match=r"--plan lowrank"):
         run(scene_file(tmp_path, "int8"), tmp_path / "a.visionary.onnx")
 
@@ -293,6 +293,6 @@ def test_a_quantised_plan_is_refused_with_what_to_do(tmp_path: Path):
         ("a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd or .visionary.onnx"),
     ],
 )
-def test_other_endings_say_what_there_is(tmp_path: Path, out: str, message: str):
+def test_unknown_endings_name_the_known_ones(tmp_path: Path, out: str, message: str):
     with pytest.raises(InvalidInput, match=message):
         run(scene_file(tmp_path), tmp_path / out)

@@ -119,7 +119,7 @@ def test_more_data_than_the_header_says_is_left_alone(tmp_path: Path):
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_a_header_that_promises_too_much_takes_no_memory(tmp_path: Path, form: str):
+def test_a_header_with_too_high_a_count_takes_no_memory(tmp_path: Path, form: str):
     file = write(tmp_path, "a.ply", ply_bytes(inria_columns(some_gaussians(5, 0)), form, count=10**12))
     tracemalloc.start()
     with pytest.raises(ImportFailed, match=r"cut off: 1,000,000,000,000 rows"):
@@ -147,7 +147,7 @@ def test_a_header_that_promises_too_much_takes_no_memory(tmp_path: Path, form: s
         ("a.txt", b"nothing of ours", r"--format names it, one of model, ply"),
     ],
 )
-def test_what_cannot_be_read_says_why(tmp_path: Path, name: str, contents: bytes, message: str):
+def test_unreadable_files_name_the_reason(tmp_path: Path, name: str, contents: bytes, message: str):
     file = write(tmp_path, name, contents)
     with pytest.raises(ImportFailed, match=message):
         read_splats(file, detect_format(file))

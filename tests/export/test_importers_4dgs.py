@@ -120,7 +120,7 @@ def test_the_network_is_theirs(tmp_path: Path, scales: tuple[int, ...], lengths:
         assert (posed.quats - turned / turned.norm(dim=1, keepdim=True)).abs().max() < tolerance("import.network")
 
 
-def test_what_its_switches_turn_off_stays(tmp_path: Path):
+def test_deltas_that_are_switched_off_are_zero(tmp_path: Path):
     run = write_run(tmp_path / "run", their_state(), "no_dx=False, no_ds=True, no_dr=True, white_background=False")
     write_model(run, "4dgs", tmp_path / "model.pt", QUIET)
     model, info, _ = load_model(tmp_path / "model.pt")

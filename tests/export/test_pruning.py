@@ -94,7 +94,7 @@ def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str)
         assert scene.metadata.sh_degree == 1
 
 
-def test_layers_whose_trial_would_be_too_dear_stay_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("export.pruning.rules.MAX_OPERATIONS", 0.0)
     pruned = job_of(tmp_path, moving_object()).pruned(45.0)
     left_out = {entry["rule"] for entry in pruned.left_out}
@@ -133,7 +133,7 @@ def test_the_error_allowed_is_kept_in_frames_of_our_own(tmp_path: Path, pruning_
     assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("pruning.other_times_db")
 
 
-def test_trimming_less_leaves_more_in(tmp_path: Path):
+def test_a_higher_psnr_prunes_less(tmp_path: Path):
     job = job_of(tmp_path, random_model(400, sh_degree=1, noise=0.02))
     sizes = [job.candidate("network", pruning_db).size for pruning_db in (30.0, 55.0, None)]
     assert sizes == sorted(sizes)
@@ -203,7 +203,7 @@ def test_cameras_are_added_where_too_few_are_stored(count: int):
         (40, {}, SceneInfo(time_range=(0.5, 0.5), bounds=SCENE.bounds, cameras=SCENE.cameras[:2])),
     ],
 )
-def test_unusual_scenes_are_trimmed_and_written(tmp_path: Path, count: int, changes: dict[str, Any], info: SceneInfo):
+def test_unusual_scenes_are_pruned_and_written(tmp_path: Path, count: int, changes: dict[str, Any], info: SceneInfo):
     job = job_of(tmp_path, random_model(count, **changes), info)
     candidate = job.candidate("network", 50.0)
     error = job.error(candidate)

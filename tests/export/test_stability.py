@@ -166,7 +166,7 @@ def test_the_worst_gaussians_are_named_with_what_they_do_to_the_image():
 
 
 @pytest.mark.parametrize(("count", "layers"), [(0, ("mlp",)), (5, ())])
-def test_what_does_not_move_is_steady(count: int, layers: tuple[str, ...]):
+def test_static_models_are_stable(count: int, layers: tuple[str, ...]):
     report = assess(random_model(count, layers=layers), SCENE)
     assert report.stable
     assert report.refusal("network") is None

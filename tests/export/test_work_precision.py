@@ -77,7 +77,7 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_p
         assert points[best].milliseconds == min(p.milliseconds for p in within)
 
 
-def test_what_no_file_can_ask_for_is_not_chosen():
+def test_rasterizers_that_no_file_can_select_are_not_chosen():
     points = [point(10, 60), point(1, 99, "another")]
     assert front(points) == [0]
     assert choose(points, 50) == 0
@@ -133,7 +133,7 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
     assert sweep._too_expensive("network", None) is None
 
 
-def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: tuple[ExportJob, SweepResult]):
+def test_of_similarly_fast_plans_the_smallest_is_pruned(swept: tuple[ExportJob, SweepResult]):
     def estimate(plan: str, cpu: float, size: int, db: float = 60.0) -> QuickEstimate:
         return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), DEFAULT_RASTERIZER, cpu + 30, cpu, db)
 
@@ -166,7 +166,7 @@ def test_the_same_model_has_the_same_errors(swept: tuple[ExportJob, SweepResult]
         assert again.error(again.candidate(c.plan, c.pruning_db, lower)) == p.error
 
 
-def test_the_report_holds_what_it_promises(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
+def test_the_report_has_its_fields(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
     contents = report(*swept)
     paths = write_report(contents, tmp_path / "ball.onnx")
     assert [path.name for path in paths] == ["ball.report.json", "ball.report.md", "ball.report.png"]
@@ -220,7 +220,7 @@ def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: p
         ),
     ],
 )
-def test_wrong_wishes_are_refused_by_name(
+def test_invalid_options_are_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
 ):
     wishes: dict[str, Any] = {"output": tmp_path / "s.onnx"} | settings

@@ -104,7 +104,7 @@ def test_a_time_outside_the_scene_is_refused_and_not_remembered(session: Deforma
         assert error.value.field == "t"
 
 
-def test_one_computation_for_all_who_ask_together(counting: CountingSession):
+def test_simultaneous_requests_share_one_computation(counting: CountingSession):
     renderer = Renderer()
     counting.release.clear()
     with ThreadPoolExecutor(8) as pool:
@@ -127,7 +127,7 @@ def test_scenes_do_not_share_poses(session: DeformationSession, counting: Counti
     assert renderer.posed(counting, 0.0) is not renderer.posed(other, 0.0)
 
 
-def test_a_failed_computation_reaches_all_who_wait_and_is_tried_again(counting: CountingSession):
+def test_a_failed_computation_fails_all_requests_and_is_repeated(counting: CountingSession):
     renderer = Renderer()
     counting.failure = RuntimeError("no memory")
     counting.release.clear()

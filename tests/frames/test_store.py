@@ -51,7 +51,7 @@ def test_a_scene_is_opened_when_first_asked_for_and_once(tmp_path: Path):
     assert store.status("walk").loaded
 
 
-def test_a_changed_file_is_loaded_anew(tmp_path: Path):
+def test_a_changed_file_is_loaded_again(tmp_path: Path):
     path = write_scene(tmp_path / "walk.onnx")
     store = SceneStore([path])
     before = store.get("walk")
@@ -174,7 +174,7 @@ def incoming(store: SceneStore, **changes: Any) -> Path:
     return write_scene(store.incoming("token"), **changes)
 
 
-def test_a_broken_file_takes_nobodys_place(tmp_path: Path):
+def test_a_broken_upload_replaces_nothing(tmp_path: Path):
     store = SceneStore([tmp_path])
     before = store.add("walk", incoming(store))
     path = incoming(store)

@@ -135,7 +135,7 @@ def test_an_animated_webp_shows_the_frames(tmp_path: Path):
     ],
     ids=lambda value: str(value)[:30],
 )
-def test_what_is_no_film(client: httpx.Client, body: dict[str, Any], field: str):
+def test_invalid_videos(client: httpx.Client, body: dict[str, Any], field: str):
     check_problem(client.post("/render/video", json=body), 422, field)
 
 
@@ -161,7 +161,7 @@ def test_images_of_a_turn(scene: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "frame 3 of 3" in printed.err
 
 
-def test_what_was_stopped_goes_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     film, drawn = tmp_path / "turn.mp4", []
 
     def encode_two(image: Image, *arguments: Any) -> bytes:

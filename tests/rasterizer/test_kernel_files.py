@@ -67,7 +67,7 @@ def flip(contents: bytes) -> bytes:
     [(".nbi", cut), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", lambda _: b""), (".nbc", flip)],
     ids=["index cut", "index empty", "code cut", "code empty", "code flipped"],
 )
-def test_a_damaged_file_is_compiled_anew_and_mended(
+def test_a_damaged_file_is_compiled_again_and_replaced(
     room: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes]
 ):
     cache = tmp_path / "cache"
@@ -94,7 +94,7 @@ def test_nothing_that_can_be_written_is_no_obstacle(room: Path, tmp_path: Path):
     assert float(value) == 42.0
 
 
-def test_what_was_compiled_beside_the_sources_is_used_from_the_copy(tmp_path: Path):
+def test_a_copy_of_compiled_kernels_is_used(tmp_path: Path):
     """As in a container with a read-only root: compiled at build, copied at start."""
     package = tmp_path / "msdgs_serve"
     shutil.copytree(ROOT / "msdgs_serve", package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -145,7 +145,7 @@ def test_code_of_older_sources_goes(tmp_path: Path):
     assert files_of(tmp_path).load("float64") == "new code"
 
 
-def test_code_whose_file_is_gone_is_compiled_anew(tmp_path: Path):
+def test_code_whose_file_is_missing_is_compiled_again(tmp_path: Path):
     files_of(tmp_path).save("float32", "code")
     for file in tmp_path.glob("*.nbc"):
         file.unlink()

@@ -71,7 +71,7 @@ def test_projection(name: str, dtype: type):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_what_is_not_drawn_adds_nothing(name: str):
+def test_culled_gaussians_add_nothing(name: str):
     gaussians, camera = scene(name, np.float64)
     splats = gsplat_projection(gaussians, camera)
     hidden = project(gaussians, camera, GSPLAT).extents[:, 0] == 0

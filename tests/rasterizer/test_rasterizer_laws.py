@@ -66,7 +66,7 @@ def test_scaling_scene_and_camera_changes_nothing(factor: float, dtype: type):
 
 
 @DTYPES
-def test_what_is_asked_for_besides_changes_nothing_else(dtype: type):
+def test_further_channels_change_no_other_channel(dtype: type):
     gaussians, camera = scene(22, dtype)
     plain = rasterize(gaussians, camera, background=BACKGROUND)
     assert plain.depth.shape == plain.median_depth.shape == plain.counts.shape == (0, 0)

@@ -65,7 +65,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("layout", [np.asfortranarray, read_only, lambda a: np.repeat(a, 2, axis=0)[::2]])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_no_layout_of_arrays_is_compiled_for_anew(layout, dtype: type):
+def test_no_layout_of_arrays_is_compiled_separately(layout, dtype: type):
     gaussians, camera = random_scene(43, 20)
     gaussians = as_dtype(gaussians, dtype)
     expected = bytes_of(draw(gaussians, camera))

@@ -48,7 +48,7 @@ def emitted() -> dict[str, dict[str, set[int]]]:
     return found
 
 
-def test_the_table_has_what_exporters_emit_and_no_more():
+def test_the_table_has_exactly_the_operators_of_exporters():
     found = emitted()
     assert sorted(found) == sorted(OPERATORS)
     for name, operator in OPERATORS.items():

@@ -128,7 +128,7 @@ def test_a_camera_of_the_scene_by_index_or_name(client: httpx.Client):
     )
 
 
-def test_what_a_camera_leaves_out_comes_from_the_scene(client: httpx.Client):
+def test_omitted_camera_fields_come_from_the_scene(client: httpx.Client):
     short = render(client, camera={"type": "orbit", "azimuth": 90, "elevation": 20}, width=None, height=None)
     first = render(client, camera={"type": "scene", "name": "view_90"}, width=None, height=None)
     assert np.abs(short.astype(int) - first).max() <= 1
@@ -235,7 +235,7 @@ def test_every_example_in_the_documentation_works(client: httpx.Client):
         assert pixels[..., :3].std() > 0, f"{name} shows nothing"
 
 
-def test_the_documentation_is_whole(client: httpx.Client):
+def test_the_openapi_document_is_complete(client: httpx.Client):
     document = client.get("/openapi.json").json()
     text = client.get("/openapi.json").text
     schemas = document["components"]["schemas"]

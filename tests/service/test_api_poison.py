@@ -56,14 +56,14 @@ NO_TIME_OR_NUMBER = [(field, value) for field in NUMBERS for value in NOT_NUMBER
 
 
 @pytest.mark.parametrize(("field", "value"), NO_TIME_OR_NUMBER, ids=lambda value: repr(value)[:12])
-def test_what_is_not_a_usable_number(client: httpx.Client, field: str, value: Any):
+def test_invalid_numbers(client: httpx.Client, field: str, value: Any):
     """`[1]` is a valid list of times."""
     assert refused(client, changed(field, value))[0].startswith(field)
 
 
 @pytest.mark.parametrize("field", ["width", "height", "quality", "camera.index"])
 @pytest.mark.parametrize("value", [*NOT_NUMBERS, 1.5, -1, 10**9], ids=lambda value: repr(value)[:12])
-def test_what_is_not_a_usable_whole_number(client: httpx.Client, field: str, value: Any):
+def test_invalid_integers(client: httpx.Client, field: str, value: Any):
     assert refused(client, {**changed(field, value), "format": "jpeg"})[0].startswith(field)
 
 
@@ -74,7 +74,7 @@ def test_what_is_not_a_usable_whole_number(client: httpx.Client, field: str, val
     + [[1, 1, bad] for bad in NOT_NUMBERS],
     ids=lambda value: repr(value)[:20],
 )
-def test_what_is_not_three_usable_numbers(client: httpx.Client, field: str, value: Any):
+def test_invalid_triples(client: httpx.Client, field: str, value: Any):
     assert all(name.startswith(field) for name in refused(client, changed(field, value)))
 
 

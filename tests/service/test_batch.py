@@ -38,7 +38,7 @@ def batch(client: httpx.Client, frames: list[Any]) -> list[dict[str, Any]]:
     return sorted((json.loads(line) for line in response.content.splitlines()), key=lambda line: line["index"])
 
 
-def test_every_frame_is_what_a_call_of_its_own_gives(client: httpx.Client):
+def test_every_frame_equals_that_of_a_single_request(client: httpx.Client):
     frames = [{**FRAME, "scene": "red"}, {**FRAME, "scene": "blue", "format": "jpeg"}]
     frames += [{**FRAME, "scene": "red", "t": 0.1 * number} for number in range(5)]
     lines = batch(client, frames)
@@ -103,7 +103,7 @@ def test_the_same_as_parts(client: httpx.Client):
 
 
 @pytest.mark.parametrize("frames", [[], [FRAME] * 21, "x", [1], None], ids=["none", "many", "text", "number", "null"])
-def test_what_is_no_batch(client: httpx.Client, frames: Any):
+def test_invalid_batches(client: httpx.Client, frames: Any):
     response = client.post("/render/batch", json={"frames": frames})
     assert response.status_code == 422
     assert response.json()["errors"][0]["field"].startswith("frames")

@@ -88,7 +88,7 @@ def test_only_a_full_queue_has_calls_turned_away(doorman: Doorman, queue: WorkQu
         HEAD.replace(b"Host", b"Host ") + b"\r\n" + BODY,
     ],
 )
-def test_what_is_not_plain_is_for_the_application(doorman: Doorman, queue: WorkQueue, data: bytes):
+def test_unusual_requests_are_left_to_the_application(doorman: Doorman, queue: WorkQueue, data: bytes):
     with full(queue, 2):
         assert doorman.answer(data, None, ()) is None
 
@@ -102,7 +102,7 @@ def sent(connection: socket.socket, data: bytes) -> tuple[int, dict[str, str], b
 
 
 @in_this_process
-def test_nobody_can_tell_the_difference(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_early_rejections_equal_those_of_the_application(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """Response, log line and counts are those of the application, and the connection stays usable."""
     write_scene(tmp_path / "ball.onnx")
     slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # a header that the doorman doesn't know

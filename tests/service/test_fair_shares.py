@@ -53,7 +53,7 @@ def test_single_frames_come_in_between_parts_which_have_their_turns_too():
     assert done[2 * PART_TURN :] == ["single", "single", "part of 2"]
 
 
-def test_who_leaves_the_line_is_in_nobodys_way():
+def test_removed_work_is_skipped():
     turns: Turns[str] = Turns()
     for item in ("a1", "a2", "b1"):
         turns.add(item, item[0], part=item[0] == "b")

@@ -60,7 +60,7 @@ def test_attacks_are_refused_while_another_scene_is_served(
     assert frame(client) == before
 
 
-def test_what_a_scene_takes_is_shown(client: httpx.Client):
+def test_the_cost_of_a_scene_is_shown(client: httpx.Client):
     cost = client.get("/scenes/good").json()["cost"]
     assert 0 < cost["memory_bytes"] < cost["limits"]["memory_bytes"] == 2 << 30
     assert 0 < cost["operations"] < cost["limits"]["operations"] == 1e13

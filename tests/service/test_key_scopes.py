@@ -125,7 +125,7 @@ def test_a_file_that_says_no_scopes_is_refused_with_the_line_that_it_needs(tmp_p
     assert "0123456789" not in str(error.value)
 
 
-def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
+def test_key_files_must_be_text(tmp_path: Path):
     (tmp_path / "keys").write_bytes(b"\xff\xfe")
     for path in (tmp_path / "keys", tmp_path / "missing", tmp_path):
         with pytest.raises(InvalidInput, match="a text file"):

@@ -80,7 +80,7 @@ def test_so_many_bytes_of_a_key(folder: Path, file: bytes, keys: Path):
     assert left(folder) == {"a.onnx"}
 
 
-def test_what_is_on_its_way_is_counted(folder: Path, file: bytes):
+def test_uploads_in_progress_are_counted(folder: Path, file: bytes):
     with serving(folder, uploads=True, max_scenes=1) as client:
         statuses = []
 

@@ -65,7 +65,7 @@ def test_it_says_where_it_listens_and_what_to_paste_and_stops_at_ctrl_c(process:
     assert (process.returncode, out.strip(), err) == (0, "Stopped.", "")
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]):
+def test_help_shows_examples_and_options(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         main(["--help"])
     assert ended.value.code == 0

@@ -59,7 +59,7 @@ def test_another_file_is_another_version(tmp_path: Path):
         eventually(lambda: post(client).headers["ETag"] != before)
 
 
-def test_the_answer_says_what_was_used(client: httpx.Client):
+def test_headers_name_plan_channels_and_stages(client: httpx.Client):
     post(client, t=0.123)
     response = post(client, t=0.123, channels=["depth"])
     stages = dict(re.findall(r"(\w+);dur=([\d.]+)", response.headers["Server-Timing"]))
@@ -101,7 +101,7 @@ def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
         assert "Msdgs-Error" not in post(client, scene="plain").headers
 
 
-def test_a_link_shows_what_the_body_would(client: httpx.Client):
+def test_get_equals_post(client: httpx.Client):
     link = f"/render?azimuth=0&elevation=0&distance=5&fov_y=40&t=0.5&width={SIZE}&height={SIZE}"
     response = client.get(link)
     assert response.content == post(client).content
@@ -266,7 +266,7 @@ def test_metrics_are_what_the_client_counted(scene: Path):
 
 
 @in_this_process
-def test_methods_that_nobody_knows_are_counted_as_one(client: httpx.Client):
+def test_unknown_methods_are_counted_as_one(client: httpx.Client):
     assert client.request("BREW", "/render").status_code == 405
     assert 'method="other"' in client.get("/metrics").text
 

@@ -69,7 +69,7 @@ def has_stopped(watch: Watch) -> bool:
     return False
 
 
-def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, poses: SlowPoses):
+def test_requests_beyond_the_queue_are_rejected_with_retry_after(scene: Path, poses: SlowPoses):
     server: list[Server] = []
     with (
         serving(scene, renderer=renderer_with(poses), server=server, concurrent_renders=2, queued_renders=3) as client,
@@ -172,7 +172,7 @@ def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: Sl
         assert poses.begun == 1
 
 
-def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses):
+def test_a_stopping_service_finishes_accepted_requests(scene: Path, poses: SlowPoses):
     server: list[Server] = []
     with (
         serving(scene, renderer=renderer_with(poses), server=server) as client,
@@ -202,7 +202,7 @@ def _listens(client: httpx.Client) -> bool:
     return True
 
 
-def test_one_who_gives_up_does_not_spoil_the_pose_for_others(scene: Path):
+def test_a_cancelled_request_keeps_poses_of_others(scene: Path):
     """A cancelled request leaves the poses of other requests in the cache."""
     cache, session = PoseCache(1 << 20), DeformationSession(scene)
     stopped = Watch()

@@ -87,7 +87,7 @@ def test_a_drip_after_an_answer_is_closed_too(client: httpx.Client):
     connection.close()
 
 
-def test_who_offers_another_protocol_is_answered_in_this_one(client: httpx.Client):
+def test_an_offer_of_http2_is_ignored(client: httpx.Client):
     offer = {"Connection": "Upgrade, HTTP2-Settings", "Upgrade": "h2c", "HTTP2-Settings": "AAMAAABkAAQCAAAAAAIAAAAA"}
     assert client.post("/render", json=FRAME, headers=offer).status_code == 200
 
@@ -119,7 +119,7 @@ def test_a_reader_that_is_only_slow_gets_all(client: httpx.Client):
     [b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n", b"GET / HTTP/9\r\n\r\n", b"GET /" + b"x" * 100_000],
     ids=["TLS", "version", "long"],
 )
-def test_what_is_no_http_is_a_problem_as_well(client: httpx.Client, sent: bytes):
+def test_invalid_http_gets_a_problem(client: httpx.Client, sent: bytes):
     connection = begun(client, sent)
     answer = rest_of(connection)
     connection.close()

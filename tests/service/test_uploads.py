@@ -59,7 +59,7 @@ def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, fo
 
 
 @pytest.mark.parametrize("content", [b"", b"no scene", b"\x08\x0a"], ids=["empty", "text", "beginning"])
-def test_what_is_no_scene_is_refused_and_leaves_nothing(client: httpx.Client, folder: Path, content: bytes):
+def test_invalid_files_are_refused_and_leave_no_file(client: httpx.Client, folder: Path, content: bytes):
     check_problem(add(client, content), 422)
     assert files(folder) == []
 
@@ -100,7 +100,7 @@ def test_where_it_is_not_allowed_nothing_is_added_or_deleted(folder: Path, file:
     assert files(folder) == ["walk.onnx"]
 
 
-def test_what_a_killed_process_left_is_cleared_at_the_start(folder: Path):
+def test_files_of_a_killed_process_are_removed_at_the_start(folder: Path):
     (folder / ".incoming-token").write_bytes(b"half a scene")
     write_scene(folder / "walk.onnx")
     with serving(folder, uploads=True) as client:
