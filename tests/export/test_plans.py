@@ -224,10 +224,6 @@ def test_more_poses_and_more_terms_are_closer():
         assert errors == sorted(errors, reverse=True)
 
 
-def test_plan_knows_whether_it_is_fitted():
-    assert [name for name, plan in PLANS.items() if plan.fitted] == ["lowrank", "keyframes"]
-
-
 @pytest.mark.parametrize("support", [GaussiansConfig(), NODES], ids=lambda support: support.kind)
 def test_a_kind_of_layer_from_elsewhere_is_exported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, support: SupportConfig

@@ -96,14 +96,6 @@ def test_without_background_colors_are_premultiplied(session: DeformationSession
     np.testing.assert_allclose(over, opaque.rgb, atol=1e-6)
 
 
-def test_a_time_outside_the_scene_is_refused_and_not_remembered(session: DeformationSession):
-    renderer = Renderer()
-    for _ in range(2):
-        with pytest.raises(InvalidInput) as error:
-            renderer.render(session, level_camera(), 1.5)
-        assert error.value.field == "t"
-
-
 def test_simultaneous_requests_share_one_computation(counting: CountingSession):
     renderer = Renderer()
     counting.release.clear()
@@ -154,12 +146,6 @@ def test_eight_threads_get_the_bytes_that_one_gets(session: DeformationSession):
     with ThreadPoolExecutor(8) as pool:
         together = list(pool.map(lambda number: draw(shared, number % 8), range(32)))
     assert together == alone * 4
-
-
-def test_a_scene_without_motion(tmp_path: Path):
-    path = write_scene(tmp_path / "static.onnx", moving=False)
-    image = Renderer().render(DeformationSession(path), level_camera(), 0.5)
-    assert image.rgb[SIZE // 2, SIZE // 2].argmax() == 0
 
 
 def test_a_cache_of_less_than_nothing_is_refused():
