@@ -23,11 +23,11 @@ _MAX_DETAILS = 500
 class DeformationSession:
     """One scene file, loaded and checked; may be asked from several threads at once, though not from inside the pool.
 
-    The file's graph deforms the Gaussians it is asked for in one go. Where it runs layers the loop over chunks of them
-    is here: each chunk is one single-threaded onnxruntime call, and the process-wide pool runs the chunks. The chunks
-    don't depend on the number of threads, so neither do the results. Other graphs blend what is stored of all Gaussians
-    whatever they are asked for, and are called once, on threads of onnxruntime's own: 1.6 times as fast on two cores,
-    the same bits.
+    The file's graph deforms the Gaussians it is asked for in one go. If it runs layers on them, the loop over chunks of
+    them is here: each chunk is one single-threaded onnxruntime call, and the process-wide pool runs the chunks. The
+    chunks don't depend on the number of threads, so neither do the results. Other graphs, of stored poses or of control
+    nodes, compute all Gaussians whatever they are asked for, and are called once, on threads of onnxruntime's own: 1.6
+    times as fast on two cores, the same bits.
 
     onnxruntime never gets the file: `read_scene_file` checks it and writes the graph again.
     """
@@ -48,7 +48,6 @@ class DeformationSession:
         if chunk is not None and chunk < 1:
             raise InvalidInput("chunk", "1 or more", chunk)
         self.path = Path(path)
-        self._chunk = chunk
         self._file = self.path.name
         contents = self._read() if contents is None else contents
         self.sha256 = hashlib.sha256(contents).hexdigest()
@@ -56,8 +55,9 @@ class DeformationSession:
         del contents  # a copy of all that is large is in `scene_file`
         self.cost = scene_file.cost
         self._steps = scene_file.steps
+        self._chunk = chunk or (max(scene_file.moving_count, 1) if scene_file.poses_all else CHUNK)
         self.scene = self._read_scene(scene_file)
-        self._session = self._open(scene_file.graph, thread_count() if self._steps is None else 1)
+        self._session = self._open(scene_file.graph, thread_count() if scene_file.poses_all else 1)
         for t in self.scene.metadata.time_range:
             self._check_sample(t)
 
@@ -99,9 +99,8 @@ class DeformationSession:
                     raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
                 expected[:] = output
 
-        chunk = self._chunk or (max(len(every), 1) if self._steps is None else CHUNK)
         with sharing_cores():
-            run_parallel(run, [(i, min(i + chunk, len(every))) for i in range(0, len(every), chunk)])
+            run_parallel(run, [(i, min(i + self._chunk, len(every))) for i in range(0, len(every), self._chunk)])
         self._check_finite(t, posed)
         return posed["means"], posed["quats"], posed["scales"]
 

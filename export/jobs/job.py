@@ -16,7 +16,7 @@ from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.registry import build, plan_of
 from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
 from export.pruning.bake import bake_pruned
-from export.pruning.mask import rows, unpruned, with_sh_degree
+from export.pruning.mask import in_spatial_order, rows, unpruned, with_sh_degree
 from export.trajectories.sampling import SomeTrajectories, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
@@ -98,7 +98,8 @@ class ExportJob:
     ) -> None:
         """`training` are the cameras of the training images, if known. Raises `CheckpointInvalid`."""
         self.folder, self.min_psnr, self.rules, self.progress = folder, min_psnr, rules, progress
-        self.model, self.info, _ = load_model(checkpoint)
+        model, self.info, _ = load_model(checkpoint)
+        self.model = in_spatial_order(model)
         with checkpoint.open("rb") as file:
             self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         self.cameras = cameras_of(self.info, training)

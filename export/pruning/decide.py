@@ -47,7 +47,7 @@ def stored_bytes(model: DynamicGaussians, mask: PruningMask) -> int:
     """Approximate size of a file of the plan `network`: Gaussians and layers."""
     gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(mask.sh_degree)
     layers = [list(model.deformation)[k] for k in mask.network.layers] if mask.moves.any() else []
-    attributes = support_export_of(model.support).bytes_per_gaussian if layers else 0
+    attributes = support_export_of(model.support).bytes_per_gaussian(model.support) if layers else 0
     moving = MOVING_BYTES + MODULATION_BYTES * mask.network.modulated + attributes
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())
     return gaussian * int(mask.kept.sum()) + moving * int(mask.moves.sum()) + weights

@@ -8,11 +8,13 @@ import torch
 
 from export.layers import HEADS, export_of
 from export.measure.poses import posed
+from export.spatial_order import morton_order
 from export.supports import support_export_of
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.layers.deformation import DeformationLayer
 
@@ -64,6 +66,12 @@ def full_mask(model: DynamicGaussians) -> PruningMask:
     network = NetworkMask(tuple(range(len(model.deformation))), heads, model.modulation is not None)
     moves = np.full(count, len(model.deformation) > 0)
     return PruningMask(network, np.ones(count, bool), moves, model.config.sh_degree)
+
+
+def in_spatial_order(model: DynamicGaussians) -> DynamicGaussians:
+    """The same Gaussians along a Z-order curve; without gradients."""
+    order = torch.from_numpy(morton_order(to_array(model.gaussians.means)))
+    return _model(model, full_mask(model).network, order, model.config.sh_degree)
 
 
 def with_network(model: DynamicGaussians, network: NetworkMask) -> DynamicGaussians:

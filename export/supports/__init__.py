@@ -4,12 +4,12 @@ A kind from outside this package registers itself with `SUPPORTS[kind] = export`
 """
 
 from export.layers.base import ModelNotExportable
-from export.supports.base import SupportExport, SupportInputs
+from export.supports.base import Layout, SupportExport, SupportInputs
 from export.supports.gaussians import GaussiansExport
 from export.supports.nodes import NodesExport
 from msdgs_train.supports.base import Support
 
-__all__ = ["SUPPORTS", "SupportExport", "SupportInputs", "support_export_of"]
+__all__ = ["SUPPORTS", "Layout", "SupportExport", "SupportInputs", "support_export_of"]
 
 SUPPORTS: dict[str, SupportExport] = {"gaussians": GaussiansExport(), "nodes": NodesExport()}
 """By the kind of the support, its attribute `kind`."""

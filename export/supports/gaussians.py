@@ -2,14 +2,11 @@
 
 from export.layers.chain import summed_deltas, used_heads
 from export.layers.graph import GraphBuilder
-from export.supports.base import SupportInputs
+from export.supports.base import SupportExport, SupportInputs
 
 
-class GaussiansExport:
+class GaussiansExport(SupportExport):
     """Of `GaussiansSupport`."""
-
-    heads_are_removable = True
-    bytes_per_gaussian = 0
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         """Of the chain itself."""

@@ -8,12 +8,27 @@ import numpy as np
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, INPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_serve.scene.metadata import SceneMetadata
-from msdgs_serve.scene.onnx import GraphLimits, Model, ModelInvalid, Tensor, Value, infer, read_model, write_model
+from msdgs_serve.scene.onnx import (
+    UNLIMITED,
+    GraphLimits,
+    Model,
+    ModelInvalid,
+    Tensor,
+    Value,
+    infer,
+    read_model,
+    write_model,
+)
 from msdgs_serve.scene.onnx.model import FLOAT, INT64, Port, element_name
 from msdgs_serve.scene.onnx.shapes import IDS, Shape, fixed, text
 
 CHUNK = 2048
-"""Gaussians a call where layers run. The widest activation of a call is CHUNK × width, whatever the scene's size."""
+"""Gaussians per call of a graph that runs layers on the Gaussians themselves. The widest activation of a call is
+CHUNK × width, whatever the scene's size."""
+
+PER_ID_FACTOR = 2
+"""A graph whose call for all Gaussians takes less than this times the operations of a call for one computes them all
+whatever it is asked for."""
 
 _INPUTS: Mapping[str, tuple[int, Shape]] = {
     "t": (FLOAT, fixed([1])),
@@ -43,6 +58,7 @@ class SceneFile:
     metadata: SceneMetadata
     moving_count: int
     steps: float | None  # by default; None where the plan doesn't run layers
+    poses_all: bool  # whether a call computes all Gaussians whatever it is asked for
     constants: Mapping[str, np.ndarray]  # those of CONSTANT_OUTPUTS that are stored as they are
     graph: bytes  # inputs of the contract, without defaults, to MOVING_OUTPUTS
     constant_graph: bytes | None  # no inputs, to the rest of CONSTANT_OUTPUTS
@@ -71,9 +87,11 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
         _check_finite(tensor)
     inputs = _inputs(model)
     moving_count, steps = _default_ids(model), _default_steps(model)
-    ids = moving_count if steps is None else min(CHUNK, moving_count)
+    returned = moving_count * _POSED_BYTES
+    poses_all = steps is None or _poses_all(model, inputs, moving_count)
+    ids = moving_count if poses_all else min(CHUNK, moving_count)
     calls = -(-moving_count // max(ids, 1))
-    values, cost = infer(model, inputs, limits, ids, calls, moving_count * _POSED_BYTES)
+    values, cost = infer(model, inputs, limits, ids, calls, returned)
     _check_outputs(model, values, moving_count)
     _check_count(moving_count + values["static_means"].shape[0].fixed, limits)
     constants = {}
@@ -86,11 +104,18 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
         metadata,
         moving_count,
         steps,
+        poses_all,
         constants,
         write_model(model, MOVING_OUTPUTS, inputs, values),
         write_model(model, computed, {}, values) if computed else None,
         SceneCost(cost.memory_bytes, cost.operations * calls, calls, limits),
     )
+
+
+def _poses_all(model: Model, inputs: Mapping[str, Value], moving_count: int) -> bool:
+    """Whether all Gaussians take hardly more operations than one."""
+    one, every = (infer(model, inputs, UNLIMITED, ids, 1, 0)[1].operations for ids in (1, moving_count))
+    return every < PER_ID_FACTOR * one
 
 
 def _check_finite(tensor: Tensor) -> None:

@@ -20,7 +20,7 @@ from export.measure.verify import VerificationFailed, times_to_verify, verify
 from export.plans.base import Plan
 from export.plans.network import network
 from export.plans.registry import PLANS, build, parse
-from export.supports import SUPPORTS, SupportInputs
+from export.supports import SUPPORTS, SupportExport, SupportInputs
 from export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
@@ -262,10 +262,7 @@ class Rigid(Support):
         return gaussians.means.new_zeros(1, 3)
 
 
-class RigidExport:
-    heads_are_removable = True
-    bytes_per_gaussian = 0
-
+class RigidExport(SupportExport):
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         origin = graph.constant("rigid.origin", np.zeros((1, 3), np.float32))
         return summed_deltas(graph, inputs.layers, origin, inputs.time, inputs.steps, list(HEAD_COLUMNS))

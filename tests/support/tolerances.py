@@ -79,6 +79,11 @@ TABLE = (
     Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
     Row("neighbor_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
+    Row(
+        "export.nodes.relative",
+        1e-4,
+        "4 weights of 16 bits, 1.5e-5 each, times motions of size 1; and as export.relative",
+    ),
     Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
     Row("fitted_beside_others", 1e-6, "float32 positions of size 1; how products round depends on how many there are"),
     Row("between_samples.factor", 2.0, "times a promise made at samples: between them a cubic is off by as much again"),

@@ -4,13 +4,14 @@
 of it into new bytes, which are all that onnxruntime ever gets.
 """
 
-from msdgs_serve.scene.onnx.cost import CallCost, GraphLimits
+from msdgs_serve.scene.onnx.cost import UNLIMITED, CallCost, GraphLimits
 from msdgs_serve.scene.onnx.infer import Value, infer
 from msdgs_serve.scene.onnx.model import Model, Node, Port, Tensor, read_model
 from msdgs_serve.scene.onnx.wire import ModelInvalid
 from msdgs_serve.scene.onnx.write import write_model
 
 __all__ = [
+    "UNLIMITED",
     "CallCost",
     "GraphLimits",
     "Model",

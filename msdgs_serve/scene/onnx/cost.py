@@ -24,6 +24,10 @@ class GraphLimits:
     """Of one call, which can't be interrupted: a few seconds."""
 
 
+UNLIMITED = GraphLimits(*[2**62] * 4)
+"""To compare costs."""
+
+
 @dataclass(frozen=True)
 class CallCost:
     """Upper bounds of one call: the values of all nodes, as if none were let go before the end, and the operations.

@@ -84,7 +84,9 @@ def _operands(node: Node, operator: Operator, values: Mapping[str, Value]) -> li
 def _element(node: Node, operator: Operator, operands: list[Value]) -> int:
     if operator.result is None:
         return operands[operator.like].element
-    return node.attributes[operator.result] if isinstance(operator.result, str) else operator.result
+    element = node.attributes[operator.result] if isinstance(operator.result, str) else operator.result
+    assert isinstance(element, int)  # `_check_attributes` has looked at the table
+    return element
 
 
 def _check_attributes(node: Node, operator: Operator) -> None:

@@ -28,7 +28,10 @@ OPSETS = range(18, 21)
 """Versions of the operator set: the operators of a scene file mean the same in all of them."""
 IR_VERSIONS = range(8, 11)
 
-_INT_ATTRIBUTE = 2  # AttributeProto.INT
+INT_ATTRIBUTE, INTS_ATTRIBUTE = 2, 7
+"""Types of attributes, by their numbers in onnx.proto."""
+
+Attribute = int | tuple[int, ...]
 
 
 def element_name(element: int) -> str:
@@ -58,7 +61,7 @@ class Node:
     name: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    attributes: Mapping[str, int]
+    attributes: Mapping[str, Attribute]
 
 
 @dataclass(frozen=True)
@@ -129,14 +132,23 @@ def _node(part: memoryview) -> Node:
     name = fields.get("name") or (outputs[0] if outputs else operator)
     if fields.get("domain", "") or fields.get("overload", ""):
         raise ModelInvalid(name, f"is {operator} of another domain, not of ONNX")
-    attributes: dict[str, int] = {}
-    for attribute in fields["attribute"]:
-        values = read_message(attribute, schema.ATTRIBUTE, f"an attribute of node `{name}`")
-        key = values.get("name", "")
-        if values.get("type") != _INT_ATTRIBUTE or "i" not in values or key in attributes:
-            raise ModelInvalid(name, f"has the attribute `{key}` that isn't one whole number")
-        attributes[key] = values["i"]
+    attributes: dict[str, Attribute] = {}
+    for part in fields["attribute"]:
+        key, value = _attribute(part, name)
+        if key in attributes:
+            raise ModelInvalid(name, f"has the attribute `{key}` more than once")
+        attributes[key] = value
     return Node(operator, name, tuple(fields["input"]), outputs, attributes)
+
+
+def _attribute(part: memoryview, node: str) -> tuple[str, Attribute]:
+    values = read_message(part, schema.ATTRIBUTE, f"an attribute of node `{node}`")
+    key, kind, single, several = values.get("name", ""), values.get("type"), values.get("i"), tuple(values["ints"])
+    if kind == INT_ATTRIBUTE and single is not None and not several:
+        return key, single
+    if kind == INTS_ATTRIBUTE and single is None and several:
+        return key, several
+    raise ModelInvalid(node, f"has the attribute `{key}` that isn't one whole number or a list of them")
 
 
 def _tensor(part: memoryview) -> Tensor:

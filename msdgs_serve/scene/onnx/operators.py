@@ -7,9 +7,10 @@ Whole numbers aren't divided, and rows that are replaced are constants, since pr
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import permutations
 
 from msdgs_serve.scene.onnx import rules
-from msdgs_serve.scene.onnx.model import BOOL, FLOAT, INT8, INT16, INT32, INT64, UINT8
+from msdgs_serve.scene.onnx.model import BOOL, FLOAT, INT8, INT16, INT32, INT64, UINT8, Attribute
 from msdgs_serve.scene.onnx.rules import Call, Result
 
 FUNCTION = 16
@@ -31,7 +32,7 @@ class Operator:
 
     operands: tuple[Operand, ...]
     rule: Callable[[Call], Result] = rules.elementwise
-    attributes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # and the values that each may have
+    attributes: Mapping[str, tuple[Attribute, ...]] = field(default_factory=dict)  # and the values that each may have
     needed: tuple[str, ...] = ()  # attributes that may not be missing
     result: int | str | None = None
     like: int = 0
@@ -55,7 +56,7 @@ def _function(work: int = FUNCTION) -> Operator:
 OPERATORS: Mapping[str, Operator] = {
     "Add": Operator((_NUMBER, _NUMBER)),
     "Cast": Operator(
-        (Operand((FLOAT, UINT8, INT16, INT64, BOOL)),), rules.alike, {"to": (FLOAT, INT64)}, ("to",), "to"
+        (Operand((FLOAT, UINT8, INT16, INT32, INT64, BOOL)),), rules.alike, {"to": (FLOAT, INT64)}, ("to",), "to"
     ),
     "Clip": Operator((_FLOAT, _FLOAT, _FLOAT), rules.clip),
     "Concat": Operator((_FLOAT,), rules.concat, _AXIS, ("axis",), repeated=True),
@@ -95,6 +96,7 @@ OPERATORS: Mapping[str, Operator] = {
     "Sqrt": _function(1),
     "Squeeze": Operator((_FLOAT, _LENGTHS), rules.squeeze),
     "Sub": Operator((_FLOAT, _FLOAT)),
+    "Transpose": Operator((_FLOAT,), rules.transpose, {"perm": tuple(permutations(range(3)))}, ("perm",)),
     "Unsqueeze": Operator((Operand((FLOAT, BOOL)), _LENGTHS), rules.unsqueeze),
     "Where": Operator((Operand((BOOL,)), _FLOAT, _FLOAT), like=1),
 }

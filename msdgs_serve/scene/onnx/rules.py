@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msdgs_serve.scene.onnx.model import Attribute
 from msdgs_serve.scene.onnx.shapes import (
     ONE,
     Dim,
@@ -26,7 +27,7 @@ class Call:
 
     shapes: Sequence[Shape]
     constants: Sequence[np.ndarray | None]
-    attributes: Mapping[str, int]
+    attributes: Mapping[str, Attribute]
     outputs: int
 
     def constant(self, index: int) -> np.ndarray:
@@ -34,6 +35,12 @@ class Call:
         values = self.constants[index]
         assert values is not None  # `infer` has looked at the table
         return values
+
+    def attribute(self, name: str, default: int) -> int:
+        """A whole number."""
+        value = self.attributes.get(name, default)
+        assert isinstance(value, int)  # `infer` has looked at the table
+        return value
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,7 @@ def clip(call: Call) -> Result:
 def quantize(call: Call) -> Result:
     """Scale and zero point are single numbers, or one for each index along an axis."""
     shape, scale, zero = call.shapes
-    if scale != zero or (scale and scale != (shape[axis_of(call.attributes.get("axis", 1), len(shape))],)):
+    if scale != zero or (scale and scale != (shape[axis_of(call.attribute("axis", 1), len(shape))],)):
         raise ShapeInvalid(f"quantises {text(shape)} with scales {text(scale)} and zero points {text(zero)}")
     return alike(call)
 
@@ -74,7 +81,7 @@ def quantize(call: Call) -> Result:
 def gather(call: Call) -> Result:
     """Rows, columns or the like by index."""
     data, indices = call.shapes
-    axis = axis_of(call.attributes.get("axis", 0), len(data))
+    axis = axis_of(call.attribute("axis", 0), len(data))
     return Result([(*data[:axis], *indices, *data[axis + 1 :])])
 
 
@@ -92,7 +99,7 @@ def scatter(call: Call) -> Result:
 def concat(call: Call) -> Result:
     """Arrays side by side."""
     first = call.shapes[0]
-    axis = axis_of(call.attributes.get("axis", 0), len(first))
+    axis = axis_of(call.attribute("axis", 0), len(first))
     if any(len(s) != len(first) or s[:axis] + s[axis + 1 :] != first[:axis] + first[axis + 1 :] for s in call.shapes):
         raise ShapeInvalid(f"can't put {' and '.join(text(shape) for shape in call.shapes)} side by side")
     return Result([(*first[:axis], added(shape[axis] for shape in call.shapes), *first[axis + 1 :])])
@@ -101,10 +108,19 @@ def concat(call: Call) -> Result:
 def split(call: Call) -> Result:
     """The reverse of `concat`, in parts of constant lengths."""
     shape, parts = call.shapes[0], numbers(call.constant(1), "lengths")
-    axis = axis_of(call.attributes.get("axis", 0), len(shape))
+    axis = axis_of(call.attribute("axis", 0), len(shape))
     if len(parts) != call.outputs or min(parts, default=-1) < 0 or shape[axis] != Dim(sum(parts)):
         raise ShapeInvalid(f"splits {text(shape)} into {call.outputs} parts of {parts}")
     return Result([(*shape[:axis], Dim(part), *shape[axis + 1 :]) for part in parts])
+
+
+def transpose(call: Call) -> Result:
+    """Axes in another order."""
+    shape, order = call.shapes[0], call.attributes["perm"]
+    assert isinstance(order, tuple)
+    if len(order) != len(shape):
+        raise ShapeInvalid(f"orders {len(order)} axes of {text(shape)}")
+    return Result([tuple(shape[axis] for axis in order)])
 
 
 def reshape(call: Call) -> Result:
@@ -131,7 +147,7 @@ def squeeze(call: Call) -> Result:
 
 def reduce(call: Call) -> Result:
     """One value along some axes."""
-    shape, keep = call.shapes[0], call.attributes.get("keepdims", 1)
+    shape, keep = call.shapes[0], call.attribute("keepdims", 1)
     gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
     left = tuple(ONE if i in gone else dim for i, dim in enumerate(shape) if keep or i not in gone)
     return Result([left], inner=tuple(shape[axis] for axis in gone))
@@ -149,7 +165,7 @@ def matmul(call: Call) -> Result:
 def gemm(call: Call) -> Result:
     """A product of two matrices and what is added to it."""
     left, right, summand = call.shapes
-    right = right[::-1] if call.attributes.get("transB", 0) else right
+    right = right[::-1] if call.attribute("transB", 0) else right
     if len(left) != 2 or len(right) != 2 or left[1] != right[0]:
         raise ShapeInvalid(f"can't multiply {text(left)} by {text(right)}")
     product = (left[0], right[1])

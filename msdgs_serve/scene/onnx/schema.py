@@ -66,7 +66,7 @@ ATTRIBUTE: Schema = {
     5: Field("t", Kind.REFUSED),
     6: Field("g", Kind.REFUSED),
     7: Field("floats", Kind.REFUSED),
-    8: Field("ints", Kind.REFUSED),
+    8: Field("ints", Kind.INTEGER, most=MAX_RANK),
     9: Field("strings", Kind.REFUSED),
     10: Field("tensors", Kind.REFUSED),
     11: Field("graphs", Kind.REFUSED),

@@ -3,11 +3,10 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from msdgs_serve.scene.onnx.infer import Value
-from msdgs_serve.scene.onnx.model import Model, Node, Tensor
+from msdgs_serve.scene.onnx.model import INT_ATTRIBUTE, INTS_ATTRIBUTE, Attribute, Model, Node, Tensor
 from msdgs_serve.scene.onnx.shapes import IDS
 
 IR_VERSION = 9
-_INT_ATTRIBUTE = 2
 _VARINT, _LENGTH = 0, 2
 
 Parts = list[bytes | memoryview]
@@ -79,11 +78,20 @@ def _node(node: Node) -> _Message:
     message.text(3, node.name)
     message.text(4, node.operator)
     for name, value in node.attributes.items():
-        attribute = _Message()
-        attribute.text(1, name)
-        attribute.number(3, value)
-        attribute.number(20, _INT_ATTRIBUTE)
-        message.message(5, attribute)
+        message.message(5, _attribute(name, value))
+    return message
+
+
+def _attribute(name: str, value: Attribute) -> _Message:
+    message = _Message()
+    message.text(1, name)
+    if isinstance(value, int):
+        message.number(3, value)
+        message.number(20, INT_ATTRIBUTE)
+    else:
+        for number in value:
+            message.number(8, number)
+        message.number(20, INTS_ATTRIBUTE)
     return message
 
 
