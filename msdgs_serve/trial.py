@@ -1,7 +1,7 @@
-"""A scene file opened and posed in a process of its own, with limits of memory and time, before a service opens it.
+"""Open and pose a scene file in a subprocess with limits on memory and time, before the service opens it.
 
-`read_scene_file` lets nothing through that onnxruntime is known to fail at. What it fails at all the same costs that
-process, and not the service.
+`read_scene_file` rejects all graphs at which onnxruntime is known to crash. If it crashes at another, that ends the
+subprocess and not the service.
 """
 
 import contextlib
@@ -17,19 +17,19 @@ from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.threads import THREADS_VARIABLE
 
-MEMORY, MEMORY_A_BYTE = 1 << 29, 6
-"""Bytes that the process may have: its own, and for each byte of the file, besides those of a call of the graph."""
+MEMORY, MEMORY_PER_BYTE = 1 << 29, 6
+"""Memory limit of the subprocess in bytes: its own, and per byte of the file; the graph's limit is added."""
 
 OPEN_FILES = 64
 NICENESS = 10
 
 
 def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
-    """Open `file` and pose its Gaussians in the middle of its time, in at most so many seconds.
+    """Open `file` in a subprocess and pose its Gaussians in the middle of its time range, within `seconds`.
 
-    Raises `SceneFileInvalid` with what that process says, or that it didn't end well.
+    Raises `SceneFileInvalid` with the subprocess's reason, or because it crashed or took too long.
     """
-    memory = MEMORY + MEMORY_A_BYTE * file.stat().st_size + limits.memory_bytes
+    memory = MEMORY + MEMORY_PER_BYTE * file.stat().st_size + limits.memory_bytes
     given = json.dumps({"file": str(file), "limits": vars(limits), "memory": memory, "seconds": seconds})
     command = [sys.executable, "-P", "-m", "msdgs_serve.trial", given]
     environment = {**os.environ, THREADS_VARIABLE: "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -44,14 +44,14 @@ def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
     except ValueError:
         answer = None
     if answer is None:
-        problem = f"ends the process that tries it ({done.returncode}), which may have {memory >> 20:,} MiB"
+        problem = f"crashes the process that tests it ({done.returncode}), within a limit of {memory >> 20:,} MiB"
         raise SceneFileInvalid(file.name, "file", problem)
     if answer:
         raise SceneFileInvalid(file.name, **answer)
 
 
 def main(given: str) -> None:
-    """In the process: prints what is wrong with the file as an object, an empty one where nothing is."""
+    """Run in the subprocess: print the problem of the file as a JSON object, which is empty if there is none."""
     asked = json.loads(given)
     _limit(asked["memory"], asked["seconds"])
     answer = {}
@@ -65,7 +65,7 @@ def main(given: str) -> None:
 
 def _limit(memory: int, seconds: float) -> None:
     os.nice(NICENESS)
-    with contextlib.suppress(OSError):  # where Linux runs out of memory, this is the process to end
+    with contextlib.suppress(OSError):  # if Linux runs out of memory, it kills this process first
         Path("/proc/self/oom_score_adj").write_text("1000")
     limits = {
         resource.RLIMIT_CPU: int(seconds) + 1,
@@ -73,11 +73,11 @@ def _limit(memory: int, seconds: float) -> None:
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: OPEN_FILES,
     }
-    if sys.platform == "linux":  # elsewhere the system doesn't keep to it
+    if sys.platform == "linux":  # other systems don't enforce it
         limits[resource.RLIMIT_DATA] = memory
     for which, limit in limits.items():
-        _, most = resource.getrlimit(which)
-        limit = limit if most == resource.RLIM_INFINITY else min(limit, most)
+        _, maximum = resource.getrlimit(which)
+        limit = limit if maximum == resource.RLIM_INFINITY else min(limit, maximum)
         resource.setrlimit(which, (limit, limit))
 
 

@@ -42,7 +42,7 @@ SHRINK = 0.6
 """Of a part's axes against those of the Gaussian it is a part of. Centres are spread by √(1 − 0.6²) of them, so that
 all parts together are as wide as the whole."""
 
-MOST_OPACITY = 0.999
+MAX_OPACITY = 0.999
 
 SAMPLES = 257
 """Times at which the small model is asked for its poses."""
@@ -202,12 +202,12 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
     places = (1 - SHRINK**2) ** 0.5 * torch.randn(count, 3, generator=generator).clamp(-2.5, 2.5)
     offsets = rotate(unit_or_identity(g.raw_quats[parents]), places * g.log_scales[parents].exp())
     parts = torch.bincount(parents, minlength=len(g))[parents]
-    clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MOST_OPACITY)).log() / (parts * SHRINK**2)
+    clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MAX_OPACITY)).log() / (parts * SHRINK**2)
     tensors = {
         "means": g.means[parents] + offsets,
         "log_scales": g.log_scales[parents] + np.log(SHRINK),
         "raw_quats": g.raw_quats[parents],
-        "raw_opacities": torch.logit((1 - clear.exp()).clamp(1e-6, MOST_OPACITY)),
+        "raw_opacities": torch.logit((1 - clear.exp()).clamp(1e-6, MAX_OPACITY)),
         "sh_dc": g.sh_dc[parents],
         "sh_rest": g.sh_rest[parents],
     }

@@ -179,7 +179,7 @@ def check() -> int:
     (row,), (real,), (scene,) = result["frames"], result["real"], result["scenes"]
     assert (row["count"], row["size"], row["repeats"], real["count"], scene["width"]) == (300, [64, 48], 2, 50, 32)
     assert all(0 < times["min"] <= times["median"] for times in row["milliseconds"].values())
-    assert 0 < row["blended"] <= row["lanes"] <= 256 * row["tile_entries"]
+    assert 0 < row["blended"] <= row["evaluated"] <= 256 * row["tile_entries"]
     (case,) = seeded_cases((300,), ("64x48",), 0)
     assert row["blended"] == rasterize(case.gaussians, case.camera, counts=True).counts.sum()
     return 0

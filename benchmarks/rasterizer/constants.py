@@ -15,7 +15,7 @@ from rich.progress import track
 from benchmarks.measuring import Times, machine, minimum_and_median, psnr
 from benchmarks.rasterizer.report import table
 from benchmarks.rasterizer.scenes import object_camera, object_scene
-from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, compositing, rasterize
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, alpha, rasterize
 from msdgs_serve.rasterizer.exponential import exp2_polynomial
 from msdgs_serve.scene import Camera, Gaussians
 from tests.support.reference import render
@@ -73,7 +73,7 @@ def with_polynomial(degree: int) -> Callable[[Gaussians, Camera], np.ndarray]:
     """2^x of another degree in the compositing."""
 
     def draw(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-        with mock.patch.object(compositing, "exp2_polynomial", return_value=exp2_polynomial(degree)):
+        with mock.patch.object(alpha, "exp2_polynomial", return_value=exp2_polynomial(degree)):
             return rasterize(gaussians, camera).rgb
 
     return draw

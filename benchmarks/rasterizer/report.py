@@ -13,10 +13,10 @@ Row = dict[str, Any]
 
 def print_tables(result: Row, console: Console) -> None:
     """Each section that has been measured."""
-    at_most = result["machine"]
-    console.print(at_most["name"])
-    if "gflops" in at_most:
-        rates = f"{at_most['gflops']:.0f} GFLOP/s of float32 fma, {at_most['gigabytes']:.1f} GB/s copied"
+    machine = result["machine"]
+    console.print(machine["name"])
+    if "gflops" in machine:
+        rates = f"{machine['gflops']:.0f} GFLOP/s of float32 fma, {machine['gigabytes']:.1f} GB/s copied"
         console.print(f"at most seen in this run: {rates}")
     for section, title in (("frames", "Seeded scenes"), ("real", "Real splats")):
         if section in result:
@@ -71,17 +71,17 @@ def _stages(rows: list[Row], title: str) -> Table:
 def _work(rows: list[Row]) -> Table:
     made = table(
         "Work and memory; floors in milliseconds at the rates above",
-        *("scene", "size", "visible", "tile entries", "lanes", "blended", "floor: blended", "lanes", "memory"),
-        *("total / (lanes + memory)", "MB", "bytes/splat"),
+        *("scene", "size", "visible", "tile entries", "evaluated", "blended", "floor: blended", "evaluated", "memory"),
+        *("total / (evaluated + memory)", "MB", "bytes/splat"),
     )
     for row in rows:
         floor = row["floor_milliseconds"]
         made.add_row(
             row["title"],
             _size(row["size"]),
-            *(f"{row[name]:,}" for name in ("visible", "tile_entries", "lanes", "blended")),
-            *(f"{floor[name]:.1f}" for name in ("arithmetic", "lanes", "memory")),
-            f"{_total(row) / (floor['lanes'] + floor['memory']):.1f}",
+            *(f"{row[name]:,}" for name in ("visible", "tile_entries", "evaluated", "blended")),
+            *(f"{floor[name]:.1f}" for name in ("arithmetic", "evaluated", "memory")),
+            f"{_total(row) / (floor['evaluated'] + floor['memory']):.1f}",
             f"{row['memory_bytes'] / 1e6:.1f}",
             f"{row['bytes_per_splat']:.0f}",
         )

@@ -1,4 +1,4 @@
-"""What this machine can do at most: two kernels on the rasterizer's own threads and lanes."""
+"""What this machine can do at most: two kernels on the rasterizer's own threads and SIMD vectors."""
 
 import time
 from typing import NamedTuple
@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lane_types import LANES
-from msdgs_serve.rasterizer.lanes import fma, spread
-from msdgs_serve.rasterizer.lanes_memory import load, store
+from msdgs_serve.rasterizer.vector_memory import load, store
+from msdgs_serve.rasterizer.vector_types import NUM_LANES
+from msdgs_serve.rasterizer.vectors import fma, spread
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
-FLOPS_A_PAIR = 37
+FLOPS_PER_PAIR = 37
 """Of one splat in one pixel, an fma counted twice: dx, dy 2; root times that 4; squares and log2 of the opacity 4;
 2^x 13 (rounding 3, polynomial of degree 5: 10); two cuts 2; transmittance 3, going on 1; three colors and depth 8."""
 
@@ -34,14 +34,14 @@ class Roofline:
         self.machine = Machine(0.0, 0.0)
         count = BANDWIDTH_BYTES // 8
         self._source, self._target = np.ones(count, np.float32), np.zeros(count, np.float32)
-        self._scratch = [np.linspace(0, 1, CHAINS * LANES, dtype=np.float32) for _ in range(thread_count())]
+        self._scratch = [np.linspace(0, 1, CHAINS * NUM_LANES, dtype=np.float32) for _ in range(thread_count())]
 
     def sample(self) -> None:
         """About 0.1 s."""
-        flops = 2 * LANES * CHAINS * ROUNDS * thread_count()
+        flops = 2 * NUM_LANES * CHAINS * ROUNDS * thread_count()
         rate = flops / _seconds(_multiply_add, [(scratch, ROUNDS) for scratch in self._scratch]) / 1e9
-        groups = split_evenly(len(self._source) // LANES, thread_count())
-        ranges = [(first * LANES, past * LANES, self._source, self._target) for first, past in groups]
+        groups = split_evenly(len(self._source) // NUM_LANES, thread_count())
+        ranges = [(first * NUM_LANES, past * NUM_LANES, self._source, self._target) for first, past in groups]
         bandwidth = BANDWIDTH_BYTES / _seconds(_copy_range, ranges) / 1e9
         self.machine = Machine(max(self.machine.gflops, rate), max(self.machine.gigabytes, bandwidth))
 
@@ -66,5 +66,5 @@ def _multiply_add(numbers: np.ndarray, rounds: int) -> None:
 
 @kernel
 def _copy_range(start: int, stop: int, source: np.ndarray, target: np.ndarray) -> None:
-    for k in range(np.uint64(start), np.uint64(stop), np.uint64(LANES)):
+    for k in range(np.uint64(start), np.uint64(stop), np.uint64(NUM_LANES)):
         store(target, k, load(source, k))

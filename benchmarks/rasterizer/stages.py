@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.measuring import Times
-from benchmarks.rasterizer.roofline import FLOPS_A_PAIR, Machine
+from benchmarks.rasterizer.roofline import FLOPS_PER_PAIR, Machine
 from benchmarks.rasterizer.scenes import Case
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, as_trained, rasterize
@@ -23,7 +23,7 @@ class Work(NamedTuple):
 
     visible: int  # splats
     tile_entries: int  # splats in tiles
-    lanes: int  # splats in pixels of the 4 × 4 blocks that they touch and that are not done: the arithmetic
+    evaluated: int  # splats in pixels of the 4 × 4 blocks that they touch and that are not done: the arithmetic
     blended: int  # splats in pixels to which they add
 
 
@@ -67,7 +67,7 @@ def work_of(case: Case) -> Work:
     splats = project(case.gaussians, camera, GSPLAT)
     tiles = bin_into_tiles(splats, camera.width, camera.height)
     counts = count_splats(splats, tiles, camera.width, camera.height, GSPLAT)
-    return Work(splats.visible, len(tiles.splat_ids), counts.lanes, int(counts.blended.sum(dtype=float)))
+    return Work(splats.visible, len(tiles.splat_ids), counts.evaluated, int(counts.blended.sum(dtype=float)))
 
 
 def memory_of(case: Case) -> int:
@@ -107,16 +107,16 @@ def row_of(case: Case, times: Times, work: Work, memory: int, machine: Machine) 
 def floor_of(case: Case, work: Work, machine: Machine) -> dict[str, float]:
     """Milliseconds that the machine needs at least, at the rates that this run has seen.
 
-    `arithmetic`: of the pairs that are blended; `lanes`: of all pixels of the 4 × 4 blocks that splats touch; `memory`:
-    reading Gaussians, writing and reading records once, tile lists twice, writing the frame.
+    `arithmetic`: of the pairs that are blended; `evaluated`: of all pixels of the 4 × 4 blocks that splats touch;
+    `memory`: reading Gaussians, writing and reading records once, tile lists twice, writing the frame.
     """
     g = case.gaussians
     bytes_in = sum(array.nbytes for array in (g.means, g.quats, g.scales, g.opacities, g.sh))
     pixels = case.camera.width * case.camera.height
     moved = bytes_in + 2 * 64 * len(g) + 8 * work.tile_entries + 20 * pixels
     return {
-        "arithmetic": work.blended * FLOPS_A_PAIR / machine.gflops / 1e6,
-        "lanes": work.lanes * FLOPS_A_PAIR / machine.gflops / 1e6,
+        "arithmetic": work.blended * FLOPS_PER_PAIR / machine.gflops / 1e6,
+        "evaluated": work.evaluated * FLOPS_PER_PAIR / machine.gflops / 1e6,
         "memory": moved / machine.gigabytes / 1e6,
     }
 

@@ -53,7 +53,7 @@ class Line:
         return answer._replace(body=await reader.readexactly(int(answer.header("content-length"))))
 
     async def close(self) -> None:
-        """It is opened anew when it is needed."""
+        """Close it; it is reopened when it is needed."""
         if self._streams is not None:
             writer, self._streams = self._streams[1], None
             writer.close()

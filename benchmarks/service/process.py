@@ -33,7 +33,7 @@ class Answer(NamedTuple):
 
 
 class Connection:
-    """To a port of this machine; opened anew where the service closed it."""
+    """A connection to a local port, reopened if the service closed it."""
 
     def __init__(self, port: int) -> None:
         self._http = http.client.HTTPConnection("127.0.0.1", port, timeout=120)

@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CLIENTS, NEIGHBOURS = 16, 8
 CATALOGUE, BATCH, BATCH_BESIDE, FILM = 48, 12, 200, 8
 COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-MOST_WAIT = 5.0
+MAX_WAIT = 5.0
 ALIKE = 1.0  # mean difference of two films of the same frames, of 255
 SAMPLE_SECONDS = 1.0
 HOSTILE_BODIES = (
@@ -91,7 +91,7 @@ class Client:
             self.statuses[answer.status] += 1
             if answer.status != 503:
                 return answer
-            time.sleep(min(float(answer.headers.get("retry-after", "1")), MOST_WAIT))
+            time.sleep(min(float(answer.headers.get("retry-after", "1")), MAX_WAIT))
 
     def post(self, path: str, body: Any) -> Answer:
         return self.ask("POST", path, json.dumps(body).encode())

@@ -13,7 +13,7 @@ from msdgs_serve.scene.gaussians import Gaussians
 
 VERSION = 3
 LARGEST = 2**23 - 1
-MOST_FRACTIONAL_BITS = 23
+MAX_FRACTIONAL_BITS = 23
 SIGN, MAGNITUDE = 512, 511
 
 
@@ -42,7 +42,7 @@ def write_spz(file: Path, gaussians: Gaussians, antialiasing: str) -> None:
 def _fractional_bits(largest: float) -> int:
     if largest > LARGEST:
         raise InvalidInput("scene", f"within {LARGEST:,} units of its origin for SPZ", largest)
-    return min(MOST_FRACTIONAL_BITS, math.floor(math.log2(LARGEST / max(largest, 1e-9))))
+    return min(MAX_FRACTIONAL_BITS, math.floor(math.log2(LARGEST / max(largest, 1e-9))))
 
 
 def _fixed_point(means: np.ndarray, bits: int) -> bytes:

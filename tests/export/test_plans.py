@@ -150,7 +150,7 @@ def test_both_ends_of_time_are_exact(tmp_path: Path, plan: str):
 @pytest.mark.parametrize(("plan", "most"), [("network", 2), ("int8", 2), ("prefix:1", 1), ("keyframes:4", 0)])
 def test_plans_that_run_layers_can_stop_after_each(tmp_path: Path, plan: str, most: int):
     baked = bake(random_model(60, layers=("mlp", "mlp")), SCENE, "0" * 64)
-    assert opened(tmp_path / "scene.onnx", build(plan, baked)).most_steps == most
+    assert opened(tmp_path / "scene.onnx", build(plan, baked)).max_steps == most
 
 
 @pytest.mark.parametrize("plan", ["prefix:1", "prefix:2", "int8", "lowrank:4", "keyframes:9"])

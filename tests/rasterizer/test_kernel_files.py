@@ -220,7 +220,7 @@ def test_kernels_use_only_what_their_stamp_follows(file: Path):
 FRAMES = """
 import dataclasses, json, sys
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer.ahead import compile_kernels
+from msdgs_serve.rasterizer.precompile import compile_kernels
 from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
 from tests.rasterizer.test_rasterizer_threads import kernels
 
@@ -228,7 +228,7 @@ def compiled():
     return {f"{kernel.__module__}.{kernel.__name__}": sorted(map(str, kernel.signatures)) for kernel in kernels()}
 
 compile_kernels()
-ahead = compiled()
+precompiled = compiled()
 session, renderer = DeformationSession(sys.argv[1]), Renderer()
 camera = session.scene.metadata.cameras[0].camera.resized(40, 30)
 for model in ("pinhole", "orthographic", "fisheye"):
@@ -241,15 +241,15 @@ for model in ("pinhole", "orthographic", "fisheye"):
         RenderOptions(shutter=Shutter(0.0, 0.1, 3)),
     ):
         renderer.render(session, view, 0.5, options)
-print(json.dumps([ahead, compiled()]))
+print(json.dumps([precompiled, compiled()]))
 """
 
 
 def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
-    ahead, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
-    assert ahead["msdgs_serve.rasterizer.projection._project_parts"]
-    assert ahead["msdgs_serve.rasterizer.compositing._composite_tiles"]
-    assert after == ahead
+    precompiled, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
+    assert precompiled["msdgs_serve.rasterizer.projection._project_parts"]
+    assert precompiled["msdgs_serve.rasterizer.compositing._composite_tiles"]
+    assert after == precompiled
 
 
 def test_kernels_run_without_the_compiler() -> None:

@@ -133,10 +133,10 @@ def test_limits_of_cost_are_those_given(tmp_path: Path):
     exact = GraphLimits(2, cost.memory_bytes, cost.operations, cost.operations)
     assert DeformationSession("sound.onnx", contents=contents, limits=exact).cost.memory_bytes == cost.memory_bytes
     for less, word in (
-        (GraphLimits(gaussians=1), "2 Gaussians; allowed are 1"),
+        (GraphLimits(gaussians=1), "2 Gaussians; the limit is 1"),
         (GraphLimits(memory_bytes=cost.memory_bytes - 1), "MiB of values"),
-        (GraphLimits(operations=cost.operations - 1), "takes a frame"),
-        (GraphLimits(call_operations=cost.operations - 1), "takes a call"),
+        (GraphLimits(operations=cost.operations - 1), "brings a frame"),
+        (GraphLimits(call_operations=cost.operations - 1), "brings a call"),
     ):
         with pytest.raises(SceneFileInvalid, match=word):
             DeformationSession("sound.onnx", contents=contents, limits=less)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from msdgs_serve.api.observe import JsonLines, request_id
+from msdgs_serve.imaging.display import FARTHEST_BRIGHTNESS
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
-from msdgs_serve.imaging.images import FARTHEST_GREY
 from tests.support.images import decode
 from tests.support.scene_files import metadata, write_scene
 from tests.support.service import ORBIT, check_problem, eventually, in_this_process, serving
@@ -155,14 +155,14 @@ def test_channels_come_in_the_order_asked_for(client: httpx.Client):
 
 
 def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
-    """The nearest point is white, the farthest `FARTHEST_GREY`; low alpha is darker, and empty pixels are black."""
+    """The nearest point is white, the farthest `FARTHEST_BRIGHTNESS`; low alpha darkens, empty pixels are black."""
     depth, alpha = (array(client, channels=[name])[..., 0] for name in ("depth", "alpha"))
     seen = np.isfinite(depth)
     assert 0 < seen.mean() < 1
     for asked, (near, far) in (({}, (depth[seen].min(), depth[seen].max())), ({"depth_range": [0, 10]}, (0, 10))):
         grey = decode(post(client, channels=["depth"], **asked).content, "png")[0][..., 0].astype(int)
         place = (np.where(seen, depth, far) - near) / (far - near)
-        want = 255 * alpha * np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0)
+        want = 255 * alpha * np.where(seen, 1 - (1 - FARTHEST_BRIGHTNESS) * place, 0)
         assert np.abs(grey - want).max() <= 1
 
 

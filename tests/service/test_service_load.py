@@ -17,10 +17,10 @@ import pytest
 from msdgs_serve.api.server import Server
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.pose_cache import PoseCache
+from msdgs_serve.render_job import RenderCancelled, RenderJob
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Gaussians
-from msdgs_serve.watch import Interrupted, Watch
-from tests.support.service import AT_MOST, FRAME, check_problem, connect, eventually, serving
+from tests.support.service import FRAME, MAX_SECONDS, check_problem, connect, eventually, serving
 
 pytestmark = pytest.mark.slow
 
@@ -38,13 +38,13 @@ class SlowPoses(PoseCache):
         self.begun = 0
         self.last = math.inf
 
-    def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
-        watch.check()
+    def get(self, session: DeformationSession, t: float, job: RenderJob, steps: float | None = None) -> Gaussians:
+        job.check()
         if self.slow:
             self.begun += 1
-            assert self.go_on.wait(AT_MOST)
+            assert self.go_on.wait(MAX_SECONDS)
             if self.begun >= self.last:
-                eventually(lambda: has_stopped(watch))
+                eventually(lambda: is_cancelled(job))
         return session.gaussians(t)
 
 
@@ -61,10 +61,10 @@ def renderer_with(poses: SlowPoses) -> Renderer:
     return renderer
 
 
-def has_stopped(watch: Watch) -> bool:
+def is_cancelled(job: RenderJob) -> bool:
     try:
-        watch.check()
-    except Interrupted:
+        job.check()
+    except RenderCancelled:
         return True
     return False
 
@@ -102,7 +102,7 @@ def test_requests_beyond_the_queue_are_rejected_with_retry_after(scene: Path, po
         for path in ("/live", "/ready", "/scenes/balls"):
             assert client.get(path).status_code == 200
         poses.go_on.set()
-        assert [future.result(AT_MOST).status_code for future in accepted] == [200] * 5
+        assert [future.result(MAX_SECONDS).status_code for future in accepted] == [200] * 5
         assert client.post("/render", json=FRAME).status_code == 200
 
 
@@ -168,7 +168,7 @@ def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: Sl
         connection.close()
         eventually(lambda: queue.waiting == 0)
         poses.go_on.set()
-        assert first.result(AT_MOST).status_code == 200
+        assert first.result(MAX_SECONDS).status_code == 200
         assert poses.begun == 1
 
 
@@ -190,7 +190,7 @@ def test_a_stopping_service_finishes_accepted_requests(scene: Path, poses: SlowP
         assert refused.status_code == 503
         assert refused.headers["Retry-After"]
         poses.go_on.set()
-        assert [frame.result(AT_MOST).status_code for frame in frames] == [200] * 8
+        assert [frame.result(MAX_SECONDS).status_code for frame in frames] == [200] * 8
         eventually(lambda: not server[0].started or not _listens(client))
 
 
@@ -205,9 +205,9 @@ def _listens(client: httpx.Client) -> bool:
 def test_a_cancelled_request_keeps_poses_of_others(scene: Path):
     """A cancelled request leaves the poses of other requests in the cache."""
     cache, session = PoseCache(1 << 20), DeformationSession(scene)
-    stopped = Watch()
-    stopped.stop()
-    assert cache.get(session, 0.5, Watch()) is cache.get(session, 0.5, Watch())
+    cancelled = RenderJob()
+    cancelled.cancel()
+    assert cache.get(session, 0.5, RenderJob()) is cache.get(session, 0.5, RenderJob())
     assert (cache.use.hits, cache.use.misses, cache.use.poses) == (1, 1, 1)
-    with pytest.raises(Exception, match="nobody waits"):
-        cache.get(session, 0.5, stopped)
+    with pytest.raises(Exception, match="cancelled"):
+        cache.get(session, 0.5, cancelled)

@@ -1,4 +1,4 @@
-"""Clients that send or read too slowly are closed, and others are served meanwhile."""
+"""Clients that send or read too slowly are disconnected, and don't delay others."""
 
 import contextlib
 import socket
@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from msdgs_serve.api.server import Server
-from tests.support.service import AT_MOST, FRAME, connect, eventually, serving
+from tests.support.service import FRAME, MAX_SECONDS, connect, eventually, serving
 
 pytestmark = pytest.mark.slow
 
@@ -68,7 +68,7 @@ def test_slow_senders_are_closed_and_others_are_served(client: httpx.Client, fir
         silent, dripping = (
             [sockets.enter_context(begun(client, first)) for _ in range(SOCKETS // 2)] for _ in range(2)
         )
-        deadline = time.monotonic() + AT_MOST
+        deadline = time.monotonic() + MAX_SECONDS
         while drip and (dripping := [connection for connection in dripping if takes(connection, drip)]):
             assert client.post("/render", json=FRAME).status_code == 200
             assert time.monotonic() < deadline, "a drip makes it wait for ever"

@@ -1,6 +1,7 @@
 """Uploads and deletions of scenes: each is complete or has no effect, and only valid scenes are stored."""
 
 import hashlib
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,15 @@ import pytest
 
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
-from tests.support.service import FRAME, check_problem, connect, eventually, own_connection, serving
+from tests.support.service import (
+    FRAME,
+    check_problem,
+    connect,
+    eventually,
+    in_this_process,
+    own_connection,
+    serving,
+)
 
 
 @pytest.fixture
@@ -62,6 +71,17 @@ def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, fo
 def test_invalid_files_are_refused_and_leave_no_file(client: httpx.Client, folder: Path, content: bytes):
     check_problem(add(client, content), 422)
     assert files(folder) == []
+
+
+@in_this_process
+def test_an_invalid_file_is_no_error_of_the_service(client: httpx.Client, caplog: pytest.LogCaptureFixture):
+    """One line of the log with the scene's name, not the temporary file's."""
+    caplog.set_level(logging.INFO, "msdgs_serve")
+    assert add(client, b"no scene", "a walk").status_code == 422
+    ((level, text),) = [(each.levelno, each.getMessage()) for each in caplog.records if each.name == "msdgs_serve"]
+    assert level == logging.INFO
+    assert "'a walk'" in text
+    assert ".incoming" not in text
 
 
 def test_a_file_that_was_damaged_on_its_way_is_refused(client: httpx.Client, folder: Path, file: bytes):

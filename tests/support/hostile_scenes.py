@@ -179,12 +179,12 @@ ATTACKS = (
     six_gigabytes("Resize(one, , , size)"),
     Attack(
         "six gigabytes by broadcasting",
-        "`vast` (Add) takes a frame to 6,104 MiB of values; allowed are 2,048 MiB",
+        "`vast` (Add) brings a frame to 6,104 MiB of values; the limit is 2,048 MiB",
         beside_the_scene(BROADCASTING, row=np.ones((1, 40_000), np.float32), column=np.ones((40_000, 1), np.float32)),
     ),
     Attack(
         "a quadrillion operations",
-        "(MatMul) takes a call to 2.1e+11 operations; allowed are 2e+11",
+        "(MatMul) brings a call to 2.1e+11 operations; the limit is 2e+11",
         beside_the_scene(PRODUCTS, square=np.eye(2000, dtype=np.float32)),
     ),
     Attack(

@@ -24,7 +24,7 @@ from tests.support.service_on_ray import serving_on_ray
 
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
 FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
-AT_MOST = 60.0
+MAX_SECONDS = 60.0
 """Seconds that a test waits, whatever else the machine does."""
 
 WATCH_SECONDS = 0.05
@@ -72,12 +72,12 @@ def serving(
 def connect(client: httpx.Client) -> socket.socket:
     """Return a plain connection to a client's service."""
     assert client.base_url.port
-    return socket.create_connection((client.base_url.host, client.base_url.port), timeout=AT_MOST)
+    return socket.create_connection((client.base_url.host, client.base_url.port), timeout=MAX_SECONDS)
 
 
 def eventually(condition: Callable[[], object]) -> None:
     """Wait until a condition holds; fail after a minute."""
-    deadline = time.monotonic() + AT_MOST
+    deadline = time.monotonic() + MAX_SECONDS
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)

@@ -25,8 +25,8 @@ TABLE = (
     Row("float32.relative", 1e-6, "a handful of float32 operations"),
     Row("pixel", 1e-9, "projecting a known point through float64 matrices, in pixels"),
     # 16 numbers at once
-    Row("lanes.float32", 3e-5, "some roundings of numbers and sums up to 100; NumPy rounds products first"),
-    Row("lanes.float64", 2e-14, "as in float32"),
+    Row("vectors.float32", 3e-5, "some roundings of numbers and sums up to 100; NumPy rounds products first"),
+    Row("vectors.float64", 2e-14, "as in float32"),
     Row("exp2.float32", 4e-7, "the polynomial's own 2e-7, and some roundings of float32"),
     Row("exp2.float64", 2e-15, "some roundings of float64"),
     Row("log2.float32", 8e-6, "a rounding of 100"),

@@ -16,7 +16,7 @@ class Fidelity(Protocol):
         ...
 
     def note(self) -> str:
-        """One sentence for whoever imports it."""
+        """One sentence for the user of the importer."""
         ...
 
 

@@ -11,7 +11,7 @@ from export.importers.splats.base import Splats
 from export.importers.splats.ply import read_ply
 from msdgs_serve.scene.errors import InvalidInput
 
-MEMORY, MEMORY_A_BYTE = 1 << 30, 32
+MEMORY, MEMORY_PER_BYTE = 1 << 30, 32
 """Address space of that process: its own, and for each byte of the file. A Gaussian of 24 bytes becomes one of 68."""
 
 SECONDS = 120.0
@@ -26,7 +26,7 @@ def read_ksplat(file: Path) -> Splats:
         raise InvalidInput("input", "another format, or pip install '.[ksplat]' to read .ksplat", str(file))
     with tempfile.TemporaryDirectory(prefix="msdgs-ksplat-") as folder:
         ply = Path(folder) / "made.ply"
-        memory = MEMORY + MEMORY_A_BYTE * file.stat().st_size
+        memory = MEMORY + MEMORY_PER_BYTE * file.stat().st_size
         command = [sys.executable, "-I", str(_PROGRAM), str(file), str(ply), str(memory)]
         try:
             done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=SECONDS, check=False)

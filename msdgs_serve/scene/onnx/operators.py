@@ -1,8 +1,8 @@
-"""The operators of a scene file: this table is all that there is. A plan that needs another adds a row here and in
+"""The table of operators that scene files may contain. A plan that needs another adds a row here and in
 docs/contract.md.
 
-No operator's output shape depends on values that are computed: shapes, axes and lengths are constants of the file.
-Whole numbers aren't divided, and rows that are replaced are constants, since processors and libraries fail there.
+Output shapes don't depend on computed values: shapes, axes and lengths are constants of the file. There is no integer
+division, and indices of replaced rows are constants, as errors in them would crash.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,12 +14,12 @@ from msdgs_serve.scene.onnx.model import BOOL, FLOAT, INT8, INT16, INT32, INT64,
 from msdgs_serve.scene.onnx.rules import Call, Result
 
 FUNCTION = 16
-"""Operations that an exponential, a sine and the like count as."""
+"""Operations that a transcendental function counts as."""
 
 
 @dataclass(frozen=True)
 class Operand:
-    """An input: its element types, and whether it has to be a constant of the file."""
+    """An input of an operator: its element types, and whether it must be a constant of the file."""
 
     elements: tuple[int, ...]
     constant: bool = False
@@ -27,17 +27,17 @@ class Operand:
 
 @dataclass(frozen=True)
 class Operator:
-    """A row of the table. Results are of the first input's element type, unless `result` is another, or the attribute
-    that says it; `like` is the input whose type they have otherwise."""
+    """A row of the table. The element type of results is `result`, or that in the attribute `result`, or else that of
+    the input `like`."""
 
     operands: tuple[Operand, ...]
     rule: Callable[[Call], Result] = rules.elementwise
-    attributes: Mapping[str, tuple[Attribute, ...]] = field(default_factory=dict)  # and the values that each may have
-    needed: tuple[str, ...] = ()  # attributes that may not be missing
+    attributes: Mapping[str, tuple[Attribute, ...]] = field(default_factory=dict)  # allowed values by attribute
+    needed: tuple[str, ...] = ()  # required attributes
     result: int | str | None = None
     like: int = 0
-    repeated: bool = False  # whether the last operand may come several times
-    work: int = 1  # operations for each element of the result
+    repeated: bool = False  # whether the last operand may be repeated
+    work: int = 1  # operations per element of the result
 
 
 _FLOAT = Operand((FLOAT,))

@@ -1,4 +1,4 @@
-"""A model in canonical form: what some outputs need of it, each value in the one way that this module writes it."""
+"""Write the part of a model that some outputs need, in a canonical encoding."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -15,7 +15,7 @@ Parts = list[bytes | memoryview]
 def write_model(
     model: Model, outputs: Sequence[str], inputs: Mapping[str, Value], values: Mapping[str, Value]
 ) -> bytes:
-    """The graph that computes `outputs` from `inputs`, none of which has a default. Large constants are copied once."""
+    """Return a model that computes `outputs` from `inputs`, without defaults. Large constants are copied once."""
     nodes, names = _needed(model, outputs)
     graph = _Message()
     for node in nodes:
@@ -38,7 +38,7 @@ def write_model(
 
 
 def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]:
-    """Nodes, in order, and names of values without which the outputs can't be computed."""
+    """Return the nodes, in order, and the names of values that the outputs depend on."""
     names, nodes = set(outputs), []
     for node in reversed(model.nodes):
         if names.intersection(node.outputs):
@@ -48,7 +48,7 @@ def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]
 
 
 class _Message:
-    """Fields, one after the other."""
+    """A Protobuf message in construction."""
 
     def __init__(self) -> None:
         self.parts: Parts = []
