@@ -59,7 +59,7 @@ def test_a_scene_is_replaced_only_on_request(client: httpx.Client, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    "name", ["../walk", "a/b", "/etc/walk", "a\\b", ".hidden", "..", "a\0b", "a\nb", "x" * 201, ""]
+    "name", [".", "../walk", "a/b", "/etc/walk", "a\\b", ".hidden", "..", "a\0b", "a\nb", "x" * 201, ""]
 )
 def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, folder: Path, file: bytes, name: str):
     check_problem(add(client, file, name), 422, "name")
