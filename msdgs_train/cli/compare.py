@@ -33,8 +33,7 @@ class Compare:
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run per seed; the table shows mean and standard deviation."""
     steps: int = 3000
-    """Optimizer steps of each run, instead of the preset's. Schedules in fractions of a run scale with it; those in
-    steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
+    """Optimizer steps of each run, instead of the preset's. All schedules are fractions of a run and scale with it."""
     minutes: float | None = None
     """Time limit of each run. Learning rates decay over --steps, which the limit should just allow."""
     size: int | None = None

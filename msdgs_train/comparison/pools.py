@@ -111,7 +111,7 @@ class _RayPool:
         self._tasks.submit(there)
 
     def ended(self) -> Iterator[tuple[Run, RunEnd]]:
-        for there, end in self._tasks.ended(POLL_SECONDS):
+        for there, end in self._tasks.finished(POLL_SECONDS):
             yield self._given.pop(there.folder), end
 
     def stop(self) -> None:
