@@ -176,7 +176,7 @@ def test_a_zip_whose_directory_is_damaged_is_refused_unnamed(tmp_path: Path, end
 def test_a_sog_is_stored_or_deflated(tmp_path: Path):
     folder = write_sog(tmp_path / "sog", some_gaussians(20, 0))
     file = write(tmp_path, "a.sog", zipped(folder, zipfile.ZIP_LZMA))
-    with pytest.raises(ImportFailed, match=r"its meta.json is packed in a way that no SOG is: 14"):
+    with pytest.raises(ImportFailed, match=r"its meta.json is packed by a method that SOG doesn't use: 14"):
         read_splats(file)
 
 

@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from export.importers import detect_format
-from export.importers.runs import fourdgs
 from export.importers.runs.model import write_model
 from export.jobs.write import properties
 from export.options import ExportOptions
@@ -190,7 +189,7 @@ def test_a_network_that_differs_is_named_before_memory_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Tensor], message: str
 ):
     changed = {f"deformation_net.{name}": tensor for name, tensor in change.items()}
-    run, built = write_run(tmp_path / "run", their_state((1,)) | changed), on_which_device(monkeypatch, fourdgs)
+    run, built = write_run(tmp_path / "run", their_state((1,)) | changed), on_which_device(monkeypatch)
     assert_refused(run, "4dgs", message)
     assert set(built) <= {"meta"}
 

@@ -2,7 +2,6 @@
 
 import zipfile
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from export.importers import ImportFailed, detect_format
-from export.importers.runs import deformgs
+from export.importers.runs import base
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
 from export.measure.poses import posed
@@ -160,7 +159,7 @@ def test_a_network_that_differs_is_named_before_memory_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Tensor], message: str
 ):
     of_blender = "linear.0.weight" not in change
-    run, built = write_run(tmp_path / "run", their_state(of_blender) | change), on_which_device(monkeypatch, deformgs)
+    run, built = write_run(tmp_path / "run", their_state(of_blender) | change), on_which_device(monkeypatch)
     assert_refused(run, "deformgs", message)
     assert set(built) <= {"meta"}
 
@@ -200,7 +199,7 @@ def test_a_checkpoint_that_unpacks_to_more_than_itself_is_refused(tmp_path: Path
     assert_refused(run, "deformgs", r"is packed: it holds 4,\d{3},\d{3} bytes")
 
 
-def on_which_device(monkeypatch: pytest.MonkeyPatch, importer: ModuleType) -> list[str]:
+def on_which_device(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return a list of the devices on which networks are made from now on; on `meta` they take no memory."""
     built: list[str] = []
 
@@ -209,7 +208,7 @@ def on_which_device(monkeypatch: pytest.MonkeyPatch, importer: ModuleType) -> li
         built.append(next(made.deformation.parameters()).device.type)
         return made
 
-    monkeypatch.setattr(importer, "DynamicGaussians", model)
+    monkeypatch.setattr(base, "DynamicGaussians", model)
     return built
 
 

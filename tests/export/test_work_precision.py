@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from export.jobs.job import ExportJob
-from export.jobs.points import DEFAULT_RASTERIZER, Point, QuickEstimate, choose, front
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.jobs.sweep import Sweep, SweepResult
+from export.jobs.sweep import DEFAULT_RASTERIZER, Point, QuickEstimate, Sweep, SweepResult, choose, front
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
 from export.options import ExportOptions
@@ -122,8 +121,8 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
     whole, fitted = job.candidate("network", None), job.candidate("keyframes:9", None)
     sweep = Sweep(job, 45.0)
     sweep.estimates = [
-        QuickEstimate(whole, DEFAULT_RASTERIZER, 90_000, 89_000, 90),
-        QuickEstimate(fitted, DEFAULT_RASTERIZER, 50, 5, 60),
+        QuickEstimate(whole, 90_000, 89_000, 90),
+        QuickEstimate(fitted, 50, 5, 60),
     ]
     sweep.baseline = sweep.estimates[0]
     assert sweep._estimate("network", 46.0) is None
@@ -135,7 +134,7 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
 
 def test_of_similarly_fast_plans_the_smallest_is_pruned(swept: tuple[ExportJob, SweepResult]):
     def estimate(plan: str, cpu: float, size: int, db: float = 60.0) -> QuickEstimate:
-        return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), DEFAULT_RASTERIZER, cpu + 30, cpu, db)
+        return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), cpu + 30, cpu, db)
 
     sweep = Sweep(swept[0], 45.0)
     fine, coarse = estimate("keyframes:0.03", 10.0, 600), estimate("keyframes:0.1", 11.0, 400)
