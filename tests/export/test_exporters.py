@@ -35,7 +35,6 @@ from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
-Change = Callable[[onnx.ModelProto], object]
 
 
 def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
