@@ -21,8 +21,8 @@ from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_rules import VisionaryInvalid, check_visionary
-from export.importers import read_splats
 from export.importers.sequence import read_sequence, sequence_scene
+from export.importers.splats.formats import read_splats
 from export.jobs.bake import bake
 from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from export.exporters.spz import write_spz
-from export.importers import ImportFailed, detect_format, read_splats
-from export.importers.detect import frame_files
+from export.importers.detect import detect_format, frame_files
+from export.importers.errors import ImportFailed
 from export.importers.scene import digest, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
+from export.importers.splats.formats import read_splats
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import rasterize

@@ -12,8 +12,9 @@ import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor
 
-from export.importers import ImportFailed, detect_format
 from export.importers.command import model_or_import
+from export.importers.detect import detect_format
+from export.importers.errors import ImportFailed
 from export.importers.runs import fourdgs
 from export.importers.runs.model import write_model
 from export.jobs.write import properties

@@ -17,10 +17,11 @@ import torch
 from rich.console import Console
 
 from export.exporters.spz import write_spz
-from export.importers import ImportFailed, read_splats
+from export.importers.errors import ImportFailed
 from export.importers.runs.model import write_model
 from export.importers.scene import write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
+from export.importers.splats.formats import read_splats
 from export.measure.poses import posed as posed_model
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize

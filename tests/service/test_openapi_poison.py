@@ -1,4 +1,4 @@
-"""Bodies and links made from the OpenAPI document, with a value at one leaf that nobody should send.
+"""Bodies, links and headers made from the OpenAPI document, with a value at one leaf that nobody should send.
 
 The answer is what the document allows: never a 5xx but 501, 503, 504 and 507, and a 422 names the leaf. A few hundred
 cases, drawn with a seed; `MSDGS_FUZZ=all pytest -n 0 tests/service/test_openapi_poison.py` tries every one.
@@ -28,8 +28,16 @@ PARTNERS: dict[str, dict[str, Any]] = {
     "distortion": {"fx": 16.0, "model": "fisheye"}, "fy": {"fx": 16.0}, "cx": {"fx": 16.0},
     "cy": {"fx": 16.0}, "axes": {"fx": 16.0}, "model": {"fx": 16.0},
 }  # fmt: skip
+KEY = "everything-0123456789"
 SIZE = {"width": 16, "height": 16}
+LINK = {"scene": "balls", "t": "0.5", "width": "16", "height": "16"}
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
+FRAME = {"camera": ORBIT, "t": 0.5}
+BODIES = {
+    "/render": {**FRAME, **SIZE},
+    "/render/batch": {"frames": [{**FRAME, **SIZE}]},
+    "/render/video": {"frames": [FRAME], **SIZE},
+}
 
 Document = dict[str, Any]
 Leaf = tuple[str | int, ...]
@@ -44,13 +52,29 @@ QUERY_POISON = [
     "", "1" * 400, "-" + "1" * 5000, "1e999", "nan", "-inf", "1e-400", "0x10", "1,2", "1,2," + "9" * 90, "\0", "../x",
     "\U0001f600" * 200, "x" * 10_000, "[1]", "{}", "true",
 ]  # fmt: skip
+HEADERS = [
+    "accept-encoding", "access-control-request-headers", "access-control-request-method", "authorization",
+    "content-encoding", "content-type", "cookie", "expect", "forwarded", "host", "if-match", "if-modified-since",
+    "origin", "range", "referer", "user-agent", "x-api-key", "x-forwarded-for", "x-forwarded-proto", "x-request-id",
+]  # fmt: skip
+"""Those that the document doesn't list since they aren't of one call."""
+HEADER_POISON = [
+    b"", b"*", b'"', b'W/"', b'"x", ' * 2000, b"1" * 5000, b"-1", b"nan", b"\xff\xfe", "\U0001f600".encode() * 200,
+    b"x" * 100_000, b"../x", b"a/b;q=nan, */*;q=-1e999", b"application/json; charset=none", b"multipart/form-data",
+    b"Bearer \xff", b"Bearer " + b"x" * 5000, b"bytes=5-1,-,9999999999999999999-", b"gzip", b"100-continue",
+    b"1.2.3.4, x, ::", b"Thu, 99 Xyz 99999 99:99:99 GMT", b"[", b"http://[::", b"@:99999",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    folder = tmp_path_factory.mktemp("scenes")
+    folder, keys = tmp_path_factory.mktemp("scenes"), tmp_path_factory.mktemp("keys") / "keys"
     write_scene(folder / "balls.onnx", steps=True, measured_error={"rendered": {"psnr_worst": 45.0}})
-    with serving(folder, uploads=True, max_pixels=64 * 64, max_samples=8, max_batch=4, max_video_frames=4) as client:
+    keys.write_text(f"read,write,operate {KEY}")
+    limits: dict[str, int] = {"max_pixels": 64 * 64, "max_samples": 8, "max_batch": 4, "max_video_frames": 4}
+    origins = ["https://example.org"]
+    with serving(folder, uploads=True, api_keys_file=keys, proxies="*", cors_origins=origins, **limits) as client:
+        client.headers["X-API-Key"] = KEY
         yield client
 
 
@@ -113,8 +137,7 @@ def bodies(document: Document) -> list[tuple[str, Any, Leaf]]:
                 frames = instances({"$ref": "#/components/schemas/RenderRequest"}, document)
                 whole = [{"frames": [{**SIZE, **frame}]} for frame in frames]
             if path == "/render/video":
-                film = {"frames": [{"camera": ORBIT, "t": 0.5}], **SIZE}
-                whole = [{**(SIZE if {"frames", "path"} & set(body) else film), **body} for body in whole]
+                whole = [{**(SIZE if {"frames", "path"} & set(body) else BODIES[path]), **body} for body in whole]
             elif path == "/render":
                 whole = [{**SIZE, **body} for body in whole]
             found += [(path, body, leaf) for body in whole for leaf in leaves(body)]
@@ -160,7 +183,7 @@ def test_no_value_at_any_leaf_of_a_body_breaks_the_service(client: httpx.Client)
         content = text_of(replaced(body, leaf, value), twice=number % 8 == 0)
         response = client.post(path, content=content, headers=headers)
         where = (path, leaf, repr(value)[:60], response.text[:300])
-        assert response.status_code < 500 or response.status_code in ALLOWED, where
+        check_no_failure(response, *where)
         for problem in problems(response, path):
             assert problem["status"] < 500 or problem["status"] in ALLOWED, where
             if problem["status"] == 422:
@@ -187,7 +210,11 @@ def test_a_leaf_that_no_float_holds_is_named(client: httpx.Client):
         assert any(named(error["field"], within) for error in found[0]["errors"]), where
 
 
-def test_no_value_in_a_link_breaks_the_service(client: httpx.Client):
+def check_no_failure(response: httpx.Response, *where: Any) -> None:
+    assert response.status_code < 500 or response.status_code in ALLOWED, (where, response.text[:300])
+
+
+def test_no_value_in_a_link_breaks_the_service(client: httpx.Client, tmp_path: Path):
     document, cases = client.get("/openapi.json").json(), []
     for path, calls in document["paths"].items():
         for method, call in calls.items():
@@ -195,19 +222,40 @@ def test_no_value_in_a_link_breaks_the_service(client: httpx.Client):
                 if parameter["in"] in ("query", "path"):
                     cases += [(method, path, parameter, value) for value in QUERY_POISON]
     assert len(cases) > 300
+    scene = write_scene(tmp_path / "other.onnx").read_bytes()
     for number, (method, path, parameter, value) in enumerate(chosen(cases)):
         name = parameter["name"]
         query = [(name, value)] * (1 + number % 2) if parameter["in"] == "query" else []
-        if path == "/scenes" and name != "name":
-            query.append(("name", "other"))
+        beside = {"/scenes": {"name": "other"}, "/render": LINK}.get(path, {})
+        query += [(key, good) for key, good in beside.items() if key != name]
         where = path.replace(f"{{{name}}}", str(httpx.URL(params={"v": value}).query.decode().removeprefix("v=")))
-        response = client.request(method, where, params=query)
-        assert response.status_code < 500 or response.status_code in ALLOWED, (method, path, name, value[:60])
+        response = client.request(method, where, params=query, content=scene if path == "/scenes" else None)
+        check_no_failure(response, method, path, name, value[:60])
         if response.status_code >= 400:
             check_problem(response)
 
 
-@pytest.mark.parametrize("text", [b'{"t": %s}' % (b"1" * 5000), b"[" * 100_000, b'{"t":' * 50_000, b'{"t": 1e99999}'])
+def test_no_header_breaks_the_service(client: httpx.Client):
+    document, cases = client.get("/openapi.json").json(), []
+    for path, calls in document["paths"].items():
+        for method, call in calls.items():
+            own = [parameter["name"] for parameter in call.get("parameters", ()) if parameter["in"] == "header"]
+            cases += [(method, path, name, value) for name in [*own, *HEADERS] for value in HEADER_POISON]
+    assert len(cases) > 2000
+    for number, (method, path, name, value) in enumerate(chosen(cases)):
+        headers = [(name.encode(), value)] * (1 + number % 2)
+        if name != "content-type":
+            headers.append((b"content-type", b"application/json"))
+        where, content = path.replace("{name}", "other"), json.dumps(BODIES.get(path))
+        response = client.request(method, where, headers=headers, content=content)
+        check_no_failure(response, method, path, name, value[:60])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b'{"t": %s}' % (b"1" * 5000), b"[" * 100_000, b'{"t":' * 50_000, b'{"t": 1e99999}'],
+    ids=["digits", "lists", "objects", "exponent"],
+)
 @pytest.mark.parametrize("path", ["/render", "/render/batch", "/render/video"])
 def test_what_python_itself_refuses_to_read_is_no_5xx(client: httpx.Client, path: str, text: bytes):
     response = client.post(path, content=text, headers={"Content-Type": "application/json"})
@@ -215,6 +263,5 @@ def test_what_python_itself_refuses_to_read_is_no_5xx(client: httpx.Client, path
     check_problem(response)
 
 
-def test_good_frames_are_still_drawn(client: httpx.Client, tmp_path: Path):
-    frame = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
-    assert client.post("/render", json={**frame, "scene": "balls"}).status_code == 200
+def test_good_frames_are_still_drawn(client: httpx.Client):
+    assert client.post("/render", json={**BODIES["/render"], "scene": "balls"}).status_code == 200
