@@ -1,5 +1,5 @@
 # Two environments: .venv-serve has what serving needs and no torch, .venv has everything.
-# They are made anew when pyproject.toml or constraints.txt change.
+# They are rebuilt when pyproject.toml or constraints.txt change.
 
 PYTHON ?= python3
 TORCH_INDEX ?=

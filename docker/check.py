@@ -231,7 +231,7 @@ def check_affinity(url: str) -> None:
 
 
 def check_kill(url: str) -> None:
-    """A replica is killed while clients ask for new frames: nobody notices."""
+    """A replica is killed while clients request new frames: no request fails."""
     numbers, statuses, slowest = itertools.count(), list[int](), 0.0
     lock, victim = threading.Lock(), containers("render")[0]
 
@@ -295,12 +295,12 @@ def post(url: str, t: float, azimuth: int, request_id: str) -> Answer:
 
 
 def get(url: str, headers: dict[str, str] | None = None) -> Answer:
-    """What a GET answers; status 0 where nobody does."""
+    """Return status and body of a GET; status 0 without an answer."""
     return ask(urllib.request.Request(url, headers=headers or {}))
 
 
 def ask(request: urllib.request.Request) -> Answer:
-    """What a request answers; status 0 where nobody does."""
+    """Return status and body of a request; status 0 without an answer."""
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
         with direct.open(request, timeout=60) as response:
@@ -346,7 +346,7 @@ def output(*command: str, check: bool = True) -> "subprocess.CompletedProcess[st
 
 
 def free_port() -> int:
-    """A port of this machine that nobody has."""
+    """Return a free port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

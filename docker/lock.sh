@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Writes docker/requirements/*.txt anew: the pins of constraints.txt with the hashes of every file that an index has for
+# Renews docker/requirements/*.txt: the pins of constraints.txt with the hashes of every file that an index has for
 # them. Needs uv (`pip install uv`).
 set -euo pipefail
 cd "$(dirname "$0")/.."

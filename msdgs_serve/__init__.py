@@ -3,6 +3,6 @@
 import os
 
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-"""onnxruntime reads it when it is imported; without it, importing writes a database into the home folder."""
+"""Read by onnxruntime when it is imported; otherwise it writes a database into the home folder."""
 
 __version__ = "0.2.0"

@@ -1,4 +1,4 @@
-"""Frames, cut into blocks by scene and time. This code draws them, here and elsewhere."""
+"""Frames in blocks by scene and time, which are drawn by this process or by workers on other machines."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ from msdgs_serve.imaging import ImageFormat, encode
 from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera
 
-LARGEST = 16
-"""Frames of a block: what a worker that dies takes with it, and what Ctrl-C throws away."""
+MAX_FRAMES = 16
+"""Frames per block: as many are lost if a worker dies or Ctrl-C is pressed."""
 
 
 class View(NamedTuple):
-    """What one frame shows."""
+    """Scene, camera and time of one frame."""
 
     scene: Path
     camera: Camera
@@ -23,7 +23,7 @@ class View(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """One frame of a block; `number` is its place among all."""
+    """One frame of a block; `number` is its index among all frames."""
 
     number: int
     camera: Camera
@@ -32,15 +32,15 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """Frames of one scene in the order of their times, so that each time is posed once."""
+    """Frames of one scene, sorted by time, so that each time is posed once."""
 
     scene: Path
     frames: tuple[Frame, ...]
 
 
 @dataclass(frozen=True)
-class Look:
-    """How frames are drawn and written."""
+class OutputOptions:
+    """How frames are drawn and encoded."""
 
     image_format: ImageFormat
     quality: int | None
@@ -48,12 +48,12 @@ class Look:
 
 
 def plan_blocks(views: Sequence[View], numbers: Sequence[int], workers: int = 1) -> list[Block]:
-    """The frames `numbers` of `views` in blocks: all of one scene after each other, by time.
+    """Return the frames `numbers` of `views` in blocks, sorted by scene and time.
 
-    Blocks have `LARGEST` frames, or fewer where `workers` would have less than four each. A time that has more frames
-    than fit into what is left of a block begins a new one.
+    Blocks have at most `MAX_FRAMES` frames, and fewer if there were less than four blocks per worker. Frames of one
+    time stay in one block if they fit into one.
     """
-    size = max(1, min(LARGEST, len(numbers) // (4 * workers)))
+    size = max(1, min(MAX_FRAMES, len(numbers) // (4 * workers)))
     scenes = list(dict.fromkeys(view.scene for view in views))
     blocks = []
     for scene in scenes:
@@ -64,9 +64,9 @@ def plan_blocks(views: Sequence[View], numbers: Sequence[int], workers: int = 1)
 
 
 def draw_block(
-    block: Block, session: DeformationSession, renderer: Renderer, look: Look
+    block: Block, session: DeformationSession, renderer: Renderer, look: OutputOptions
 ) -> Iterator[tuple[int, bytes]]:
-    """Number and file contents of each frame, one after the other."""
+    """Yield the number and the encoded file of each frame."""
     for number, camera, t in block.frames:
         yield number, encode(renderer.render(session, camera, t, look.options), look.image_format, look.quality)
 

@@ -1,4 +1,4 @@
-"""Cameras along a path, each with its time: read from nerfstudio's files, or a turn around the scene."""
+"""Camera paths, with a time for each camera: nerfstudio's files, or a full turn around the scene."""
 
 import json
 import math
@@ -14,25 +14,25 @@ from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
 
 DEFAULT_FPS = 24.0
 MAX_FPS = 240.0
-LARGEST = 1e9
-"""Of any number of a path: single precision neither overflows nor underflows."""
+MAX_NUMBER = 1e9
+"""Limit of all numbers in a path, within which single precision neither overflows nor underflows."""
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """What is seen, frame by frame."""
+    """Cameras and times of the frames of a video."""
 
     frames: tuple[tuple[Camera, float], ...]  # camera and scene time
     fps: float
 
     def __post_init__(self) -> None:
         if not self.frames:
-            raise InvalidInput("path", "of at least one frame", 0)
+            raise InvalidInput("path", "a path of at least one frame", 0)
         if not (math.isfinite(self.fps) and 0 < self.fps <= MAX_FPS):
             raise InvalidInput("fps", f"in (0, {MAX_FPS:g}]", self.fps)
 
 
-def turn_around(
+def orbit_path(
     target: np.ndarray,
     distance: float,
     elevation: float,
@@ -42,30 +42,30 @@ def turn_around(
     count: int,
     time_range: tuple[float, float],
 ) -> list[tuple[Camera, float]]:
-    """One turn in `count` steps, while the scene's time runs from its beginning to its end. Angles in degrees."""
-    times = spread_times(count, time_range)
+    """Return `count` cameras on a circle around `target`, at times from first to last. Angles in degrees."""
+    times = even_times(count, time_range)
     poses = [orbit(target, distance, 360 * number / count, elevation, up) for number in range(count)]
     return [(Camera.from_fov(pose, *size, fov_y), t) for pose, t in zip(poses, times, strict=True)]
 
 
-def spread_times(count: int, time_range: tuple[float, float]) -> list[float]:
-    """`count` times from the first to the last, evenly."""
+def even_times(count: int, time_range: tuple[float, float]) -> list[float]:
+    """Return `count` evenly spaced times from the first to the last."""
     return np.linspace(*time_range, count).tolist()
 
 
 def read_nerfstudio(
     document: Mapping[str, Any], time_range: tuple[float, float], size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """A path from the contents of nerfstudio's camera_path.json, whose cameras have OpenGL axes.
+    """Read a path from the contents of nerfstudio's camera_path.json, whose cameras have OpenGL axes.
 
-    Each camera's time is its `render_time`, a part of the scene's time in [0, 1]; where none has one, time runs evenly
-    over the path. `size` is used in place of the file's. Raises `InvalidInput` naming the key.
+    A camera's time is its `render_time`, a fraction of the scene's time range; without one, times are evenly spaced
+    over the path. `size` replaces the size in the file. Raises `InvalidInput` naming the key.
     """
     cameras = document.get("camera_path")
     if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
         raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
-    width, height = size or (_whole(document, "render_width"), _whole(document, "render_height"))
-    evenly = spread_times(len(cameras), time_range)
+    width, height = size or (_integer(document, "render_width"), _integer(document, "render_height"))
+    even = even_times(len(cameras), time_range)
     frames = []
     for number, each in enumerate(cameras):
         name = f"camera_path.{number}"
@@ -77,17 +77,17 @@ def read_nerfstudio(
             raise InvalidInput(f"{name}.fov", "in (0, 180) degrees", fov_y)
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov_y))
         camera = Camera.from_opengl(pose, width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
-        frames.append((camera, _time(each, evenly[number], time_range, name)))
+        frames.append((camera, _time(each, even[number], time_range, name)))
     return CameraPath(tuple(frames), _fps(document))
 
 
 def read_path_file(path: Path, time_range: tuple[float, float], size: tuple[int, int] | None = None) -> CameraPath:
-    """The path in a JSON file in nerfstudio's layout. Raises `InvalidInput`."""
+    """Read a path from a JSON file in nerfstudio's format. Raises `InvalidInput`."""
     return read_nerfstudio(_document(path), time_range, size)
 
 
 def read_scene_names(path: Path) -> list[str]:
-    """The `scene` that each camera of a path in a JSON file names. Raises `InvalidInput` naming the key."""
+    """Return the `scene` of each camera of a path in a JSON file. Raises `InvalidInput` naming the key."""
     cameras = _document(path).get("camera_path")
     if not isinstance(cameras, list) or not cameras:
         raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
@@ -97,7 +97,7 @@ def read_scene_names(path: Path) -> list[str]:
 def _scene_name(camera: Any, at: str) -> str:
     name = camera.get("scene") if isinstance(camera, dict) else None
     if not isinstance(name, str) or not name.endswith(".onnx"):
-        raise InvalidInput(f"{at}.scene", "a scene file (.onnx), from the path's folder", name)
+        raise InvalidInput(f"{at}.scene", "a scene file (.onnx), relative to the path's folder", name)
     return name
 
 
@@ -105,39 +105,39 @@ def _document(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError) as error:
-        raise InvalidInput("path", "a JSON file that can be read", f"{path}: {error}") from None
+        raise InvalidInput("path", "a readable JSON file", f"{path}: {error}") from None
     if not isinstance(document, dict):
-        raise InvalidInput("path", "a JSON object, as nerfstudio writes it", f"{path}: {type(document).__name__}")
+        raise InvalidInput("path", "a JSON object in nerfstudio's format", f"{path}: {type(document).__name__}")
     return document
 
 
-def _time(camera: Mapping[str, Any], evenly: float, time_range: tuple[float, float], name: str) -> float:
+def _time(camera: Mapping[str, Any], even: float, time_range: tuple[float, float], name: str) -> float:
     if camera.get("render_time") is None:
-        return evenly
-    (part,) = _numbers([camera["render_time"]], 1, f"{name}.render_time")
-    if not 0 <= part <= 1:
-        raise InvalidInput(f"{name}.render_time", "in [0, 1]", part)
+        return even
+    (fraction,) = _numbers([camera["render_time"]], 1, f"{name}.render_time")
+    if not 0 <= fraction <= 1:
+        raise InvalidInput(f"{name}.render_time", "in [0, 1]", fraction)
     first, last = time_range
-    return float(min(first + part * (last - first), last))
+    return float(min(first + fraction * (last - first), last))
 
 
 def _fps(document: Mapping[str, Any]) -> float:
     return float(_numbers([document.get("fps", DEFAULT_FPS)], 1, "fps")[0])
 
 
-def _whole(document: Mapping[str, Any], name: str) -> int:
+def _integer(document: Mapping[str, Any], name: str) -> int:
     value = document.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_PIXELS_PER_SIDE:
         got = value if isinstance(value, float) else type(value).__name__
-        raise InvalidInput(name, f"a whole number of pixels in [1, {MAX_PIXELS_PER_SIDE}]", got)
+        raise InvalidInput(name, f"an integer number of pixels in [1, {MAX_PIXELS_PER_SIDE}]", got)
     return value
 
 
 def _numbers(value: Any, count: int, name: str) -> np.ndarray:
     good = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
     if not good or any(isinstance(each, bool) or not isinstance(each, int | float) for each in value):
-        raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", "something else")
+        raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", "another value")
     numbers: list[float] = list(value)
-    if not all(-LARGEST <= each <= LARGEST for each in numbers):
-        raise InvalidInput(name, f"finite and at most {LARGEST:g}", "NaN, infinity or more")
+    if not all(-MAX_NUMBER <= each <= MAX_NUMBER for each in numbers):
+        raise InvalidInput(name, f"finite and at most {MAX_NUMBER:g}", "NaN, infinity or more")
     return np.array(numbers, dtype=np.float64)

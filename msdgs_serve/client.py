@@ -5,8 +5,8 @@
         frame.rgb, frame.alpha, frame.depth
 
 ClientError
-├── Problem         the service refused: `status`, `detail` and the `errors` by field
-└── Unreachable     no answer came
+├── Problem         the service answered with an error: `status`, `detail` and `errors` by field
+└── Unreachable     there was no answer
 """
 
 import base64
@@ -38,15 +38,15 @@ OVERLOADED = 503
 
 
 class ClientError(Exception):
-    """Base of what this module raises."""
+    """Base of the errors that this module raises."""
 
 
 class Unreachable(ClientError):
-    """No answer came: nobody listens there, or the time was over."""
+    """There was no answer: the connection failed or timed out."""
 
 
 class Problem(ClientError):
-    """The service refused (RFC 9457)."""
+    """The service answered with an error (RFC 9457)."""
 
     def __init__(self, status: int, detail: str, errors: Sequence[Mapping[str, str]] = ()) -> None:
         super().__init__(f"{status}: {detail}")
@@ -57,7 +57,7 @@ class Problem(ClientError):
 
 @dataclass(frozen=True)
 class Orbit:
-    """A camera on a sphere around `target`. Angles in degrees; what is None comes from the scene."""
+    """A camera on a sphere around `target`. Angles in degrees; the scene has defaults for None."""
 
     azimuth: float
     elevation: float
@@ -70,7 +70,7 @@ class Orbit:
 
 @dataclass(frozen=True)
 class LookAt:
-    """A camera at `eye` that sees `target` in the middle."""
+    """A camera at `eye` that looks at `target`."""
 
     eye: Sequence[float]  # [3] world
     target: Sequence[float] | None = None
@@ -81,7 +81,7 @@ class LookAt:
 
 @dataclass(frozen=True)
 class Matrix:
-    """A pose and intrinsics: `fov_y` in degrees, or `fx` and perhaps the others in pixels."""
+    """A pose and intrinsics: `fov_y` in degrees, or `fx` and optionally `fy`, `cx`, `cy` in pixels."""
 
     camera_to_world: npt.ArrayLike  # [4, 4]
     axes: Literal["opencv", "opengl"] = "opencv"
@@ -95,7 +95,7 @@ class Matrix:
 
 @dataclass(frozen=True)
 class SceneCamera:
-    """A camera that the scene was made with, by `name` or `index`."""
+    """A camera that is stored in the scene, by `name` or `index`."""
 
     name: str | None = None
     index: int | None = None
@@ -116,13 +116,13 @@ class Shutter:
 
 @dataclass(frozen=True)
 class Frame:
-    """What was drawn, as float32; channels that were not asked for are None."""
+    """A rendered frame as float32 arrays; channels that were not requested are None."""
 
-    rgb: FloatArray | None  # [H, W, 3] sRGB-encoded; premultiplied by alpha where the background is transparent
+    rgb: FloatArray | None  # [H, W, 3] sRGB-encoded; premultiplied by alpha if the background is transparent
     alpha: FloatArray | None  # [H, W]
-    depth: FloatArray | None  # [H, W] along the camera's axis, scene units, infinite where nothing is
-    motion: FloatArray | None  # [H, W, 2] pixels to the right and down, to where things are at t + dt
-    gaussians: FloatArray | None  # [H, W] how many add to each pixel
+    depth: FloatArray | None  # [H, W] along the camera's axis, scene units, infinite where nothing was drawn
+    motion: FloatArray | None  # [H, W, 2] displacement until t + dt, pixels to the right and down
+    gaussians: FloatArray | None  # [H, W] number of Gaussians that contribute to each pixel
     plan: str  # how the scene's motion is computed
     milliseconds: dict[str, float]  # by stage: queue, pose, draw, encode
 
@@ -139,8 +139,8 @@ class Client:
         tries: int = TRIES,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        """`seconds` is the time limit of a call; where the service is overloaded, a call is made up to `tries` times
-        and waits in between as long as the service says."""
+        """`seconds` is the time limit of a call. While the service is overloaded, a call is repeated up to `tries`
+        times, after the delay that the service asks for."""
         headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
         self._http = httpx.Client(base_url=url, headers=headers, timeout=seconds, transport=transport)
         self._tries = tries
@@ -154,7 +154,7 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Let go of the connections."""
+        """Close the connections."""
         self._http.close()
 
     def render(
@@ -171,8 +171,8 @@ class Client:
         dt: float | None = None,
         steps: float | None = None,
     ) -> Frame:
-        """A frame as arrays. The channel `motion` needs `dt`, in scene time; `steps` is how many of the scene's layers
-        are applied. Raises `Problem` or `Unreachable`."""
+        """Return a frame as arrays. The channel `motion` needs `dt`, in scene time; `steps` is the number of the
+        scene's layers that are applied. Raises `Problem` or `Unreachable`."""
         body = request_body(
             camera, t, scene=scene, width=width, height=height, channels=channels, background=background,
             shutter=shutter, dt=dt, steps=steps, format="npy",
@@ -182,13 +182,13 @@ class Client:
         return _frame(pixels, channels, response.headers)
 
     def render_file(self, camera: Camera, t: float, *, format: Format = "png", **options: Any) -> bytes:
-        """A frame as an image file; `options` are those of `request_body`."""
+        """Return a frame as an image file; `options` are those of `request_body`."""
         return self._call("POST", "/render", json=request_body(camera, t, format=format, **options)).content
 
     def render_many(self, bodies: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, bytes | Problem]]:
-        """The files of many frames as they are ready, with their places; bodies are those of `request_body`.
+        """Yield index and file of many frames as they are ready; bodies are those of `request_body`.
 
-        A frame that fails is a `Problem` in its place; the others are drawn.
+        A frame that fails yields a `Problem`; the others are drawn.
         """
         with self._http.stream("POST", "/render/batch", json={"frames": [dict(body) for body in bodies]}) as response:
             if response.is_error:
@@ -203,24 +203,24 @@ class Client:
                     yield line["index"], Problem(line["status"], problem["detail"], problem["errors"])
 
     def scenes(self) -> list[str]:
-        """Names of the scenes that are served."""
+        """Return the names of the scenes that are served."""
         return [scene["name"] for scene in self._call("GET", "/scenes").json()["scenes"]]
 
     def scene(self, name: str) -> dict[str, Any]:
-        """What a scene says of itself: time range, cameras, plan, measured error."""
+        """Return the description of a scene: time range, cameras, plan, measured error."""
         return self._call("GET", f"/scenes/{quote(name, safe='')}").json()
 
     def add_scene(self, name: str, file: Path, *, replace: bool = False) -> str:
-        """Add a scene file where the service takes them; returns its SHA-256."""
+        """Add a scene file, if the service allows uploads, and return its SHA-256."""
         query = {"name": name, "replace": str(replace).lower()}
         return self._call("POST", "/scenes", params=query, content=file.read_bytes()).json()["sha256"]
 
     def delete_scene(self, name: str) -> None:
-        """Delete a scene where the service lets."""
+        """Delete a scene, if the service allows uploads."""
         self._call("DELETE", f"/scenes/{quote(name, safe='')}")
 
     def ready(self) -> bool:
-        """Whether frames can be asked for."""
+        """Whether the service is ready to render frames."""
         try:
             return self._http.get("/ready").is_success
         except httpx.TransportError:
@@ -256,7 +256,7 @@ def request_body(
     dt: float | None = None,
     steps: float | None = None,
 ) -> dict[str, Any]:
-    """The JSON of `POST /render`; what is None is left out."""
+    """Return the JSON body of `POST /render`; None is left out."""
     values = {
         "scene": scene, "camera": _plain(camera), "t": t, "width": width, "height": height, "format": format,
         "quality": quality, "channels": None if channels is None else list(channels), "background": background,
@@ -291,5 +291,5 @@ def _problem(response: httpx.Response) -> Problem:
     try:
         problem = response.json()
         return Problem(response.status_code, problem["detail"], problem["errors"])
-    except (ValueError, KeyError, TypeError):  # a proxy in between may answer in its own words
+    except (ValueError, KeyError, TypeError):  # an answer of a proxy in between
         return Problem(response.status_code, response.reason_phrase)

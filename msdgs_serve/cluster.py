@@ -1,11 +1,11 @@
-"""The service on Ray Serve, for those who run Ray already. Needs `msdgs[cluster]`.
+"""The service as a Ray Serve application. Needs `msdgs[cluster]`.
 
     serve run msdgs_serve.cluster:application scenes=/data/scenes
     serve run msdgs_serve.cluster:application scenes=/data/scenes replicas=4 cores=8 queued_renders=32
 
-Arguments are the settings of `msdgs-serve`, and `replicas` and `cores` of each. Where replicas are on several machines,
-scenes lie where all see them. Ray's own proxy takes the connections: host, port, header_seconds, read_seconds and
-drain_seconds are set there.
+Arguments are the settings of `msdgs-serve`, the number of `replicas` and the `cores` per replica. If replicas run on
+several machines, all must be able to read the scenes. Ray's proxy handles the connections and replaces the settings
+host, port, header_seconds, read_seconds and drain_seconds.
 """
 
 import asyncio
@@ -19,13 +19,13 @@ from msdgs_serve.threads import THREADS_VARIABLE
 if TYPE_CHECKING:
     from msdgs_serve.api.settings import Settings
 
-ROOM_FOR_REFUSALS = 200
-"""Requests that a replica may have beside those with a place in its queue: it answers them at once, with 503 and
-`Retry-After`. Ray Serve would keep them waiting, or refuse them without saying for how long."""
+MAX_REJECTIONS = 200
+"""Requests that Ray sends to a replica beyond the places in its queue. The replica rejects them with 503 and
+`Retry-After`; Ray Serve would let them wait, or reject them without `Retry-After`."""
 
 
 def application(arguments: Mapping[str, str]) -> Any:
-    """A Ray Serve application. Raises pydantic's `ValidationError` naming the argument that is wrong."""
+    """Return a Ray Serve application. Raises pydantic's `ValidationError` naming the invalid argument."""
     from msdgs_serve.api.settings import Settings
 
     given = dict(arguments)
@@ -42,12 +42,12 @@ POLL_SECONDS = 0.05
 
 
 def deployment(settings: "Settings", replicas: int = 1, cores: int = 1) -> Any:
-    """The service with these settings as a Ray Serve application, to be given to `serve.run`."""
+    """Return the service with these settings as a Ray Serve application, for `serve.run`."""
     from ray import serve  # pyright: ignore[reportMissingImports]  # an extra
 
-    places = settings.concurrent_renders + settings.queued_renders + ROOM_FOR_REFUSALS
+    places = settings.concurrent_renders + settings.queued_renders + MAX_REJECTIONS
 
-    # made in the replica, as scenes and locks don't travel
+    # created in the replica: scenes and locks can't be pickled
     replica = serve.ingress(lambda: _service(settings, cores))()
     configured = serve.deployment(
         replica, name="msdgs", num_replicas=replicas, ray_actor_options={"num_cpus": cores},
@@ -57,7 +57,7 @@ def deployment(settings: "Settings", replicas: int = 1, cores: int = 1) -> Any:
 
 
 def _service(settings: "Settings", cores: int) -> Any:
-    """The FastAPI application of `msdgs-serve`, which has begun when its scenes are loaded."""
+    """Return the FastAPI application of `msdgs-serve`, whose startup ends when its scenes are loaded."""
     from msdgs_serve.api.app import create_app
     from msdgs_serve.api.observe import REQUEST_ID
     from msdgs_serve.api.service import Phase
@@ -79,22 +79,22 @@ def _service(settings: "Settings", cores: int) -> Any:
             yield state
 
     app.router.lifespan_context = loaded
-    app.add_middleware(_Without, REQUEST_ID)
+    app.add_middleware(_DropHeader, REQUEST_ID)
     return app
 
 
-class _Without:
-    """Leaves a header out of answers: Ray's proxy, which has given the request its id, adds it too."""
+class _DropHeader:
+    """ASGI middleware that removes a header from responses, which Ray's proxy adds itself."""
 
     def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]], header: str) -> None:
         self._app = app
         self._name = header.lower().encode()
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        async def shorter(message: Message) -> None:
+        async def send_without(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = [each for each in message["headers"] if each[0].lower() != self._name]
                 message = {**message, "headers": headers}
             await send(message)
 
-        await self._app(scope, receive, shorter)
+        await self._app(scope, receive, send_without)

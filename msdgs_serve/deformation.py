@@ -1,4 +1,4 @@
-"""A scene file in onnxruntime: time and ids in, posed Gaussians out."""
+"""Run scene files in onnxruntime: from a time to posed Gaussians."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -21,15 +21,14 @@ _MAX_DETAILS = 500
 
 
 class DeformationSession:
-    """One scene file, loaded and checked; may be asked from several threads at once, though not from inside the pool.
+    """One scene file, loaded and checked. Safe to use from several threads, but not from inside the thread pool.
 
-    The file's graph deforms the Gaussians it is asked for in one go. Where it runs layers the loop over chunks of them
-    is here: each chunk is one single-threaded onnxruntime call, and the process-wide pool runs the chunks. The chunks
-    don't depend on the number of threads, so neither do the results. Other graphs blend what is stored of all Gaussians
-    whatever they are asked for, and are called once, on threads of onnxruntime's own: 1.6 times as fast on two cores,
-    the same bits.
+    A graph that runs layers on Gaussians is called for chunks of them: each chunk is one single-threaded onnxruntime
+    call, and the process-wide pool runs the chunks. Chunks and results don't depend on the number of threads. Other
+    graphs, of stored poses or of control nodes, compute all Gaussians in any case and are called once, on onnxruntime's
+    own threads: 1.6 times as fast on two cores, with the same bits.
 
-    onnxruntime never gets the file: `read_scene_file` checks it and writes the graph again.
+    onnxruntime never reads the file itself: `read_scene_file` checks it and writes a new graph.
     """
 
     def __init__(
@@ -40,51 +39,57 @@ class DeformationSession:
         contents: bytes | None = None,
         limits: GraphLimits | None = None,
     ) -> None:
-        """`contents` are the file's, where they came by another way and `path` is but its name. `chunk` is how many
-        Gaussians a call takes, by default what suits the file's graph. `limits` are those of the graph's cost.
+        """Load a scene file.
 
-        Raises `SceneFileInvalid` naming the field where the file isn't a whole, finite `msdgs/1` scene.
+        Args:
+            path: the file, or its name in messages if `contents` are given.
+            chunk: Gaussians per call; the default depends on the file's graph.
+            contents: of the file, if they are in memory already.
+            limits: of the graph's cost.
+
+        Raises `SceneFileInvalid` naming the field if the file isn't a complete, finite `msdgs/1` scene.
         """
         if chunk is not None and chunk < 1:
             raise InvalidInput("chunk", "1 or more", chunk)
         self.path = Path(path)
-        self._chunk = chunk
         self._file = self.path.name
         contents = self._read() if contents is None else contents
         self.sha256 = hashlib.sha256(contents).hexdigest()
         scene_file = read_scene_file(contents, self._file, limits or GraphLimits())
-        del contents  # a copy of all that is large is in `scene_file`
+        del contents  # `scene_file` has copies of all large arrays
         self.cost = scene_file.cost
         self._steps = scene_file.steps
+        self._chunk = chunk or (max(scene_file.moving_count, 1) if scene_file.poses_all else CHUNK)
         self.scene = self._read_scene(scene_file)
-        self._session = self._open(scene_file.graph, thread_count() if self._steps is None else 1)
+        self._session = self._open(scene_file.graph, thread_count() if scene_file.poses_all else 1)
         for t in self.scene.metadata.time_range:
             self._check_sample(t)
 
     @property
-    def most_steps(self) -> int:
-        """How many deformation layers can be applied one after the other; 0 where the scene's plan doesn't run them."""
+    def max_steps(self) -> int:
+        """Number of deformation layers that `pose` can apply one by one; 0 if the scene's plan doesn't run layers."""
         return 0 if self._steps is None else len(self.scene.metadata.layers)
 
     def check_steps(self, steps: float | None) -> None:
-        """Raise `InvalidInput` where the scene can't be posed after so many layers."""
+        """Raise `InvalidInput` if the scene can't be posed after `steps` layers."""
         if steps is None:
             return
-        if not self.most_steps:
+        if not self.max_steps:
             plan = self.scene.metadata.plan
-            raise InvalidInput("steps", f"left out: the plan {plan} doesn't run layers one by one", steps)
-        if not 0 <= steps <= self.most_steps:
-            raise InvalidInput("steps", f"in [0, {self.most_steps}], the scene's layers", steps)
+            raise InvalidInput("steps", f"left out, as the plan {plan} runs no layers", steps)
+        if not 0 <= steps <= self.max_steps:
+            raise InvalidInput("steps", f"in [0, {self.max_steps}], the scene's layers", steps)
 
     def pose(
         self, t: float, ids: npt.ArrayLike | None = None, steps: float | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Means [M, 3], unit wxyz quaternions [M, 4] and scales [M, 3] of the moving Gaussians `ids`, [M], or of all.
+        """Return means [M, 3], unit wxyz quaternions [M, 4] and scales [M, 3] of the moving Gaussians `ids`, [M], or
+        all.
 
-        After `steps` of the scene's layers, of the last one a part where that is no whole number; or after all.
+        `steps` is the number of layers to apply, with a fraction of the last one if it isn't an integer; None for all.
 
-        Raises `InvalidInput` for a time outside the scene's range, an id that isn't there or steps that it can't make,
-        and `SceneFileInvalid` where the deformation overflows.
+        Raises `InvalidInput` for a time outside the scene's range and for invalid ids or steps, and `SceneFileInvalid`
+        if the deformation overflows.
         """
         t = self._checked_time(t)
         self.check_steps(steps)
@@ -99,20 +104,19 @@ class DeformationSession:
                     raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
                 expected[:] = output
 
-        chunk = self._chunk or (max(len(every), 1) if self._steps is None else CHUNK)
         with sharing_cores():
-            run_parallel(run, [(i, min(i + chunk, len(every))) for i in range(0, len(every), chunk)])
+            run_parallel(run, [(i, min(i + self._chunk, len(every))) for i in range(0, len(every), self._chunk)])
         self._check_finite(t, posed)
         return posed["means"], posed["quats"], posed["scales"]
 
     def gaussians(self, t: float, steps: float | None = None) -> Gaussians:
-        """All Gaussians at time `t`, moving and static, ready to draw; moving ones as `pose` has them."""
+        """Return all Gaussians at time `t`, the posed moving ones and the static ones."""
         return self.scene.gaussians(*self.pose(t, steps=steps))
 
     @contextmanager
-    def answering_for(self, t: float) -> Iterator[None]:
-        """Turn `InvalidInput` about this scene's Gaussians at `t` into `SceneFileInvalid`: only the first and the last
-        time are looked at when a file is loaded."""
+    def as_scene_file_error(self, t: float) -> Iterator[None]:
+        """Turn `InvalidInput` about this scene's Gaussians at `t` into `SceneFileInvalid`: loading checks the first and
+        the last time only."""
         try:
             yield
         except InvalidInput as error:
@@ -161,16 +165,16 @@ class DeformationSession:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 4  # its errors are raised as well, its warnings are about how graphs are written
+        options.log_severity_level = 4  # errors are raised as exceptions; warnings are about the style of graphs
         try:
             return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's errors share no base below it
-            raise self._refused("is refused", error) from error
+        except Exception as error:  # onnxruntime's errors have no common base class
+            raise self._runtime_error("is rejected", error) from error
 
     def _check_sample(self, t: float) -> None:
         sample = slice(min(self.scene.moving_count, 64))
         posed = self.pose(t, np.arange(sample.stop))
-        with self.answering_for(t):
+        with self.as_scene_file_error(t):
             Gaussians(*posed, self.scene.opacities[sample], self.scene.sh[sample]).validate()
 
     def _run(self, t: float, ids: npt.NDArray[np.int64], steps: float | None = None) -> list[FloatArray]:
@@ -185,8 +189,8 @@ class DeformationSession:
         try:
             arrays = session.run(list(outputs), inputs)
         except Exception as error:
-            raise self._refused("can't be run", error) from error
+            raise self._runtime_error("can't be run", error) from error
         return [np.asarray(array) for array in arrays]
 
-    def _refused(self, what: str, error: Exception) -> SceneFileInvalid:
-        return SceneFileInvalid(self._file, "file", f"{what} by onnxruntime", str(error)[:_MAX_DETAILS])
+    def _runtime_error(self, problem: str, error: Exception) -> SceneFileInvalid:
+        return SceneFileInvalid(self._file, "file", f"{problem} by onnxruntime", str(error)[:_MAX_DETAILS])

@@ -1,4 +1,4 @@
-"""How a scene is seen where nothing is said of it: from its cameras, or its bounds."""
+"""Default view of a scene, from its cameras or its bounds."""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +9,20 @@ from msdgs_serve.scene.baked import SceneMetadata
 
 DEFAULT_SIZE = 512
 DEFAULT_FOV_Y = 50.0
-LEAST_CONVERGENCE = 0.02
-"""Of the viewing axes, the mean square sine of their angles to the direction that they have most in common; below it
-they are so nearly parallel that where they meet says little."""
+MIN_CONVERGENCE = 0.02
+"""Smallest mean squared sine of the angles between the viewing axes and their main direction at which their nearest
+point is well defined; below it they are too parallel."""
 
-GRAIN = 1e-5
-"""Of the bounds' diagonal: what is finer is rounding of poses, and would fill links with digits."""
+ROUNDING = 1e-5
+"""Rounding of the target, as a fraction of the bounds' diagonal: avoids long numbers in links."""
 
 
 @dataclass(frozen=True)
 class Framing:
-    """What a camera needs and a request may leave out."""
+    """Camera parameters for requests that leave them out."""
 
-    target: np.ndarray  # [3] what the cameras look at, or the middle of the bounds
-    distance: float  # from there, to see all
+    target: np.ndarray  # [3] point that the cameras look at, or the center of the bounds
+    distance: float  # of the camera from the target
     up: np.ndarray  # [3] unit
     fov_y: float  # degrees
     width: int
@@ -30,7 +30,7 @@ class Framing:
 
 
 def framing(metadata: SceneMetadata) -> Framing:
-    """From the scene's cameras, or its bounds where it has none (then z is up)."""
+    """Return the default view from the scene's cameras, or from its bounds if it has none (then z is up)."""
     low, high = np.asarray(metadata.bounds, dtype=np.float64)
     target = (low + high) / 2
     if not metadata.cameras:
@@ -38,32 +38,33 @@ def framing(metadata: SceneMetadata) -> Framing:
         distance = radius / math.sin(math.radians(DEFAULT_FOV_Y) / 2)
         return Framing(target, distance, np.array([0.0, 0.0, 1.0]), DEFAULT_FOV_Y, DEFAULT_SIZE, DEFAULT_SIZE)
     poses = np.array([each.camera.camera_to_world for each in metadata.cameras])
-    target = _meeting_point(poses, low, high, target)
+    target = _nearest_point(poses, low, high, target)
     distance = float(np.median(np.linalg.norm(poses[:, :3, 3] - target, axis=1)))
     first = metadata.cameras[0].camera
     fov_y = math.degrees(2 * math.atan(first.height / (2 * first.fy)))
     return Framing(target, max(distance, 1e-3), _up(poses), fov_y, first.width, first.height)
 
 
-def _meeting_point(poses: np.ndarray, low: np.ndarray, high: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """The point nearest to all viewing axes of cameras, [N, 4, 4], where it lies in the bounds and ahead of most.
+def _nearest_point(poses: np.ndarray, low: np.ndarray, high: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Return the point nearest to all viewing axes of poses [N, 4, 4], if it is in the bounds and in front of most,
+    else `otherwise`.
 
-    Bounds hold Gaussians far out as well, so that their middle may be beside all that cameras look at.
+    Bounds include distant Gaussians, so that no camera may look at their center.
     """
-    grain = 10.0 ** np.floor(np.log10(GRAIN * max(np.linalg.norm(high - low), 1e-3)))
+    step = 10.0 ** np.floor(np.log10(ROUNDING * max(np.linalg.norm(high - low), 1e-3)))
     eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [N, 3, 3] takes the part along an axis away
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [N, 3, 3] projects onto the plane normal to an axis
     system = across.mean(axis=0)
-    if np.linalg.eigvalsh(system)[0] < LEAST_CONVERGENCE:
+    if np.linalg.eigvalsh(system)[0] < MIN_CONVERGENCE:
         return otherwise
     point = np.linalg.solve(system, (across @ eyes[:, :, None]).mean(axis=0)[:, 0])
-    point = np.round(point / grain) * grain
-    is_ahead = np.einsum("ni,ni->n", point - eyes, axes) > 0
-    return point if is_ahead.mean() > 0.5 and np.all((low <= point) & (point <= high)) else otherwise
+    point = np.round(point / step) * step
+    in_front = np.einsum("ni,ni->n", point - eyes, axes) > 0
+    return point if in_front.mean() > 0.5 and np.all((low <= point) & (point <= high)) else otherwise
 
 
 def _up(poses: np.ndarray) -> np.ndarray:
-    """The mean of the up directions of cameras, [N, 4, 4]; the world axis that is near it, where one is."""
+    """Return the mean up direction of poses [N, 4, 4], or the world axis that is close to it."""
     mean = -poses[:, :3, 1].mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length < 1e-3:

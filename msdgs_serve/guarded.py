@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from msdgs_serve.threads import GIVING_WAY, THREADS_VARIABLE
+from msdgs_serve.threads import NICENESS, THREADS_VARIABLE
 
 OPEN_FILES = 64
 
@@ -47,7 +47,9 @@ def call_guarded(function: Callable[..., None], *arguments: Any, limits: Process
     except subprocess.TimeoutExpired:
         raise ProcessFailed(f"isn't read within {limits.seconds:g} s") from None
     if done.returncode:
-        problem = f"ends the process that reads it ({done.returncode}), which may have {limits.memory >> 20:,} MiB"
+        problem = (
+            f"crashes the process that reads it ({done.returncode}), within a limit of {limits.memory >> 20:,} MiB"
+        )
         raise ProcessFailed(problem)
     answer.seek(0)
 
@@ -62,7 +64,7 @@ def main(text: str) -> None:
 
 
 def _limit(limits: ProcessLimits) -> None:
-    os.nice(GIVING_WAY)
+    os.nice(NICENESS)
     with contextlib.suppress(OSError):  # where Linux runs out of memory, this is the process to end
         Path("/proc/self/oom_score_adj").write_text("1000")
     values = {

@@ -1,4 +1,4 @@
-"""Posed Gaussians by scene and time: computed once for all who ask together, kept as long as the memory allows."""
+"""Cache of posed Gaussians by scene and time; concurrent requests for the same pose compute it once."""
 
 import threading
 import weakref
@@ -7,8 +7,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.render_job import RenderCancelled, RenderJob
 from msdgs_serve.scene import Gaussians, InvalidInput
-from msdgs_serve.watch import Interrupted, Watch
 
 PoseKey = tuple[weakref.ref[DeformationSession], float, float | None]
 
@@ -17,7 +17,7 @@ STAGE = "pose"
 
 @dataclass(frozen=True)
 class CacheUse:
-    """What the cache holds and did so far."""
+    """Contents of the cache, and its hits and misses so far."""
 
     poses: int
     bytes: int
@@ -26,9 +26,9 @@ class CacheUse:
 
 
 class PoseCache:
-    """At most `capacity` bytes of posed Gaussians, used last stay. Safe to use from several threads.
+    """A least-recently-used cache of at most `capacity` bytes of posed Gaussians. Safe to use from several threads.
 
-    Opacities and colors don't depend on time and are shared with the scene, so that they don't count.
+    Opacities and colors are shared with the scene and don't count.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -42,26 +42,26 @@ class PoseCache:
 
     @property
     def use(self) -> CacheUse:
-        """As of now."""
+        """Current contents and counters."""
         with self._lock:
             return CacheUse(len(self._sizes), sum(self._sizes.values()), self._hits, self._misses)
 
-    def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
-        """The scene's Gaussians at `t`, perhaps after some of its layers; notes `hit` or `miss` with the watch."""
-        key = (weakref.ref(session), t, steps)  # a scene that was replaced is not kept alive
-        with watch.stage(STAGE):
+    def get(self, session: DeformationSession, t: float, job: RenderJob, steps: float | None = None) -> Gaussians:
+        """Return the scene's Gaussians at `t`, after `steps` layers or all; note `hit` or `miss` in the job."""
+        key = (weakref.ref(session), t, steps)  # a replaced scene is not kept alive
+        with job.stage(STAGE):
             while True:
                 future, mine = self._claim(key)
-                watch.notes[STAGE] = "miss" if mine else "hit"
+                job.notes[STAGE] = "miss" if mine else "hit"
                 if mine:
                     self._compute(session, key, future)
                 try:
                     return future.result()
-                except Interrupted:
-                    watch.check()  # not this one's: who computed it gave up, so it is claimed anew
+                except RenderCancelled:
+                    job.check()  # the job that computed it was cancelled, not this one: claim it again
 
     def _claim(self, key: PoseKey) -> tuple[Future[Gaussians], bool]:
-        """The pose, perhaps still being computed, and whether the caller is to compute it."""
+        """Return the future of the pose, and whether the caller must compute it."""
         with self._lock:
             future = self._poses.get(key)
             mine = future is None
@@ -77,31 +77,31 @@ class PoseCache:
             gaussians = session.gaussians(*key[1:])
         except BaseException as error:
             with self._lock:
-                self._forget(key)
+                self._remove(key)
             future.set_exception(error)
             return
         with self._lock:
             self._sizes[key] = _own_bytes(gaussians, session)
-            self._make_room()
+            self._evict()
         future.set_result(gaussians)
 
-    def _make_room(self) -> None:
+    def _evict(self) -> None:
         for key in [key for key in self._sizes if key[0]() is None]:
-            self._forget(key)
+            self._remove(key)
         total = sum(self._sizes.values())
         for key in [key for key in self._poses if key in self._sizes]:
             if total <= self._capacity:
                 break
             total -= self._sizes[key]
-            self._forget(key)
+            self._remove(key)
 
-    def _forget(self, key: PoseKey) -> None:
+    def _remove(self, key: PoseKey) -> None:
         self._poses.pop(key, None)
         self._sizes.pop(key, None)
 
 
 def _own_bytes(gaussians: Gaussians, session: DeformationSession) -> int:
-    """Of the arrays that are not the scene's own."""
+    """Return the bytes of the arrays that are not shared with the scene."""
     if gaussians.means is session.scene.static_means:
         return 0
     return gaussians.means.nbytes + gaussians.quats.nbytes + gaussians.scales.nbytes

@@ -1,4 +1,4 @@
-"""Blocks of frames on a Ray cluster. A scene's file goes into the object store once, and to each machine once."""
+"""Draw blocks of frames on a Ray cluster. A scene file is put into the object store once and sent to a machine once."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -8,33 +8,33 @@ from typing import Any
 
 import numpy as np
 
-from msdgs_serve.blocks import Block, Look, draw_block
+from msdgs_serve.blocks import Block, OutputOptions, draw_block
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.ray_tasks import RayTasks, in_turns
+from msdgs_serve.ray_tasks import RayTasks, run_tasks
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.threads import THREADS_VARIABLE
 
 OPEN_SCENES = 2
-"""That a worker keeps: blocks come scene by scene, and while one ends the next begins."""
+"""Scenes that a worker keeps open: blocks are sorted by scene, and one scene's last overlap the next one's first."""
 
 
-def draw_on_ray(blocks: Sequence[Block], look: Look, cores: int) -> Iterator[tuple[int, bytes]]:
-    """Number and file contents of each frame, block by block as they end. One core draws one block.
+def draw_on_ray(blocks: Sequence[Block], look: OutputOptions, cores: int) -> Iterator[tuple[int, bytes]]:
+    """Yield the number and the encoded file of each frame as blocks finish. Each block is drawn on one core.
 
-    Needs a connection, `ray_cluster`. Raises `MsdgsError` for what can't be drawn.
+    Call it within `ray_cluster`. Raises `MsdgsError` if a frame can't be drawn.
     """
     import ray  # pyright: ignore[reportMissingImports]
 
     scenes = {block.scene: None for block in blocks}
-    # an array, which workers of one machine see without copies
+    # as arrays, which Ray shares between the workers of a machine without copies
     stored = {scene: ray.put(np.frombuffer(scene.read_bytes(), np.uint8)) for scene in scenes}
     tasks: RayTasks[Block, list[tuple[int, bytes]]] = RayTasks(_draw, stored, look)
-    for _, frames in in_turns(tasks, list(blocks), cores):
+    for _, frames in run_tasks(tasks, list(blocks), cores):
         yield from frames
 
 
-def _draw(stored: dict[Path, Any], look: Look, block: Block) -> list[tuple[int, bytes]]:
-    os.environ[THREADS_VARIABLE] = "1"  # other blocks have the other cores
+def _draw(stored: dict[Path, Any], look: OutputOptions, block: Block) -> list[tuple[int, bytes]]:
+    os.environ[THREADS_VARIABLE] = "1"  # other cores draw other blocks
     session, renderer = _opened(block.scene, stored[block.scene])
     return list(draw_block(block, session, renderer, look))
 

@@ -1,4 +1,4 @@
-"""Work on a Ray cluster: tasks that are given again where a worker or its machine is lost. Needs `msdgs[cluster]`."""
+"""Tasks on a Ray cluster that are repeated if their worker or its machine is lost. Needs `msdgs[cluster]`."""
 
 import itertools
 import os
@@ -14,8 +14,8 @@ Result = TypeVar("Result")
 
 AUTO = "auto"
 MAX_LOSSES = 5
-AHEAD = 2
-"""Tasks for each core: one that runs, and one whose turn comes when that has ended."""
+TASKS_PER_CORE = 2
+"""Tasks submitted per core: a running one and a waiting one."""
 
 
 class RayUnavailable(MsdgsError):
@@ -23,26 +23,26 @@ class RayUnavailable(MsdgsError):
 
 
 class WorkLost(MsdgsError):
-    """A task's worker died again and again."""
+    """A task's worker died `MAX_LOSSES` times."""
 
 
 class _Problem(NamedTuple):
-    """An error of ours on its way back; the errors themselves can't be pickled."""
+    """The message of an `MsdgsError`, which can't be pickled itself."""
 
     message: str
 
 
 @contextmanager
 def ray_cluster(address: str) -> Iterator[int]:
-    """A connection to Ray, which ends on leaving; yields how many cores the cluster has.
+    """Connect to Ray within the context; yield the number of the cluster's cores.
 
-    `auto` is the cluster that runs on this machine (or that RAY_ADDRESS names); where there is none, one is started
-    and stopped again. Raises `RayUnavailable`, and `InvalidInput` where nobody answers at `address`.
+    `auto` is the cluster that runs on this machine or that RAY_ADDRESS names; if there is none, one is started for the
+    duration of the context. Raises `RayUnavailable`, and `InvalidInput` if there is no cluster at `address`.
     """
     try:
         import ray  # pyright: ignore[reportMissingImports]  # an extra
     except ImportError:
-        raise RayUnavailable("other machines are reached through Ray: pip install 'msdgs[cluster]'") from None
+        raise RayUnavailable("drawing on other machines needs Ray: pip install 'msdgs[cluster]'") from None
     quiet = {"log_to_driver": False, "logging_level": "error"}
     try:
         ray.init(address=address, **quiet)
@@ -57,9 +57,9 @@ def ray_cluster(address: str) -> Iterator[int]:
 
 
 class RayTasks(Generic[Item, Result]):
-    """Calls `function(*shared, item)` for each item that is submitted, on `cores` cores of some machine.
+    """Calls `function(*shared, item)` for each submitted item, on `cores` cores of one machine.
 
-    `shared` may hold what `ray.put` has returned, which comes as its value.
+    References from `ray.put` in `shared` arrive as their values.
     """
 
     def __init__(self, function: Callable[..., Result], *shared: Any, cores: int = 1) -> None:
@@ -71,26 +71,26 @@ class RayTasks(Generic[Item, Result]):
             except MsdgsError as error:
                 return _Problem(str(error))
 
-        # lost tasks are given again here, so that one way counts them all
+        # lost tasks are resubmitted here, so that all losses are counted
         self._call = ray.remote(num_cpus=cores, max_retries=0)(guarded)
         self._shared = shared
-        self._going: dict[Any, Item] = {}
+        self._running: dict[Any, Item] = {}
         self._losses: Counter[int] = Counter()
 
     def __len__(self) -> int:
-        """Items that haven't ended."""
-        return len(self._going)
+        """Number of unfinished items."""
+        return len(self._running)
 
     def submit(self, item: Item) -> None:
-        """Have it done when its turn comes."""
-        self._going[self._call.remote(*self._shared, item)] = item
+        """Queue an item."""
+        self._running[self._call.remote(*self._shared, item)] = item
 
-    def ended(self, timeout: float | None = None) -> Iterator[tuple[Item, Result]]:
-        """What has ended meanwhile, after waiting for the first of it, `timeout` seconds at most.
+    def finished(self, timeout: float | None = None) -> Iterator[tuple[Item, Result]]:
+        """Yield finished items with their results, after waiting at most `timeout` seconds for the first.
 
         Raises:
-            MsdgsError: what the function raised, as its message.
-            WorkLost: if the machines that worked on an item were lost `MAX_LOSSES` times.
+            MsdgsError: with the message of an error that the function raised.
+            WorkLost: if the workers of an item were lost `MAX_LOSSES` times.
         """
         import ray  # pyright: ignore[reportMissingImports]
         from ray import exceptions  # pyright: ignore[reportMissingImports]
@@ -99,36 +99,36 @@ class RayTasks(Generic[Item, Result]):
             exceptions.WorkerCrashedError, exceptions.NodeDiedError, exceptions.ObjectLostError,
             exceptions.OutOfMemoryError, exceptions.LocalRayletDiedError,
         )  # fmt: skip
-        if not self._going:
+        if not self._running:
             return
-        ready, _ = ray.wait(list(self._going), num_returns=1, timeout=timeout)
-        more, _ = ray.wait(list(self._going), num_returns=len(self._going), timeout=0)
+        ready, _ = ray.wait(list(self._running), num_returns=1, timeout=timeout)
+        more, _ = ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
         for reference in dict.fromkeys([*ready, *more]):
-            item = self._going.pop(reference)
+            item = self._running.pop(reference)
             try:
                 result = ray.get(reference)
             except lost as error:
-                self._again(item, error)
+                self._resubmit(item, error)
                 continue
             if isinstance(result, _Problem):
                 raise MsdgsError(result.message)
             yield item, result
 
-    def _again(self, item: Item, error: Exception) -> None:
+    def _resubmit(self, item: Item, error: Exception) -> None:
         self._losses[id(item)] += 1
         if self._losses[id(item)] >= MAX_LOSSES:
             reason = str(error).strip().splitlines()[0]
-            raise WorkLost(f"work was lost {MAX_LOSSES} times with its worker, the last time as: {reason}")
+            raise WorkLost(f"a task lost its worker {MAX_LOSSES} times, last because: {reason}")
         self.submit(item)
 
 
-def in_turns(tasks: RayTasks[Item, Result], items: list[Item], cores: int) -> Iterator[tuple[Item, Result]]:
-    """All items with their results as they end; a few are ahead of the cores, so that results don't pile up."""
+def run_tasks(tasks: RayTasks[Item, Result], items: list[Item], cores: int) -> Iterator[tuple[Item, Result]]:
+    """Yield all items with their results as they finish; few are submitted at a time, so that results don't pile up."""
     waiting = iter(items)
-    for item in itertools.islice(waiting, AHEAD * cores):
+    for item in itertools.islice(waiting, TASKS_PER_CORE * cores):
         tasks.submit(item)
     while len(tasks):
-        for ended in tasks.ended():
+        for finished in tasks.finished():
             for item in itertools.islice(waiting, 1):
                 tasks.submit(item)
-            yield ended
+            yield finished

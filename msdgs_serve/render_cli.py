@@ -1,6 +1,6 @@
-"""`msdgs-render`: a camera path through scenes, as images or as a film, drawn here or by a Ray cluster.
+"""`msdgs-render`: render a camera path through scenes as images or a video, on this machine or a Ray cluster.
 
-Goes on where it was stopped.
+Continues where an earlier run was stopped.
 """
 
 import argparse
@@ -19,8 +19,8 @@ from typing import cast, get_args
 import numpy as np
 import OpenImageIO as oiio
 
-from msdgs_serve.blocks import Block, Look, View, draw_block, plan_blocks
-from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_path_file, read_scene_names, turn_around
+from msdgs_serve.blocks import Block, OutputOptions, View, draw_block, plan_blocks
+from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, orbit_path, read_path_file, read_scene_names
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
@@ -39,24 +39,24 @@ RECORD = "msdgs-render.json"
 
 EXAMPLES = """\
 examples:
-  msdgs-render scene.onnx frames/                           one turn around the scene while its time runs, as PNG
-  msdgs-render scene.onnx turn.mp4 --frames 96 --fps 24     the same as a film
-  msdgs-render scene.onnx walk.webm --path camera_path.json a path drawn in nerfstudio's viewer
+  msdgs-render scene.onnx frames/                           one turn around the scene over its time range, as PNG
+  msdgs-render scene.onnx turn.mp4 --frames 96 --fps 24     the same as a video
+  msdgs-render scene.onnx walk.webm --path camera_path.json a path saved by nerfstudio's viewer
   msdgs-render scene.onnx frames/ --format exr              color, alpha and depth as numbers, for compositing
   msdgs-render views.json frames/                           a path whose cameras each name their "scene"
-  msdgs-render scene.onnx frames/ --ray auto                drawn by the Ray cluster of this machine; else ADDRESS
+  msdgs-render scene.onnx frames/ --ray auto                on the Ray cluster of this machine, or at an address
 
-Ctrl-C loses nothing: the same command goes on where it was stopped.
+After Ctrl-C, the same command continues where it was stopped.
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Returns the exit status: 2 where the command can't be carried out, 130 after Ctrl-C."""
+    """Run the command. Return the exit status: 2 after an error, 130 after Ctrl-C."""
     options = _parser().parse_args(arguments)
     try:
         _run(options)
     except KeyboardInterrupt:
-        print(f"\n{PROGRAM}: stopped; the same command goes on from here", file=sys.stderr)
+        print(f"\n{PROGRAM}: stopped; the same command continues from here", file=sys.stderr)
         return INTERRUPTED
     except (MsdgsError, OSError) as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
@@ -68,42 +68,48 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         PROGRAM, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    scene = 'a scene file (.onnx), or a camera path (.json) whose cameras name one each, as "scene"'
+    scene = 'a scene file (.onnx), or a camera path (.json) in which each camera names one as "scene"'
     parser.add_argument("scene", type=Path, help=scene)
     parser.add_argument("out", type=Path, help="a folder for images, or a video: name.mp4, name.webm or name.webp")
-    parser.add_argument("--path", type=Path, help="a camera path, as nerfstudio writes it; default: one turn around")
-    parser.add_argument("--frames", type=int, default=60, help="of the turn (default 60)")
-    parser.add_argument("--elevation", type=float, default=20.0, help="of the turn, degrees (default 20)")
-    parser.add_argument("--fps", type=float, help=f"of a film; default: the path's, else {DEFAULT_FPS:g}")
-    parser.add_argument("--width", type=int, help="pixels; default: the path's, else the scene's first camera's")
-    parser.add_argument("--height", type=int, help="pixels; goes with --width")
-    parser.add_argument("--format", choices=get_args(ImageFormat), default="png", help="of images (default png)")
-    parser.add_argument("--quality", type=int, help="of jpeg and webp, 1 to 100")
-    parser.add_argument("--transparent", action="store_true", help="no background; for images")
-    ray = "draw on a Ray cluster: `auto`, that of this machine (one is started where there is none), or its address"
+    parser.add_argument(
+        "--path", type=Path, help="a camera path in nerfstudio's format; default: one turn around the scene"
+    )
+    parser.add_argument("--frames", type=int, default=60, help="frames of the turn (default 60)")
+    parser.add_argument("--elevation", type=float, default=20.0, help="elevation of the turn, degrees (default 20)")
+    parser.add_argument(
+        "--fps", type=float, help=f"frames per second of a video; default: the path's, else {DEFAULT_FPS:g}"
+    )
+    parser.add_argument(
+        "--width", type=int, help="image width, pixels; default: the path's, else the scene's first camera's"
+    )
+    parser.add_argument("--height", type=int, help="image height, pixels; required with --width")
+    parser.add_argument("--format", choices=get_args(ImageFormat), default="png", help="format of images (default png)")
+    parser.add_argument("--quality", type=int, help="quality of jpeg and webp, 1 to 100")
+    parser.add_argument("--transparent", action="store_true", help="render images without a background")
+    ray = "render on a Ray cluster: `auto` for that of this machine (started if there is none), or its address"
     parser.add_argument("--ray", metavar="ADDRESS", help=ray)
     return parser
 
 
 def _run(options: argparse.Namespace) -> None:
     video = options.out.suffix.lstrip(".")
-    is_film = bool(video)
-    if is_film:
+    is_video = bool(video)
+    if is_video:
         check_video(video)
     views, fps = _views(options)
-    image_format = cast(ImageFormat, "png" if is_film else options.format)
-    transparent = options.transparent or (FORMATS[image_format].holds_float and not is_film)
+    image_format = cast(ImageFormat, "png" if is_video else options.format)
+    transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
     first = views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
-    if is_film and transparent:
-        raise InvalidInput("--transparent", "left out for a film", "given")
-    folder = options.out.with_name(f"{options.out.name}.frames") if is_film else options.out
+    if is_video and transparent:
+        raise InvalidInput("--transparent", "left out for a video", "given")
+    folder = options.out.with_name(f"{options.out.name}.frames") if is_video else options.out
     _claim(folder, _record(options, views, image_format, transparent))
     files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(views))]
     background = "transparent" if transparent else "scene"
     drawn = RenderOptions(background, depth="depth" in default_channels(image_format))
-    _draw(views, files, Look(image_format, options.quality, drawn), options.ray)
-    if is_film:
+    _draw(views, files, OutputOptions(image_format, options.quality, drawn), options.ray)
+    if is_video:
         unfinished = options.out.with_name(f".{options.out.name}.part")
         with unfinished.open("wb") as file:
             write_video(_images(files), fps, cast(VideoFormat, video), file)
@@ -113,9 +119,9 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _views(options: argparse.Namespace) -> tuple[list[View], float]:
-    """All frames, and how many of them are a second of a film."""
+    """Return all frames, and the frames per second of a video."""
     if (options.width is None) != (options.height is None):
-        raise InvalidInput("--width", "given together with --height", "one of them")
+        raise InvalidInput("--width", "given together with --height", "only one of them")
     if options.scene.suffix == ".json":
         return _views_of_scenes(options)
     path = _path(options, DeformationSession(options.scene))
@@ -124,7 +130,7 @@ def _views(options: argparse.Namespace) -> tuple[list[View], float]:
 
 def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
     if options.path is not None:
-        raise InvalidInput("--path", "left out where the first argument is a path", options.path)
+        raise InvalidInput("--path", "left out if the first argument is a camera path", options.path)
     scenes = [options.scene.parent / name for name in read_scene_names(options.scene)]
     ranges = {scene: DeformationSession(scene).scene.metadata.time_range for scene in dict.fromkeys(scenes)}
     paths = {scene: read_path_file(options.scene, time_range, _size(options)) for scene, time_range in ranges.items()}
@@ -141,7 +147,7 @@ def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPat
         raise InvalidInput("--frames", "at least 1", options.frames)
     view = framing(metadata)
     size = size or (view.width, view.height)
-    frames = turn_around(
+    frames = orbit_path(
         view.target, view.distance, options.elevation, view.up, view.fov_y, size, options.frames, metadata.time_range
     )
     return CameraPath(tuple(frames), options.fps or DEFAULT_FPS)
@@ -151,11 +157,11 @@ def _size(options: argparse.Namespace) -> tuple[int, int] | None:
     return None if options.width is None else (options.width, options.height)
 
 
-def _draw(views: Sequence[View], files: Sequence[Path], look: Look, ray: str | None) -> None:
-    """The files that aren't there yet; each appears whole."""
+def _draw(views: Sequence[View], files: Sequence[Path], look: OutputOptions, ray: str | None) -> None:
+    """Draw the files that don't exist yet; each is written atomically."""
     missing = [number for number, file in enumerate(files) if not file.exists()]
     if len(missing) < len(files):
-        print(f"{len(files) - len(missing)} of {len(files)} frames are there already")
+        print(f"{len(files) - len(missing)} of {len(files)} frames exist already")
     if not missing:
         return
     with ExitStack() as stack:
@@ -173,7 +179,7 @@ def _draw(views: Sequence[View], files: Sequence[Path], look: Look, ray: str | N
             _show_progress(done, len(missing), time.monotonic() - started)
 
 
-def _draw_here(blocks: Sequence[Block], look: Look) -> Iterator[tuple[int, bytes]]:
+def _draw_here(blocks: Sequence[Block], look: OutputOptions) -> Iterator[tuple[int, bytes]]:
     renderer = Renderer()
     for scene, of_one_scene in itertools.groupby(blocks, lambda block: block.scene):
         session = DeformationSession(scene)
@@ -185,22 +191,22 @@ def _show_progress(done: int, count: int, seconds: float) -> None:
     if sys.stderr.isatty() or done in (1, count):
         left = seconds / done * (count - done)
         end = "\n" if done == count or not sys.stderr.isatty() else ""
-        text = f"\rframe {done} of {count}, {done / max(seconds, 1e-9):.2f} a second, {left:.0f} s left   "
+        text = f"\rframe {done} of {count}, {done / max(seconds, 1e-9):.2f} per second, {left:.0f} s left   "
         print(text, end=end, file=sys.stderr, flush=True)
 
 
 def _images(files: Sequence[Path]) -> Iterator[np.ndarray]:
-    """[H, W, 3] uint8 each."""
+    """Yield the images, [H, W, 3] uint8."""
     for file in files:
         reader = oiio.ImageInput.open(str(file))
         if not reader:
-            raise InvalidInput("frame", "an image that can be read; delete it to have it drawn anew", file)
+            raise InvalidInput("frame", "a readable image; delete it to have it drawn again", file)
         yield np.asarray(reader.read_image(oiio.UINT8))[..., :3]
         reader.close()
 
 
 def _record(options: argparse.Namespace, views: Sequence[View], image_format: str, transparent: bool) -> str:
-    """What the frames depend on."""
+    """Return a text that identifies the frames: formats, and a digest of scenes, cameras and times."""
     digest = hashlib.sha256()
     contents = {scene: hashlib.sha256(scene.read_bytes()).digest() for scene in {view.scene for view in views}}
     for scene, camera, t in views:
@@ -212,16 +218,16 @@ def _record(options: argparse.Namespace, views: Sequence[View], image_format: st
 
 
 def _claim(folder: Path, record: str) -> None:
-    """Make the folder, or see that what is in it belongs to the same command."""
+    """Create the folder, or check that its frames belong to the same command."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / RECORD
     if file.exists():
         if file.read_text() != record:
-            expected = "an empty folder, or one with frames of the same scene, path and format"
-            raise InvalidInput("out", expected, f"{folder}, made by another command")
+            expected = "an empty folder, or one with frames of the same scenes, path and format"
+            raise InvalidInput("out", expected, f"{folder}, with frames of another command")
         return
     if any(not each.name.startswith(".") for each in folder.iterdir()):
-        raise InvalidInput("out", "an empty folder, or one that this command has begun", folder)
+        raise InvalidInput("out", "an empty folder, or one of an earlier run of this command", folder)
     unfinished = folder / f".{RECORD}.part"
     unfinished.write_text(record)
     os.replace(unfinished, file)

@@ -1,4 +1,4 @@
-"""A scene, a camera and a time → an image. No HTTP here."""
+"""Render a scene at a time, with a camera, to an image. Independent of HTTP."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import Image, average
 from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, as_trained, rasterize
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
-from msdgs_serve.watch import Watch
 
 Color = tuple[float, float, float]
 Background = Color | Literal["scene", "transparent"]
@@ -21,11 +21,11 @@ DEFAULT_CACHE_BYTES = 256 << 20
 
 @dataclass(frozen=True)
 class Shutter:
-    """When the light comes in: from `t + open` to `t + close`, in the scene's units of time."""
+    """Motion blur over the exposure from `t + open` to `t + close`, in scene time."""
 
     open: float
     close: float
-    samples: int  # moments, in the middles of equal parts of that time
+    samples: int  # frames averaged, at the centers of equal parts of the exposure
 
     def __post_init__(self) -> None:
         if not self.open < self.close:
@@ -34,7 +34,7 @@ class Shutter:
             raise InvalidInput("shutter.samples", "at least 1", self.samples)
 
     def times(self, t: float) -> list[float]:
-        """The moments, about the time `t` of the frame."""
+        """Return the times of the samples for a frame at `t`."""
         step = (self.close - self.open) / self.samples
         return [t + self.open + (number + 0.5) * step for number in range(self.samples)]
 
@@ -43,12 +43,12 @@ class Shutter:
 class RenderOptions:
     """How a frame is drawn."""
 
-    background: Background = "scene"  # an sRGB-encoded color, what the scene was trained on, or none
-    shutter: Shutter | None = None  # motion blur; None: one moment
-    motion_dt: float | None = None  # draw motion vectors too, to this much later; not together with a shutter
-    depth: bool = False  # draw how far what is seen is too
-    counts: bool = False  # count the Gaussians that add to each pixel too
-    steps: float | None = None  # after so many of the scene's layers; None: all
+    background: Background = "scene"  # an sRGB-encoded color, the one of training, or none
+    shutter: Shutter | None = None  # motion blur; None: a single time
+    motion_dt: float | None = None  # also draw motion vectors until t + motion_dt; excludes a shutter
+    depth: bool = False  # also draw depth
+    counts: bool = False  # also count the Gaussians that contribute to each pixel
+    steps: float | None = None  # number of the scene's layers to apply; None: all
     rasterizer: RasterizerOptions = GSPLAT
 
 
@@ -56,9 +56,9 @@ DEFAULT_OPTIONS = RenderOptions()
 
 
 class Renderer:
-    """Draws scenes, and remembers the Gaussians posed last. Safe to use from several threads.
+    """Renders scenes and caches posed Gaussians. Safe to use from several threads.
 
-    Requests for the same scene and time that arrive together pose its Gaussians once.
+    Concurrent requests for the same scene and time pose its Gaussians once.
     """
 
     def __init__(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
@@ -70,38 +70,43 @@ class Renderer:
         camera: Camera,
         t: float,
         options: RenderOptions = DEFAULT_OPTIONS,
-        watch: Watch | None = None,
+        job: RenderJob | None = None,
     ) -> Image:
-        """The frame that `camera` sees at `t`. The same arguments give the same pixels, whatever else runs.
+        """Return the frame that `camera` sees at `t`. Equal arguments give equal pixels.
 
-        `watch` times the stages `pose` and `draw` and may end the work between them.
+        `job` times the stages `pose` and `draw`.
 
         Raises:
-            InvalidInput: if `t` or a moment of the shutter is outside of the scene's time range, or it has no such
-                steps.
-            Interrupted: if the watch was stopped.
-            SceneFileInvalid: if the scene's Gaussians at such a moment are none that can be drawn.
+            InvalidInput: if `t`, the shutter or `steps` are outside the scene's range.
+            RenderCancelled: if the job was cancelled.
+            SceneFileInvalid: if the scene's Gaussians at that time are not valid.
         """
-        watch = watch or Watch()
+        job = job or RenderJob()
         check_times(session, t, options.shutter, options.motion_dt)
         if options.shutter is None:
-            return self._moment(session, camera, t, t, options, watch)
-        moments = options.shutter.times(t)
-        return average(self._moment(session, camera, t, moment, options, watch) for moment in moments)
+            return self._render_at(session, camera, t, t, options, job)
+        times = options.shutter.times(t)
+        return average(self._render_at(session, camera, t, time, options, job) for time in times)
 
     def posed(
-        self, session: DeformationSession, t: float, watch: Watch | None = None, steps: float | None = None
+        self, session: DeformationSession, t: float, job: RenderJob | None = None, steps: float | None = None
     ) -> Gaussians:
-        """The scene's Gaussians at `t`, from the cache where it has them."""
-        return self.cache.get(session, t, watch or Watch(), steps)
+        """Return the scene's Gaussians at `t`, from the cache if possible."""
+        return self.cache.get(session, t, job or RenderJob(), steps)
 
-    def _moment(
-        self, session: DeformationSession, camera: Camera, t: float, moment: float, options: RenderOptions, watch: Watch
+    def _render_at(
+        self,
+        session: DeformationSession,
+        camera: Camera,
+        t: float,
+        time: float,
+        options: RenderOptions,
+        job: RenderJob,
     ) -> Image:
-        gaussians, later = self.posed(session, moment, watch, options.steps), None
+        gaussians, later = self.posed(session, time, job, options.steps), None
         if options.motion_dt is not None:
-            later = self.posed(session, moment + options.motion_dt, watch, options.steps)
-        with watch.stage("draw"), session.answering_for(moment):
+            later = self.posed(session, time + options.motion_dt, job, options.steps)
+        with job.stage("draw"), session.as_scene_file_error(time):
             background = resolve_background(session, options.background)
             constants = as_trained(session.scene.metadata, options.rasterizer)
             extra = None if later is None else displacements(gaussians, later, camera)
@@ -121,9 +126,9 @@ class Renderer:
 
 
 def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarray:
-    """[N, 2] how far each centre goes in the image of `camera`, pixels to the right and down.
+    """Return the displacement of each center in the image of `camera`, [N, 2] pixels to the right and down.
 
-    0 for those that are behind the camera at one of the times.
+    It is 0 for Gaussians that are behind the near plane at one of the times.
     """
     (start, start_depths), (end, end_depths) = camera.project(now.means), camera.project(later.means)
     seen = (start_depths > GSPLAT.near_plane) & (end_depths > GSPLAT.near_plane)
@@ -133,10 +138,10 @@ def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarra
 def check_times(
     session: DeformationSession, t: float, shutter: Shutter | None = None, motion_dt: float | None = None
 ) -> None:
-    """Raise `InvalidInput`, naming the field, for a time that the scene doesn't have."""
+    """Raise `InvalidInput`, naming the field, for times outside the scene's range."""
     first, last = session.scene.metadata.time_range
     if shutter is not None and motion_dt is not None:
-        raise InvalidInput("shutter", "left out where motion is drawn", "given")
+        raise InvalidInput("shutter", "left out if motion is drawn", "given")
     for field, time in _times(t, shutter, motion_dt):
         if not first <= time <= last:
             expected = f"in the scene's range [{first}, {last}]"
@@ -153,7 +158,7 @@ def _times(t: float, shutter: Shutter | None, motion_dt: float | None) -> Iterat
 
 
 def resolve_background(session: DeformationSession, background: Background) -> Color:
-    """The color to draw over; black where transparent, which makes the colors premultiplied."""
+    """Return the background color; black if transparent, which gives premultiplied colors."""
     if background == "transparent":
         return (0.0, 0.0, 0.0)
     if background == "scene":

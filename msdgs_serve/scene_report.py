@@ -1,4 +1,4 @@
-"""The report that the exporter leaves beside a scene file: error against run time of the ways to store the scene."""
+"""The exporter's report beside a scene file: error against run time of the plans for the scene."""
 
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,14 @@ MAX_BYTES = 4 << 20
 
 
 def report_path(scene_file: Path) -> Path:
-    """Where the report of a scene lies, if there is one."""
+    """Return the path of a scene's report, which may not exist."""
     return scene_file.with_suffix(SUFFIX)
 
 
 def read_report(scene_file: Path, checkpoint_sha256: str) -> dict[str, Any] | None:
-    """The report beside `scene_file`; None where there is none, or where it is of another model.
+    """Return the report beside `scene_file`, or None if there is none or it belongs to another model.
 
-    Raises `SceneFileInvalid` for a file that is no report.
+    Raises `SceneFileInvalid` for a file that isn't a report.
     """
     path = report_path(scene_file)
     try:

@@ -1,4 +1,4 @@
-"""The scenes on disk: found by name, opened when first asked for, swapped when their file changes."""
+"""Scenes on disk: found by name, loaded at the first request, reloaded when their file changes."""
 
 import logging
 import os
@@ -15,7 +15,7 @@ from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneN
 SUFFIX = ".onnx"
 INCOMING_PREFIX = ".incoming-"
 MAX_NAME_LENGTH = 200
-OPEN_TRIES = 5
+MAX_OPEN_ATTEMPTS = 5
 
 logger = logging.getLogger("msdgs_serve")
 
@@ -23,7 +23,7 @@ Signature = tuple[Path, int, int, int]
 
 
 class SceneExists(MsdgsError):
-    """There is a scene of this name, and it was not to be replaced."""
+    """A scene of this name exists, and the request doesn't allow to replace it."""
 
 
 @dataclass(frozen=True)
@@ -35,27 +35,27 @@ class ServedScene:
 
     @property
     def sha256(self) -> str:
-        """Of its file."""
+        """SHA-256 of the scene file."""
         return self.session.sha256
 
     @cached_property
     def framing(self) -> Framing:
-        """How it is seen where a request says nothing; needed for each."""
+        """The default view; cached, as every request needs it."""
         return framing(self.session.scene.metadata)
 
 
 @dataclass(frozen=True)
 class SceneStatus:
-    """What the store knows of a scene without opening it."""
+    """State of a scene, known without loading it."""
 
     name: str
-    loaded: bool  # whether some version of it is being served
-    problem: SceneFileInvalid | None  # why the file as it is now can't be loaded; None before the first try
+    loaded: bool  # whether a version of it is in memory
+    problem: SceneFileInvalid | None  # why the current file can't be loaded; None before the first attempt
 
 
 @dataclass
 class _Entry:
-    lock: threading.Lock = field(default_factory=threading.Lock)  # held by the thread that loads
+    lock: threading.Lock = field(default_factory=threading.Lock)  # held while loading
     tried: Signature | None = None
     served: ServedScene | None = None
     problem: SceneFileInvalid | None = None
@@ -64,9 +64,8 @@ class _Entry:
 class SceneStore:
     """Scenes in files and folders, named by the files' stems. Safe to use from several threads.
 
-    Folders are looked at again with every call, so that files may come, change and go. A file that changes is loaded
-    by `refresh`, while others still get the scene as it was; a file that breaks is reported by `status` and the scene
-    as it was stays.
+    Folders are listed again by every call, so that files may be added, changed and removed. `refresh` reloads changed
+    files; meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports.
     """
 
     def __init__(
@@ -76,7 +75,7 @@ class SceneStore:
         self._open_scene = open_scene
         self._entries: dict[str, _Entry] = {}
         self._lock = threading.Lock()
-        self._writing = threading.Lock()  # held while files are put in or taken out
+        self._writing = threading.Lock()  # held while files are added or removed
         by_name: dict[str, Path] = {}
         for file in self._scan():
             if by_name.setdefault(file.stem, file) != file:
@@ -84,32 +83,32 @@ class SceneStore:
 
     @property
     def folder(self) -> Path | None:
-        """Where scenes are added and removed: the first folder among the paths."""
+        """The folder in which scenes are added and removed: the first one among the paths."""
         return next((path for path in self._paths if path.is_dir()), None)
 
     def names(self) -> list[str]:
-        """Of all scenes, sorted; whether they can be opened is not known yet."""
+        """Return the names of all scenes, sorted, without opening them."""
         return sorted(self._files())
 
     def file(self, name: str) -> Path:
-        """Where a scene lies, for what may lie beside it. Raises `SceneNotFound`."""
+        """Return the path of a scene's file. Raises `SceneNotFound`."""
         return self._file(name)
 
     def status(self, name: str) -> SceneStatus:
-        """Raises `SceneNotFound`."""
+        """Return the state of a scene. Raises `SceneNotFound`."""
         self._file(name)
         return self._status(name)
 
     def statuses(self) -> list[SceneStatus]:
-        """Of all scenes, sorted by name."""
+        """Return the states of all scenes, sorted by name."""
         return [self._status(name) for name in self.names()]
 
     def get(self, name: str) -> ServedScene:
-        """The scene as it was last loaded; the first call for it loads it.
+        """Return the scene as it was last loaded; the first call loads it.
 
         Raises:
             SceneNotFound: if there is no file of this name.
-            SceneFileInvalid: if it breaks the contract and no earlier version of it is being served.
+            SceneFileInvalid: if it violates the contract and no earlier version is loaded.
         """
         file = self._file(name)
         entry = self._entry(name)
@@ -120,7 +119,7 @@ class SceneStore:
         return entry.served
 
     def refresh(self) -> None:
-        """Load anew what changed on disk since it was loaded or tried. Scenes nobody asked for yet stay closed."""
+        """Reload files that changed since the last attempt. Scenes that were never requested are not loaded."""
         for name, file in self._files().items():
             with self._lock:
                 entry = self._entries.get(name)
@@ -128,43 +127,45 @@ class SceneStore:
                 self._update(entry, file)
 
     def incoming(self, token: str) -> Path:
-        """Where the file of a scene to be added is written first; no scene yet, as its name is hidden."""
+        """Return a hidden temporary path for the file of a scene to be added."""
         return self._writable_folder() / f"{INCOMING_PREFIX}{token}"
 
     def clear_incoming(self) -> None:
-        """Remove what a process that died left of files to be added."""
+        """Remove temporary files that an earlier process has left."""
         for file in self._writable_folder().glob(f"{INCOMING_PREFIX}*"):
             file.unlink(missing_ok=True)
 
     def add(self, name: str, incoming: Path, *, replace: bool = False) -> ServedScene:
-        """Open a file from `incoming`, and make it the scene `name` if it is one. All or nothing.
+        """Open a file from `incoming`, and if it is valid, move it atomically to the scene `name`.
 
         Raises:
-            InvalidInput: if the name isn't a plain one.
-            SceneExists: if there is one and it was not to be replaced.
-            SceneFileInvalid: if the file breaks the contract.
+            InvalidInput: if the name isn't valid.
+            SceneExists: if the scene exists and `replace` is false.
+            SceneFileInvalid: if the file violates the contract.
         """
         if not is_servable_name(name) or "/" in name:
-            raise InvalidInput("name", f"plain text of at most {MAX_NAME_LENGTH} letters, no separators", repr(name))
+            raise InvalidInput(
+                "name", f"printable text of at most {MAX_NAME_LENGTH} characters without separators", repr(name)
+            )
         target = self._writable_folder() / f"{name}{SUFFIX}"
         with self._writing:
             present = self._files().get(name, target)
             if present != target or (present.exists() and not replace):
-                raise SceneExists(f"there is a scene `{name}` already")
+                raise SceneExists(f"the scene `{name}` exists already")
             session = self._open(incoming)
-            _write_through(incoming)
+            _sync(incoming)
             entry = self._entry(name)
             with entry.lock:
                 os.replace(incoming, target)
-                _write_through(target.parent)
+                _sync(target.parent)
                 entry.served, entry.problem = ServedScene(name, session), None
                 entry.tried = _signature(target)
             return entry.served
 
     def remove(self, name: str) -> None:
-        """Delete a scene's file; who draws it at this moment is not disturbed.
+        """Delete a scene's file. Renders in progress are finished.
 
-        Raises `SceneNotFound`, and `InvalidInput` for a scene that lies elsewhere.
+        Raises `SceneNotFound`, and `InvalidInput` for a scene in another folder.
         """
         folder = self._writable_folder()
         with self._writing:
@@ -172,7 +173,7 @@ class SceneStore:
             if file.parent != folder:
                 raise InvalidInput("name", "that of a scene in the folder for uploads", name)
             file.unlink(missing_ok=True)
-            _write_through(folder)
+            _sync(folder)
 
     def _status(self, name: str) -> SceneStatus:
         entry = self._entry(name)
@@ -181,12 +182,12 @@ class SceneStore:
     def _writable_folder(self) -> Path:
         if self.folder is None:
             raise InvalidInput(
-                "paths", "with a folder, as scenes are added to one", [str(path) for path in self._paths]
+                "paths", "paths with a folder, to which scenes are added", [str(path) for path in self._paths]
             )
         return self.folder
 
     def _file(self, name: str) -> Path:
-        """Looked for by its name alone: every request does this, and a folder may hold any number of scenes."""
+        """Find a scene's file by name, without listing folders: every request does this."""
         if is_servable_name(name) and "/" not in name:
             for path in self._paths:
                 file = path / f"{name}{SUFFIX}" if path.is_dir() else path
@@ -195,7 +196,7 @@ class SceneStore:
         raise SceneNotFound(name, self.names())
 
     def _update(self, entry: _Entry, file: Path) -> None:
-        """Load `file` where it isn't what was tried last; one thread does, those that have a scene don't wait."""
+        """Load `file` if it changed since the last attempt. Other threads wait only if no version is loaded."""
         try:
             signature = _signature(file)
         except FileNotFoundError:
@@ -215,26 +216,26 @@ class SceneStore:
             entry.problem = error.again()
         except OSError as error:
             entry.problem = SceneFileInvalid(file.name, "file", f"can't be read: {error.strerror}")
-        except Exception as error:  # one file, whatever is in it, doesn't stop the others from being served
+        except Exception as error:  # one file must not keep others from being served
             logger.exception("%s can't be opened", file)
             entry.problem = SceneFileInvalid(file.name, "file", f"can't be opened: {type(error).__name__}")
         entry.tried = signature
 
     def _open(self, file: Path) -> DeformationSession:
-        """The scene in a file; of one version, though the file may change meanwhile."""
-        for _ in range(OPEN_TRIES):
+        """Open the scene in a file, again if the file changes meanwhile."""
+        for _ in range(MAX_OPEN_ATTEMPTS):
             before = _signature(file)
             session = self._open_scene(file)
             if _signature(file) == before:
                 return session
-        raise SceneFileInvalid(file.name, "file", "changes while it is read")
+        raise SceneFileInvalid(file.name, "file", "changes while it is being read")
 
     def _entry(self, name: str) -> _Entry:
         with self._lock:
             return self._entries.setdefault(name, _Entry())
 
     def _files(self) -> dict[str, Path]:
-        """Name → file; scenes whose file is gone are forgotten."""
+        """Return the files by scene name, and drop scenes whose file was removed."""
         files: dict[str, Path] = {}
         for file in self._scan():
             files.setdefault(file.stem, file)
@@ -254,7 +255,7 @@ class SceneStore:
 
 
 def is_servable_name(name: str) -> bool:
-    """Not hidden (files being written are), and printable text without separators."""
+    """Whether a name is printable, without separators, and not hidden as temporary files are."""
     return bool(name) and name[0] != "." and name.isprintable() and len(name) <= MAX_NAME_LENGTH and "\\" not in name
 
 
@@ -267,7 +268,7 @@ def _checked(path: Path) -> Path:
         hint = "; `python export/to_onnx.py model.pt` turns a checkpoint into a scene" if path.suffix == ".pt" else ""
         raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}{hint}")
     if not is_servable_name(path.stem):
-        raise InvalidInput("paths", "files with plain names", repr(path.name))
+        raise InvalidInput("paths", "files with printable, unhidden names", repr(path.name))
     return path
 
 
@@ -280,8 +281,8 @@ def _signature(path: Path) -> Signature:
     return path, status.st_mtime_ns, status.st_size, status.st_ino
 
 
-def _write_through(path: Path) -> None:
-    """Onto the disk, so that a loss of power doesn't undo it."""
+def _sync(path: Path) -> None:
+    """Flush a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,7 +1,7 @@
-"""One pool of threads for the whole process: nogil kernels and onnxruntime calls share it, not more than cores.
+"""One thread pool for the process, shared by kernels and onnxruntime calls, with one thread per core.
 
-numba's own parallel layers abort when two threads enter them or when the process forks; plain threads over nogil
-kernels do neither.
+numba's own parallel layers abort when two threads enter them or when the process forks; threads that run nogil kernels
+don't.
 """
 
 import contextlib
@@ -17,18 +17,18 @@ from functools import cache
 from typing import Any
 
 THREADS_VARIABLE = "MSDGS_THREADS"
-GIVING_WAY = 10
-"""Niceness of threads that compute for requests: under too much load /live is answered in a quarter of the time that it
-takes without, or less; with 5 the gain is smaller."""
+NICENESS = 10
+"""Niceness of render threads: under overload /live is answered in a quarter of the time or less; a niceness of 5 gains
+less."""
 
 _check: ContextVar[Callable[[], object] | None] = ContextVar("check", default=None)
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
-_callers = 0  # within `sharing_cores` at this moment
+_callers = 0  # number of callers within `sharing_cores`
 
 
 def thread_count() -> int:
-    """Threads in the pool: `MSDGS_THREADS`, or the cores this process could use when this was first asked."""
+    """Return the size of the pool: `MSDGS_THREADS`, or the cores this process may use, read once."""
     setting = os.environ.get(THREADS_VARIABLE)
     if setting is None:
         return _cores()
@@ -44,7 +44,7 @@ def _cores() -> int:
 
 @contextmanager
 def checking(check: Callable[[], object]) -> Iterator[None]:
-    """Within it, `run_parallel` and `run_serially` call `check` before every item: what that raises ends the work."""
+    """Within the context, `run_parallel` and `run_serially` call `check` before every item; its exception ends them."""
     token = _check.set(check)
     try:
         yield
@@ -52,22 +52,22 @@ def checking(check: Callable[[], object]) -> Iterator[None]:
         _check.reset(token)
 
 
-def give_way() -> None:
-    """This thread, and those that it starts from now on, let other threads go first (Linux).
+def lower_priority() -> None:
+    """Lower the priority of this thread and of threads that it starts (Linux).
 
-    Without it a thread that is woken up to answer something short waits while all cores compute.
+    Otherwise short requests wait for a core while all cores render.
     """
-    if sys.platform == "linux":  # elsewhere priorities are the process's
+    if sys.platform == "linux":  # elsewhere priorities are per process
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), GIVING_WAY)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
 @contextmanager
 def sharing_cores() -> Iterator[None]:
-    """Around what one caller computes. Where several do at once, each stays on its own thread.
+    """Mark the computation of one caller. If there are several callers at once, each computes on its own thread.
 
-    Cores that have a frame each needn't share (1.04 times as many frames a second from 8 clients), and every part is
-    one more wait for Python's interpreter.
+    One frame per core is faster than sharing cores (1.04 times as many frames per second from 8 clients), since each
+    parallel part waits for Python's interpreter once more.
     """
     _count_callers(1)
     try:
@@ -77,15 +77,15 @@ def sharing_cores() -> Iterator[None]:
 
 
 def threads_to_use() -> int:
-    """How many parts of work are worth while now: `thread_count()`, or 1 where several callers share the cores."""
+    """Return into how many parts to split work now: `thread_count()`, or 1 if several callers compute at once."""
     return thread_count() if _callers <= 1 else 1
 
 
 def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
-    """Call `function(*item)` for every item; results in the order of the items.
+    """Call `function(*item)` for every item, and return the results in order.
 
-    On the caller's thread and the pool's, or where several callers share the cores on the caller's alone.
-    The first exception is raised after all calls that began have ended. Must not be called from inside the pool.
+    Runs on the caller's thread and the pool's, or on the caller's alone if several callers compute at once. The first
+    exception is raised after all started calls have ended. Must not be called from inside the pool.
     """
     threads = min(threads_to_use(), len(items)) if len(items) > 1 else 1
     if threads <= 1:
@@ -95,7 +95,7 @@ def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[A
     def work() -> bool:
         while (k := next(turn)) < len(items):
             results[k] = call(*items[k])
-        return False  # what the others have begun is not known
+        return False  # other threads may still be working
 
     _on_threads(threads, work, ())
     return results
@@ -104,29 +104,30 @@ def run_parallel(function: Callable[..., Any], items: Sequence[tuple]) -> list[A
 def run_together(work: Callable[..., bool], arguments: tuple) -> None:
     """Call `work(*arguments)` on the caller's thread and on the pool's, as `run_parallel` does.
 
-    Each call takes parts of the work until none is left, and returns whether all parts are done. Only if not, because
-    another thread still has one, the caller sleeps until it has: to be woken up takes as long as a small part.
+    Each call takes parts of the work until none is left, and returns whether all parts are done. The caller sleeps only
+    if another thread still works on one, since waking up takes as long as a small part.
     """
     _on_threads(threads_to_use(), _checked(work), arguments)
 
 
 def _on_threads(threads: int, work: Callable[..., bool], arguments: tuple) -> None:
-    """`work(*arguments)` on so many; where the caller's doesn't say that all is done, what has begun is waited for."""
+    """Call `work(*arguments)` on several threads; unless the caller's call returns True, wait for the others."""
     helpers = [_shared_pool().submit(work, *arguments) for _ in range(threads - 1)]
     done = False
     try:
         done = work(*arguments)
     finally:
-        begun = [helper for helper in helpers if not helper.cancel()]
+        started = [helper for helper in helpers if not helper.cancel()]
         if not done:
-            wait(begun)
+            wait(started)
     if not done:
-        for helper in begun:
+        for helper in started:
             helper.result()
 
 
 def run_serially(function: Callable[..., Any], items: Sequence[tuple]) -> list[Any]:
-    """As `run_parallel`, one after the other: waking a thread up takes longer than some items."""
+    """Call `function(*item)` for every item on the caller's thread: waking up a thread takes longer than short
+    items."""
     call = _checked(function)
     return [call(*item) for item in items]
 
@@ -143,14 +144,14 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _count_callers(more: int) -> None:
+def _count_callers(change: int) -> None:
     global _callers
     with _lock:
-        _callers += more
+        _callers += change
 
 
 def split_evenly(count: int, parts: int) -> list[tuple[int, int]]:
-    """`parts` or fewer consecutive, non-empty (start, stop) ranges that cover `range(count)`."""
+    """Return at most `parts` consecutive, non-empty (start, stop) ranges that cover `range(count)`."""
     parts = max(1, min(parts, count))
     edges = [count * part // parts for part in range(parts + 1)]
     return [(start, stop) for start, stop in itertools.pairwise(edges) if stop > start]
@@ -164,11 +165,11 @@ def _shared_pool() -> ThreadPoolExecutor:
         return _pool
 
 
-def _forget_pool() -> None:
-    """A forked child has none of its parent's threads, and perhaps a lock that nobody will release."""
+def _reset_pool() -> None:
+    """Reset the pool in a forked child, which has no threads and may have inherited a locked lock."""
     global _pool, _lock, _callers
     _pool, _lock, _callers = None, threading.Lock(), 0
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pool)
+    os.register_at_fork(after_in_child=_reset_pool)

@@ -1,7 +1,7 @@
-"""A scene file opened and posed in a process of its own, before a service opens it.
+"""Open and pose a scene file in a subprocess, before the service opens it.
 
-`read_scene_file` lets nothing through that onnxruntime is known to fail at. What it fails at all the same costs that
-process, and not the service.
+`read_scene_file` rejects all graphs at which onnxruntime is known to crash. If it crashes at another, that ends the
+subprocess and not the service.
 """
 
 import json
@@ -14,19 +14,19 @@ from msdgs_serve.guarded import ProcessFailed, ProcessLimits, call_guarded
 from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.onnx import GraphLimits
 
-MEMORY, MEMORY_A_BYTE = 1 << 29, 6
-"""Bytes that the process may have: its own, and for each byte of the file, besides those of a call of the graph."""
+MEMORY, MEMORY_PER_BYTE = 1 << 29, 6
+"""Memory limit of the subprocess in bytes: its own, and per byte of the file; the graph's limit is added."""
 
 MAX_ANSWER = 1 << 16
-"""Bytes."""
+"""Bytes that the subprocess returns."""
 
 
 def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
-    """Open `file` and pose its Gaussians in the middle of its time, in at most so many seconds.
+    """Open `file` in a subprocess and pose its Gaussians in the middle of its time range, within `seconds`.
 
-    Raises `SceneFileInvalid` with what that process says, or that it didn't end well.
+    Raises `SceneFileInvalid` with the subprocess's reason, or because it crashed or took too long.
     """
-    memory = MEMORY + MEMORY_A_BYTE * file.stat().st_size + limits.memory_bytes
+    memory = MEMORY + MEMORY_PER_BYTE * file.stat().st_size + limits.memory_bytes
     with tempfile.TemporaryFile() as answer:
         try:
             process_limits = ProcessLimits(memory, MAX_ANSWER, seconds)
@@ -39,7 +39,7 @@ def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
 
 
 def open_and_pose(answer: BinaryIO, file: str, limits: dict[str, Any]) -> None:
-    """Write what is wrong with the file as an object, an empty one if nothing is."""
+    """Run in the subprocess: write the problem of the file as a JSON object, which is empty if there is none."""
     problem = {}
     try:
         session = DeformationSession(file, limits=GraphLimits(**limits))

@@ -1,4 +1,4 @@
-"""Frames to a film, through PyAV. Needs it: `pip install 'msdgs[video]'`."""
+"""Encode frames as a video with PyAV. Needs `pip install 'msdgs[video]'`."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ VideoFormat = Literal["mp4", "webm", "webp"]
 
 @dataclass(frozen=True)
 class VideoTraits:
-    """How a format is written."""
+    """Media type and encoder of a video format."""
 
     media_type: str
     codec: str
     options: dict[str, str]
 
 
-# Frames that an encoder looks ahead at and those of its threads stay in memory: with x264's defaults 330 to 390 MB at
-# 1920 × 1080, so 190, for files of the same size.
+# Lookahead and threads of an encoder keep frames in memory: 330 to 390 MB at 1920 × 1080 with x264's defaults, 190 MB
+# with these, for files of the same size.
 BOUNDED = {"threads": "4"}
 VIDEO_FORMATS: dict[VideoFormat, VideoTraits] = {
     "mp4": VideoTraits("video/mp4", "libx264", {"crf": "18", "preset": "fast", "rc-lookahead": "10", **BOUNDED}),
@@ -36,7 +36,7 @@ VIDEO_FORMATS: dict[VideoFormat, VideoTraits] = {
     "webp": VideoTraits("image/webp", "libwebp_anim", {"quality": "70"}),
 }  # fmt: skip
 
-# mp4 in fragments, so that it can be played while it is received; an animated WebP repeats without end
+# fragmented mp4 can be played while it is received; animated WebP loops forever
 MUXER_OPTIONS: dict[VideoFormat, dict[str, str]] = {
     "mp4": {"movflags": "frag_keyframe+empty_moov+default_base_moof"},
     "webm": {},
@@ -49,20 +49,19 @@ class VideoUnavailable(MsdgsError):
 
 
 def check_video(video_format: str) -> None:
-    """Raise `InvalidInput` for a format that isn't known, and `VideoUnavailable` where films can't be written."""
+    """Raise `InvalidInput` for an unknown format, and `VideoUnavailable` without PyAV."""
     if video_format not in VIDEO_FORMATS:
         raise InvalidInput("format", f"one of {', '.join(VIDEO_FORMATS)}", video_format)
     try:
-        import av  # noqa: F401  # an extra; nothing else here needs it
+        import av  # noqa: F401  # an optional dependency
     except ImportError:
-        raise VideoUnavailable("films need PyAV: pip install 'msdgs[video]'") from None
+        raise VideoUnavailable("videos need PyAV: pip install 'msdgs[video]'") from None
 
 
-class FilmWriter:
-    """Encodes sRGB frames, [H, W, 3] uint8 of one size, one after the other into a file that needs no `seek`.
+class VideoWriter:
+    """Encodes sRGB frames, [H, W, 3] uint8 of one size, into a file that may not support `seek`.
 
-    An odd row or column at the lower or right edge is left out: the codecs want even sizes. Not safe to use from two
-    threads at once.
+    The codecs need even sizes: an odd last row or column is dropped. Not safe to use from several threads.
     """
 
     def __init__(self, file: BinaryIO, fps: float, video_format: VideoFormat) -> None:
@@ -74,24 +73,24 @@ class FilmWriter:
         self._stream: VideoStream | None = None
 
     def add(self, pixels: np.ndarray) -> None:
-        """Encode the next frame. The encoder holds back some, about which it may still decide."""
+        """Encode the next frame. The encoder may delay its output."""
         import av
 
         height, width = (side - side % 2 for side in pixels.shape[:2])
         if self._stream is None:
-            self._stream = self._begun(width, height)
+            self._stream = self._open_stream(width, height)
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels[:height, :width]), format="rgb24")
         self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
-        """Write what is held back, and the end of the file."""
+        """Write the delayed frames and the end of the file."""
         if self._stream is not None:
             self._container.mux(self._stream.encode())
         self._container.close()
 
-    def _begun(self, width: int, height: int) -> "VideoStream":
+    def _open_stream(self, width: int, height: int) -> "VideoStream":
         if min(height, width) < 2:
-            raise InvalidInput("height" if height < width else "width", "at least 2 for a film", min(height, width))
+            raise InvalidInput("height" if height < width else "width", "at least 2 for a video", min(height, width))
         options = dict(self._traits.options)
         stream = cast("VideoStream", self._container.add_stream(self._traits.codec, rate=self._rate, options=options))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
@@ -99,8 +98,8 @@ class FilmWriter:
 
 
 def write_video(frames: Iterable[np.ndarray], fps: float, video_format: VideoFormat, file: BinaryIO) -> int:
-    """Write frames to a file; returns how many there were. See `FilmWriter`."""
-    writer, count = FilmWriter(file, fps, video_format), 0
+    """Write frames to a file and return their number. See `VideoWriter`."""
+    writer, count = VideoWriter(file, fps, video_format), 0
     for pixels in frames:
         writer.add(pixels)
         count += 1

@@ -29,7 +29,7 @@ def tiny_numbers_stay():
 
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene file of two balls, one of which moves; nobody writes to it."""
+    """A scene file of two balls, one of which moves; read-only."""
     return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 

@@ -23,7 +23,7 @@
 
 namespace {
 
-using Lanes = __m512;
+using Vec = __m512;
 constexpr int kLanes = 16, kTile = 16, kBatch = 64, kChunk = 2048, kDigitBits = 11, kBuckets = 1 << kDigitBits;
 constexpr int kHarmonics = 48, kTilesATurn = 4, kAhead = 16;
 constexpr float kReachScale = 1.3862944f;  // 2 ln 2: of a distance in log2 of alpha to one in standard deviations
@@ -31,11 +31,11 @@ constexpr float kReachScale = 1.3862944f;  // 2 ln 2: of a distance in log2 of a
 // Columns of a record, one cache line a splat.
 enum { kX, kY, kRootA, kRootB, kRootC, kLog2Opacity, kRed, kGreen, kBlue, kPerRootA, kExtremeY, kUsed, kRecord = 16 };
 
-Lanes all(float value) { return _mm512_set1_ps(value); }
-Lanes fma(Lanes a, Lanes b, Lanes c) { return _mm512_fmadd_ps(a, b, c); }
-Lanes clamp(Lanes a, Lanes low, Lanes high) { return _mm512_max_ps(_mm512_min_ps(a, high), low); }
-Lanes polynomial(Lanes x, std::span<const float> coefficients) {
-    Lanes value = all(coefficients[0]);
+Vec all(float value) { return _mm512_set1_ps(value); }
+Vec fma(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a, b, c); }
+Vec clamp(Vec a, Vec low, Vec high) { return _mm512_max_ps(_mm512_min_ps(a, high), low); }
+Vec polynomial(Vec x, std::span<const float> coefficients) {
+    Vec value = all(coefficients[0]);
     for (float coefficient : coefficients.subspan(1)) value = fma(value, x, all(coefficient));
     return value;
 }
@@ -46,27 +46,27 @@ constexpr float kAtanh[] = {0.32059890f, 0.41219859f, 0.57707802f, 0.96179669f, 
 constexpr float kEighthRoot[] = {2.889639371e-08f, 2.248335048e-06f, 1.080041400e-04f,
                                  3.752796192e-03f, 8.664289183e-02f, 9.999999439e-01f};
 
-Lanes log2_of(Lanes x) {
-    Lanes exponent = _mm512_getexp_ps(x), mantissa = _mm512_getmant_ps(x, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_zero);
+Vec log2_of(Vec x) {
+    Vec exponent = _mm512_getexp_ps(x), mantissa = _mm512_getmant_ps(x, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_zero);
     __mmask16 upper = _mm512_cmp_ps_mask(mantissa, all(1.41421356f), _CMP_GT_OQ);
     mantissa = _mm512_mask_mul_ps(mantissa, upper, mantissa, all(0.5f));
     exponent = _mm512_mask_add_ps(exponent, upper, exponent, all(1));
-    Lanes s = (mantissa - all(1)) / (mantissa + all(1));
+    Vec s = (mantissa - all(1)) / (mantissa + all(1));
     return fma(s, polynomial(s * s, kAtanh), exponent);
 }
 
 // Columns 4k to 4k + 3 of 16 rows.
 template <typename Row>
-void load_four_columns(Row row, Lanes* columns) {
-    Lanes v[4];
+void load_four_columns(Row row, Vec* columns) {
+    Vec v[4];
     for (int r = 0; r < 4; r++) {
         v[r] = _mm512_castps128_ps512(_mm_loadu_ps(row(r)));
         v[r] = _mm512_insertf32x4(v[r], _mm_loadu_ps(row(4 + r)), 1);
         v[r] = _mm512_insertf32x4(v[r], _mm_loadu_ps(row(8 + r)), 2);
         v[r] = _mm512_insertf32x4(v[r], _mm_loadu_ps(row(12 + r)), 3);
     }
-    Lanes a = _mm512_unpacklo_ps(v[0], v[1]), b = _mm512_unpackhi_ps(v[0], v[1]);
-    Lanes c = _mm512_unpacklo_ps(v[2], v[3]), d = _mm512_unpackhi_ps(v[2], v[3]);
+    Vec a = _mm512_unpacklo_ps(v[0], v[1]), b = _mm512_unpackhi_ps(v[0], v[1]);
+    Vec c = _mm512_unpacklo_ps(v[2], v[3]), d = _mm512_unpackhi_ps(v[2], v[3]);
     columns[0] = _mm512_castpd_ps(_mm512_unpacklo_pd(_mm512_castps_pd(a), _mm512_castps_pd(c)));
     columns[1] = _mm512_castpd_ps(_mm512_unpackhi_pd(_mm512_castps_pd(a), _mm512_castps_pd(c)));
     columns[2] = _mm512_castpd_ps(_mm512_unpacklo_pd(_mm512_castps_pd(b), _mm512_castps_pd(d)));
@@ -74,8 +74,8 @@ void load_four_columns(Row row, Lanes* columns) {
 }
 
 // 16 triples, 48 numbers in a row, as three columns.
-void load_triples(const float* source, Lanes* columns) {
-    Lanes a = _mm512_loadu_ps(source), b = _mm512_loadu_ps(source + 16), c = _mm512_loadu_ps(source + 32);
+void load_triples(const float* source, Vec* columns) {
+    Vec a = _mm512_loadu_ps(source), b = _mm512_loadu_ps(source + 16), c = _mm512_loadu_ps(source + 32);
     for (int column = 0; column < 3; column++) {
         alignas(64) int first[16], second[16];
         for (int k = 0; k < 16; k++) {
@@ -83,26 +83,26 @@ void load_triples(const float* source, Lanes* columns) {
             first[k] = place < 32 ? place : 0;
             second[k] = place < 32 ? k : 16 + place - 32;
         }
-        Lanes two = _mm512_permutex2var_ps(a, _mm512_load_si512(first), b);
+        Vec two = _mm512_permutex2var_ps(a, _mm512_load_si512(first), b);
         columns[column] = _mm512_permutex2var_ps(two, _mm512_load_si512(second), c);
     }
 }
 
 // 16 columns as 16 rows in memory, one after the other, 64-byte aligned.
-void store_rows(const Lanes* columns, float* target) {
-    Lanes w[4][4];
+void store_rows(const Vec* columns, float* target) {
+    Vec w[4][4];
     for (int j = 0; j < 4; j++) {
-        const Lanes* v = columns + 4 * j;
-        Lanes a = _mm512_unpacklo_ps(v[0], v[1]), b = _mm512_unpackhi_ps(v[0], v[1]);
-        Lanes c = _mm512_unpacklo_ps(v[2], v[3]), d = _mm512_unpackhi_ps(v[2], v[3]);
+        const Vec* v = columns + 4 * j;
+        Vec a = _mm512_unpacklo_ps(v[0], v[1]), b = _mm512_unpackhi_ps(v[0], v[1]);
+        Vec c = _mm512_unpacklo_ps(v[2], v[3]), d = _mm512_unpackhi_ps(v[2], v[3]);
         w[j][0] = _mm512_castpd_ps(_mm512_unpacklo_pd(_mm512_castps_pd(a), _mm512_castps_pd(c)));
         w[j][1] = _mm512_castpd_ps(_mm512_unpackhi_pd(_mm512_castps_pd(a), _mm512_castps_pd(c)));
         w[j][2] = _mm512_castpd_ps(_mm512_unpacklo_pd(_mm512_castps_pd(b), _mm512_castps_pd(d)));
         w[j][3] = _mm512_castpd_ps(_mm512_unpackhi_pd(_mm512_castps_pd(b), _mm512_castps_pd(d)));
     }
     for (int r = 0; r < 4; r++) {
-        Lanes low01 = _mm512_shuffle_f32x4(w[0][r], w[1][r], 0x44), high01 = _mm512_shuffle_f32x4(w[0][r], w[1][r], 0xee);
-        Lanes low23 = _mm512_shuffle_f32x4(w[2][r], w[3][r], 0x44), high23 = _mm512_shuffle_f32x4(w[2][r], w[3][r], 0xee);
+        Vec low01 = _mm512_shuffle_f32x4(w[0][r], w[1][r], 0x44), high01 = _mm512_shuffle_f32x4(w[0][r], w[1][r], 0xee);
+        Vec low23 = _mm512_shuffle_f32x4(w[2][r], w[3][r], 0x44), high23 = _mm512_shuffle_f32x4(w[2][r], w[3][r], 0xee);
         _mm512_store_ps(target + kRecord * r, _mm512_shuffle_f32x4(low01, low23, 0x88));
         _mm512_store_ps(target + kRecord * (4 + r), _mm512_shuffle_f32x4(low01, low23, 0xdd));
         _mm512_store_ps(target + kRecord * (8 + r), _mm512_shuffle_f32x4(high01, high23, 0x88));
@@ -245,7 +245,7 @@ private:
     void bin(int thread);
     void composite(int tile);
     void test_ellipses(const uint32_t* ids, int many, float x0, float y0, struct Batch& batch) const;
-    void write_block(int x, int y, Lanes red, Lanes green, Lanes blue) const;
+    void write_block(int x, int y, Vec red, Vec green, Vec blue) const;
 };
 
 void Renderer::project(int chunk, Part& part) {
@@ -271,72 +271,72 @@ void Renderer::project_sixteen(const float* means, const float* quats, const flo
                                const float* harmonics, int64_t first, int many, int chunk, Part& part) {
     const View& v = view_;
     const float* r = v.rotation;
-    Lanes m[3], q[4], size[3];
+    Vec m[3], q[4], size[3];
     load_triples(means, m);
-    auto turned = [&](Lanes x, Lanes y, Lanes z, int row) {
+    auto turned = [&](Vec x, Vec y, Vec z, int row) {
         return fma(all(r[3 * row]), x, fma(all(r[3 * row + 1]), y, all(r[3 * row + 2]) * z));
     };
-    Lanes x = turned(m[0], m[1], m[2], 0) + all(v.translation[0]);
-    Lanes y = turned(m[0], m[1], m[2], 1) + all(v.translation[1]);
-    Lanes z = turned(m[0], m[1], m[2], 2) + all(v.translation[2]);
-    Lanes opacity = _mm512_loadu_ps(opacities);
+    Vec x = turned(m[0], m[1], m[2], 0) + all(v.translation[0]);
+    Vec y = turned(m[0], m[1], m[2], 1) + all(v.translation[1]);
+    Vec z = turned(m[0], m[1], m[2], 2) + all(v.translation[2]);
+    Vec opacity = _mm512_loadu_ps(opacities);
     __mmask16 drawn = _mm512_cmp_ps_mask(z, all(v.near_plane), _CMP_GT_OQ) & static_cast<__mmask16>((1u << many) - 1);
     drawn = _mm512_mask_cmp_ps_mask(drawn, opacity, all(v.alpha_min), _CMP_GE_OQ);
     if (!drawn) return;
     load_four_columns([&](int k) { return quats + 4 * k; }, q);
     load_triples(scales, size);
 
-    Lanes per_z = all(1) / z, ratio_x = x * per_z, ratio_y = y * per_z;
-    Lanes u = fma(all(v.fx), ratio_x, all(v.cx)), w = fma(all(v.fy), ratio_y, all(v.cy));
-    Lanes jxx = all(v.fx) * per_z, jyy = all(v.fy) * per_z;
-    Lanes jxz = -jxx * clamp(ratio_x, all(v.min_x), all(v.max_x));
-    Lanes jyz = -jyy * clamp(ratio_y, all(v.min_y), all(v.max_y));
-    Lanes qw = q[0], qx = q[1], qy = q[2], qz = q[3], two = all(2), one = all(1);
-    Lanes axes[3][3] = {
+    Vec per_z = all(1) / z, ratio_x = x * per_z, ratio_y = y * per_z;
+    Vec u = fma(all(v.fx), ratio_x, all(v.cx)), w = fma(all(v.fy), ratio_y, all(v.cy));
+    Vec jxx = all(v.fx) * per_z, jyy = all(v.fy) * per_z;
+    Vec jxz = -jxx * clamp(ratio_x, all(v.min_x), all(v.max_x));
+    Vec jyz = -jyy * clamp(ratio_y, all(v.min_y), all(v.max_y));
+    Vec qw = q[0], qx = q[1], qy = q[2], qz = q[3], two = all(2), one = all(1);
+    Vec axes[3][3] = {
         {one - two * (qy * qy + qz * qz), two * (qx * qy + qw * qz), two * (qx * qz - qw * qy)},
         {two * (qx * qy - qw * qz), one - two * (qx * qx + qz * qz), two * (qy * qz + qw * qx)},
         {two * (qx * qz + qw * qy), two * (qy * qz - qw * qx), one - two * (qx * qx + qy * qy)},
     };
-    Lanes hx[3], hy[3];
+    Vec hx[3], hy[3];
     for (int k = 0; k < 3; k++) {
-        Lanes depth = turned(axes[k][0], axes[k][1], axes[k][2], 2);
+        Vec depth = turned(axes[k][0], axes[k][1], axes[k][2], 2);
         hx[k] = fma(jxx, turned(axes[k][0], axes[k][1], axes[k][2], 0), jxz * depth) * size[k];
         hy[k] = fma(jyy, turned(axes[k][0], axes[k][1], axes[k][2], 1), jyz * depth) * size[k];
     }
     // the determinant as a sum of squares (Cauchy-Binet): nothing cancels in float32
-    Lanes eps = all(v.eps2d);
-    Lanes xx = hx[0] * hx[0] + hx[1] * hx[1] + hx[2] * hx[2], yy = hy[0] * hy[0] + hy[1] * hy[1] + hy[2] * hy[2];
-    Lanes xy = hx[0] * hy[0] + hx[1] * hy[1] + hx[2] * hy[2];
-    Lanes d0 = hx[1] * hy[2] - hx[2] * hy[1], d1 = hx[2] * hy[0] - hx[0] * hy[2], d2 = hx[0] * hy[1] - hx[1] * hy[0];
-    Lanes det = d0 * d0 + d1 * d1 + d2 * d2 + eps * (xx + yy) + eps * eps;
+    Vec eps = all(v.eps2d);
+    Vec xx = hx[0] * hx[0] + hx[1] * hx[1] + hx[2] * hx[2], yy = hy[0] * hy[0] + hy[1] * hy[1] + hy[2] * hy[2];
+    Vec xy = hx[0] * hy[0] + hx[1] * hy[1] + hx[2] * hy[2];
+    Vec d0 = hx[1] * hy[2] - hx[2] * hy[1], d1 = hx[2] * hy[0] - hx[0] * hy[2], d2 = hx[0] * hy[1] - hx[1] * hy[0];
+    Vec det = d0 * d0 + d1 * d1 + d2 * d2 + eps * (xx + yy) + eps * eps;
     xx += eps, yy += eps;
 
-    Lanes log2_opacity = log2_of(_mm512_max_ps(opacity, all(v.alpha_min)));
-    Lanes reach = (log2_opacity - all(std::log2(v.alpha_min))) * all(kReachScale);
-    Lanes extent_x = fma(_mm512_sqrt_ps(reach * xx), all(1.0001f), all(1e-3f));
-    Lanes extent_y = fma(_mm512_sqrt_ps(reach * yy), all(1.0001f), all(1e-3f));
+    Vec log2_opacity = log2_of(_mm512_max_ps(opacity, all(v.alpha_min)));
+    Vec reach = (log2_opacity - all(std::log2(v.alpha_min))) * all(kReachScale);
+    Vec extent_x = fma(_mm512_sqrt_ps(reach * xx), all(1.0001f), all(1e-3f));
+    Vec extent_y = fma(_mm512_sqrt_ps(reach * yy), all(1.0001f), all(1e-3f));
     // from the first to the last pixel centre that is within reach
-    Lanes left = u - extent_x - all(0.5f), right = u + extent_x - all(0.5f);
-    Lanes top = w - extent_y - all(0.5f), bottom = w + extent_y - all(0.5f);
+    Vec left = u - extent_x - all(0.5f), right = u + extent_x - all(0.5f);
+    Vec top = w - extent_y - all(0.5f), bottom = w + extent_y - all(0.5f);
     drawn = _mm512_mask_cmp_ps_mask(drawn, right, all(0), _CMP_GE_OQ);
     drawn = _mm512_mask_cmp_ps_mask(drawn, bottom, all(0), _CMP_GE_OQ);
     drawn = _mm512_mask_cmp_ps_mask(drawn, left, all(static_cast<float>(v.width - 1)), _CMP_LE_OQ);
     drawn = _mm512_mask_cmp_ps_mask(drawn, top, all(static_cast<float>(v.height - 1)), _CMP_LE_OQ);
     if (!drawn) return;
-    auto tile_of = [](Lanes pixel, float offset, int most) {
-        Lanes place = fma(pixel, all(1.0f / kTile), all(offset));
+    auto tile_of = [](Vec pixel, float offset, int most) {
+        Vec place = fma(pixel, all(1.0f / kTile), all(offset));
         return _mm512_cvttps_epi32(clamp(place, all(0), all(static_cast<float>(most))));
     };
-    auto ceil_of = [](Lanes pixel) { return _mm512_roundscale_ps(pixel, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); };
+    auto ceil_of = [](Vec pixel) { return _mm512_roundscale_ps(pixel, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); };
     __m512i columns = _mm512_or_si512(tile_of(ceil_of(left), 0, columns_),
                                       _mm512_slli_epi32(tile_of(right, 1, columns_), 16));
     __m512i rows = _mm512_or_si512(tile_of(ceil_of(top), 0, rows_), _mm512_slli_epi32(tile_of(bottom, 1, rows_), 16));
 
-    Lanes dx = m[0] - all(v.position[0]), dy = m[1] - all(v.position[1]), dz = m[2] - all(v.position[2]);
-    Lanes per_distance = all(1) / _mm512_sqrt_ps(dx * dx + dy * dy + dz * dz);
+    Vec dx = m[0] - all(v.position[0]), dy = m[1] - all(v.position[1]), dz = m[2] - all(v.position[2]);
+    Vec per_distance = all(1) / _mm512_sqrt_ps(dx * dx + dy * dy + dz * dz);
     dx *= per_distance, dy *= per_distance, dz *= per_distance;
-    Lanes dxx = dx * dx, dyy = dy * dy, dzz = dz * dz;
-    Lanes basis[16] = {
+    Vec dxx = dx * dx, dyy = dy * dy, dzz = dz * dz;
+    Vec basis[16] = {
         all(0.28209479f), all(-0.48860251f) * dy, all(0.48860251f) * dz, all(-0.48860251f) * dx,
         all(1.09254843f) * dx * dy, all(-1.09254843f) * dy * dz, all(0.31539157f) * (two * dzz - dxx - dyy),
         all(-1.09254843f) * dx * dz, all(0.54627422f) * (dxx - dyy),
@@ -346,10 +346,10 @@ void Renderer::project_sixteen(const float* means, const float* quats, const flo
         all(-0.45704580f) * dx * (all(4) * dzz - dxx - dyy), all(1.44530572f) * dz * (dxx - dyy),
         all(-0.59004359f) * dx * (dxx - all(3) * dyy),
     };
-    Lanes colors[3] = {all(0.5f), all(0.5f), all(0.5f)};
+    Vec colors[3] = {all(0.5f), all(0.5f), all(0.5f)};
 #pragma GCC unroll 12
     for (int group = 0; group < kHarmonics / 4; group++) {
-        Lanes four[4];
+        Vec four[4];
         load_four_columns([&](int k) { return harmonics + kHarmonics * k + 4 * group; }, four);
 #pragma GCC unroll 4
         for (int k = 0; k < 4; k++) {
@@ -357,7 +357,7 @@ void Renderer::project_sixteen(const float* means, const float* quats, const flo
             colors[place % 3] = fma(basis[place / 3], four[k], colors[place % 3]);
         }
     }
-    Lanes root_a = _mm512_sqrt_ps(yy / det) * all(0.84932180f), record[kRecord];
+    Vec root_a = _mm512_sqrt_ps(yy / det) * all(0.84932180f), record[kRecord];
     std::fill_n(record, kRecord, all(0));
     record[kX] = u, record[kY] = w, record[kRootA] = root_a, record[kRootB] = -xy / yy * root_a;
     record[kRootC] = all(0.84932180f) / _mm512_sqrt_ps(yy), record[kLog2Opacity] = log2_opacity;
@@ -489,23 +489,23 @@ void Renderer::test_ellipses(const uint32_t* ids, int many, float x0, float y0, 
         const float* rows[kLanes];
         for (int k = 0; k < kLanes; k++)
             rows[k] = records + static_cast<size_t>(kRecord) * ids[std::min(start + k, many - 1)];
-        Lanes s[12];
+        Vec s[12];
         for (int j = 0; j < 3; j++) load_four_columns([&](int k) { return rows[k] + 4 * j; }, s + 4 * j);
-        Lanes x = s[kX] - all(x0), y = s[kY] - all(y0), a = s[kRootA], b = s[kRootB], c = s[kRootC];
+        Vec x = s[kX] - all(x0), y = s[kY] - all(y0), a = s[kRootA], b = s[kRootB], c = s[kRootC];
         _mm512_store_ps(batch.a + start, a), _mm512_store_ps(batch.b + start, b);
         _mm512_store_ps(batch.c + start, c), _mm512_store_ps(batch.log2_opacity + start, s[kLog2Opacity]);
         _mm512_store_ps(batch.p + start, -fma(a, x, b * y)), _mm512_store_ps(batch.q + start, -c * y);
         _mm512_store_ps(batch.red + start, s[kRed]), _mm512_store_ps(batch.green + start, s[kGreen]);
         _mm512_store_ps(batch.blue + start, s[kBlue]);
-        Lanes reach = fma(s[kLog2Opacity] - all(least), all(1.001f), all(1e-3f)), per_a = s[kPerRootA];
+        Vec reach = fma(s[kLog2Opacity] - all(least), all(1.001f), all(1e-3f)), per_a = s[kPerRootA];
         __mmask16 there = static_cast<__mmask16>((1u << std::min(many - start, kLanes)) - 1);
         for (int row = 0; row < 4; row++) {
-            Lanes low = all(4 * row + 0.5f) - y, high = low + all(3);
-            Lanes at_right = clamp(s[kExtremeY], low, high), at_left = clamp(-s[kExtremeY], low, high);
-            auto half = [&](Lanes at) { return _mm512_fnmadd_ps(c * at, c * at, reach); };
-            Lanes right = half(at_right), left = half(at_left);
+            Vec low = all(4 * row + 0.5f) - y, high = low + all(3);
+            Vec at_right = clamp(s[kExtremeY], low, high), at_left = clamp(-s[kExtremeY], low, high);
+            auto half = [&](Vec at) { return _mm512_fnmadd_ps(c * at, c * at, reach); };
+            Vec right = half(at_right), left = half(at_left);
             __mmask16 meets = _mm512_mask_cmp_ps_mask(there, right, all(0), _CMP_GE_OQ);
-            auto root = [](Lanes square) {
+            auto root = [](Vec square) {
                 square = _mm512_max_ps(square, all(1e-20f));
                 return square * _mm512_rsqrt14_ps(square);
             };
@@ -521,24 +521,24 @@ void Renderer::test_ellipses(const uint32_t* ids, int many, float x0, float y0, 
 }
 
 struct Block {
-    Lanes light, red, green, blue;
+    Vec light, red, green, blue;
     __mmask16 open;  // pixels to which splats may still add
 };
 
-void blend(const Batch& batch, uint64_t splats, Lanes x, Lanes y, const View& view, float log2_alpha_min, Block& block) {
-    Lanes light = block.light, red = block.red, green = block.green, blue = block.blue;
+void blend(const Batch& batch, uint64_t splats, Vec x, Vec y, const View& view, float log2_alpha_min, Block& block) {
+    Vec light = block.light, red = block.red, green = block.green, blue = block.blue;
     __mmask16 open = block.open;
-    const Lanes least = all(log2_alpha_min), most = all(view.alpha_max), dark = all(view.transmittance_min);
+    const Vec least = all(log2_alpha_min), most = all(view.alpha_max), dark = all(view.transmittance_min);
     for (; splats; splats &= splats - 1) {
         size_t k = std::countr_zero(splats);
-        Lanes p = fma(all(batch.a[k]), x, fma(all(batch.b[k]), y, all(batch.p[k])));
-        Lanes q = fma(all(batch.c[k]), y, all(batch.q[k]));
-        Lanes exponent = _mm512_fnmadd_ps(p, p, _mm512_fnmadd_ps(q, q, all(batch.log2_opacity[k])));
+        Vec p = fma(all(batch.a[k]), x, fma(all(batch.b[k]), y, all(batch.p[k])));
+        Vec q = fma(all(batch.c[k]), y, all(batch.q[k]));
+        Vec exponent = _mm512_fnmadd_ps(p, p, _mm512_fnmadd_ps(q, q, all(batch.log2_opacity[k])));
         __mmask16 seen = _mm512_cmp_ps_mask(exponent, least, _CMP_GE_OQ);
-        Lanes power = polynomial(exponent, kEighthRoot);
+        Vec power = polynomial(exponent, kEighthRoot);
         power *= power, power *= power, power *= power;
-        Lanes weight = _mm512_maskz_min_ps(seen, power, most) * light;
-        Lanes after = light - weight;
+        Vec weight = _mm512_maskz_min_ps(seen, power, most) * light;
+        Vec after = light - weight;
         open = _mm512_mask_cmp_ps_mask(open, after, dark, _CMP_GT_OQ);
         light = _mm512_mask_mov_ps(light, open, after);
         red = _mm512_mask3_fmadd_ps(all(batch.red[k]), weight, red, open);
@@ -553,8 +553,8 @@ void Renderer::composite(int tile) {
     Block blocks[kTile];
     std::fill_n(blocks, kTile, Block{all(1), all(0), all(0), all(0), 0xffff});
     int x0 = kTile * (tile % columns_), y0 = kTile * (tile / columns_);
-    const Lanes in_block_x = _mm512_setr_ps(.5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5);
-    const Lanes in_block_y = _mm512_setr_ps(.5, .5, .5, .5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5);
+    const Vec in_block_x = _mm512_setr_ps(.5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5);
+    const Vec in_block_y = _mm512_setr_ps(.5, .5, .5, .5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5);
     float log2_alpha_min = std::log2(view_.alpha_min);
     uint32_t open = 0xffff;
     const uint32_t* ids = ids_.get();
@@ -569,7 +569,7 @@ void Renderer::composite(int tile) {
             uint64_t splats;
             std::memcpy(&splats, batch.masks[k], sizeof splats);
             if (!splats) continue;
-            Lanes x = in_block_x + all(static_cast<float>(4 * (k % 4))), y = in_block_y + all(static_cast<float>(k / 4 * 4));
+            Vec x = in_block_x + all(static_cast<float>(4 * (k % 4))), y = in_block_y + all(static_cast<float>(k / 4 * 4));
             blend(batch, splats, x, y, view_, log2_alpha_min, blocks[k]);
             if (!blocks[k].open) open &= ~(1u << k);
         }
@@ -582,7 +582,7 @@ void Renderer::composite(int tile) {
     }
 }
 
-void Renderer::write_block(int x, int y, Lanes red, Lanes green, Lanes blue) const {
+void Renderer::write_block(int x, int y, Vec red, Vec green, Vec blue) const {
     int across = std::clamp(view_.width - x, 0, 4);
     if (!across) return;
     __mmask16 columns = static_cast<__mmask16>((1u << (3 * across)) - 1);
@@ -590,7 +590,7 @@ void Renderer::write_block(int x, int y, Lanes red, Lanes green, Lanes blue) con
         int p = 4 * row;
         __m512i two = _mm512_setr_epi32(p, 16 + p, 0, p + 1, 17 + p, 0, p + 2, 18 + p, 0, p + 3, 19 + p, 0, 0, 0, 0, 0);
         __m512i three = _mm512_setr_epi32(0, 1, 16 + p, 3, 4, 17 + p, 6, 7, 18 + p, 9, 10, 19 + p, 0, 0, 0, 0);
-        Lanes line = _mm512_permutex2var_ps(_mm512_permutex2var_ps(red, two, green), three, blue);
+        Vec line = _mm512_permutex2var_ps(_mm512_permutex2var_ps(red, two, green), three, blue);
         _mm512_mask_storeu_ps(rgb_ + 3 * (static_cast<size_t>(y + row) * view_.width + x), columns, line);
     }
 }

@@ -14,19 +14,19 @@ from msdgs_serve.guarded import ProcessFailed, ProcessLimits, call_guarded
 
 Arrays = Mapping[str, np.ndarray]
 
-MEMORY, MEMORY_A_BYTE = 2 << 30, 1 << 10
+MEMORY, MEMORY_PER_BYTE = 2 << 30, 1 << 10
 """Bytes that the process may have: its own, torch among them, and for each byte of the file, which may be packed by
 deflate."""
 
-SECONDS, SECONDS_A_BYTE = 120.0, 1e-5
+SECONDS, SECONDS_PER_BYTE = 120.0, 1e-5
 
 
 def read_guarded(read: Callable[..., Arrays], path: Path, *options: str) -> dict[str, np.ndarray]:
     """What a module's function `read` makes of a file or folder: arrays of numbers or text. Raises `ImportFailed`."""
     files = [each for each in path.iterdir() if each.is_file()] if path.is_dir() else [path]
     size = sum(file.stat().st_size for file in files)
-    memory = MEMORY + MEMORY_A_BYTE * size
-    limits = ProcessLimits(memory, written=memory, seconds=SECONDS + SECONDS_A_BYTE * size)
+    memory = MEMORY + MEMORY_PER_BYTE * size
+    limits = ProcessLimits(memory, written=memory, seconds=SECONDS + SECONDS_PER_BYTE * size)
     with tempfile.TemporaryFile() as answer:
         try:
             where = read.__module__, read.__name__

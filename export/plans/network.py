@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import onnx
+from onnx import TensorProto
 
 from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
 from export.plans.base import Plan
 from export.plans.scene_graph import finished, new_graph, unit_quats
-from export.supports import SupportInputs, support_export_of
+from export.supports import Layout, SupportInputs, support_export_of
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT, MIN_SCALE
 
@@ -23,51 +24,83 @@ def network(baked: Baked, plan: str = "network") -> onnx.ModelProto:
 
 def _deform(graph: GraphBuilder, baked: Baked) -> None:
     """Canonical values of the ids, moved by the chain on its support, then activated: `DynamicGaussians.pose`."""
-    moving = baked.moving
-    means = graph.node("Gather", [graph.constant("canonical_means", moving.means), "ids"], "ids.means")
-    log_scales = graph.node(
-        "Gather", [graph.constant("canonical_log_scales", moving.log_scales), "ids"], "ids.log_scales"
-    )
-    quats = graph.node("Gather", [graph.constant("canonical_quats", moving.quats), "ids"], "ids.quats")
+    moving, export = baked.moving, support_export_of(baked.support)
+    rows = _Rows(graph, len(moving), export.layout(moving.means, moving.baked_attributes))
+    means = rows.of("canonical_means", moving.means)
+    log_scales = rows.of("canonical_log_scales", moving.log_scales)
+    quats = rows.of("canonical_quats", moving.quats)
     time = graph.node("Reshape", ["t", graph.constant("time_shape", np.array([1, 1], np.int64))], "time")
 
     steps = graph.constant("steps", np.array([len(baked.layers)], np.float32))
-    inputs = SupportInputs(baked.support, baked.layers, means, quats, time, steps, moving.baked_attributes)
-    parts = support_export_of(baked.support).deltas(graph, inputs)
-    parts = {part: _modulated(graph, part, moving.modulation.get(part), value) for part, value in parts.items()}
-    graph.node(*(("Add", [means, parts["means"]]) if "means" in parts else ("Identity", [means])), "means")
-    _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space)
-    unit_quats(graph, graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats)
+    attributes = moving.baked_attributes if rows.layout is None else rows.layout.attributes
+    inputs = SupportInputs(baked.support, baked.layers, means, quats, time, steps, attributes)
+    parts = export.deltas(graph, inputs)
+    parts = {part: _modulated(graph, rows, part, moving.modulation.get(part), value) for part, value in parts.items()}
+    operator = ("Add", [means, parts["means"]]) if "means" in parts else ("Identity", [means])
+    graph.node(*operator, rows.output("means"))
+    _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space, rows.output("scales"))
+    raw_quats = graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats
+    unit_quats(graph, raw_quats, rows.output("quats"))
+    rows.select()
 
 
-def _modulated(graph: GraphBuilder, part: str, factors: np.ndarray | None, deltas: str) -> str:
-    """Equation 12: the summed deltas times the factors of the ids, if there are any."""
+class _Rows:
+    """The Gaussians that a graph poses: those asked for, or all in the order of a layout, from which it selects."""
+
+    def __init__(self, graph: GraphBuilder, count: int, layout: Layout | None) -> None:
+        self.layout, self._graph, self._count = layout, graph, count
+
+    def of(self, name: str, values: np.ndarray) -> str:
+        """Values stored per moving Gaussian, [M, ·], as values of the rows."""
+        if self.layout is None:
+            return self._graph.node("Gather", [self._graph.constant(name, values), "ids"], f"ids.{name}")
+        return self._graph.constant(name, values[self.layout.rows])
+
+    def output(self, name: str) -> str:
+        """The name of an output before the selection."""
+        return name if self.layout is None else f"rows.{name}"
+
+    def select(self) -> None:
+        """Add the nodes that select the ids."""
+        if self.layout is None:
+            return
+        graph, row_of_id = self._graph, np.zeros(self._count, np.int32)
+        row_of_id[self.layout.rows[::-1]] = np.arange(len(self.layout.rows))[::-1]
+        ids = "ids"
+        if not np.array_equal(row_of_id, np.arange(self._count)):
+            rows = graph.node("Cast", [graph.constant("row_of_id", row_of_id)], "rows.of_id", to=TensorProto.INT64)
+            ids = graph.node("Gather", [rows, "ids"], "rows.ids")
+        for name in ("means", "scales", "quats"):
+            graph.node("Gather", [self.output(name), ids], name)
+
+
+def _modulated(graph: GraphBuilder, rows: _Rows, part: str, factors: np.ndarray | None, deltas: str) -> str:
+    """The summed deltas times the factors of the rows, if there are any (equation 12)."""
     if factors is None:
         return deltas
     name = f"{part.removesuffix('s')}_modulation"
-    rows = graph.node("Gather", [graph.constant(name, factors), "ids"], f"ids.{name}")
-    return graph.node("Mul", [rows, deltas], f"{name}.applied")
+    return graph.node("Mul", [rows.of(name, factors), deltas], f"{name}.applied")
 
 
-def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_space: str) -> None:
+def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_space: str, output: str) -> None:
     """The output `scales`: deltas, if there are any, are added before or after the exponential."""
     limits = [
         graph.constant(f"log_scales.{name}", np.array(limit, np.float32))
         for name, limit in (("min", -LOG_SCALE_LIMIT), ("max", LOG_SCALE_LIMIT))
     ]
     if deltas is None:
-        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "scales")
+        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], output)
     elif delta_space == "raw":
         log_scales = graph.node("Add", [log_scales, deltas], "log_scales")
-        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "scales")
+        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], output)
     else:
         canonical = graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "ids.scales")
         least = graph.constant("scales.min", np.array(MIN_SCALE, np.float32))
-        graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], "scales")
+        graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], output)
 
 
 def prefix(baked: Baked, count: int) -> onnx.ModelProto:
-    """The scene with its first `count` layers as trained. Raises `InvalidInput` where it hasn't as many."""
+    """The scene with its first `count` layers as trained. Raises `InvalidInput` if it has fewer."""
     if count > len(baked.layers):
         raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
     metadata = replace(baked.scene.metadata, layers=baked.scene.metadata.layers[:count])

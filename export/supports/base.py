@@ -1,7 +1,7 @@
-"""What an export needs to know of a kind of support."""
+"""The interface of the export of a kind of support."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,27 +10,41 @@ from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.supports.base import Support
 
 
+class Layout(NamedTuple):
+    """The rows of a graph that poses all Gaussians in one order and then selects those that are asked for."""
+
+    rows: np.ndarray  # [R] int64, the Gaussian of each row; every Gaussian has one at least
+    attributes: Mapping[str, np.ndarray]  # what the support stores of the rows
+
+
 class SupportInputs(NamedTuple):
     """A support with its chain of layers, and the names of the graph's values that it may read."""
 
     support: Support
     layers: Sequence[DeformationLayer]
-    means: str  # [M, 3] canonical
-    quats: str  # [M, 4] canonical, wxyz, unit
+    means: str  # [R, 3] canonical, of the Gaussians asked for or of a layout's rows
+    quats: str  # [R, 4] canonical, wxyz, unit
     time: str  # [1, 1]
     steps: str  # [1] how many layers are applied
-    attributes: Mapping[str, np.ndarray]  # `Support.baked`, of all moving Gaussians
+    attributes: Mapping[str, np.ndarray]  # a layout's, or `Support.baked` of all moving Gaussians
 
 
-class SupportExport(Protocol):
+class SupportExport:
     """How supports of one kind are exported. Register one in `export.supports.SUPPORTS` under the kind's name."""
 
-    heads_are_removable: bool
-    """Whether a head of the layers that is always 0 is one of the Gaussians that is."""
-    bytes_per_gaussian: int
-    """What `Support.baked` takes in a scene file."""
+    heads_are_removable = True
+    """Whether a head that is 0 in all layers is 0 for the Gaussians too."""
+
+    def bytes_per_gaussian(self, support: Support) -> int:
+        """What the support stores per Gaussian in a scene file."""
+        return 0
+
+    def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout | None:
+        """The rows of a graph of all moving Gaussians, of canonical means [M, 3] and attributes `Support.baked`; None
+        for a graph that poses the Gaussians asked for alone."""
+        return None
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
-        """Add the nodes of the chain and of what follows it. Returns summed deltas of Gaussians by head, those that
-        aren't always 0 (equations 7 to 9, before modulation)."""
-        ...
+        """Add the nodes of the chain and of the support. Returns the summed deltas of the rows by head, without heads
+        that are always 0 (equations 7 to 9, before modulation)."""
+        raise NotImplementedError

@@ -2,16 +2,13 @@
 
 from export.layers.chain import summed_deltas, used_heads
 from export.layers.graph import GraphBuilder
-from export.supports.base import SupportInputs
+from export.supports.base import SupportExport, SupportInputs
 
 
-class GaussiansExport:
-    """Of `GaussiansSupport`."""
-
-    heads_are_removable = True
-    bytes_per_gaussian = 0
+class GaussiansExport(SupportExport):
+    """Exports `GaussiansSupport`."""
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
-        """Of the chain itself."""
+        """The deltas of the chain itself."""
         used = used_heads(inputs.layers)
         return summed_deltas(graph, inputs.layers, inputs.means, inputs.time, inputs.steps, used)

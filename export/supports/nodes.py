@@ -1,6 +1,10 @@
-"""The support `nodes` as a graph: the chain at the nodes once a call, then linear blend skinning of each Gaussian."""
+"""The support `nodes` as a graph: the chain at the nodes once a call, then linear blend skinning of all Gaussians.
 
-from collections.abc import Mapping
+Gaussians come in B blocks of S rows (`export.supports.blocks`). Values of a block lie in columns, [B, C, S], so that
+operations on them are on long contiguous rows.
+"""
+
+from collections.abc import Mapping, Sequence
 from typing import cast
 
 import numpy as np
@@ -9,35 +13,47 @@ from onnx import TensorProto
 from export.layers.base import HEADS
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder, to_numpy
-from export.supports.base import SupportInputs
+from export.supports.base import Layout, SupportExport, SupportInputs
+from export.supports.blocks import WEIGHT_ONE, block_layout
 from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_train.supports.base import Support
 from msdgs_train.supports.nodes import NodesSupport
-from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MIN_STRETCH
+from msdgs_train.supports.skinning_kernels import MIN_STRETCH
 
+WIDTHS = {"means": 3, "scales": 3, "quats": 4}
 IDENTITY = np.array([1, 0, 0, 0], np.float32)
 
 
-class NodesExport:
-    """Of `NodesSupport`."""
+class NodesExport(SupportExport):
+    """Exports `NodesSupport`."""
 
     heads_are_removable = False
-    bytes_per_gaussian = MAX_NEAREST * (4 + 1)  # a weight in float32 and an id in 8 bits for each node
+
+    def bytes_per_gaussian(self, support: Support) -> int:
+        """A weight in 16 bits and an index in 8 bits for each node that a Gaussian follows."""
+        return 3 * cast(NodesSupport, support).config.followed
+
+    def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout:
+        """Blocks of Gaussians that are near each other."""
+        return block_layout(means, attributes["node_ids"], attributes["skinning_weights"])
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         """Motions of the nodes, blended for each Gaussian, applied to its canonical pose."""
-        motions = _motions(graph, inputs)
-        blended = _blended(graph, inputs.attributes, motions)
-        names = [f"skinning.{part}" for part in ("matrices", "offsets", "rots")]
-        matrices, offsets, rots = graph.split(blended, names, [9, 3, 4])
-        return {
-            "means": _moved(graph, matrices, offsets, inputs.means),
-            "scales": _stretched(graph, matrices, inputs.quats),
-            "quats": _rotated(graph, rots, inputs.quats),
+        blended = _blended(graph, inputs.attributes, _motions(graph, inputs))
+        names = ["skinning.x", "skinning.y", "skinning.z", "skinning.offsets", "skinning.rots"]
+        *columns, offsets, rots = graph.split(blended, names, [3, 3, 3, 3, 4])
+        blocks, _, rows = inputs.attributes["weights"].shape
+        means, quats = _columns(graph, inputs.means, blocks, rows, 3), _columns(graph, inputs.quats, blocks, rows, 4)
+        parts = {
+            "means": _moved(graph, columns, offsets, means),
+            "scales": _stretched(graph, columns, quats),
+            "quats": _rotated(graph, rots, quats),
         }
+        return {part: _rows(graph, value, WIDTHS[part]) for part, value in parts.items()}
 
 
 def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
-    """[M, 16] `NodesSupport.motions`."""
+    """[M, 16] `NodesSupport.motions`, but matrices column by column."""
     support = cast(NodesSupport, inputs.support)
     positions = to_numpy(support.nodes)
     nodes = graph.constant("nodes", positions)
@@ -48,22 +64,50 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     tiled = graph.constant("nodes.tiled", np.tile(positions, 3))
     rotated = _row_sums(graph, "nodes.rotated", graph.node("Mul", [matrices, tiled], "nodes.products"))
     offsets = graph.node("Sub", [graph.node("Add", [nodes, parts["means"]], "nodes.moved"), rotated], "nodes.offsets")
+    by_columns = graph.constant("nodes.by_columns", np.arange(9).reshape(3, 3).T.reshape(9))
+    matrices = graph.node("Gather", [matrices, by_columns], "nodes.columns", axis=1)
     return graph.node("Concat", [matrices, offsets, rots], "nodes.motions", axis=1)
 
 
 def _blended(graph: GraphBuilder, attributes: Mapping[str, np.ndarray], motions: str) -> str:
-    """[M, 16] the weighted mean of the motions, [nodes, 16], of the nodes that each Gaussian follows."""
-    node_ids, skinning_weights = attributes["node_ids"], attributes["skinning_weights"]
-    small = np.uint8 if node_ids.max(initial=0) < 256 else np.int64
-    ids = graph.node("Gather", [graph.constant("node_ids", node_ids.astype(small)), "ids"], "ids.node_ids")
-    ids = graph.node("Cast", [ids], "skinning.ids", to=TensorProto.INT64)
-    weights = graph.node(
-        "Gather", [graph.constant("skinning_weights", skinning_weights), "ids"], "ids.skinning_weights"
-    )
-    axis = graph.constant("skinning.axis", np.array([1], np.int64))
-    row = graph.node("Unsqueeze", [weights, axis], "skinning.row")
-    picked = graph.node("Gather", [motions, ids], "skinning.picked")
-    return graph.node("Squeeze", [graph.node("MatMul", [row, picked], "skinning.mean"), axis], "skinning.blended")
+    """[B, 16, S] weighted means of the motions, [M, 16], of the nodes that each Gaussian follows."""
+    nodes, ids, weights = (attributes[name] for name in ("nodes", "ids", "weights"))
+    picked = graph.node("Gather", [motions, _stored_ids(graph, "skinning.nodes", nodes)], "skinning.picked")
+    picked = graph.node("Transpose", [picked], "skinning.motions", perm=[0, 2, 1])
+    own = graph.constant("skinning.own", np.arange(nodes.shape[1])[:, None])
+    one = graph.constant("skinning.one", np.array([1 / WEIGHT_ONE], np.float32))
+    matrix = ""
+    for f in range(ids.shape[1]):  # constant: onnxruntime computes the matrices when it opens the file
+        name = f"skinning.node{f}"
+        followed = graph.node("Equal", [_stored_ids(graph, name, ids[:, f, None]), own], f"{name}.equal")
+        stored = graph.constant(f"{name}.stored_weight", weights[:, f, None])
+        weight = graph.node("Cast", [stored], f"{name}.number", to=TensorProto.FLOAT)
+        weight = graph.node("Mul", [weight, one], f"{name}.weight")
+        place = graph.node("Cast", [followed], f"{name}.place", to=TensorProto.FLOAT)
+        term = graph.node("Mul", [place, weight], f"{name}.matrix")
+        matrix = graph.node("Add", [matrix, term], f"{name}.sum") if matrix else term
+    return graph.node("MatMul", [picked, matrix], "skinning.blended")
+
+
+def _stored_ids(graph: GraphBuilder, name: str, ids: np.ndarray) -> str:
+    """Indices in as few bits as they need."""
+    small = np.uint8 if ids.max() < 1 << 8 else np.int16 if ids.max() < 1 << 15 else np.int32
+    stored = graph.constant(f"{name}.stored", ids.astype(small))
+    return graph.node("Cast", [stored], f"{name}.ids", to=TensorProto.INT64)
+
+
+def _columns(graph: GraphBuilder, rows: str, blocks: int, size: int, width: int) -> str:
+    """[B, C, S] of [B · S, C]."""
+    shape = graph.constant(f"{rows}.block_shape", np.array([blocks, size, width], np.int64))
+    block = graph.node("Reshape", [rows, shape], f"{rows}.blocks")
+    return graph.node("Transpose", [block], f"{rows}.columns", perm=[0, 2, 1])
+
+
+def _rows(graph: GraphBuilder, columns: str, width: int) -> str:
+    """[B · S, C] of [B, C, S]."""
+    flat = graph.constant(f"{columns}.flat_shape", np.array([-1, width], np.int64))
+    block = graph.node("Transpose", [columns], f"{columns}.blocks", perm=[0, 2, 1])
+    return graph.node("Reshape", [block, flat], f"{columns}.rows")
 
 
 def _stretching(graph: GraphBuilder, name: str, rotations: str, stretches: str) -> str:
@@ -111,56 +155,88 @@ def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
     )
 
 
-def _moved(graph: GraphBuilder, matrices: str, offsets: str, means: str) -> str:
-    """[M, 3] by how much means move."""
-    three = graph.node("Concat", [means, means, means], "skinning.means.tiled", axis=1)
-    rotated = _row_sums(
-        graph, "skinning.means.rotated", graph.node("Mul", [matrices, three], "skinning.means.products")
-    )
-    return graph.node(
-        "Sub", [graph.node("Add", [rotated, offsets], "skinning.means.moved"), means], "skinning.means.delta"
-    )
-
-
-def _stretched(graph: GraphBuilder, matrices: str, quats: str) -> str:
-    """[M, 3] logarithms of how much longer a Gaussian's axes are, columns of its rotation, times its matrix."""
-    axes = _products(graph, "skinning.axes", matrices, _matrices(graph, "skinning.axes.canonical", quats))
-    columns = graph.constant("skinning.axes.columns", np.tile(np.eye(3, dtype=np.float32), (3, 1)))
-    squares = graph.node("Mul", [axes, axes], "skinning.axes.squares")
-    lengths = graph.node(
-        "Sqrt", [graph.node("MatMul", [squares, columns], "skinning.axes.sums")], "skinning.axes.lengths"
-    )
-    least = graph.constant("skinning.axes.least", np.array(MIN_STRETCH, np.float32))
-    return graph.node("Log", [graph.node("Max", [lengths, least], "skinning.axes.kept")], "skinning.scales.delta")
-
-
 def _row_sums(graph: GraphBuilder, name: str, products: str) -> str:
-    """[·, 9] → [·, 3]: of three at a time."""
+    """[·, 9] → [·, 3]: sums of three columns at a time."""
     threes = graph.constant(f"{name}.threes", np.kron(np.eye(3), np.ones((3, 1))).astype(np.float32))
     return graph.node("MatMul", [products, threes], name)
 
 
+def _linear(graph: GraphBuilder, name: str, factors: Sequence[str], vectors: Sequence[str]) -> str:
+    """[B, C, S] sum of vectors [B, C, S] times factors, [B, 1, S] each, or the other way round."""
+    terms = [graph.node("Mul", [f, v], f"{name}.{i}") for i, (f, v) in enumerate(zip(factors, vectors, strict=True))]
+    total = terms[0]
+    for i, term in enumerate(terms[1:], start=1):
+        total = graph.node("Add", [total, term], f"{name}.sum{i}")
+    return total
+
+
+def _moved(graph: GraphBuilder, columns: list[str], offsets: str, means: str) -> str:
+    """[B, 3, S] by how much means move."""
+    coordinates = graph.split(means, [f"{means}.{axis}" for axis in "xyz"], [1, 1, 1])
+    rotated = _linear(graph, "skinning.means", coordinates, columns)
+    moved = graph.node("Add", [rotated, offsets], "skinning.means.moved")
+    return graph.node("Sub", [moved, means], "skinning.means.delta")
+
+
+def _stretched(graph: GraphBuilder, columns: list[str], quats: str) -> str:
+    """[B, 3, S] logarithms of how much longer a Gaussian's axes, columns of its rotation, become by its matrix."""
+    ones, lengths = graph.constant("skinning.axes.ones", np.ones((1, 3), np.float32)), list[str]()
+    for axis, parts in enumerate(_axes(graph, quats)):
+        name = f"skinning.axis{axis}"
+        moved = _linear(graph, name, parts, columns)
+        lengths.append(
+            graph.node("MatMul", [ones, graph.node("Mul", [moved, moved], f"{name}.squares")], f"{name}.square")
+        )
+    squares = graph.node("Concat", lengths, "skinning.squares", axis=1)
+    least = graph.constant("skinning.least", np.array([MIN_STRETCH**2], np.float32))
+    half = graph.constant("skinning.half", np.array([0.5], np.float32))
+    logs = graph.node("Log", [graph.node("Max", [squares, least], "skinning.kept")], "skinning.logs")
+    return graph.node("Mul", [logs, half], "skinning.scales.delta")
+
+
+def _axes(graph: GraphBuilder, quats: str) -> list[list[str]]:
+    """Columns of the rotation matrices of quaternions, [B, 4, S], each as three of [B, 1, S]; constant."""
+    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+    w, x, y, z = range(4)
+    entries = [
+        {(w, w): 1, (x, x): 1, (y, y): -1, (z, z): -1}, {(x, y): 2, (w, z): 2}, {(x, z): 2, (w, y): -2},
+        {(x, y): 2, (w, z): -2}, {(w, w): 1, (y, y): 1, (x, x): -1, (z, z): -1}, {(y, z): 2, (w, x): 2},
+        {(x, z): 2, (w, y): 2}, {(y, z): 2, (w, x): -2}, {(w, w): 1, (z, z): 1, (x, x): -1, (y, y): -1},
+    ]  # fmt: skip
+    sums = np.array([[entry.get(pair, 0) for pair in pairs] for entry in entries], np.float32)
+    sides = [graph.constant(f"skinning.axes.side{k}", np.array([pair[k] for pair in pairs])) for k in (0, 1)]
+    left, right = (graph.node("Gather", [quats, ids], f"{ids}.columns", axis=1) for ids in sides)
+    products = graph.node("Mul", [left, right], "skinning.axes.products")
+    matrix = graph.node("MatMul", [graph.constant("skinning.axes.sums", sums), products], "skinning.axes")
+    parts = graph.split(matrix, [f"skinning.axes.{k}" for k in range(9)], [1] * 9)
+    return [parts[:3], parts[3:6], parts[6:]]
+
+
 def _rotated(graph: GraphBuilder, rots: str, quats: str) -> str:
-    """[M, 4] by how much quaternions change when `rots`, made unit, rotate them."""
-    rots = _unit(graph, "skinning.rots.unit", rots)
-    left = graph.constant("skinning.left", np.repeat(np.arange(4), 4))
-    right = graph.constant("skinning.right", np.tile(np.arange(4), 4))
-    a = graph.node("Gather", [rots, left], "skinning.quats.left", axis=1)
-    b = graph.node("Gather", [quats, right], "skinning.quats.right", axis=1)
-    hamilton = np.zeros((4, 4, 4), np.float32)
-    for i, row in enumerate((((0, 1), (1, 1), (2, 1), (3, 1)), ((1, 1), (0, -1), (3, 1), (2, -1)),
-                             ((2, 1), (3, -1), (0, -1), (1, 1)), ((3, 1), (2, 1), (1, -1), (0, -1)))):  # fmt: skip
-        for j, (k, sign) in enumerate(row):
-            hamilton[i, j, k] = sign
-    products = graph.node("Mul", [a, b], "skinning.quats.products")
-    rotated = graph.node(
-        "MatMul", [products, graph.constant("skinning.hamilton", hamilton.reshape(16, 4))], "skinning.quats.rotated"
+    """[B, 4, S] by how much quaternions change when `rots`, made unit, rotate them."""
+    rows = (((0, 1), (1, 1), (2, 1), (3, 1)), ((1, -1), (0, 1), (3, -1), (2, 1)),
+            ((2, -1), (3, 1), (0, 1), (1, -1)), ((3, -1), (2, -1), (1, 1), (0, 1)))  # fmt: skip
+    ones = graph.constant("skinning.quats.ones", np.ones((1, 4), np.float32))
+    factors = graph.split(rots, [f"{rots}.{axis}" for axis in "wxyz"], [1, 1, 1, 1])
+    products = []
+    for axis, row in zip("wxyz", rows, strict=True):  # row i of the left factor's matrix: unit i times the quaternion
+        matrix = np.zeros((4, 4), np.float32)
+        for k, (source, sign) in enumerate(row):
+            matrix[k, source] = sign
+        name = f"skinning.quats.{axis}"
+        products.append(graph.node("MatMul", [graph.constant(f"{name}.unit", matrix), quats], f"{name}.product"))
+    rotated = _linear(graph, "skinning.quats", factors, products)
+    squares = graph.node("Mul", [rots, rots], "skinning.rots.squares")
+    norm = graph.node("Sqrt", [graph.node("MatMul", [ones, squares], "skinning.rots.sum")], "skinning.rots.norm")
+    least = graph.constant("skinning.rots.least", np.array([MIN_NORM], np.float32))
+    unit = graph.node(
+        "Div", [rotated, graph.node("Max", [norm, least], "skinning.rots.divisor")], "skinning.quats.unit"
     )
-    return graph.node("Sub", [rotated, quats], "skinning.quats.delta")
+    return graph.node("Sub", [unit, quats], "skinning.quats.delta")
 
 
 def _unit(graph: GraphBuilder, name: str, quats: str) -> str:
-    """Quaternions [·, 4] of unit length, as training makes them."""
+    """Normalize quaternions, [·, 4], as training does."""
     ones = graph.constant(f"{name}.four", np.ones((4, 4), np.float32))
     least = graph.constant(f"{name}.least", np.array(MIN_NORM, np.float32))
     sums = graph.node("MatMul", [graph.node("Mul", [quats, quats], f"{name}.squares"), ones], f"{name}.sums")

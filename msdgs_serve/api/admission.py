@@ -1,4 +1,4 @@
-"""Calls that take a place in the queue of renders."""
+"""Admission of requests to the render queue."""
 
 from collections.abc import Collection, Mapping
 from contextlib import ExitStack
@@ -6,26 +6,26 @@ from contextlib import ExitStack
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from msdgs_serve.api.errors import KIND, Refused, refusal
+from msdgs_serve.api.errors import KIND, RequestRejected, rejection
 from msdgs_serve.api.keys import client_of
 from msdgs_serve.api.prefix import route_path
 from msdgs_serve.api.work import WorkQueue
 
 Call = tuple[str, str]
-"""Method and path."""
+"""HTTP method and path."""
 
 
 class Admission:
-    """ASGI middleware: gives a call its place, or refuses it, before its body is parsed and a route is looked for.
+    """ASGI middleware that admits a request to the queue or rejects it, before its body is parsed and routed.
 
-    Under too much load refusals are most of the work. Who may have the answer already, by `If-None-Match`, needs no
-    place until it has work.
+    Under overload most of the work is rejecting requests. A request with `If-None-Match` takes a place in the queue
+    only once it has work.
     """
 
     def __init__(
         self, app: ASGIApp, queue: WorkQueue, routes: Mapping[Call, BaseRoute], streamed: Collection[Call]
     ) -> None:
-        """`routes`: those that take a place; `streamed`: of these, whose answers are sent while others are drawn."""
+        """`routes` are those that take a place in the queue; `streamed` are calls whose responses are streamed."""
         self._app = app
         self._queue = queue
         self._routes = routes
@@ -43,8 +43,8 @@ class Admission:
                 place.enter_context(
                     self._queue.admitted(client_of(scope), streamed=call in self._streamed, at_once=at_once)
                 )
-            except Refused as refused:
+            except RequestRejected as refused:
                 scope["route"], scope[KIND] = route, refused.kind
-                await refusal(refused)(scope, receive, send)
+                await rejection(refused)(scope, receive, send)
                 return
             await self._app(scope, receive, send)

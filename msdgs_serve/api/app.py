@@ -1,4 +1,4 @@
-"""The application: routes, error handlers and what they share, put together."""
+"""Create the application from routes, error handlers, middleware and the service."""
 
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
@@ -18,21 +18,21 @@ from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 
-DESCRIPTION = """Frames of moving scenes, for any camera and any time.
+DESCRIPTION = """Frames of dynamic Gaussian scenes, for any camera and any time.
 
 World and cameras have OpenCV axes: x right, y down, z forward. Angles are degrees. Every error is
-`application/problem+json` (RFC 9457) and names the fields that are wrong. Every answer has an `X-Request-ID`, the
-client's own where it sends a plain one."""
+`application/problem+json` (RFC 9457) and names the invalid fields. Every response has an `X-Request-ID`, which is the
+client's own if it sends a valid one."""
 
 STREAMED = (("POST", "/scenes"),)
-SAID_OF_FRAMES = ("Msdgs-Scene", "Msdgs-Plan", "Msdgs-Error", "Msdgs-Channels")
-EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *SAID_OF_FRAMES, "Retry-After")
+FRAME_HEADERS = ("Msdgs-Scene", "Msdgs-Plan", "Msdgs-Error", "Msdgs-Channels")
+EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *FRAME_HEADERS, "Retry-After")
 
 
 def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> FastAPI:
-    """The service over the scenes of `store`, which are loaded when it starts.
+    """Return the application that serves the scenes of `store`, which are loaded when it starts.
 
-    Raises `InvalidInput` where the file of keys can't be used.
+    Raises `InvalidInput` if the file of API keys is invalid.
     """
     keys = None if settings.api_keys_file is None else read_keys(settings.api_keys_file)
     service = Service(store, renderer, settings)
@@ -49,7 +49,7 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
         if isinstance(route, APIRoute)
         for method in route.methods or ()
     }
-    # the last is the outermost
+    # the middleware added last is the outermost
     streamed = {("POST", "/render/batch"), ("POST", "/render/video")}
     app.add_middleware(Admission, service.queue, queued, streamed)
     app.add_middleware(BodyLimit, settings.max_body_bytes, settings.body_seconds, STREAMED)

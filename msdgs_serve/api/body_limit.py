@@ -1,4 +1,4 @@
-"""Refuse bodies that are too large or too slow, without keeping them in memory."""
+"""Reject request bodies that are too large or too slow, without keeping them in memory."""
 
 import asyncio
 from collections.abc import Collection
@@ -10,13 +10,13 @@ from msdgs_serve.api.errors import KIND, FieldError, problem_response
 from msdgs_serve.api.prefix import route_path
 
 DRAINED_BYTES = 64 << 20
-"""Of a body that is too large this much is read and thrown away: most clients look for an answer only after sending."""
+"""Bytes of a body that is too large to read and discard: most clients read the response only after sending."""
 
 
 class BodyLimit:
-    """ASGI middleware: 413 for a body of more than `max_bytes`, announced or not; 408 for one not here in `seconds`.
+    """ASGI middleware: 413 for a body of more than `max_bytes`, 408 for one that takes longer than `seconds`.
 
-    Calls in `streamed`, as (method, path), read their body themselves, with limits of their own.
+    Routes in `streamed`, as (method, path), read their bodies themselves, with limits of their own.
     """
 
     def __init__(
@@ -35,17 +35,17 @@ class BodyLimit:
             async with asyncio.timeout(self._seconds):
                 body = await self._read(receive)
         except TimeoutError:
-            message = f"must be complete after {self._seconds:g} s"
-            await _refuse(HTTPStatus.REQUEST_TIMEOUT, message, "slow_body", scope, receive, send)
+            message = f"must be complete within {self._seconds:g} s"
+            await _reject(HTTPStatus.REQUEST_TIMEOUT, message, "slow_body", scope, receive, send)
             return
         if isinstance(body, bytes):
             await self._app(scope, _replay(body, receive), send)
         elif body:
             message = f"must be at most {self._max_bytes} bytes"
-            await _refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, message, "large_body", scope, receive, send)
+            await _reject(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, message, "large_body", scope, receive, send)
 
     async def _read(self, receive: Receive) -> bytes | bool:
-        """The body; True where it is too large; False where the client went away."""
+        """Return the body, True if it is too large, or False if the client disconnected."""
         parts: list[bytes] = []
         size = 0
         while size <= DRAINED_BYTES:
@@ -63,7 +63,7 @@ class BodyLimit:
         return b"".join(parts) if size <= self._max_bytes else True
 
 
-async def _refuse(status: HTTPStatus, message: str, kind: str, scope: Scope, receive: Receive, send: Send) -> None:
+async def _reject(status: HTTPStatus, message: str, kind: str, scope: Scope, receive: Receive, send: Send) -> None:
     scope[KIND] = kind
     errors = [FieldError(field="body", message=message)]
     headers = {"Connection": "close"} if status == HTTPStatus.REQUEST_TIMEOUT else None
@@ -71,7 +71,7 @@ async def _refuse(status: HTTPStatus, message: str, kind: str, scope: Scope, rec
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """A `receive` that first gives the whole body, then what comes after it."""
+    """Return a `receive` that first returns the whole body, then the messages after it."""
     given = False
 
     async def replayed() -> Message:

@@ -1,4 +1,4 @@
-"""From a request's camera, and what it leaves to the scene, to a pinhole camera."""
+"""Resolve the camera of a request, with the scene's defaults."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from msdgs_serve.store import ServedScene
 
 
 def resolve_camera(request: RenderRequest, served: ServedScene) -> Camera:
-    """The camera to draw with, of the size to draw. Raises `InvalidInput` naming the request's field."""
+    """Return the camera and image size of a request. Raises `InvalidInput` naming the field."""
     spec = request.camera
     if isinstance(spec, SceneCamera):
         camera = _pick(spec, served.session.scene.metadata.cameras).camera
@@ -40,7 +40,7 @@ def _matrix_camera(spec: MatrixCamera, request: RenderRequest, scene: Framing) -
         missing = "width" if request.width is None else "height"
         raise InvalidInput(missing, "given together with camera.fx, which is in pixels", "nothing")
     if spec.fx is None and spec.fy is not None:
-        raise InvalidInput("camera.fy", "left out where camera.fx is", spec.fy)
+        raise InvalidInput("camera.fy", "left out without camera.fx", spec.fy)
     width, height = _size(request, scene.width, scene.height)
     fx = spec.fx or 0.5 * height / math.tan(0.5 * math.radians(spec.fov_y or 0))
     fy = spec.fy or fx
@@ -50,12 +50,12 @@ def _matrix_camera(spec: MatrixCamera, request: RenderRequest, scene: Framing) -
     if spec.axes == "opengl":
         pose = pose @ OPENGL_TO_OPENCV
     if spec.model != "pinhole" and spec.fx is None:
-        raise InvalidInput("camera.fov_y", "camera.fx, unless camera.model is pinhole", spec.fov_y)
+        raise InvalidInput("camera.fov_y", "replaced by camera.fx unless camera.model is pinhole", spec.fov_y)
     return Camera(fx, fy, cx, cy, width, height, pose, spec.model, spec.distortion)
 
 
 def _size(request: RenderRequest, width: int, height: int) -> tuple[int, int]:
-    """Width and height asked for; what is left out follows from those given here."""
+    """Return the requested width and height; a missing one follows from the proportions of the given default."""
     if request.width is not None and request.height is not None:
         return request.width, request.height
     if request.width is not None:
@@ -67,17 +67,17 @@ def _size(request: RenderRequest, width: int, height: int) -> tuple[int, int]:
 
 def _side(name: str, pixels: float) -> int:
     if round(pixels) > MAX_PIXELS_PER_SIDE:
-        raise InvalidInput(name, f"at most {MAX_PIXELS_PER_SIDE}", f"{round(pixels)} by the camera's proportions")
+        raise InvalidInput(name, f"at most {MAX_PIXELS_PER_SIDE}", f"{round(pixels)} by the camera's aspect ratio")
     return max(1, round(pixels))
 
 
 def _pick(spec: SceneCamera, cameras: Sequence[StoredCamera]) -> StoredCamera:
     if spec.name is not None and spec.index is not None:
-        raise InvalidInput("camera.index", "left out where camera.name is given", spec.index)
+        raise InvalidInput("camera.index", "left out if camera.name is given", spec.index)
     if spec.name is not None:
         named = [camera for camera in cameras if camera.name == spec.name]
         if not named:
-            raise InvalidInput("camera.name", "that of a camera of the scene", repr(spec.name))
+            raise InvalidInput("camera.name", "the name of a camera of the scene", repr(spec.name))
         return named[0]
     index = spec.index or 0
     if index >= len(cameras):

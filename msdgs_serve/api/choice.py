@@ -1,4 +1,4 @@
-"""`min_psnr`: of the files that one model was exported to, the fastest whose measured error fits."""
+"""Choose the fastest exported file of a model with a minimal measured PSNR (`min_psnr`)."""
 
 from collections.abc import Iterator
 
@@ -11,26 +11,26 @@ FIELD = "min_psnr"
 
 
 def fastest_within(store: SceneStore, scene: ServedScene, decibels: float) -> ServedScene:
-    """Of `walk.onnx` and, beside it, `walk.….onnx` of the same model: the fastest whose worst frame has at least so
-    many decibels (PSNR against the whole model). Times are those that reports beside the files have; where there are
-    none, the smallest file.
+    """Return the fastest of `walk.onnx` and the files `walk.….onnx` of the same model beside it, whose worst frame has
+    at least `decibels` (PSNR against the full model). Times are from the reports beside the files; without reports,
+    return the smallest file.
 
-    Raises `InvalidInput` where none fits or none says how its frames compare.
+    Raises `InvalidInput` if no file has that PSNR, or none has a measured one.
     """
     measured = [(each, error) for each in _of_one_model(store, scene) if (error := worst_decibels(each)) is not None]
     if not measured:
-        raise InvalidInput(FIELD, f"left out, as no file of `{scene.name}` was compared with its model", decibels)
+        raise InvalidInput(FIELD, f"left out, as no file of `{scene.name}` has a measured PSNR", decibels)
     fitting = [each for each, error in measured if error >= decibels]
     if not fitting:
         best = max(error for _, error in measured)
-        raise InvalidInput(FIELD, f"at most {best:.1f} dB, which the best file of `{scene.name}` has", decibels)
+        raise InvalidInput(FIELD, f"at most {best:.1f} dB, the highest of the files of `{scene.name}`", decibels)
     milliseconds = _reported_milliseconds(store, [each for each, _ in measured])
     unknown = float("inf")
     return min(fitting, key=lambda each: (milliseconds.get(_key(each), unknown), store.file(each.name).stat().st_size))
 
 
 def worst_decibels(scene: ServedScene) -> float | None:
-    """PSNR of the worst frame that the exporter compared with the whole model's, as the file says."""
+    """Return the file's measured PSNR of the worst frame against the full model, or None."""
     rendered = scene.session.scene.metadata.measured_error.get("rendered")
     value = rendered.get("psnr_worst") if isinstance(rendered, dict) else None
     return float(value) if isinstance(value, int | float) else None
@@ -43,13 +43,13 @@ def _of_one_model(store: SceneStore, scene: ServedScene) -> Iterator[ServedScene
             try:
                 other = store.get(name)
             except SceneFileInvalid:
-                continue  # the store reports it
+                continue  # the store logs it
             if _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
                 yield other
 
 
 def _reported_milliseconds(store: SceneStore, scenes: list[ServedScene]) -> dict[tuple[str, float], float]:
-    """Of a frame, by plan and error, as all reports beside the files say."""
+    """Return milliseconds per frame by plan and PSNR, from the reports beside the files."""
     found: dict[tuple[str, float], float] = {}
     for scene in scenes:
         try:
@@ -58,7 +58,7 @@ def _reported_milliseconds(store: SceneStore, scenes: list[ServedScene]) -> dict
                 key = (point["plan"], point["error"]["psnr_worst"])
                 found.setdefault(key, float(point["milliseconds"]["total"]["min"]))
         except (SceneFileInvalid, LookupError, TypeError, ValueError, OverflowError):
-            continue  # a report of another shape: as if there were none
+            continue  # an invalid report counts as none
     return found
 
 

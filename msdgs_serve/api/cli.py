@@ -1,4 +1,4 @@
-"""`msdgs-serve`: settings from flags and environment, then the server."""
+"""The command `msdgs-serve`: reads settings from flags and environment and runs the server."""
 
 import gc
 import json
@@ -16,7 +16,7 @@ from msdgs_serve.api.observe import JsonLines
 from msdgs_serve.api.openapi import render_examples
 from msdgs_serve.api.server import Server
 from msdgs_serve.api.settings import PROGRAM, Settings
-from msdgs_serve.rasterizer.ahead import compile_kernels
+from msdgs_serve.rasterizer.precompile import compile_kernels
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import MsdgsError
 from msdgs_serve.store import SceneStore
@@ -24,16 +24,16 @@ from msdgs_serve.threads import THREADS_VARIABLE
 
 USAGE_ERROR = 2
 SWITCH_SECONDS = 0.001
-"""After which a thread that wants Python's interpreter gets it. Under four times too much load the slowest accepted
-frames wait 0.7 times as long as with Python's 5 ms, and /live a quarter as long."""
+"""Switch interval of Python's interpreter. Under 4x overload the slowest accepted frames wait 0.7 times as long as with
+Python's default of 5 ms, and /live a quarter as long."""
 
 
 class UsageError(Exception):
-    """What the person who started the program can put right."""
+    """An error in how the program was started."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until Ctrl-C. Returns the exit status: 2 where settings, scenes or the port are wrong."""
+    """Serve until Ctrl-C. Return the exit status: 2 for invalid settings, scenes or port."""
     try:
         settings = _settings(sys.argv[1:] if arguments is None else arguments)
         _configure_logging(settings)
@@ -58,7 +58,7 @@ def _settings(arguments: Sequence[str]) -> Settings:
         wrong = [f"--{item['loc'][0]}: {item['msg']}".replace("_", "-") for item in error.errors()]
         raise UsageError("; ".join(wrong)) from None
     if not (settings.scenes or settings.compile):
-        raise UsageError(f"which scene? `{PROGRAM} scene.onnx` serves one; `{PROGRAM} --help` tells more")
+        raise UsageError(f"no scene given; `{PROGRAM} scene.onnx` serves one, see `{PROGRAM} --help`")
     return settings
 
 
@@ -72,7 +72,7 @@ def _configure_logging(settings: Settings) -> None:
 
 
 def _compile() -> int:
-    print("Compiling, which takes up to a minute …", flush=True)
+    print("Compiling kernels, which takes up to a minute …", flush=True)
     started = time.perf_counter()
     folder = compile_kernels()
     print(f"Kernels are ready after {time.perf_counter() - started:.1f} s, in {folder}", flush=True)
@@ -84,18 +84,18 @@ def _serve(settings: Settings) -> None:
     store, renderer = SceneStore(settings.scenes, settings.open_scene), Renderer(settings.cache_megabytes << 20)
     app = create_app(store, renderer, settings)
     with bind(settings.host, settings.port) as listener:
-        print("Loading; the very first start compiles, which takes up to a minute …", flush=True)
+        print("Loading scenes; the first start compiles kernels, which takes up to a minute …", flush=True)
         server = _AnnouncedServer(app, settings, store, listener)
         try:
             server.run(sockets=[listener])
         finally:
-            gc.unfreeze()  # or OpenImageIO's bindings complain in the end of what was not let go
+            gc.unfreeze()  # otherwise OpenImageIO's bindings report leaked objects at exit
     if server.service.failure is not None:
         raise server.service.failure
 
 
 class _AnnouncedServer(Server):
-    """Says where it listens, once it can be used."""
+    """A server that prints its address when it is ready."""
 
     def __init__(self, app: object, settings: Settings, store: SceneStore, listener: socket.socket) -> None:
         super().__init__(app, settings)  # pyright: ignore[reportArgumentType]
@@ -103,18 +103,18 @@ class _AnnouncedServer(Server):
         self._address = listener.getsockname()[:2]
 
     def on_ready(self) -> None:
-        # what the start has made stays; to look through it again and again would make the slowest frames under four
-        # times too much load 1.3 times as slow
+        # objects of the startup are permanent: scanning them in each garbage collection makes the slowest frames under
+        # 4x overload take 1.3 times as long
         gc.collect()
         gc.freeze()
         names = self._store.names()
         print(f"{len(names)} scene(s) after {self.service.start_seconds:.1f} s: {', '.join(names[:20])}", flush=True)
         if not names:
-            print(f"{PROGRAM}: no .onnx file there yet; scenes are served as they come", file=sys.stderr)
+            print(f"{PROGRAM}: no .onnx files found; new files are served when they are added", file=sys.stderr)
         host, port = self._address
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host) or str(host)
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-        print(f"Listening on {url} (Ctrl-C stops). Every call is explained at {url}/docs")
+        print(f"Listening on {url} (Ctrl-C stops). API documentation: {url}/docs")
         for example in list(render_examples(self._store).values())[:1]:
             body = json.dumps(example["value"]).replace("'", "'\\''")
             print(f"Try:\n  curl {url}/render -H 'content-type: application/json' -o frame.png \\\n    -d '{body}'")
@@ -122,9 +122,9 @@ class _AnnouncedServer(Server):
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A socket that has its port but doesn't listen yet, so that a port in use is told before anything is loaded.
+    """Return a bound socket that doesn't listen yet, so that a port in use is reported before scenes are loaded.
 
-    It knows its protocol: only then asyncio sends without Nagle's delay, which would cost 40 ms a request.
+    Its protocol is set explicitly: otherwise asyncio doesn't disable Nagle's algorithm, which costs 40 ms per request.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]

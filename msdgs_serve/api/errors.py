@@ -1,4 +1,4 @@
-"""Errors as HTTP: one table from domain errors to a status, one body shape (RFC 9457, application/problem+json)."""
+"""HTTP responses for errors: the table of statuses, and bodies as application/problem+json (RFC 9457)."""
 
 import itertools
 import json
@@ -25,13 +25,13 @@ STATUS_OF: dict[type[MsdgsError], HTTPStatus] = {
     SceneFileInvalid: HTTPStatus.SERVICE_UNAVAILABLE,
 }
 KIND = "msdgs.problem"
-"""Key of an ASGI scope: what kind of problem it was answered with, for the metrics."""
+"""Key of an ASGI scope for the kind of problem in the response, for the metrics."""
 
-CLIENT_CLOSED_REQUEST = 499  # nginx's
+CLIENT_CLOSED_REQUEST = 499  # as in nginx
 
 UNIONS = ("camera", "background", "t")
 MEMBERS = ("orbit", "look_at", "matrix", "scene", "name", "color", "one", "list")
-"""Of the unions: pydantic puts which one it took behind the field's name."""
+"""Members of unions: pydantic appends the one that it tried to the field's location."""
 
 MEDIA_TYPE = "application/problem+json"
 MAX_BODY_BYTES = 8192
@@ -42,21 +42,21 @@ MAX_MESSAGE_LENGTH = 200
 logger = logging.getLogger("msdgs_serve")
 
 
-class Refused(MsdgsError):
-    """A request that is not carried out for another reason than its values; knows its own status."""
+class RequestRejected(MsdgsError):
+    """A request is rejected with a status of its own, not for the values of its fields."""
 
     def __init__(
         self, status: HTTPStatus, kind: str, detail: str, *, field: str | None = None, retry_after: int | None = None
     ) -> None:
         super().__init__(detail)
         self.status = status
-        self.kind = kind  # one word for the metrics
+        self.kind = kind  # label in the metrics
         self.field = field
         self.headers = {} if retry_after is None else {"Retry-After": str(retry_after)}
 
 
 class ClientGone(MsdgsError):
-    """The client closed the connection before its answer was ready."""
+    """The client closed the connection before the response was ready."""
 
 
 KINDS: dict[type[Exception], str] = {
@@ -70,53 +70,55 @@ KINDS: dict[type[Exception], str] = {
 
 
 class FieldError(BaseModel):
-    """One value that is wrong."""
+    """An invalid value of a request."""
 
-    field: str = Field(description="where it is in the request, as in `camera.fov_y`", examples=["camera.fov_y"])
-    message: str = Field(description="what was expected", examples=["must be in (0, 180) degrees, got 190"])
+    field: str = Field(description="path in the request, such as `camera.fov_y`", examples=["camera.fov_y"])
+    message: str = Field(description="the expected value", examples=["must be in (0, 180) degrees, got 190"])
 
 
 class Problem(BaseModel):
     """The body of every error (RFC 9457), at most 8 kB."""
 
-    type: str = Field(default="about:blank", description="always `about:blank`: the status says the kind")
-    title: str = Field(description="the status in words")
+    type: str = Field(default="about:blank", description="always `about:blank`; the status tells the kind")
+    title: str = Field(description="reason phrase of the status")
     status: int
-    detail: str = Field(description="what went wrong, for people")
-    errors: list[FieldError] = Field(default=[], description="the values that are wrong, where the request is to blame")
+    detail: str = Field(description="explanation for people")
+    errors: list[FieldError] = Field(default=[], description="invalid values of the request")
 
 
 def problem_response(
     status: int, detail: str, errors: Sequence[FieldError] = (), headers: dict[str, str] | None = None
 ) -> Response:
-    """A problem as a response; what would make it too long is cut off."""
+    """Return a problem as a response; long texts are truncated."""
     shown = [
-        FieldError(field=_cut(error.field, MAX_FIELD_LENGTH), message=_cut(error.message, MAX_MESSAGE_LENGTH))
+        FieldError(
+            field=_truncated(error.field, MAX_FIELD_LENGTH), message=_truncated(error.message, MAX_MESSAGE_LENGTH)
+        )
         for error in errors[:MAX_ERRORS]
     ]
     problem = Problem(
-        title=HTTPStatus(status).phrase, status=status, detail=_cut(detail, MAX_MESSAGE_LENGTH), errors=shown
+        title=HTTPStatus(status).phrase, status=status, detail=_truncated(detail, MAX_MESSAGE_LENGTH), errors=shown
     )
-    # ASCII, because a lone surrogate in a JSON string of the request has no UTF-8
+    # ASCII: a lone surrogate in a JSON string of the request can't be encoded in UTF-8
     while len(body := json.dumps(problem.model_dump()).encode("ascii")) > MAX_BODY_BYTES:
         problem.errors.pop()
     return Response(body, status, headers, MEDIA_TYPE)
 
 
 def install_error_handlers(app: FastAPI) -> None:
-    """Make every error of the application a problem."""
+    """Answer every error of the application with a problem."""
     app.add_exception_handler(MsdgsError, _on_domain_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_error)
 
 
 def server_error() -> Response:
-    """The answer to what nothing else handles."""
-    return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The server failed; its log says why.")
+    """Return the response to an unhandled error."""
+    return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "Internal error; see the server's log.")
 
 
 def problem_of(error: Exception) -> tuple[int, bytes]:
-    """Status and body for one frame of a batch."""
+    """Return status and body of a problem for one frame of a batch."""
     if isinstance(error, ValidationError):
         response = _invalid([{**item, "loc": ("body", *item["loc"])} for item in error.errors()])
     elif isinstance(error, MsdgsError):
@@ -127,30 +129,30 @@ def problem_of(error: Exception) -> tuple[int, bytes]:
     return response.status_code, bytes(response.body)
 
 
-def refusal(error: Refused) -> Response:
-    """The answer to what is refused."""
+def rejection(error: RequestRejected) -> Response:
+    """Return the response to a rejected request."""
     errors = [FieldError(field=error.field, message=str(error))] if error.field else []
     return problem_response(error.status, str(error), errors, error.headers)
 
 
 async def _on_domain_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, MsdgsError)
-    request.scope[KIND] = error.kind if isinstance(error, Refused) else KINDS.get(type(error), "internal")
+    request.scope[KIND] = error.kind if isinstance(error, RequestRejected) else KINDS.get(type(error), "internal")
     return _domain_problem(error)
 
 
 def _domain_problem(error: MsdgsError) -> Response:
     if isinstance(error, ClientGone):
-        return Response(status_code=CLIENT_CLOSED_REQUEST)  # nobody reads it; the metrics and the log do
-    if isinstance(error, Refused):
-        return refusal(error)
+        return Response(status_code=CLIENT_CLOSED_REQUEST)  # for metrics and log only
+    if isinstance(error, RequestRejected):
+        return rejection(error)
     status = next((status for kind, status in STATUS_OF.items() if isinstance(error, kind)), None)
     if status is None:
         logger.error("unexpected domain error", exc_info=error)
         return server_error()
     if isinstance(error, SceneFileInvalid):
         logger.error("%s", error)
-        return problem_response(status, f"The scene's file is broken at `{error.field}`; the server's log says how.")
+        return problem_response(status, f"The scene's file is invalid at `{error.field}`; see the server's log.")
     if isinstance(error, VideoUnavailable):
         return problem_response(status, str(error))
     field = error.field if isinstance(error, InvalidInput) else "scene"
@@ -165,38 +167,38 @@ async def _on_validation_error(request: Request, error: Exception) -> Response:
 
 def _invalid(items: Sequence[Any]) -> Response:
     errors = [_field_error(item) for item in items[:MAX_ERRORS]]
-    detail = f"`{_cut(errors[0].field, MAX_FIELD_LENGTH)}`: {errors[0].message}"
+    detail = f"`{_truncated(errors[0].field, MAX_FIELD_LENGTH)}`: {errors[0].message}"
     return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, detail, errors)
 
 
 async def _on_http_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     errors = []
-    if error.status_code == HTTPStatus.BAD_REQUEST:  # FastAPI's, for a body that is no text or no JSON
+    if error.status_code == HTTPStatus.BAD_REQUEST:  # raised by FastAPI for a body that isn't valid JSON
         errors.append(FieldError(field="body", message=str(error.detail)))
     return problem_response(error.status_code, str(error.detail), errors, dict(error.headers or {}))
 
 
 def _field_error(item: dict[str, Any]) -> FieldError:
-    """From one of pydantic's errors; its input is left out, it may be huge or have no JSON."""
+    """Return one of pydantic's errors, without its input, which may be large or not representable in JSON."""
     field, message = _field_name(item["loc"]), item["msg"]
     if field == "body" and item["type"] != "missing":
         message = f"must be a JSON object, sent as content-type: application/json ({message})"
     if item["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        field, message = f"{field}.type", "must be one of those that /docs lists"
+        field, message = f"{field}.type", "must be one of the types listed at /docs"
         if tags := item.get("ctx", {}).get("expected_tags"):
             message = f"must be one of {tags}"
     return FieldError(field=field, message=message)
 
 
 def _field_name(location: Sequence[str | int]) -> str:
-    """`("body", "camera", "orbit", "azimuth")` → `camera.azimuth`: the chosen member of a union isn't named."""
-    where, *parts = location
-    path = [part for before, part in itertools.pairwise((where, *parts)) if not (before in UNIONS and part in MEMBERS)]
+    """Return `camera.azimuth` for `("body", "camera", "orbit", "azimuth")`, without members of unions."""
+    source, *parts = location
+    path = [part for before, part in itertools.pairwise((source, *parts)) if not (before in UNIONS and part in MEMBERS)]
     if not path or (len(path) == 1 and isinstance(path[0], int)):  # no body, or the offset of a JSON error
-        return str(where)
+        return str(source)
     return ".".join(str(part) for part in path)
 
 
-def _cut(text: str, length: int) -> str:
+def _truncated(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"

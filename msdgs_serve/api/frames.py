@@ -1,4 +1,4 @@
-"""A request for a frame, from its values to the bytes of a file and what the answer's headers say of it."""
+"""Plan and render the frames of a request, from its values to the encoded file and the response headers."""
 
 import hashlib
 import io
@@ -19,18 +19,18 @@ from msdgs_serve.api.service import Service
 from msdgs_serve.imaging import FORMATS, Channel, DepthRange, Image, encode
 from msdgs_serve.imaging.encode import check_encodable, npy, numbers
 from msdgs_serve.imaging.formats import default_channels
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import Background, RenderOptions, Shutter, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
-from msdgs_serve.watch import Watch
 
 ZIP = "application/zip"
-ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the first that a ZIP file can hold; equal requests give equal bytes
+ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the first date that ZIP supports; equal requests give equal bytes
 
 
 @dataclass(frozen=True)
 class FramePlan:
-    """All that a frame needs, checked."""
+    """A checked request with everything needed to render it."""
 
     request: RenderRequest
     scene: ServedScene
@@ -43,12 +43,12 @@ class FramePlan:
 
     @property
     def media_type(self) -> str:
-        """Of the answer."""
+        """Media type of the response."""
         several = isinstance(self.request.t, list) and self.request.format != "npy"
         return ZIP if several else FORMATS[self.request.format].media_type
 
     def headers(self, max_age: int) -> dict[str, str]:
-        """What was used, whatever it took."""
+        """Return the response headers, which don't depend on the rendering."""
         error = worst_decibels(self.scene)
         return {
             "ETag": self.etag,
@@ -61,7 +61,7 @@ class FramePlan:
 
 
 def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
-    """Check everything that can be wrong with a request; may load its scene. Raises the domain's errors."""
+    """Check a request and return its plan; may load the scene. Raises `MsdgsError`."""
     scene = service.scene(request.scene)
     if request.min_psnr is not None:
         scene = fastest_within(service.store, scene, request.min_psnr)
@@ -76,7 +76,7 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
         shutter = Shutter(request.shutter.open, request.shutter.close, request.shutter.samples)
     channels = request.channels or default_channels(request.format)
     if ("motion" in channels) != (request.dt is not None):
-        expected = "given, as channels has motion" if request.dt is None else "left out, as channels has no motion"
+        expected = "given for the channel motion" if request.dt is None else "left out without the channel motion"
         raise InvalidInput("dt", expected, "nothing" if request.dt is None else request.dt)
     for t in times:
         check_times(scene.session, t, shutter, request.dt)
@@ -93,43 +93,43 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
 
 
-def draw_frame(service: Service, plan: FramePlan, t: float, watch: Watch) -> bytes:
-    """The file of one frame. The watch has the stages `pose`, `draw` and `encode`."""
-    image = _draw(service, plan, t, watch)
-    with watch.stage("encode"):
+def draw_frame(service: Service, plan: FramePlan, t: float, job: RenderJob) -> bytes:
+    """Return the file of one frame. Stages of the job: `pose`, `draw` and `encode`."""
+    image = _draw(service, plan, t, job)
+    with job.stage("encode"):
         return encode(image, plan.request.format, plan.request.quality, plan.channels, plan.depth_range)
 
 
-async def draw_plan(service: Service, plan: FramePlan, watch: Watch) -> bytes:
-    """The file of a plan, when its turns come: where it has several times, each is a part of the work."""
+async def draw_plan(service: Service, plan: FramePlan, job: RenderJob) -> bytes:
+    """Render a plan through the queue and return its file; each of several times is queued as a part."""
     run = service.queue.run
     if not isinstance(plan.request.t, list):
-        return await run(lambda: draw_frame(service, plan, plan.times[0], watch), watch)
+        return await run(lambda: draw_frame(service, plan, plan.times[0], job), job)
     if plan.request.format == "npy":
-        draw = partial(_draw_numbers, service, plan, watch=watch)
-        arrays = [await run(partial(draw, t), watch, part=True) for t in plan.times]
-        return await run(lambda: npy(np.stack(arrays)), watch, part=True)
-    draw = partial(draw_frame, service, plan, watch=watch)
-    files = [await run(partial(draw, t), watch, part=True) for t in plan.times]
-    return await run(lambda: _zipped(files, FORMATS[plan.request.format].extension), watch, part=True)
+        draw = partial(_draw_numbers, service, plan, job=job)
+        arrays = [await run(partial(draw, t), job, part=True) for t in plan.times]
+        return await run(lambda: npy(np.stack(arrays)), job, part=True)
+    draw = partial(draw_frame, service, plan, job=job)
+    files = [await run(partial(draw, t), job, part=True) for t in plan.times]
+    return await run(lambda: _zipped(files, FORMATS[plan.request.format].extension), job, part=True)
 
 
-def _draw(service: Service, plan: FramePlan, t: float, watch: Watch) -> Image:
-    return service.renderer.render(plan.scene.session, plan.camera, t, plan.options, watch)
+def _draw(service: Service, plan: FramePlan, t: float, job: RenderJob) -> Image:
+    return service.renderer.render(plan.scene.session, plan.camera, t, plan.options, job)
 
 
-def _draw_numbers(service: Service, plan: FramePlan, t: float, watch: Watch) -> np.ndarray:
-    return numbers(_draw(service, plan, t, watch), plan.channels)
+def _draw_numbers(service: Service, plan: FramePlan, t: float, job: RenderJob) -> np.ndarray:
+    return numbers(_draw(service, plan, t, job), plan.channels)
 
 
-def server_timing(watch: Watch) -> str:
-    """The `Server-Timing` header: milliseconds by stage, and whether poses came from the cache."""
-    notes = {stage: f';desc="{note}"' for stage, note in watch.notes.items()}
-    return ", ".join(f"{stage};dur={1000 * s:.2f}{notes.get(stage, '')}" for stage, s in watch.seconds.items())
+def server_timing(job: RenderJob) -> str:
+    """Return the `Server-Timing` header: milliseconds by stage, and whether the pose was cached."""
+    notes = {stage: f';desc="{note}"' for stage, note in job.notes.items()}
+    return ", ".join(f"{stage};dur={1000 * s:.2f}{notes.get(stage, '')}" for stage, s in job.seconds.items())
 
 
 def is_unchanged(if_none_match: str | None, etag: str) -> bool:
-    """Whether the client says that it has this version."""
+    """Whether `If-None-Match` includes this version."""
     if if_none_match is None:
         return False
     known = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
@@ -137,7 +137,7 @@ def is_unchanged(if_none_match: str | None, etag: str) -> bool:
 
 
 def _etag(scene: ServedScene, request: RenderRequest) -> str:
-    """Of the scene's file, the request and this version of the program."""
+    """Return the ETag of scene file, request and program version."""
     asked = request.model_dump(mode="json", exclude={"scene"}, exclude_defaults=True)
     text = json.dumps([__version__, scene.sha256, asked], sort_keys=True)
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
@@ -161,13 +161,13 @@ def _check_amounts(service: Service, request: RenderRequest, camera: Camera, fra
 
 
 def check_pixels(camera: Camera, frames: int, limit: int, total: int, field: str) -> None:
-    """Raise `InvalidInput` for a frame of more pixels than `limit`, and for frames of more than `total` together."""
+    """Raise `InvalidInput` for more than `limit` pixels per frame or more than `total` pixels in all frames."""
     pixels, size = camera.width * camera.height, f"{camera.width} × {camera.height}"
     if pixels > limit:
         larger = "width" if camera.width >= camera.height else "height"
         raise InvalidInput(larger, f"such that width × height is at most {limit} pixels", size)
     if pixels * frames > total:
-        expected = f"so many that width × height × their number is at most {total} pixels"
+        expected = f"such that width × height × number of frames is at most {total} pixels"
         raise InvalidInput(field, expected, f"{frames} of {size}")
 
 
@@ -182,5 +182,5 @@ def _depth_range(request: RenderRequest) -> DepthRange | None:
         return None
     near, far = request.depth_range
     if not near < far:
-        raise InvalidInput("depth_range", "two depths, the nearer first", [near, far])
+        raise InvalidInput("depth_range", "two depths in increasing order", [near, far])
     return DepthRange(near, far)

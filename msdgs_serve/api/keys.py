@@ -1,4 +1,4 @@
-"""Keys and what they open: 401 without one, 403 where it lacks the scope; health and the page's files need none."""
+"""API keys and their scopes: 401 without a key, 403 without the scope. Health checks and the viewer need none."""
 
 import hashlib
 import hmac
@@ -15,46 +15,46 @@ from msdgs_serve.api.prefix import route_path
 from msdgs_serve.scene import InvalidInput
 
 KeyScope = Literal["read", "write", "operate"]
-"""read: frames, scenes, documents. write: add, replace, delete scenes. operate: metrics."""
+"""read: frames, scenes, documentation. write: add, replace and delete scenes. operate: metrics."""
 
 SCOPES: tuple[KeyScope, ...] = get_args(KeyScope)
 OPEN_PATHS = ("/live", "/ready", "/")
 OPEN_FOLDER = "/viewer/"
 OPERATED_PATHS = ("/metrics",)
 WRITTEN_PATH, WRITTEN_FOLDER = "/scenes", "/scenes/"
-SHORTEST_KEY = 16
+MIN_KEY_LENGTH = 16
 MAX_BYTES = 1 << 20
 CLIENT = "msdgs.client"
-"""Key of an ASGI scope: whose key was used, as the first digits of its digest."""
+"""Key of an ASGI scope for the client: the first digits of the digest of its API key."""
 CLIENT_DIGITS = 16
 
-LINE = re.compile(rf"(?P<scopes>\w+(,\w+)*)[ \t]+(?P<key>\S{{{SHORTEST_KEY},}})")
+LINE = re.compile(rf"(?P<scopes>\w+(,\w+)*)[ \t]+(?P<key>\S{{{MIN_KEY_LENGTH},}})")
 
 
 class Key(NamedTuple):
-    """One line of the file."""
+    """An API key: a line of the file of keys."""
 
     digest: bytes
     scopes: frozenset[str]
 
     @property
     def client(self) -> str:
-        """Who uses it, without saying what it is."""
+        """Identifier of the client, which doesn't reveal the key."""
         return self.digest.hex()[:CLIENT_DIGITS]
 
 
 def client_of(scope: Scope) -> str:
-    """Who calls, for what is shared out among clients: a key, or else an address."""
+    """Return the identifier of a client, by which resources are shared: its key, or else its address."""
     return scope.get(CLIENT) or address_of(scope.get("client"))
 
 
 def address_of(client: Sequence[object] | None) -> str:
-    """Of a connection, or of whom a trusted proxy names."""
+    """Return the address of a connection, or the one that a trusted proxy forwards."""
     return str(client[0]) if client else "unknown"
 
 
 def scope_of(method: str, path: str) -> KeyScope | None:
-    """What a key must have for a call; None where it needs none."""
+    """Return the scope that a call needs, or None if it needs no key."""
     if path in OPEN_PATHS or path.startswith(OPEN_FOLDER):
         return None
     if path in OPERATED_PATHS:
@@ -65,9 +65,9 @@ def scope_of(method: str, path: str) -> KeyScope | None:
 
 
 class KeyCheck:
-    """ASGI middleware. The key comes as `Authorization: Bearer …` or as `X-API-Key`.
+    """ASGI middleware that checks the key in `Authorization: Bearer …` or `X-API-Key`.
 
-    Digests are compared, in constant time, and always with all keys: how long it takes tells nothing.
+    Digests of all keys are compared in constant time, so that timing reveals nothing.
     """
 
     def __init__(self, app: ASGIApp, keys: Iterable[Key]) -> None:
@@ -102,19 +102,19 @@ class KeyCheck:
 
 
 def read_keys(path: Path) -> list[Key]:
-    """Scopes, joined by commas, and a key a line; empty lines and those that begin with # don't count.
+    """Read lines of comma-separated scopes and a key; empty lines and those that begin with # are ignored.
 
-    Raises `InvalidInput` that says which line is wrong and what it needs, and repeats no key.
+    Raises `InvalidInput` naming the invalid line, without revealing keys.
     """
     try:
         with path.open("rb") as file:
             lines = file.read(MAX_BYTES).decode().splitlines()
     except (OSError, UnicodeDecodeError):
-        raise InvalidInput("api_keys_file", "a text file that can be read", path) from None
+        raise InvalidInput("api_keys_file", "a readable text file", path) from None
     texts = [(number, line.strip()) for number, line in enumerate(lines, 1)]
     keys = [_key_of(number, text) for number, text in texts if text and not text.startswith("#")]
     if len({key.digest for key in keys}) < len(keys) or not keys:
-        raise InvalidInput("api_keys_file", "a file of different keys, one a line", f"{len(keys)} keys")
+        raise InvalidInput("api_keys_file", "a file of different keys, one per line", f"{len(keys)} keys")
     return keys
 
 
@@ -122,8 +122,8 @@ def _key_of(number: int, text: str) -> Key:
     match = LINE.fullmatch(text)
     scopes = frozenset(match["scopes"].split(",")) if match else frozenset()
     if match is None or not scopes <= set(SCOPES):
-        form = f"`scopes key`, as in `{','.join(SCOPES)} <a key of {SHORTEST_KEY} or more letters>`"
-        got = "a key without scopes" if " " not in text and "\t" not in text else "something else"
+        form = f"`scopes key`, as in `{','.join(SCOPES)} <a key of {MIN_KEY_LENGTH} or more characters>`"
+        got = "a key without scopes" if " " not in text and "\t" not in text else "another line"
         raise InvalidInput(f"api_keys_file, line {number}", form, got)
     return Key(_digest(match["key"].encode()), scopes)
 

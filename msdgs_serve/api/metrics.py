@@ -1,4 +1,4 @@
-"""Numbers about the service, as Prometheus reads them."""
+"""Metrics of the service for Prometheus."""
 
 from collections.abc import Iterable, Mapping
 
@@ -16,7 +16,7 @@ MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class Metrics:
-    """Counters of one service; several may live in a process."""
+    """Metrics of one service, with a registry of its own."""
 
     def __init__(self, store: SceneStore, cache: PoseCache, queue: WorkQueue) -> None:
         self._registry = CollectorRegistry()
@@ -24,52 +24,52 @@ class Metrics:
             "msdgs_requests", "Requests answered", ("method", "route", "status"), registry=self._registry
         )
         self._latency = Histogram(
-            "msdgs_request_seconds", "From the headers to the last byte", ("route",),
+            "msdgs_request_seconds", "Time from the headers of a request to the last byte of its response", ("route",),
             buckets=SECONDS, registry=self._registry,
         )  # fmt: skip
         self._stages = Histogram(
-            "msdgs_stage_seconds", "Of a frame: queue, pose, draw, encode", ("stage",),
+            "msdgs_stage_seconds", "Time of the stages of a frame: queue, pose, draw, encode", ("stage",),
             buckets=SECONDS, registry=self._registry,
         )  # fmt: skip
-        self._problems = Counter("msdgs_problems", "Answers that are problems", ("kind",), registry=self._registry)
-        self._bytes = Counter("msdgs_sent_bytes", "Bytes of answers", ("route",), registry=self._registry)
+        self._problems = Counter("msdgs_problems", "Responses that are problems", ("kind",), registry=self._registry)
+        self._bytes = Counter("msdgs_sent_bytes", "Bytes of response bodies", ("route",), registry=self._registry)
         self._registry.register(_State(store, cache, queue))
         ProcessCollector(registry=self._registry)
         GCCollector(registry=self._registry)
 
     def count_request(self, method: str, route: str, status: int, seconds: float, sent: int) -> None:
-        """One request that was answered."""
+        """Count an answered request."""
         self._requests.labels(method, route, str(status)).inc()
         self._latency.labels(route).observe(seconds)
         self._bytes.labels(route).inc(sent)
 
     def count_problem(self, kind: str) -> None:
-        """One answer that was a problem."""
+        """Count a response that is a problem."""
         self._problems.labels(kind).inc()
 
     def count_stages(self, seconds: Mapping[str, float]) -> None:
-        """The stages of one frame."""
+        """Count the stages of a frame."""
         for stage, duration in seconds.items():
             self._stages.labels(stage).observe(duration)
 
     def page(self) -> bytes:
-        """All of it, in Prometheus' text format."""
+        """Return all metrics in Prometheus' text format."""
         return generate_latest(self._registry)
 
 
 class _State(Collector):
-    """What is read when it is asked for."""
+    """Metrics that are read when they are requested."""
 
     def __init__(self, store: SceneStore, cache: PoseCache, queue: WorkQueue) -> None:
         self._store, self._cache, self._queue = store, cache, queue
 
     def collect(self) -> Iterable[Metric]:
-        yield GaugeMetricFamily("msdgs_queue_waiting", "Renders in line", self._queue.waiting)
-        yield GaugeMetricFamily("msdgs_renders_running", "Renders in work", self._queue.running)
+        yield GaugeMetricFamily("msdgs_queue_waiting", "Renders that wait in the queue", self._queue.waiting)
+        yield GaugeMetricFamily("msdgs_renders_running", "Renders in progress", self._queue.running)
         use = self._cache.use
-        yield GaugeMetricFamily("msdgs_pose_cache_bytes", "Posed Gaussians kept", use.bytes)
-        yield GaugeMetricFamily("msdgs_pose_cache_poses", "Poses kept", use.poses)
-        lookups = CounterMetricFamily("msdgs_pose_cache_lookups", "Poses asked for", labels=("result",))
+        yield GaugeMetricFamily("msdgs_pose_cache_bytes", "Memory of cached poses", use.bytes)
+        yield GaugeMetricFamily("msdgs_pose_cache_poses", "Cached poses", use.poses)
+        lookups = CounterMetricFamily("msdgs_pose_cache_lookups", "Lookups in the pose cache", labels=("result",))
         lookups.add_metric(("hit",), use.hits)
         lookups.add_metric(("miss",), use.misses)
         yield lookups

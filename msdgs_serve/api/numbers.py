@@ -1,4 +1,4 @@
-"""Numbers and names from outside: each has its limits here, before anything computes with it."""
+"""Types of numbers and names in requests, with their limits."""
 
 from typing import Annotated
 
@@ -7,9 +7,9 @@ from pydantic import AfterValidator, Field
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
 
 MAX_NAME_BYTES = 200
-"""In UTF-8: with a suffix and a prefix of the service's own still a file name on any file system."""
+"""Limit in UTF-8, so that a name with prefix and suffix is a valid file name on any file system."""
 
-# Bounds far beyond any sensible value, within which single precision neither overflows nor underflows
+# limits beyond any sensible value, within which single precision neither overflows nor underflows
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
 Distance = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-6, le=1e9)]
 Focal = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e8)]
@@ -24,7 +24,7 @@ Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
 Decibels = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=200)]
 Steps = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1000)]
 
-# of links, where all is text
+# query parameters, which are strings
 LaxNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 LaxPixels = Annotated[int, Field(ge=1, le=MAX_PIXELS_PER_SIDE)]
 LaxIndex = Annotated[int, Field(ge=0, le=1_000_000)]

@@ -1,4 +1,4 @@
-"""Around every request: an id, a line in the log, a count in the metrics, and a problem where nothing else answers."""
+"""Middleware for every request: request id, access log, metrics, and the response to unhandled errors."""
 
 import contextvars
 import json
@@ -26,7 +26,7 @@ access_log = logging.getLogger("msdgs_serve.access")
 
 
 class Observe:
-    """ASGI middleware, the outermost. A client's own `X-Request-ID` is kept where it is short and plain."""
+    """The outermost ASGI middleware. Keeps a client's `X-Request-ID` if it is valid."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
@@ -45,7 +45,7 @@ class Observe:
             logger.error("%s %s failed", scope["method"], scope["path"], exc_info=error)
             scope[KIND] = "internal"
             if answer.status is not None:
-                raise  # too late for an answer; the server closes the connection
+                raise  # the response has started: the server closes the connection
             await server_error()(scope, receive, answer.send)
         finally:
             self._record(scope, answer, time.perf_counter() - started)
@@ -60,19 +60,19 @@ class Observe:
 
 
 class Answered(NamedTuple):
-    """What is known of a request in the end."""
+    """A finished request."""
 
     method: str
     path: str
     route: str
-    status: int  # 0 where there was none
-    kind: str | None  # of problem, where one is known
+    status: int  # 0 if there was no response
+    kind: str | None  # of the problem, if known
     seconds: float
     sent: int  # bytes of the body
 
 
 def record(metrics: Metrics, request: Answered, client: tuple[str, int] | None) -> None:
-    """Count a request, and log it."""
+    """Count and log a request."""
     method = request.method if request.method in METHODS else UNKNOWN_METHOD
     metrics.count_request(method, request.route, request.status, request.seconds, request.sent)
     if request.status >= FIRST_ERROR:
@@ -89,7 +89,7 @@ def record(metrics: Metrics, request: Answered, client: tuple[str, int] | None) 
 
 
 class _Answer:
-    """Sends on, with the request's id among the headers, and remembers what was sent."""
+    """Forwards a response with the request's id as a header, and records status and bytes sent."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -110,7 +110,7 @@ class JsonLines(logging.Formatter):
     """A log record as one line of JSON."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """With the request's id, and what the access log knows of the request."""
+        """Return the record as JSON, with the request's id and the fields of the access log."""
         line: dict[str, Any] = {
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S") + f".{int(record.msecs):03d}",
             "level": record.levelname.lower(),
@@ -126,6 +126,6 @@ class JsonLines(logging.Formatter):
 
 
 def usable_id(given: bytes) -> str:
-    """A client's own id, or a new one where that isn't short and plain."""
+    """Return a client's request id, or a new one if it isn't valid."""
     text = given.decode("latin-1")
     return text if USABLE_ID.fullmatch(text) else f"{random.getrandbits(128):032x}"

@@ -1,4 +1,4 @@
-"""The OpenAPI document: error bodies on every call, and examples that work on the scenes being served."""
+"""The OpenAPI document: error responses, API keys, and examples for the scenes that are served."""
 
 from http import HTTPStatus
 from typing import Any
@@ -20,7 +20,7 @@ Examples = dict[str, dict[str, Any]]
 
 IMAGE_RESPONSE: Responses = {
     200: {
-        "description": "The frame, or a ZIP file of the frames of several times",
+        "description": "The frame, or a ZIP file of frames at several times",
         "content": {
             media_type: {"schema": {"type": "string", "format": "binary"}}
             for media_type in (*(traits.media_type for traits in FORMATS.values()), "application/zip")
@@ -28,12 +28,12 @@ IMAGE_RESPONSE: Responses = {
         "headers": {
             name: {"description": text, "schema": {"type": "string"}}
             for name, text in {
-                "ETag": "of the scene's file and the request",
-                "Server-Timing": "milliseconds by stage: queue, pose (from the cache or not), draw, encode",
+                "ETag": "ETag of scene file and request",
+                "Server-Timing": "milliseconds by stage: queue, pose (cached or not), draw, encode",
                 "Msdgs-Scene": "the scene's name, percent-encoded",
                 "Msdgs-Plan": "how the scene's motion is computed",
-                "Msdgs-Error": "PSNR in dB of the file's worst frame against the whole model, where that was measured",
-                "Msdgs-Channels": "of the file, in order",
+                "Msdgs-Error": "PSNR in dB of the file's worst frame against the full model, if measured",
+                "Msdgs-Channels": "channels of the file, in order",
             }.items()
         },
     }
@@ -41,7 +41,7 @@ IMAGE_RESPONSE: Responses = {
 NOT_MODIFIED: Responses = {304: {"description": "The client has this frame"}}
 BATCH_RESPONSE: Responses = {
     200: {
-        "description": "A frame or a problem a line, or a part",
+        "description": "A frame or a problem per line or part",
         "content": {
             "application/x-ndjson": {"schema": {"$ref": "#/components/schemas/BatchItem"}},
             "multipart/mixed": {"schema": {"type": "string", "format": "binary"}},
@@ -50,7 +50,7 @@ BATCH_RESPONSE: Responses = {
 }
 VIDEO_RESPONSE: Responses = {
     200: {
-        "description": "The film",
+        "description": "The video",
         "content": {
             traits.media_type: {"schema": {"type": "string", "format": "binary"}} for traits in VIDEO_FORMATS.values()
         },
@@ -66,13 +66,13 @@ SCENE_BODY = {
 
 
 def problems(*statuses: HTTPStatus) -> Responses:
-    """The part of a call's `responses` on its errors."""
+    """Return the error responses of a call."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status.value: {"description": status.phrase, "content": content} for status in statuses}
 
 
 def install_openapi(app: FastAPI, store: SceneStore, *, keys: bool) -> None:
-    """Replace the application's OpenAPI document by one with examples that work on the scenes that are loaded."""
+    """Replace the application's OpenAPI document by one with examples for the loaded scenes."""
 
     def build() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -86,7 +86,7 @@ def install_openapi(app: FastAPI, store: SceneStore, *, keys: bool) -> None:
             examples = render_examples(store)
             document["paths"]["/render"]["post"]["requestBody"]["content"]["application/json"]["examples"] = examples
             if not examples:
-                return document  # made anew once a scene is loaded
+                return document  # not stored, so that examples follow once a scene is loaded
             app.openapi_schema = document
         return app.openapi_schema
 
@@ -94,7 +94,7 @@ def install_openapi(app: FastAPI, store: SceneStore, *, keys: bool) -> None:
 
 
 def render_examples(store: SceneStore) -> Examples:
-    """Bodies for `POST /render` that work on the first scene that is loaded; none where none is."""
+    """Return example bodies of `POST /render` for the first loaded scene; none if no scene is loaded."""
     statuses = store.statuses()
     loaded = next((status.name for status in statuses if status.loaded), None)
     if loaded is None:
@@ -103,7 +103,7 @@ def render_examples(store: SceneStore) -> Examples:
 
 
 def _add_keys(document: dict[str, Any]) -> None:
-    """What scope of a key each call needs."""
+    """Add the scope that each call needs."""
     schemes = {
         "bearer": {"type": "http", "scheme": "bearer"},
         "key": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
@@ -127,7 +127,7 @@ def _examples(served: ServedScene, scene: dict[str, str]) -> Examples:
     matrix = {"type": "matrix", "camera_to_world": _rounded(pose), "fx": 500.0, "cx": 200.0, "cy": 200.0}
     bodies = {
         "Around the scene": {"camera": around, "t": t, **size},
-        "From a place to a place": {"camera": look_at, "t": t, **size},
+        "From an eye to a target": {"camera": look_at, "t": t, **size},
         "By matrix and intrinsics": {"camera": matrix, "t": t, **size},
         "Without background, WebP": {
             "camera": around, "t": t, **size, "format": "webp", "quality": 80, "background": "transparent"

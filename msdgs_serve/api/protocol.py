@@ -1,8 +1,7 @@
-"""HTTP/1.1 as uvicorn speaks it, with the time limits that it lacks: on headers, and on clients that don't read.
+"""uvicorn's HTTP/1.1 protocol with time limits on request headers and on clients that don't read their responses.
 
-An answer's head is written together with the first part of its body. Each write wakes the client, and where all cores
-are busy it takes the one on which the loop runs, which has Python's interpreter meanwhile: under four times too much
-load 10 % more frames were answered so.
+The head of a response is written together with the first part of its body. Each write wakes up the client, which may
+preempt the event loop while that holds Python's interpreter: under 4x overload 10 % more frames are answered.
 """
 
 import asyncio
@@ -14,74 +13,74 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from msdgs_serve.api.doorman import Doorman
+from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.errors import MEDIA_TYPE, problem_response
 
-NOTHING_BUFFERED = (b"", False)  # nor an end of the connection
+NOTHING_BUFFERED = (b"", False)  # no data, and the connection is open
 
 
 class LimitedProtocol(H11Protocol):
-    """Closes connections whose headers don't come within `header_seconds`, or that take no bytes for `read_seconds`."""
+    """Closes connections whose headers take longer than `header_seconds` or that read nothing for `read_seconds`."""
 
     def __init__(
         self,
         *arguments: Any,
         header_seconds: float,
         read_seconds: float,
-        doorman: Doorman | None = None,
+        early_rejection: EarlyRejection | None = None,
         **keywords: Any,
     ) -> None:
         super().__init__(*arguments, **keywords)
         self.conn = _HeadWithBody(h11.SERVER)
         self._header_seconds = header_seconds
         self._read_seconds = read_seconds
-        self._doorman = doorman
+        self._doorman = early_rejection
         self._header_timer: asyncio.TimerHandle | None = None
         self._read_timer: asyncio.TimerHandle | None = None
         self._unsent = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Headers are awaited from now on."""
+        """Start the time limit of the first headers."""
         super().connection_made(transport)
-        self._watch_headers()
+        self._start_header_timer()
 
     def data_received(self, data: bytes) -> None:
-        """Headers are complete once h11 has left its idle state; what comes after the answer may begin new ones."""
-        if self._is_turned_away(data):
+        """Stop the time limit when h11 has left its idle state: then the headers are complete."""
+        if self._is_rejected_early(data):
             return
         super().data_received(data)
         if self.conn.their_state is not h11.IDLE:
             self._header_timer = _cancelled(self._header_timer)
         elif self._header_timer is None and not self.transport.is_closing():
-            self._watch_headers()
+            self._start_header_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nothing is awaited any more."""
+        """Cancel all timers."""
         self._header_timer = _cancelled(self._header_timer)
         self._read_timer = _cancelled(self._read_timer)
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """The client reads more slowly than is written: look at it again and again."""
+        """Start checking whether the client reads."""
         super().pause_writing()
-        self._watch_reading()
+        self._start_read_timer()
 
     def resume_writing(self) -> None:
-        """It has read nearly all."""
+        """Stop checking, as the client has read nearly everything."""
         self._read_timer = _cancelled(self._read_timer)
         super().resume_writing()
 
     def timeout_keep_alive_handler(self) -> None:
-        """The answer has been given and nothing more is asked; a client that didn't read all of it is let go too."""
+        """Close an idle connection, even if the client hasn't read all of its response."""
         super().timeout_keep_alive_handler()
-        self._watch_reading()
+        self._start_read_timer()
 
     def send_400_response(self, msg: str) -> None:
-        """A problem like any other, for what is no HTTP."""
-        self._send_problem(http.HTTPStatus.BAD_REQUEST, "That is no HTTP/1.1 request, or its headers are too long.")
+        """Answer invalid HTTP with a problem."""
+        self._send_problem(http.HTTPStatus.BAD_REQUEST, "Not a valid HTTP/1.1 request, or its headers are too long.")
 
-    def _is_turned_away(self, data: bytes) -> bool:
-        """Whether this was a call, and the doorman has answered it: h11 then knows nothing of it."""
+    def _is_rejected_early(self, data: bytes) -> bool:
+        """Whether `data` was a request that was rejected early; h11 doesn't see it then."""
         between = self.conn.their_state is h11.IDLE and self.conn.our_state is h11.IDLE
         if self._doorman is None or not between or self.conn.trailing_data != NOTHING_BUFFERED:
             return False
@@ -94,26 +93,26 @@ class LimitedProtocol(H11Protocol):
         self.timeout_keep_alive_task = self.loop.call_later(self.timeout_keep_alive, self.timeout_keep_alive_handler)
         return True
 
-    def _watch_headers(self) -> None:
-        self._header_timer = self.loop.call_later(self._header_seconds, self._headers_late)
+    def _start_header_timer(self) -> None:
+        self._header_timer = self.loop.call_later(self._header_seconds, self._on_headers_late)
 
-    def _headers_late(self) -> None:
+    def _on_headers_late(self) -> None:
         self._header_timer = None
         if not self.transport.is_closing() and self.conn.their_state is h11.IDLE:
-            detail = f"The headers must be complete after {self._header_seconds:g} s."
+            detail = f"The headers must be complete within {self._header_seconds:g} s."
             self._send_problem(http.HTTPStatus.REQUEST_TIMEOUT, detail)
 
-    def _watch_reading(self) -> None:
+    def _start_read_timer(self) -> None:
         self._unsent = self.transport.get_write_buffer_size()
         if self._unsent and self._read_timer is None:
-            self._read_timer = self.loop.call_later(self._read_seconds, self._look_at_reading)
+            self._read_timer = self.loop.call_later(self._read_seconds, self._check_reading)
 
-    def _look_at_reading(self) -> None:
+    def _check_reading(self) -> None:
         self._read_timer = None
         if self.transport.get_write_buffer_size() >= self._unsent:
             self.transport.abort()
         else:
-            self._watch_reading()
+            self._start_read_timer()
 
     def _send_problem(self, status: http.HTTPStatus, detail: str) -> None:
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
@@ -122,11 +121,11 @@ class LimitedProtocol(H11Protocol):
             head += f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
             self.transport.write(head.encode() + bytes(body))
         self.transport.close()
-        self._watch_reading()
+        self._start_read_timer()
 
 
 class _HeadWithBody(h11.Connection):
-    """Keeps the head of an answer back until more of it is sent."""
+    """Delays the head of a response until the next part of it is sent."""
 
     _head = b""
 
@@ -142,10 +141,12 @@ class _HeadWithBody(h11.Connection):
 
 
 def limited_protocol(
-    header_seconds: float, read_seconds: float, doorman: Doorman | None
+    header_seconds: float, read_seconds: float, early_rejection: EarlyRejection | None
 ) -> Callable[..., LimitedProtocol]:
-    """What uvicorn makes a connection's protocol with."""
-    return partial(LimitedProtocol, header_seconds=header_seconds, read_seconds=read_seconds, doorman=doorman)
+    """Return the protocol factory for uvicorn."""
+    return partial(
+        LimitedProtocol, header_seconds=header_seconds, read_seconds=read_seconds, early_rejection=early_rejection
+    )
 
 
 def _cancelled(timer: asyncio.TimerHandle | None) -> None:

@@ -1,4 +1,4 @@
-"""From a link's query to a request for a frame."""
+"""Convert the query of `GET /render` to the request of `POST /render`."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ PASSED_ON = ("scene", "min_psnr", "steps", "width", "height", "format", "quality
 
 
 def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:
-    """The request that a link means. Raises `InvalidInput` naming the parameter."""
+    """Return the request of a query. Raises `InvalidInput` naming the parameter."""
     given = query.model_dump(exclude_none=True)
     body = {name: given[name] for name in PASSED_ON if name in given}
     body |= {"camera": _camera(given), "t": given.get("t", metadata.time_range[0])}
@@ -44,7 +44,7 @@ def _camera(given: dict[str, Any]) -> dict[str, Any]:
         camera = {"type": "orbit", **DEFAULT_VIEW, **{name: given[name] for name in orbit}}
         unused, kind = [], ""
     if unused:
-        raise InvalidInput(unused[0], f"left out where {kind} is given", given[unused[0]])
+        raise InvalidInput(unused[0], f"left out if {kind} is given", given[unused[0]])
     if not by_name:
         for name in LOOK_AT_FIELDS:
             if name in given:
@@ -56,7 +56,7 @@ def _numbers(name: str, text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise InvalidInput(name, "numbers with commas between them", repr(text[:20])) from None
+        raise InvalidInput(name, "comma-separated numbers", repr(text[:20])) from None
 
 
 def _parameter(location: tuple[str | int, ...]) -> str:

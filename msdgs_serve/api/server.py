@@ -1,4 +1,4 @@
-"""uvicorn with limits on slow connections, and an end that finishes what was begun."""
+"""uvicorn with limits on slow connections and a graceful shutdown."""
 
 import asyncio
 import socket
@@ -8,27 +8,29 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from msdgs_serve.api.doorman import Doorman
+from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.protocol import limited_protocol
 from msdgs_serve.api.service import Phase, Service
 from msdgs_serve.api.settings import Settings
 
-CLOSING_SECONDS = 5  # for what is still being sent when the work is done
+CLOSING_SECONDS = 5  # for responses that are still being sent after all renders
 POLL_SECONDS = 0.05
 
 
 class Server(uvicorn.Server):
     """Serves an application from `create_app`. The first signal drains it, the second ends it at once.
 
-    While it drains, /ready answers 503 on new connections too, so that who balances loads sends requests elsewhere.
+    While it drains, it accepts connections and /ready answers 503, so that load balancers send requests elsewhere.
     """
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         self.service: Service = app.state.service
-        # with keys or other origins a refusal depends on headers, which the application looks at
-        is_plain = settings.api_keys_file is None and not settings.cors_origins
-        doorman = Doorman(self.service.queue, self.service.metrics, settings.max_body_bytes) if is_plain else None
-        protocol = limited_protocol(settings.header_seconds, settings.read_seconds, doorman)
+        # with API keys or CORS, a rejection depends on headers that only the application checks
+        is_simple = settings.api_keys_file is None and not settings.cors_origins
+        early_rejection = (
+            EarlyRejection(self.service.queue, self.service.metrics, settings.max_body_bytes) if is_simple else None
+        )
+        protocol = limited_protocol(settings.header_seconds, settings.read_seconds, early_rejection)
         config = uvicorn.Config(
             app,
             http=protocol,  # pyright: ignore[reportArgumentType]
@@ -40,10 +42,10 @@ class Server(uvicorn.Server):
         )
         super().__init__(config)
         self._drain_seconds = settings.drain_seconds
-        self._drained_by = 0.0
+        self._drain_deadline = 0.0
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen at once, so that /live answers; `on_ready` follows when scenes are loaded."""
+        """Listen at once, so that /live answers; call `on_ready` when scenes are loaded."""
         await super().startup(sockets)
         self._announcement = asyncio.ensure_future(self._announce())
 
@@ -51,22 +53,22 @@ class Server(uvicorn.Server):
         """Whether to stop now."""
         if self.service.phase is Phase.FAILED:
             return True
-        if self.service.phase is Phase.DRAINING and (self._is_idle() or time.monotonic() > self._drained_by):
+        if self.service.phase is Phase.DRAINING and (self._is_idle() or time.monotonic() > self._drain_deadline):
             return True
         return await super().on_tick(counter)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """A signal came."""
+        """Handle a signal."""
         if self.service.phase is Phase.DRAINING:
             self.should_exit = self.force_exit = True
-        self._drained_by = time.monotonic() + self._drain_seconds
+        self._drain_deadline = time.monotonic() + self._drain_seconds
         self.service.drain()
 
     def on_ready(self) -> None:
-        """Called once, when the service can be used."""
+        """Called once when the service is ready."""
 
     def _is_idle(self) -> bool:
-        """Whether nothing is in work or being sent."""
+        """Whether no request is in progress."""
         return not self.server_state.tasks
 
     async def _announce(self) -> None:

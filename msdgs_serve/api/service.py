@@ -1,4 +1,4 @@
-"""What the calls share: scenes, renderer, queue, metrics, settings, and what state the service is in."""
+"""State that the calls share: scenes, renderer, queue, metrics, settings and the phase of the service."""
 
 import logging
 import threading
@@ -14,7 +14,7 @@ import anyio.to_thread
 from fastapi import Depends, FastAPI, Request
 
 from msdgs_serve.api.cameras import resolve_camera
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.schemas import RenderRequest
 from msdgs_serve.api.settings import Settings
@@ -24,17 +24,17 @@ from msdgs_serve.imaging import encode
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.store import SceneStore, ServedScene
-from msdgs_serve.threads import give_way
+from msdgs_serve.threads import lower_priority
 from msdgs_serve.trial import try_scene
 
-LAST_LOOK_SECONDS = 2.0
-"""That the end waits for the thread that looks after files: cut off amid a call, libraries complain on the terminal."""
+JOIN_SECONDS = 2.0
+"""Time that shutdown waits for the thread that refreshes scenes: if it is killed, libraries print errors."""
 
 logger = logging.getLogger("msdgs_serve")
 
 
 class Phase(Enum):
-    """Of a service's life."""
+    """Phases of a service."""
 
     STARTING = "starting"
     READY = "ready"
@@ -43,7 +43,7 @@ class Phase(Enum):
 
 
 class Service:
-    """One for each application."""
+    """The state of an application."""
 
     def __init__(self, store: SceneStore, renderer: Renderer, settings: Settings) -> None:
         self.store = store
@@ -60,23 +60,23 @@ class Service:
 
     @asynccontextmanager
     async def lifespan(self, _: FastAPI) -> AsyncIterator[None]:
-        """Load and warm up beside the event loop, look after changed files, let go of threads in the end."""
-        thread = threading.Thread(target=self._live, name="scenes", daemon=True)
+        """Load scenes, warm up and refresh changed files in a thread, which is joined at the end."""
+        thread = threading.Thread(target=self._load_and_refresh, name="scenes", daemon=True)
         thread.start()
         try:
             yield
         finally:
             self._stopped.set()
             self.queue.shut_down()
-            await anyio.to_thread.run_sync(thread.join, LAST_LOOK_SECONDS)
+            await anyio.to_thread.run_sync(thread.join, JOIN_SECONDS)
 
     def drain(self) -> None:
-        """Finish what there is, refuse what comes."""
+        """Finish admitted requests and reject new ones."""
         self.phase = Phase.DRAINING
         self.queue.close()
 
     def scene(self, name: str | None) -> ServedScene:
-        """The scene of a request, which may leave the name out where only one is served."""
+        """Return the scene of a request; the name may be None if only one scene is served."""
         if name is None:
             names = self.store.names()
             if len(names) != 1:
@@ -85,24 +85,27 @@ class Service:
         return self.store.get(name)
 
     def add_scene(self, name: str, incoming: Path, *, replace: bool) -> ServedScene:
-        """A file that clients sent becomes a scene, once a process of its own could pose it.
+        """Test an uploaded file in a subprocess and add it as the scene `name`.
 
-        Raises `SceneFileInvalid`, and what `SceneStore.add` raises.
+        Raises `SceneFileInvalid` and the errors of `SceneStore.add`.
         """
         try_scene(incoming, self.settings.graph_limits, self.settings.trial_seconds)
         return self.store.add(name, incoming, replace=replace)
 
     def check_uploads(self) -> None:
-        """Raises `Refused` where clients may not add and delete scenes."""
+        """Raise `RequestRejected` if clients may not add and delete scenes."""
         if not self.settings.uploads:
-            raise Refused(HTTPStatus.FORBIDDEN, "forbidden", "Scenes can't be added or deleted here: no --uploads.")
+            raise RequestRejected(
+                HTTPStatus.FORBIDDEN, "forbidden", "The service runs without --uploads: scenes can't be changed."
+            )
 
-    def log_problem(self, error: SceneFileInvalid) -> None:
-        """For the operator: what a client isn't told."""
-        logger.error("%s", error)
+    def log_rejected_upload(self, name: str, error: SceneFileInvalid) -> None:
+        """Log why the file that a client uploaded as `name` is invalid, with details that the client isn't told."""
+        details = f": {error.details}" if error.details else ""
+        logger.info("upload of scene %r rejected: `%s` %s%s", name, error.field, error.problem, details)
 
-    def _live(self) -> None:
-        give_way()  # loading a scene disturbs nobody
+    def _load_and_refresh(self) -> None:
+        lower_priority()  # loading scenes must not delay requests
         started = time.perf_counter()
         try:
             self._warm_up()
@@ -111,7 +114,7 @@ class Service:
             return
         except Exception:
             logger.exception("the service could not start")
-            self.failure, self.phase = MsdgsError("could not start; the log says why"), Phase.FAILED
+            self.failure, self.phase = MsdgsError("could not start; see the log"), Phase.FAILED
             return
         self.start_seconds = time.perf_counter() - started
         if self.phase is Phase.STARTING:
@@ -120,7 +123,7 @@ class Service:
             self._refresh()
 
     def _warm_up(self) -> None:
-        """Load the scenes given as files, and draw one small frame so that the kernels are compiled."""
+        """Load the scenes given as files, and render a small frame to compile the kernels."""
         if self.settings.uploads:
             self.store.clear_incoming()
         files = [path.stem for path in self.settings.scenes if path.is_file()]
@@ -147,11 +150,12 @@ class Service:
                     logger.error("%s", problem)
             self._reported = problems
         except Exception:
-            logger.exception("looking at the scenes' files failed")
+            logger.exception("refreshing the scenes failed")
 
 
 async def _service(request: Request) -> Service:
-    """Not a plain function: those FastAPI calls on a thread, and a health check would wait for one."""
+    """Return the service. A coroutine, as FastAPI runs plain functions in threads, for which health checks would
+    wait."""
     return request.app.state.service
 
 

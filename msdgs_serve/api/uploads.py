@@ -1,4 +1,4 @@
-"""What clients may store: how many scenes, how many bytes, in all and each key, and how much of the disk is left."""
+"""Quotas of uploaded scenes: numbers and bytes, in all and per API key, and free disk space."""
 
 import errno
 import shutil
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import anyio
 
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.store import SUFFIX
 
@@ -23,82 +23,82 @@ MIB = 1 << 20
 
 @dataclass(eq=False)
 class Stored:
-    """A scene in the folder for uploads, or on its way there."""
+    """A scene in the folder for uploads, or an upload in progress."""
 
     name: str
-    owner: str | None  # the key that sent it; None: the operator, or a client where there are no keys
+    owner: str | None  # the API key of the upload; None: the operator, or a client without a key
     bytes: int = 0
 
 
 class Uploads:
-    """Counts what lies in the folder for uploads and what is on its way there. Safe to use from several threads.
+    """Counts scenes in the folder for uploads and uploads in progress. Safe to use from several threads.
 
-    Whose key a scene came with is kept in a hidden file beside it.
+    The owner of a scene is stored in a hidden file beside it.
     """
 
     def __init__(self, folder: Path | None, settings: Settings) -> None:
-        self._folder = folder or Path()  # without one uploads are refused before
+        self._folder = folder or Path()  # without a folder uploads are rejected earlier
         self._settings = settings
         self._stored: dict[str, Stored] = {}
-        self._coming: set[Stored] = set()
+        self._incoming: set[Stored] = set()
         self._lock = threading.Lock()
         self.opening = anyio.CapacityLimiter(OPENED_AT_ONCE)
-        """Of threads that open what has come: more would wait for each other, and frames for a thread."""
+        """Limits the threads that open uploads: more would slow each other and the renders down."""
 
     def scan(self) -> None:
-        """Look at what is there; other processes may write into the folder too."""
+        """Read the folder, into which other processes may write too."""
         found: dict[str, Stored] = {}
         for file in self._folder.glob(f"*{SUFFIX}"):
-            with suppress(OSError):  # it is gone meanwhile
+            with suppress(OSError):  # it was removed meanwhile
                 found[file.stem] = Stored(file.stem, self._owner(file.stem), file.stat().st_size)
         with self._lock:
             self._stored = found
 
     @contextmanager
-    def room(self, name: str, owner: str | None) -> Iterator[Stored]:
-        """Around an upload, after a `scan`. Raises `Refused` (507) where it may not be stored, or the disk is full."""
+    def receiving(self, name: str, owner: str | None) -> Iterator[Stored]:
+        """Count an upload in the context, after `scan`. Raises `RequestRejected` (507) for quotas and full disks."""
         upload = Stored(name, owner)
         with self._lock:
-            self._coming.add(upload)
+            self._incoming.add(upload)
         try:
             self.grow(upload, 0)
             yield upload
         except OSError as error:
             if error.errno not in DISK_IS_FULL:
                 raise
-            raise _no_room("disk_full", "The disk of the service is full.") from None
+            raise _storage_full("disk_full", "The disk of the service is full.") from None
         finally:
             with self._lock:
-                self._coming.discard(upload)
+                self._incoming.discard(upload)
 
     def grow(self, upload: Stored, size: int) -> None:
-        """So many bytes more have come. Raises `Refused`: 413 for a file that is too large, 507 for all else."""
+        """Count received bytes. Raises `RequestRejected`: 413 for a file that is too large, 507 for quotas."""
         limits = self._settings
         upload.bytes += size
         if upload.bytes > limits.max_scene_megabytes * MIB:
-            detail = f"A scene file must be at most {limits.max_scene_megabytes} MiB."
-            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "large_body", detail, field="body")
+            detail = f"A scene file must be at limit {limits.max_scene_megabytes} MiB."
+            raise RequestRejected(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "large_body", detail, field="body")
         if shutil.disk_usage(self._folder).free < limits.min_free_megabytes * MIB + size:
-            raise _no_room("disk_full", f"The service leaves {limits.min_free_megabytes} MiB of its disk free.")
+            raise _storage_full("disk_full", f"The service keeps {limits.min_free_megabytes} MiB of its disk free.")
         with self._lock:
-            everything = [each for each in self._stored.values() if each.name != upload.name] + list(self._coming)
+            everything = [each for each in self._stored.values() if each.name != upload.name] + list(self._incoming)
         _check(everything, limits.max_scenes, limits.max_scenes_megabytes, "The service")
         if upload.owner is not None:
             own = [each for each in everything if each.owner == upload.owner]
             _check(own, limits.max_key_scenes, limits.max_key_megabytes, "This key")
 
     def added(self, upload: Stored) -> None:
-        """It has become a scene."""
+        """Record that an upload was added as a scene."""
         if upload.owner is None:
             self._owner_file(upload.name).unlink(missing_ok=True)
         else:
             self._owner_file(upload.name).write_text(upload.owner)
         with self._lock:
             self._stored[upload.name] = upload
-            self._coming.discard(upload)
+            self._incoming.discard(upload)
 
     def removed(self, name: str) -> None:
-        """The scene is gone."""
+        """Record that a scene was deleted."""
         self._owner_file(name).unlink(missing_ok=True)
         with self._lock:
             self._stored.pop(name, None)
@@ -113,12 +113,12 @@ class Uploads:
         return self._folder / f".{name}{OWNER_SUFFIX}"
 
 
-def _check(scenes: list[Stored], most: int, megabytes: int, whose: str) -> None:
-    if len(scenes) > most:
-        raise _no_room("quota", f"{whose} has room for {most} scenes; delete one first.")
+def _check(scenes: list[Stored], limit: int, megabytes: int, owner: str) -> None:
+    if len(scenes) > limit:
+        raise _storage_full("quota", f"{owner} may store {limit} scenes; delete one first.")
     if sum(each.bytes for each in scenes) > megabytes * MIB:
-        raise _no_room("quota", f"{whose} has room for {megabytes} MiB of scenes; delete some first.")
+        raise _storage_full("quota", f"{owner} may store {megabytes} MiB of scenes; delete some first.")
 
 
-def _no_room(kind: str, detail: str) -> Refused:
-    return Refused(HTTPStatus.INSUFFICIENT_STORAGE, kind, detail, field="body")
+def _storage_full(kind: str, detail: str) -> RequestRejected:
+    return RequestRejected(HTTPStatus.INSUFFICIENT_STORAGE, kind, detail, field="body")

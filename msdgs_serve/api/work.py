@@ -1,4 +1,4 @@
-"""The queue of renders: bounded, fair, with a time limit for each, and without work for clients that are gone."""
+"""The render queue: bounded, fair between clients, with a time limit, and cancelled when a client disconnects."""
 
 import asyncio
 import math
@@ -15,14 +15,14 @@ from typing import Any, TypeVar
 
 from starlette.requests import Request
 
-from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.errors import ClientGone, RequestRejected
 from msdgs_serve.api.turns import Turns
-from msdgs_serve.threads import give_way
-from msdgs_serve.watch import Watch
+from msdgs_serve.render_job import RenderJob
+from msdgs_serve.threads import lower_priority
 
 Result = TypeVar("Result")
 
-LONGEST_RETRY = 60
+MAX_RETRY_SECONDS = 60
 FIRST_GUESS = 0.5  # seconds a piece of work takes, until one was measured
 SMOOTHING = 0.1
 UNKNOWN = "unknown"
@@ -30,23 +30,23 @@ UNKNOWN = "unknown"
 
 @dataclass(eq=False)
 class _Call:
-    """One that was admitted, or will be where it has work."""
+    """A call that is admitted, or will be with its first work."""
 
     client: str
     streamed: bool
     has_place: bool = False
-    future: Future[Any] | None = None  # of its last piece of work
+    future: Future[Any] | None = None  # of its latest work
 
 
 @dataclass(eq=False)
 class _Piece:
-    """Work in line."""
+    """A piece of waiting work."""
 
     future: Future[Any]
     work: Callable[[], Any]
 
     def do(self) -> None:
-        """Unless nobody waits for it."""
+        """Run the work, unless it was cancelled."""
         if self.future.set_running_or_notify_cancel():
             try:
                 result = self.work()
@@ -60,17 +60,17 @@ _call: ContextVar[_Call | None] = ContextVar("call", default=None)
 
 
 class WorkQueue:
-    """`workers` pieces of work at once and places for `waiting` more calls; what comes on top is refused.
+    """Runs `workers` pieces of work at once, with places for `waiting` more calls; further calls are rejected.
 
-    A client has at most as many places as it leaves free, and streamed calls, whose work comes in parts, have at most
-    half of all. Whose work is done next: see `Turns`.
+    A client may hold at most as many places as are left for others, and streamed calls, whose work has several parts,
+    at most half of all places. `Turns` decides the order.
     """
 
     def __init__(self, workers: int, waiting: int, seconds: float) -> None:
         self._workers = workers
         self._places = workers + waiting
         self._seconds = seconds
-        self._executor = ThreadPoolExecutor(workers, "render", initializer=give_way)
+        self._executor = ThreadPoolExecutor(workers, "render", initializer=lower_priority)
         self._lock = threading.Lock()
         self._turns: Turns[_Piece] = Turns()
         self._held: Counter[str] = Counter()  # places by client
@@ -81,20 +81,20 @@ class WorkQueue:
 
     @property
     def waiting(self) -> int:
-        """Places that are taken, and whose work isn't being done yet."""
+        """Number of admitted calls whose work isn't running."""
         return max(0, self._held.total() - self._running)
 
     @property
     def running(self) -> int:
-        """Pieces of work being done."""
+        """Number of running pieces of work."""
         return self._running
 
     @contextmanager
     def admitted(self, client: str, *, streamed: bool = False, at_once: bool = True) -> Iterator[None]:
-        """Around a call: it has a place from now, or unless `at_once` from its first work, until that is done.
+        """Hold a place for a call within the context, from now if `at_once`, else from its first work, until it ends.
 
-        A streamed call has its place to the end, and no later work of any call is refused. Raises `Refused` where there
-        is no place for it.
+        A streamed call holds its place to the end; later work of an admitted call is never rejected. Raises
+        `RequestRejected` if there is no place.
         """
         call = _Call(client, streamed)
         if at_once:
@@ -110,57 +110,57 @@ class WorkQueue:
             else:
                 call.future.add_done_callback(lambda _: self._leave(call))
 
-    def refuse_if_full(self, client: str) -> None:
-        """Raise `Refused` where a call that isn't streamed would not be admitted now."""
+    def reject_if_full(self, client: str) -> None:
+        """Raise `RequestRejected` if a call that isn't streamed would not be admitted now."""
         with self._lock:
-            self._refuse_if_full(client)
+            self._reject_if_full(client)
 
     def close(self) -> None:
-        """Refuse new work; what is there is finished."""
+        """Reject new calls, and finish admitted ones."""
         self._closed = True
 
     def shut_down(self) -> None:
-        """Let go of the threads; what has not begun never will."""
+        """Stop the threads and drop waiting work."""
         self.close()
         self._executor.shutdown(wait=False, cancel_futures=True)
 
-    async def run(self, work: Callable[[], Result], watch: Watch, *, part: bool = False) -> Result:
-        """Do `work` when its turn comes; where the call wasn't admitted before, it may be refused here.
+    async def run(self, work: Callable[[], Result], job: RenderJob, *, part: bool = False) -> Result:
+        """Run `work` when its turn comes, and return its result. A call that isn't admitted yet may be rejected.
 
-        `part`: of work that goes on, so that the call keeps its place; single frames of others come in between. Whoever
-        awaits this may be cancelled: work that waits is dropped, and work that runs is ended by its watch.
+        `part` is set for work that has further parts, so that the call keeps its place; single frames of others come in
+        between. If the caller is cancelled, waiting work is dropped and running work is cancelled through its job.
 
         Raises:
-            Refused: with 503 where the queue is full or closed, with 504 when the time is over.
+            RequestRejected: with 503 if the queue is full or closed, with 504 after the time limit.
         """
-        piece = self._submit(work, watch, part=part)
+        piece = self._submit(work, job, part=part)
         waiter = asyncio.wrap_future(piece.future)
-        waiter.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody may be left to look
+        waiter.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may never be awaited
         try:
             async with asyncio.timeout(self._seconds):
                 return await asyncio.shield(waiter)
         except TimeoutError:
-            detail = f"It took longer than {self._seconds:g} s, the time limit of a request."
-            raise Refused(HTTPStatus.GATEWAY_TIMEOUT, "deadline", detail) from None
+            detail = f"The request took longer than its time limit of {self._seconds:g} s."
+            raise RequestRejected(HTTPStatus.GATEWAY_TIMEOUT, "deadline", detail) from None
         finally:
             if not piece.future.done():
-                watch.stop()
+                job.cancel()
                 if piece.future.cancel():
                     with self._lock:
                         self._turns.remove(piece)
 
-    def _submit(self, work: Callable[[], Result], watch: Watch, *, part: bool) -> _Piece:
+    def _submit(self, work: Callable[[], Result], job: RenderJob, *, part: bool) -> _Piece:
         submitted = time.perf_counter()
         admitted = _call.get()
         call = admitted or _Call(UNKNOWN, streamed=False)
 
         def timed() -> Result:
             started = time.perf_counter()
-            watch.add("queue", started - submitted)
+            job.add("queue", started - submitted)
             with self._lock:
                 self._running += 1
             try:
-                watch.check()
+                job.check()
                 return work()
             finally:
                 with self._lock:
@@ -170,7 +170,7 @@ class WorkQueue:
         piece = _Piece(Future(), timed)
         with self._lock:
             if not call.has_place:
-                self._take_place(call, again=call.future is not None)
+                self._take_place(call, admitted_before=call.future is not None)
             call.future = piece.future
             self._turns.add(piece, call.client, part=part)
         if admitted is None or not (part or call.streamed):
@@ -184,9 +184,9 @@ class WorkQueue:
         if piece is not None:
             piece.do()
 
-    def _take_place(self, call: _Call, *, again: bool = False) -> None:
-        if not again:
-            self._refuse_if_full(call.client, streamed=call.streamed)
+    def _take_place(self, call: _Call, *, admitted_before: bool = False) -> None:
+        if not admitted_before:
+            self._reject_if_full(call.client, streamed=call.streamed)
         self._held[call.client] += 1
         self._streams += call.streamed
         call.has_place = True
@@ -200,28 +200,28 @@ class WorkQueue:
                 if not self._held[call.client]:
                     del self._held[call.client]
 
-    def _refuse_if_full(self, client: str, *, streamed: bool = False) -> None:
+    def _reject_if_full(self, client: str, *, streamed: bool = False) -> None:
         if self._closed:
-            detail = "The service is about to stop; ask again, another one may answer."
-            raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "draining", detail, retry_after=1)
+            detail = "The service is stopping; try again, another instance may answer."
+            raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "draining", detail, retry_after=1)
         taken = self._held.total()
         if taken >= self._places:
             detail = f"All {self._places} places for work and in the queue are taken; try again later."
         elif self._held[client] >= self._places - taken:
             detail = f"You have {self._held[client]} places for work and in the queue, as many as are left for others."
         elif streamed and self._streams >= max(1, self._places // 2):
-            detail = f"All {self._streams} places for batches and films are taken; try again later."
+            detail = f"All {self._streams} places for batches and videos are taken; try again later."
         else:
             return
         seconds = math.ceil(taken * self._mean_seconds / self._workers)
-        retry_after = min(max(1, seconds), LONGEST_RETRY)
-        raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
+        retry_after = min(max(1, seconds), MAX_RETRY_SECONDS)
+        raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
 
 
 async def unless_gone(request: Request, call: Awaitable[Result]) -> Result:
-    """The result of `call`; where the client closes the connection first, `call` is cancelled.
+    """Return the result of `call`, or cancel it and raise `ClientGone` if the client disconnects first.
 
-    The body of the request must have been read. Raises `ClientGone`.
+    The body of the request must have been read.
     """
     task = asyncio.ensure_future(call)
     gone = asyncio.ensure_future(_disconnection(request))

@@ -1,9 +1,9 @@
-"""What a render is as an image, and its encoders. No HTTP here."""
+"""Rendered images and their encoders. Independent of HTTP."""
 
+from msdgs_serve.imaging.display import DepthRange
 from msdgs_serve.imaging.encode import EncodingFailed, encode
 from msdgs_serve.imaging.formats import CHANNELS, FORMATS, Channel, ImageFormat
 from msdgs_serve.imaging.image import Image, average, linear_to_srgb, srgb_to_linear
-from msdgs_serve.imaging.images import DepthRange
 
 __all__ = [
     "CHANNELS",

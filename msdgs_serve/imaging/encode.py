@@ -1,4 +1,4 @@
-"""Image → bytes of a file, through OpenImageIO and NumPy. Equal images give equal bytes."""
+"""Encode images as files with OpenImageIO and NumPy. Equal images give equal bytes."""
 
 import io
 import os
@@ -10,27 +10,27 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
+from msdgs_serve.imaging.display import DepthRange, channel_of, display_image
 from msdgs_serve.imaging.exr_header import camera_attributes
 from msdgs_serve.imaging.formats import CHANNELS, DEFAULT_QUALITY, FORMATS, Channel, ImageFormat, default_channels
 from msdgs_serve.imaging.image import Image
-from msdgs_serve.imaging.images import DepthRange, channel_of, display_image
 from msdgs_serve.scene import InvalidInput, MsdgsError
 
 Attributes = dict[str, int | float | str]
 
 DISPLAY_ATTRIBUTES: Attributes = {
     "oiio:ColorSpace": "srgb_rec709_scene",
-    "oiio:UnassociatedAlpha": 1,  # the pixels are straight: without it the writer divides by alpha once more
+    "oiio:UnassociatedAlpha": 1,  # straight alpha: otherwise the writer divides by alpha
 }
 PNG_ATTRIBUTES: Attributes = {
     "png:compressionLevel": 1,
-    "png:filter": 64,  # Paeth for every row; at level 1: 2 times faster than trying all filters, same size
+    "png:filter": 64,  # Paeth for every row: at level 1 twice as fast as trying all filters, same size
 }
 WEBP_ATTRIBUTES: Attributes = {"webp:method": 0}  # 4 times faster than the default with soft alpha, 10-30 % larger
 EXR_ATTRIBUTES: Attributes = {
     "compression": "zips",  # 4 times faster than "zip" while other threads compute, files 4 % larger
     "oiio:ColorSpace": "lin_rec709_scene",
-    "DateTime": "1970:01:01 00:00:00",  # otherwise the writer puts in the time of writing
+    "DateTime": "1970:01:01 00:00:00",  # otherwise the writer stores the current time
 }
 # CIE xy of red, green, blue and white
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -43,14 +43,14 @@ EXR_NAMES: dict[Channel, tuple[str, ...]] = {
 }
 
 
-MOST_AT_ONCE = 1 << 30
-"""Bytes that a system reads in one piece."""
+MAX_READ_BYTES = 1 << 30
+"""Limit of bytes per read, below that of any system."""
 
-oiio.attribute("threads", 1)  # 3 times as fast for a 400 × 400 JPEG as with its own, which wait for work by spinning
+oiio.attribute("threads", 1)  # 3 times as fast for a 400 × 400 JPEG as with its own threads, which busy-wait
 
 
 class EncodingFailed(MsdgsError):
-    """The image library refused to write an image."""
+    """The image library failed to write an image."""
 
 
 def encode(
@@ -60,9 +60,9 @@ def encode(
     channels: Sequence[Channel] | None = None,
     depth_range: DepthRange | None = None,
 ) -> bytes:
-    """The image as a file of `image_format`.
+    """Return the image as a file of `image_format`.
 
-    PNG, JPEG and WebP hold an 8-bit image: sRGB with straight alpha where the image is transparent (JPEG can't be),
+    PNG, JPEG and WebP hold an 8-bit image: sRGB with straight alpha if the image is transparent (not in JPEG),
     or a single channel. EXR holds any channels as 32-bit floats: scene-linear Rec.709 premultiplied R, G, B, A and
     depth Z, motion as forward.u and forward.v, gaussians, with the camera and the time in its header. NPY holds float32
     [H, W, C] as rendered: sRGB-encoded color.
@@ -75,7 +75,7 @@ def encode(
     if image_format == "exr":
         return _write(_exr_pixels(image, channels), _exr_spec(image, channels), image_format)
     pixels = display_image(image, channels[0], depth_range)
-    if pixels.shape[2] == 1 and not traits.holds_grey:
+    if pixels.shape[2] == 1 and not traits.holds_gray:
         pixels = np.repeat(pixels, 3, axis=2)
     spec = oiio.ImageSpec(image.width, image.height, pixels.shape[2], oiio.UINT8)
     _set(spec, DISPLAY_ATTRIBUTES)
@@ -96,7 +96,7 @@ def check_encodable(
     quality: int | None,
     channels: Sequence[Channel] | None = None,
 ) -> None:
-    """Raise `InvalidInput` for what `encode` would refuse, so that nothing is rendered in vain."""
+    """Raise `InvalidInput` for arguments that `encode` would reject, before anything is rendered."""
     if image_format not in FORMATS:
         raise InvalidInput("format", f"one of {', '.join(FORMATS)}", image_format)
     traits = FORMATS[image_format]
@@ -114,13 +114,13 @@ def check_encodable(
 
 
 def numbers(image: Image, channels: Sequence[Channel]) -> np.ndarray:
-    """[H, W, C] float32: the channels as rendered, in the order asked for; color sRGB-encoded."""
+    """Return the channels as rendered, [H, W, C] float32, in the given order; color is sRGB-encoded."""
     parts = [channel_of(image, channel) for channel in channels]
     return np.dstack(parts).astype(np.float32, copy=False)
 
 
 def npy(array: np.ndarray) -> bytes:
-    """The array as a .npy file."""
+    """Return the array as a .npy file."""
     file = io.BytesIO()
     np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
     return file.getvalue()
@@ -129,15 +129,15 @@ def npy(array: np.ndarray) -> bytes:
 def _check_channels(channels: Sequence[Channel], image_format: ImageFormat) -> None:
     for channel in channels:
         if channel not in CHANNELS:
-            raise InvalidInput("channels", f"of {', '.join(CHANNELS)}", channel)
+            raise InvalidInput("channels", f"a list of {', '.join(CHANNELS)}", channel)
     if not channels or len(set(channels)) < len(channels):
         raise InvalidInput("channels", "a list of different channels", list(channels))
     if len(channels) > 1 and not FORMATS[image_format].holds_float:
-        raise InvalidInput("channels", f"a single one for {image_format}", list(channels))
+        raise InvalidInput("channels", f"a single channel for {image_format}", list(channels))
 
 
 def _exr_pixels(image: Image, channels: Sequence[Channel]) -> np.ndarray:
-    """[H, W, C] float32. Alpha is 1 everywhere unless the image is transparent."""
+    """Return channels in linear light, [H, W, C] float32. Alpha is 1 unless the image is transparent."""
 
     def part(channel: Channel) -> np.ndarray:
         if channel == "rgb":
@@ -180,14 +180,14 @@ def _write(pixels: np.ndarray, spec: oiio.ImageSpec, image_format: ImageFormat) 
 
 @contextmanager
 def _scratch_file() -> Iterator[tuple[str, Callable[[], bytes]]]:
-    """A path to write to, and what reads it; in memory where the system can (Linux).
+    """Yield a path to write to and a function that reads it; in memory on Linux.
 
-    Every call into the system lets another thread have the interpreter, so there are few.
+    Every system call may pass the interpreter to another thread, so there are few.
     """
     if hasattr(os, "memfd_create"):
         handle = os.memfd_create("image")
         try:
-            yield f"/proc/self/fd/{handle}", lambda: _whole(handle)
+            yield f"/proc/self/fd/{handle}", lambda: _read_all(handle)
         finally:
             os.close(handle)
     else:
@@ -196,6 +196,6 @@ def _scratch_file() -> Iterator[tuple[str, Callable[[], bytes]]]:
             yield str(path), path.read_bytes
 
 
-def _whole(handle: int) -> bytes:
+def _read_all(handle: int) -> bytes:
     size = os.fstat(handle).st_size
-    return b"".join(os.pread(handle, MOST_AT_ONCE, start) for start in range(0, size, MOST_AT_ONCE))
+    return b"".join(os.pread(handle, MAX_READ_BYTES, start) for start in range(0, size, MAX_READ_BYTES))

@@ -1,4 +1,4 @@
-"""What an EXR file says of its camera and its time, by OpenEXR's standard attributes and our own."""
+"""Attributes of EXR files for camera and time: OpenEXR's standard ones and our own."""
 
 from typing import Any
 
@@ -9,14 +9,14 @@ from msdgs_serve.scene import Camera
 TypedAttributes = dict[str, tuple[str, Any]]
 
 TO_LEFT_HANDED = np.diag([1.0, -1.0, 1.0, 1.0])
-"""OpenEXR's camera space: x right, y up, z forward; ours has y down."""
+"""To OpenEXR's camera space (x right, y up, z forward) from ours, which has y down."""
 
 
 def camera_attributes(camera: Camera, t: float) -> TypedAttributes:
-    """OpenEXR's `worldToCamera` and `worldToNDC`, under the names that OpenImageIO has for them, and ours.
+    """Return OpenEXR's `worldToCamera` and `worldToNDC`, under OpenImageIO's names, and our attributes.
 
-    OpenEXR multiplies row vectors from the left, so that matrices are transposed. NDC is (0, 0) at the upper left
-    corner of the image and (1, 1) at the lower right. `msdgs:camera_to_world` has OpenCV axes; it is transposed too.
+    OpenEXR uses row vectors, so that all matrices are transposed. NDC is (0, 0) at the upper left corner of the image
+    and (1, 1) at the lower right. `msdgs:camera_to_world` has OpenCV axes.
     """
     world_to_camera = camera.world_to_camera
     to_ndc = np.array(
@@ -38,5 +38,5 @@ def camera_attributes(camera: Camera, t: float) -> TypedAttributes:
 
 
 def _rows(matrix: np.ndarray) -> tuple[float, ...]:
-    """For row vectors."""
+    """Return the transposed matrix in row-major order."""
     return tuple(matrix.T.ravel().tolist())

@@ -1,4 +1,4 @@
-"""The file formats of an image and the channels that it can hold: one row each."""
+"""The table of image file formats and their capabilities."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -11,15 +11,15 @@ CHANNELS: tuple[Channel, ...] = get_args(Channel)
 
 @dataclass(frozen=True)
 class FormatTraits:
-    """What a format can hold and how it is announced."""
+    """The capabilities and media type of a format."""
 
     media_type: str
     extension: str
     plugin: str | None  # OpenImageIO's name for the writer; None: written by NumPy
     holds_alpha: bool
-    holds_grey: bool  # an image of one channel
+    holds_gray: bool  # images of one channel
     takes_quality: bool  # lossy, with a quality from 1 to 100
-    holds_float: bool  # any channels as numbers; others hold one image, of color or of one channel
+    holds_float: bool  # any channels as numbers; others hold color or a single channel
     max_side: int  # pixels
 
 
@@ -36,5 +36,5 @@ DEFAULT_QUALITY = 90
 
 
 def default_channels(image_format: ImageFormat) -> tuple[Channel, ...]:
-    """What a file holds where nothing is said: color, alpha and depth as numbers, or an image."""
+    """Return the default channels: color, alpha and depth for formats of numbers, else color."""
     return ("rgb", "alpha", "depth") if FORMATS[image_format].holds_float else ("rgb",)

@@ -1,4 +1,4 @@
-"""An image of named float channels, and the color arithmetic its encoders need."""
+"""An image of named float channels, and its color conversions."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,18 +13,18 @@ from msdgs_serve.scene.gaussians import FloatArray
 class Image:
     """One rendered frame, rows from the top.
 
-    `rgb` is display-referred (sRGB-encoded) and already blended with the background; where `transparent`, there is no
-    background and `rgb` is premultiplied by `alpha`. Values above 1 are possible.
+    `rgb` is display-referred (sRGB-encoded) and blended with the background; if `transparent`, there is no background
+    and `rgb` is premultiplied by `alpha`. Values above 1 are possible.
     """
 
     rgb: FloatArray  # [H, W, 3] sRGB-encoded, >= 0
-    alpha: FloatArray  # [H, W] coverage by Gaussians in [0, 1], whatever the background
-    depth: FloatArray | None = None  # [H, W] along the camera axis, scene units; infinite where alpha is 0
+    alpha: FloatArray  # [H, W] coverage by Gaussians in [0, 1]
+    depth: FloatArray | None = None  # [H, W] along the camera axis, scene units; infinite if alpha is 0
     transparent: bool = False
-    camera: Camera | None = None  # that saw it, for formats that can say so
-    t: float | None = None  # when, in the scene's time
-    motion: FloatArray | None = None  # [H, W, 2] pixels to the right and down, to where it is later; 0 for nothing
-    gaussians: FloatArray | None = None  # [H, W] how many add to each pixel
+    camera: Camera | None = None  # for formats that store it
+    t: float | None = None  # scene time
+    motion: FloatArray | None = None  # [H, W, 2] displacement, pixels to the right and down; 0 if alpha is 0
+    gaussians: FloatArray | None = None  # [H, W] number that contribute to each pixel
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3:
@@ -43,22 +43,21 @@ class Image:
         return self.rgb.shape[0]
 
     def as_shown(self) -> FloatArray:
-        """sRGB-encoded: [H, W, 3], or [H, W, 4] with straight alpha where `transparent`."""
+        """Return sRGB-encoded color, [H, W, 3], or [H, W, 4] with straight alpha if `transparent`."""
         if not self.transparent:
             return self.rgb
         return np.concatenate([_straight(self.rgb, self.alpha), self.alpha[..., None]], axis=2)
 
     def display_pixels(self) -> np.ndarray:
-        """The same in 8 bits, rounded to nearest and cut."""
+        """Return `as_shown` in 8 bits, rounded to nearest and clipped."""
         scaled = self.as_shown() * 255
         scaled += 0.5  # in place: 4 times faster than one expression
         return np.clip(scaled, 0, 255, out=scaled).astype(np.uint8)
 
     def linear_rgb(self) -> FloatArray:
-        """[H, W, 3] scene-linear Rec.709, premultiplied by alpha where `transparent`.
+        """Return scene-linear Rec.709 color, [H, W, 3], premultiplied by alpha if `transparent`.
 
-        The transfer function is not linear, so that it is undone on straight color, between taking alpha out and
-        putting it back.
+        The transfer function is not linear and is inverted on straight color.
         """
         if not self.transparent:
             return srgb_to_linear(self.rgb)
@@ -66,8 +65,8 @@ class Image:
 
 
 def average(images: Iterable[Image]) -> Image:
-    """The mean of frames of one camera: color in linear light, depth weighted by alpha, numbers of
-    Gaussians. Keeps one frame at a time."""
+    """Return the mean of frames of one camera: color in linear light, depth weighted by alpha, numbers of Gaussians.
+    Keeps one frame in memory at a time."""
     count, first = 0, None
     light = coverage = depth = gaussians = np.zeros(())
     for image in images:
@@ -98,15 +97,15 @@ def average(images: Iterable[Image]) -> Image:
 
 
 def srgb_to_linear(encoded: FloatArray) -> FloatArray:
-    """Undo the sRGB transfer function (IEC 61966-2-1); values above 1 follow the same power."""
+    """Invert the sRGB transfer function (IEC 61966-2-1), extended to values above 1."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(linear: FloatArray) -> FloatArray:
-    """The sRGB transfer function (IEC 61966-2-1); values above 1 follow the same power."""
+    """Apply the sRGB transfer function (IEC 61966-2-1), extended to values above 1."""
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def _straight(premultiplied: FloatArray, alpha: FloatArray) -> FloatArray:
-    """[H, W, 3] color with alpha taken out; where alpha is 0, premultiplied color is 0 and stays so."""
+    """Return straight color, [H, W, 3]; 0 if alpha is 0."""
     return premultiplied / np.where(alpha > 0, alpha, 1)[..., None]

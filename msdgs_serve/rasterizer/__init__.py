@@ -1,4 +1,4 @@
-"""Gaussian splats on a CPU: tile-based, exact, deterministic. `rasterize` is the entrance."""
+"""Tile-based, exact and deterministic Gaussian splatting on a CPU; call `rasterize`."""
 
 from msdgs_serve.rasterizer.rasterize import Rendering, rasterize
 from msdgs_serve.rasterizer.view import GSPLAT, INRIA, RasterizerOptions, as_trained

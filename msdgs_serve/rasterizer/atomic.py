@@ -1,4 +1,4 @@
-"""Counters that several threads of compiled kernels take their work from."""
+"""Atomic counters by which threads of compiled kernels share work."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,13 +11,13 @@ from numba.extending import lower_builtin, type_callable
 from msdgs_serve.rasterizer.jit import kernel
 
 TAKEN, DONE = range(2)
-"""Of the counters [2] of a piece of work: how many of its parts are taken, and how many of these are done."""
-PATIENCE = 5000
-"""Looks at what others do, 0.03 ms and more; a thread that sleeps takes twice as long to wake up."""
+"""Indices of the counters [2] of a piece of work: parts that threads have taken, and parts that are done."""
+MAX_POLLS = 5000
+"""Polls of other threads' progress, at least 0.03 ms in all; waking a sleeping thread takes twice as long."""
 
 
 def fetch_add(counters: np.ndarray, place: int, amount: int) -> int:
-    """Add to an int64 of `counters`; returns what it was. Without the compiler not safe from several threads."""
+    """Add to an int64 of `counters` and return its old value. Atomic in compiled code only."""
     before = int(counters[place])
     counters[place] += amount
     return before
@@ -38,8 +38,8 @@ def _lower_fetch_add(context: Any, builder: Any, signature: Any, values: Any) ->
 
 @kernel
 def all_done(counters: np.ndarray, count: int) -> bool:
-    """Whether `count` parts are done, perhaps by other threads, now or in a moment."""
-    for _ in range(PATIENCE):
+    """Whether `count` parts are done; polls for a moment while other threads finish theirs."""
+    for _ in range(MAX_POLLS):
         if fetch_add(counters, DONE, 0) >= count:
             return True
     return False

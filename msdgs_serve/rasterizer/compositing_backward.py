@@ -1,8 +1,8 @@
-"""Gradient of the blending. Runs front to back like the forward pass and repeats its arithmetic, so that it takes the
-very decisions (which splat is drawn in which pixel) that the image was made with.
+"""Gradient of the blending. Runs front to back and repeats the arithmetic of the forward pass, so that it draws exactly
+the same splats in each pixel.
 
-For a pixel with gradient g, the splat's share of the loss is s = color · g_rgb + g_alpha and
-d loss / d alpha_i = T_i s_i - (what all splats behind it and the background add) / (1 - alpha_i).
+For a pixel with gradient g, the splat's contribution to the loss is s = color · g_rgb + g_alpha and
+d loss / d alpha_i = T_i s_i - (contributions of all splats behind it and the background) / (1 - alpha_i).
 """
 
 import itertools
@@ -10,57 +10,37 @@ import math
 
 import numpy as np
 
+from msdgs_serve.rasterizer.alpha import PixelLimits, exponent_terms, log2_alpha, pixel_limits
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
-from msdgs_serve.rasterizer.compositing import (
-    BLOCK_SIDE,
-    BLOCKS,
-    PIXELS,
-    TILES_A_TURN,
-    Frame,
-    PixelLimits,
-    exponent_of,
-    grid_of_a_tile,
-    log2_alpha,
-    pixel_limits,
-    place_in_tile,
-    touched_blocks,
-)
+from msdgs_serve.rasterizer.compositing import TILES_PER_TURN, Frame
 from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
-from msdgs_serve.rasterizer.lane_types import LANES
-from msdgs_serve.rasterizer.lanes import bits_of, filled, fma, lowest_bit, minimum, select, spread
-from msdgs_serve.rasterizer.lanes_memory import load, load_square, load_square_of_triples, prefetch, store, sums_of
-from msdgs_serve.rasterizer.projection import (
-    BLUE,
-    DEPTH,
-    EXTENT_X,
-    GREEN,
-    RECORD,
-    RED,
-    Splats,
-    X,
-    Y,
-)
+from msdgs_serve.rasterizer.splats import BLUE, DEPTH, EXTENT_X, GREEN, RECORD, RED, Splats, X, Y
+from msdgs_serve.rasterizer.tile_blocks import BLOCK_SIDE, BLOCKS, PIXELS, grid_of_a_tile, place_in_tile, touched_blocks
 from msdgs_serve.rasterizer.tiles import TileLists
+from msdgs_serve.rasterizer.vector_memory import load, prefetch, store
+from msdgs_serve.rasterizer.vector_squares import load_square, load_square_of_triples
+from msdgs_serve.rasterizer.vector_types import NUM_LANES
+from msdgs_serve.rasterizer.vectors import bits_of, filled, fma, lowest_bit, minimum, select, spread, sums_of
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_parallel, run_together, threads_to_use
 
-# places in a tile's scratch: what is left of the light (0 where a pixel is done), the pixel's gradient, what is still
-# behind, and where the pixels are in the tile
+# offsets in a tile's state: transmittance (0 if the pixel is finished), the pixel's gradient, the contribution of
+# splats behind, and the pixel's position in the tile
 LEFT, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND, PIXEL_X, PIXEL_Y = (
     np.uint64(PIXELS * place) for place in range(8)
 )
-SUMS = LANES
-"""Numbers of a pair of splat and tile, nine in use: red, green, blue, then the moments of d loss / d sigma about the
-splat: 1, x, y, xx, xy, yy."""
+SUMS = NUM_LANES
+"""Numbers per pair of splat and tile, of which nine are used: red, green, blue, and the moments 1, x, y, xx, xy, yy of
+d loss / d sigma about the splat's mean."""
 
-PAIRS_A_ROUND = 1 << 18
-"""16 MB of sums: with those of 1,400,000 pairs at once, 85 MB, the gradient takes 1.1 times as long."""
+PAIRS_PER_ROUND = 1 << 18
+"""16 MB of sums; in one round of 1,400,000 pairs (85 MB) the gradient takes 1.1 times as long."""
 
-DEPTHS_LOOKED_AT = 1000
-"""To find those that part the splats among threads."""
-AHEAD = np.uint64(16)
-"""Pairs between asking for a record and needing it."""
+DEPTH_SAMPLES = 1000
+"""Depths that are sampled to divide the splats among threads."""
+PREFETCH_DISTANCE = np.uint64(16)
+"""Pairs between prefetch and use of a record."""
 
 
 def composite_backward(
@@ -71,10 +51,10 @@ def composite_backward(
     grad_rgb: np.ndarray,
     grad_alpha: np.ndarray,
 ) -> np.ndarray:
-    """The sums of each splat, [N, SUMS]: zero where it isn't drawn.
+    """Return the sums of each splat, [N, SUMS], zero if it isn't drawn.
 
     Args:
-        frame: what `composite` drew; its depth is not looked at.
+        frame: the result of `composite`; its depths are not used.
         grad_rgb: [H, W, 3].
         grad_alpha: [H, W].
     """
@@ -93,10 +73,10 @@ def composite_backward(
 
 
 def _rounds(offsets: np.ndarray) -> list[tuple[int, int]]:
-    """(first, past) of tiles, all of them in order, with `PAIRS_A_ROUND` or fewer pairs each or a single tile."""
+    """Return consecutive ranges (first, past) of tiles, of at most `PAIRS_PER_ROUND` pairs or a single tile each."""
     rounds, first, count = [], 0, len(offsets) - 1
     while first < count:
-        past = int(np.searchsorted(offsets, offsets[first] + PAIRS_A_ROUND, side="right")) - 1
+        past = int(np.searchsorted(offsets, offsets[first] + PAIRS_PER_ROUND, side="right")) - 1
         past = max(min(past, count), first + 1)
         rounds.append((first, past))
         first = past
@@ -104,8 +84,8 @@ def _rounds(offsets: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _depths_between(records: np.ndarray, parts: int) -> list[float]:
-    """Depths from -infinity to infinity, between which there are about as many splats each, judged by some of them."""
-    some = records[:: max(len(records) // DEPTHS_LOOKED_AT, 1)]
+    """Return depths from -infinity to infinity that divide the splats into about equal `parts`, by a sample of them."""
+    some = records[:: max(len(records) // DEPTH_SAMPLES, 1)]
     some = np.sort(some[some[:, EXTENT_X] > 0, DEPTH])
     return [-math.inf, *(float(some[len(some) * part // parts]) for part in range(1, parts) if len(some)), math.inf]
 
@@ -122,8 +102,9 @@ def _tiles_backward(
     pair_sums: np.ndarray,
     seen: np.ndarray,
 ) -> bool:
-    """Write the sums of each pair of splat and tile, of tiles `first_tile` to `past_tile`, and how many pairs of a tile
-    have been: those behind what hides them are left out. Whether all these tiles are done.
+    """Write the sums of each pair of splat and tile, for tiles `first_tile` to `past_tile`, and into `seen` how many
+    pairs of each tile were processed: those behind finished pixels are skipped. Return whether all these tiles are
+    done.
 
     `images` are color, alpha, and the gradients of both.
     """
@@ -132,18 +113,18 @@ def _tiles_backward(
     origin = np.zeros(RECORD, records.dtype)
     grid = grid_of_a_tile(records)
     for block in range(np.uint64(BLOCKS)):
-        store(state, PIXEL_X + block * np.uint64(LANES), load(grid, 32) + grid[block])
-        store(state, PIXEL_Y + block * np.uint64(LANES), load(grid, 48) + grid[np.uint64(16) + block])
+        store(state, PIXEL_X + block * np.uint64(NUM_LANES), load(grid, 32) + grid[block])
+        store(state, PIXEL_Y + block * np.uint64(NUM_LANES), load(grid, 48) + grid[np.uint64(16) + block])
     rgb, alpha, grad_rgb, grad_alpha = images
     height, width = alpha.shape
     base = np.uint64(tiles.offsets[first_tile])
     flat, flat_sums = records.reshape(-1), pair_sums.reshape(-1)
     pixels = (rgb.reshape(-1), alpha.reshape(-1), grad_rgb.reshape(-1), grad_alpha.reshape(-1))
     while True:
-        first = fetch_add(counters, TAKEN, TILES_A_TURN)
+        first = fetch_add(counters, TAKEN, TILES_PER_TURN)
         if first >= past_tile:
             return all_done(counters, past_tile)
-        end_of_turn = min(first + TILES_A_TURN, past_tile)
+        end_of_turn = min(first + TILES_PER_TURN, past_tile)
         for tile in range(first, end_of_turn):
             x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
             origin[0], origin[1] = x0, y0
@@ -156,8 +137,8 @@ def _tiles_backward(
             first_pair, past = np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])
             pair = first_pair
             while pair < past and alive != np.uint64(0):
-                ahead = min(pair + AHEAD, past - np.uint64(1))
-                prefetch(flat, np.uint64(tiles.splat_ids[ahead]) * np.uint64(RECORD))
+                upcoming = min(pair + PREFETCH_DISTANCE, past - np.uint64(1))
+                prefetch(flat, np.uint64(tiles.splat_ids[upcoming]) * np.uint64(RECORD))
                 store(record, 0, load(flat, np.uint64(tiles.splat_ids[pair]) * np.uint64(RECORD)) - load(origin, 0))
                 bits = alive & bits_of(touched_blocks(record, grid, limits.log2_alpha_min))
                 place = (pair - base) * np.uint64(SUMS)
@@ -169,11 +150,11 @@ def _tiles_backward(
 
 @inlined_kernel
 def _load_tile(width: int, x0: int, y0: int, pixels: tuple, state: np.ndarray) -> None:
-    """What the tile's state is before the first splat. Pixel by pixel, as a cut tile's, a frame of 10,000 splats at
-    1920 × 1080 takes 1.1 times as long."""
+    """Initialize the tile's state. Pixel by pixel, as in `_load_cut_tile`, a frame of 10,000 splats at 1920 × 1080
+    takes 1.1 times as long."""
     rgb, alphas, grad_rgb, grad_alphas = pixels
     for block in range(np.uint64(BLOCKS)):
-        lane = block * np.uint64(LANES)
+        offset = block * np.uint64(NUM_LANES)
         column, row = np.int64(block % np.uint64(BLOCK_SIDE)), np.int64(block // np.uint64(BLOCK_SIDE))
         start = (y0 + BLOCK_SIDE * row) * width + x0 + BLOCK_SIDE * column
         _prefetch_block(width, start + TILE, pixels)
@@ -181,17 +162,17 @@ def _load_tile(width: int, x0: int, y0: int, pixels: tuple, state: np.ndarray) -
         grad_red, grad_green, grad_blue = load_square_of_triples(grad_rgb, 3 * start, 3 * width)
         alpha, grad_alpha = load_square(alphas, start, width), load_square(grad_alphas, start, width)
         behind = fma(red, grad_red, fma(green, grad_green, fma(blue, grad_blue, alpha * grad_alpha)))
-        store(state, LEFT + lane, filled(1, behind))
-        store(state, GRAD_RED + lane, grad_red)
-        store(state, GRAD_GREEN + lane, grad_green)
-        store(state, GRAD_BLUE + lane, grad_blue)
-        store(state, GRAD_ALPHA + lane, grad_alpha)
-        store(state, BEHIND + lane, behind)
+        store(state, LEFT + offset, filled(1, behind))
+        store(state, GRAD_RED + offset, grad_red)
+        store(state, GRAD_GREEN + offset, grad_green)
+        store(state, GRAD_BLUE + offset, grad_blue)
+        store(state, GRAD_ALPHA + offset, grad_alpha)
+        store(state, BEHIND + offset, behind)
 
 
 @kernel
 def _load_cut_tile(width: int, x0: int, y0: int, size: tuple, pixels: tuple, state: np.ndarray) -> None:
-    """As `_load_tile`, of a tile of which the image has so many columns and rows."""
+    """Initialize the state of a tile that extends beyond the image, of which `size` columns and rows are inside."""
     rgb, alphas, grad_rgb, grad_alphas = pixels
     columns, rows = size
     state[:PIXEL_X] = 0
@@ -210,7 +191,7 @@ def _load_cut_tile(width: int, x0: int, y0: int, size: tuple, pixels: tuple, sta
 
 @inlined_kernel
 def _prefetch_block(width: int, start: int, pixels: tuple) -> None:
-    """Fetch a block of the next tile while this one is worked on: its rows are a page away from each other."""
+    """Prefetch a block of the next tile: rows of an image are a memory page apart."""
     rgb, alphas, grad_rgb, grad_alphas = pixels
     for row in range(BLOCK_SIDE):
         pixel = start + row * width
@@ -229,36 +210,36 @@ def _splat_backward(
     sums: np.ndarray,
     place: np.uint64,
 ) -> np.uint64:
-    """Write the sums of a splat over the blocks that `bits` names; returns those of them that are done now."""
+    """Write the sums of a splat over the blocks whose `bits` are set. Return the mask of blocks that it finishes."""
     zero = spread(record.dtype.type(0))
     sum_red, sum_green, sum_blue = zero, zero, zero
     sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
     done = np.uint64(0)
-    # read once: the compiler can't know that what is written below is not the record
-    x, y, exponent_terms = spread(record[X]), spread(record[Y]), exponent_of(record)
+    # read once: to the compiler, the stores below may change the record
+    x, y, terms = spread(record[X]), spread(record[Y]), exponent_terms(record)
     red, green, blue = spread(record[RED]), spread(record[GREEN]), spread(record[BLUE])
     while bits != np.uint64(0):
         block = lowest_bit(bits)
         bits &= bits - np.uint64(1)
-        lane = block * np.uint64(LANES)
-        pixel_x, pixel_y = load(state, PIXEL_X + lane), load(state, PIXEL_Y + lane)
+        offset = block * np.uint64(NUM_LANES)
+        pixel_x, pixel_y = load(state, PIXEL_X + offset), load(state, PIXEL_Y + offset)
         dx, dy = pixel_x - x, pixel_y - y
-        left = load(state, LEFT + lane)
-        exponent = log2_alpha(*exponent_terms, pixel_x, pixel_y)
+        left = load(state, LEFT + offset)
+        exponent = log2_alpha(*terms, pixel_x, pixel_y)
         raw_alpha = exp2(exponent, limits.exp2)
         uncut = raw_alpha < limits.alpha_max
         alpha = minimum(raw_alpha, filled(limits.alpha_max, raw_alpha))
         alpha = select(exponent >= limits.log2_alpha_min, alpha, zero)
         after = fma(-alpha, left, left)
         goes_on = after > limits.transmittance_min
-        store(state, LEFT + lane, select(goes_on, after, zero))
+        store(state, LEFT + offset, select(goes_on, after, zero))
         weight = select(goes_on, alpha * left, zero)
-        grad_red, grad_green = load(state, GRAD_RED + lane), load(state, GRAD_GREEN + lane)
-        grad_blue = load(state, GRAD_BLUE + lane)
-        share = fma(grad_red, red, load(state, GRAD_ALPHA + lane))
+        grad_red, grad_green = load(state, GRAD_RED + offset), load(state, GRAD_GREEN + offset)
+        grad_blue = load(state, GRAD_BLUE + offset)
+        share = fma(grad_red, red, load(state, GRAD_ALPHA + offset))
         share = fma(grad_blue, blue, fma(grad_green, green, share))
-        behind = fma(-weight, share, load(state, BEHIND + lane))
-        store(state, BEHIND + lane, behind)
+        behind = fma(-weight, share, load(state, BEHIND + offset))
+        store(state, BEHIND + offset, behind)
         # d alpha / d sigma = -alpha where the splat is drawn and not cut to alpha_max
         grad_sigma = select(uncut & goes_on, alpha * fma(-left, share, behind / (1 - alpha)), zero)
         sum_red, sum_green = fma(weight, grad_red, sum_red), fma(weight, grad_green, sum_green)
@@ -285,8 +266,8 @@ def _add_up(
     pair_sums: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Add up the tiles of splats from a depth to another, always in the same order: in each tile they are next to each
-    other."""
+    """Add the sums of a splat's tiles, for splats at depths from `nearest` to `past`, which are consecutive in each
+    tile. The order of the additions is always the same."""
     flat_pairs, flat = pair_sums.reshape(-1), sums.reshape(-1)
     base = np.uint64(tiles.offsets[first_tile])
     for tile in range(np.uint64(first_tile), np.uint64(past_tile)):
@@ -295,14 +276,16 @@ def _add_up(
         first = _first_at(nearest, start, end, records, tiles.splat_ids)
         stop = _first_at(past, first, end, records, tiles.splat_ids)
         for pair in range(first, stop):
-            prefetch(flat, np.uint64(tiles.splat_ids[min(pair + AHEAD, stop - np.uint64(1))]) * np.uint64(SUMS))
+            prefetch(
+                flat, np.uint64(tiles.splat_ids[min(pair + PREFETCH_DISTANCE, stop - np.uint64(1))]) * np.uint64(SUMS)
+            )
             place = np.uint64(tiles.splat_ids[pair]) * np.uint64(SUMS)
             store(flat, place, load(flat, place) + load(flat_pairs, (pair - base) * np.uint64(SUMS)))
 
 
 @kernel
 def _first_at(depth: float, start: np.uint64, end: np.uint64, records: np.ndarray, splat_ids: np.ndarray) -> np.uint64:
-    """The first pair from `start` of a tile, before `end`, whose splat is at a depth or behind it."""
+    """Return the first pair of a tile, from `start` to `end`, whose splat is at `depth` or behind it."""
     while start < end:
         middle = (start + end) >> np.uint64(1)
         if np.float32(records[np.uint64(splat_ids[middle]), DEPTH]) < np.float32(depth):

@@ -1,4 +1,4 @@
-"""2^x, log2 x and atan x of 16 numbers at once; NumPy's and the C library's are a call a number."""
+"""2^x, log2 x and atan x of vectors; the C library's take a call per number."""
 
 import math
 from functools import cache
@@ -6,23 +6,23 @@ from functools import cache
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lane_types import Lanes
-from msdgs_serve.rasterizer.lanes import exponent_of, filled, mantissa_of, rounder, select, times_power_of_two
+from msdgs_serve.rasterizer.vector_types import Vector
+from msdgs_serve.rasterizer.vectors import exponent_of, filled, mantissa_of, rounder, select, times_power_of_two
 
 ATANH_SERIES = tuple(2 / math.log(2) / n for n in range(21, 0, -2))
-"""Of 2 atanh(s) / ln 2 over s, highest power of s² first."""
+"""Coefficients of 2 atanh(s) / (s ln 2), highest power of s² first."""
 
 
 ATAN_SERIES = tuple((-1) ** (n // 2) / n for n in range(37, 0, -2))
-"""Of atan(s) / s, highest power of s² first; for |s| up to tan(pi / 8) the next term is 1e-16."""
+"""Coefficients of atan(s) / s, highest power of s² first; for |s| up to tan(pi / 8) the next term is 1e-16."""
 
 
 @cache
 def exp2_polynomial(degree: int) -> tuple[float, ...]:
-    """Coefficients, highest power first, of 1 + r p(r) for 2^r: p meets (2^r - 1) / r at Chebyshev's nodes of
-    [-1/2, 1/2], so that whole powers are exact.
+    """Return coefficients, highest power first, of 1 + r p(r) ≈ 2^r: p interpolates (2^r - 1) / r at the Chebyshev
+    nodes of [-1/2, 1/2], so that integer powers are exact.
 
-    Its relative error is 6e-6 for degree 4, 3e-7 for degree 5, some roundings of float64 for degree 12.
+    The relative error is 6e-6 for degree 4, 3e-7 for degree 5 and a few roundings of float64 for degree 12.
     """
 
     def slope(r: np.ndarray) -> np.ndarray:
@@ -34,8 +34,8 @@ def exp2_polynomial(degree: int) -> tuple[float, ...]:
 
 
 @kernel
-def exp2(x: Lanes, polynomial: tuple[float, ...]) -> Lanes:
-    """2^x where that is a normal number; what is returned for other x means nothing."""
+def exp2(x: Vector, polynomial: tuple[float, ...]) -> Vector:
+    """Return 2^x if that is a normal number; the result is undefined otherwise."""
     rounded = x + rounder(x)
     r = x - (rounded - rounder(x))
     value = r * polynomial[0] + polynomial[1]
@@ -45,8 +45,8 @@ def exp2(x: Lanes, polynomial: tuple[float, ...]) -> Lanes:
 
 
 @kernel
-def log2(x: Lanes) -> Lanes:
-    """log2 of positive normal numbers, by 2 atanh((m - 1) / (m + 1)) / ln 2; within 1e-15 in float64."""
+def log2(x: Vector) -> Vector:
+    """Return log2 of positive normal numbers, by 2 atanh((m - 1) / (m + 1)) / ln 2; within 1e-15 in float64."""
     exponent, mantissa = exponent_of(x), mantissa_of(x)
     upper = mantissa > math.sqrt(2)
     exponent = select(upper, exponent + 1, exponent)
@@ -59,8 +59,8 @@ def log2(x: Lanes) -> Lanes:
 
 
 @kernel
-def arctangent(x: Lanes) -> Lanes:
-    """atan(x) of numbers that aren't negative, within some roundings."""
+def arctangent(x: Vector) -> Vector:
+    """Return atan(x) for x >= 0, within a few roundings."""
     steep = x > 1
     x = select(steep, 1 / x, x)
     upper = x > math.tan(math.pi / 8)

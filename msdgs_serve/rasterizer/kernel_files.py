@@ -1,7 +1,7 @@
-"""Machine code on disk: files that are cut off or changed are compiled anew, folders that can't be written are copied.
+"""numba's cache of compiled kernels: damaged files are replaced, read-only folders are copied to a writable one.
 
-numba keeps pickles beside the sources, or under `NUMBA_CACHE_DIR`. As it comes, one truncated file makes every call
-of its kernel fail, and where no folder can be written importing a kernel fails.
+numba stores pickles beside the sources or under `NUMBA_CACHE_DIR`. By default a truncated file makes every call of its
+kernel fail, and importing a kernel fails if no folder can be written.
 """
 
 import atexit
@@ -18,28 +18,28 @@ from numba.core.caching import IndexDataCacheFile, UserProvidedCacheLocator
 
 DIGEST_BYTES = hashlib.sha256().digest_size
 NAME_DIGITS = 16
-"""Of a file of machine code."""
+"""Digits of the digest in the name of a file of machine code."""
 
 logger = logging.getLogger("msdgs_serve")
 
 
 class CheckedFiles(IndexDataCacheFile):
-    """One kernel's files, each with the SHA-256 of its contents. What doesn't match is wiped, then made anew.
+    """One kernel's files, each with the SHA-256 of its contents. A file that doesn't match is removed and recompiled.
 
-    Machine code lies under the digest of itself. numba numbers its files: of two processes that store code for other
-    types at the same time both take the same number, and a call may run the code of other types.
+    A file of machine code is named by its digest. numba's own names are numbers: two processes that store code for
+    different types at the same time take the same number, and a call may run the code for other types.
     """
 
     def load(self, key: Any) -> Any:
-        """The stored machine code; None where there is none that is whole."""
+        """Return the stored machine code, or None if it is missing or damaged."""
         try:
             return super().load(key)
-        except Exception as error:  # unpickling foreign bytes raises nearly anything
+        except Exception as error:  # unpickling damaged bytes may raise any exception
             self._wipe(error)
             return None
 
     def save(self, key: Any, data: Any) -> None:
-        """Store machine code; a disk that is full or gone costs the next start its time, not this call its answer."""
+        """Store machine code. If the disk is full or missing, log it: the next start compiles again."""
         try:
             self._save(key, data)
         except OSError as error:
@@ -49,7 +49,7 @@ class CheckedFiles(IndexDataCacheFile):
             self._save(key, data)
 
     def _save(self, key: Any, data: Any) -> None:
-        """The data before the index that names it; where the sources have changed, what was stored before goes."""
+        """Write the data before the index that names it; if the sources have changed, remove the old data first."""
         known: dict[Any, str] = self._load_index()  # pyright: ignore[reportAttributeAccessIssue]
         if not known:
             self._remove(self._data_files())
@@ -71,11 +71,11 @@ class CheckedFiles(IndexDataCacheFile):
         stored = (Path(self._cache_path) / name).read_bytes()
         payload, digest = stored[:-DIGEST_BYTES], stored[-DIGEST_BYTES:]
         if hashlib.sha256(payload).digest() != digest:
-            raise ValueError("its digest is another")
+            raise ValueError("the digest doesn't match")
         return super()._load_data(name)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _wipe(self, error: Exception) -> None:
-        logger.warning("stored kernel %s is damaged (%s), it is compiled anew", self._index_name, type(error).__name__)
+        logger.warning("stored kernel %s is damaged (%s), it is compiled again", self._index_name, type(error).__name__)
         self._remove([Path(self._cache_path) / self._index_name, *self._data_files()])
 
     def _remove(self, files: list[Path]) -> None:
@@ -85,16 +85,16 @@ class CheckedFiles(IndexDataCacheFile):
 
 
 def use_writable_folder(package: Path) -> bool:
-    """Make sure that kernels of `package` can be stored; False where nothing can be written at all.
+    """Make sure that kernels of `package` can be stored. Return False if no folder can be written.
 
-    Where the usual folder is read-only (a container, an installation by root), what it holds is copied to a folder of
-    this process, so that what was compiled beforehand is used.
+    If the usual folder is read-only (a container, an installation by root), its kernels are copied to a temporary
+    folder of this process, so that precompiled kernels are used.
     """
     usual = Path(config.CACHE_DIR) if config.CACHE_DIR else package / "__pycache__"  # pyright: ignore
     if is_writable(usual):
         return True
     try:
-        copy = Path(tempfile.mkdtemp(prefix="msdgs-kernels-"))  # mode 0700: who writes here runs code in this process
+        copy = Path(tempfile.mkdtemp(prefix="msdgs-kernels-"))  # mode 0700: files here are run as code by this process
     except OSError:
         return False
     atexit.register(shutil.rmtree, copy, ignore_errors=True)
@@ -105,7 +105,7 @@ def use_writable_folder(package: Path) -> bool:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether a file can be made there; the folder itself is made where it is missing."""
+    """Whether files can be created in a folder; the folder is created if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -115,11 +115,11 @@ def is_writable(folder: Path) -> bool:
 
 
 def copy_kernels(source: Path, target: Path, *, nested: bool) -> None:
-    """Copy machine code to a folder of numba's layout; from `__pycache__` folders below a package where `nested`."""
+    """Copy machine code to a folder in numba's layout; `nested`: from the `__pycache__` folders of a package."""
     if not nested:
         shutil.copytree(source, target, dirs_exist_ok=True)
         return
     for file in source.rglob("__pycache__/*.nb[ic]"):
-        room = UserProvidedCacheLocator.get_suitable_cache_subpath(str(file.parent.parent / "module.py"))
-        (target / room).mkdir(exist_ok=True)
-        shutil.copy(file, target / room)
+        subfolder = UserProvidedCacheLocator.get_suitable_cache_subpath(str(file.parent.parent / "module.py"))
+        (target / subfolder).mkdir(exist_ok=True)
+        shutil.copy(file, target / subfolder)

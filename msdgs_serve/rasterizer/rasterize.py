@@ -1,4 +1,4 @@
-"""Gaussians and a camera to an image."""
+"""Render an image of Gaussians with a camera."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,8 @@ import numpy.typing as npt
 
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.counts import count_splats
-from msdgs_serve.rasterizer.projection import BLUE, RED, Splats, project
+from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.splats import BLUE, RED, Splats
 from msdgs_serve.rasterizer.tiles import TileLists, bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.camera import Camera
@@ -19,12 +20,12 @@ from msdgs_serve.threads import sharing_cores
 class Rendering(NamedTuple):
     """One frame in the dtype of its Gaussians."""
 
-    rgb: np.ndarray  # [H, W, 3] display-referred, the background included
+    rgb: np.ndarray  # [H, W, 3] display-referred, background included
     alpha: np.ndarray  # [H, W] 1 - transmittance
-    depth: np.ndarray  # [H, W] expected distance along the camera axis, infinite where alpha is 0; [0, 0] unasked
-    median_depth: np.ndarray  # [H, W] distance of the splat that takes half of the light, else infinite; [0, 0] unasked
-    extra: np.ndarray  # [H, W, C] what was asked for besides, weighted as colors are; divide by alpha for a mean
-    counts: np.ndarray  # [H, W] Gaussians that add to each pixel; [0, 0] unasked
+    depth: np.ndarray  # [H, W] expected distance along the camera axis, infinite if alpha is 0; [0, 0] if not requested
+    median_depth: np.ndarray  # [H, W] depth at which transmittance falls to 1/2, or infinite; [0, 0] if not requested
+    extra: np.ndarray  # [H, W, C] blended as colors are; divide by alpha for a mean
+    counts: np.ndarray  # [H, W] Gaussians that contribute to each pixel; [0, 0] if not requested
 
 
 @sharing_cores()
@@ -39,11 +40,10 @@ def rasterize(
     counts: bool = False,
     options: RasterizerOptions = GSPLAT,
 ) -> Rendering:
-    """Draw the Gaussians (equations 1 and 2) over a background color.
+    """Render the Gaussians (equations 1 and 2) over a background color.
 
-    Color and alpha are drawn always. Depths are in scene units; with the median the expected depth is drawn too.
-    `extra` [N, C] is any C numbers of each Gaussian, drawn as if they were colors over nothing; three of them take as
-    long as the colors do. `counts` take a pass of their own.
+    Depths are in scene units; `median_depth` implies `depth`. `extra` [N, C] are any C numbers per Gaussian, blended
+    like colors without a background; three of them take as long as the colors. `counts` takes a pass of its own.
 
     Safe to call from several threads; the same input gives the same bytes, whatever the number of threads.
 
@@ -55,7 +55,7 @@ def rasterize(
     if background.shape != (3,) or not np.isfinite(background).all():
         raise InvalidInput("background", "3 finite numbers", background.tolist())
     splats = project(gaussians, camera, options)
-    if not splats.sound:
+    if not splats.valid:
         gaussians.validate()
     extra = _checked_extra(extra, gaussians)
     tiles = bin_into_tiles(splats, camera.width, camera.height)
@@ -82,7 +82,7 @@ def _checked_extra(extra: np.ndarray | None, gaussians: Gaussians) -> np.ndarray
 def _drawn_extra(
     extra: np.ndarray, splats: Splats, tiles: TileLists, camera: Camera, options: RasterizerOptions
 ) -> np.ndarray:
-    """Three channels at a time in the place of the colors."""
+    """Return the blended extra channels, drawn three at a time in place of the colors."""
     channels = extra.shape[1]
     dtype = splats.records.dtype
     drawn = np.empty((camera.height, camera.width, channels), dtype)

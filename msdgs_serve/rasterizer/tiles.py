@@ -1,7 +1,7 @@
-"""Which splats touch which tile of the image, nearest first.
+"""List the splats that touch each tile of the image, nearest first.
 
-The visible splats are sorted once, then dealt out to the tiles in that order. Both are done in parts side by side:
-each part counts, the counts say where each part writes, each part writes.
+The visible splats are sorted by depth once, then appended to the lists of their tiles in that order. Both run in
+parallel parts: each part counts, prefix sums of the counts give each part its write positions, then each part writes.
 """
 
 from typing import NamedTuple
@@ -9,19 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.lanes_memory import prefetch
-from msdgs_serve.rasterizer.projection import Splats
+from msdgs_serve.rasterizer.splats import Splats
+from msdgs_serve.rasterizer.vector_memory import prefetch
 from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.threads import run_parallel, run_serially, split_evenly, threads_to_use
 
 DIGIT_BITS = 12
-"""Of the sort: counters of 16 kB, half of a level-1 cache."""
+"""Bits per digit of the radix sort: counters of 16 kB, half of a level-1 cache."""
 
-SPLATS_A_PART = 16_384
-"""Fewer aren't worth another thread."""
+SPLATS_PER_PART = 16_384
+"""Fewer splats don't justify another thread."""
 
-AHEAD = np.uint64(16)
-"""Splats between asking for a rectangle and needing it."""
+PREFETCH_DISTANCE = np.uint64(16)
+"""Splats between prefetch and use of a rectangle."""
 
 
 class TileLists(NamedTuple):
@@ -34,12 +34,12 @@ class TileLists(NamedTuple):
 
 
 def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
-    """Sort the visible splats by float32 depth, equal depths by index, and deal them out to the tiles."""
+    """Sort the visible splats by float32 depth, equal depths by index, and list those of each tile."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     count, (nearest, farthest) = splats.visible, splats.depth_range
     digits = _digits(np.uint64(nearest), max(farthest - nearest, 0).bit_length())
     offsets = np.empty(columns * rows + 1, np.int64)
-    if count < SPLATS_A_PART:
+    if count < SPLATS_PER_PART:
         few = (count, splats.keys, splats.drawn, digits, splats.rectangles, rows, columns, offsets)
         (splat_ids,) = run_serially(_bin_few, [few])
         return TileLists(offsets, splat_ids, columns, rows)
@@ -55,33 +55,33 @@ def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
     _place_parts(corners, offsets, cursors)
     splat_ids = np.empty(offsets[-1], np.uint32)
     run_parallel(
-        _deal_out, [(*part, order, rectangles, cursors[k], columns, splat_ids) for k, part in enumerate(parts)]
+        _append_to_tiles, [(*part, order, rectangles, cursors[k], columns, splat_ids) for k, part in enumerate(parts)]
     )
     return TileLists(offsets, splat_ids, columns, rows)
 
 
 class _Digits(NamedTuple):
-    """How depths are taken apart by a sort, one digit a pass, the last ones first."""
+    """The digits of depths in the radix sort, one per pass, least significant first."""
 
-    base: np.uint64  # bits of the least depth, which is taken from all
-    width: np.uint64  # bits of a digit
+    base: np.uint64  # bits of the smallest depth, which is subtracted from all
+    width: np.uint64  # bits per digit
     passes: int
 
 
 def _digits(base: np.uint64, bits: int) -> _Digits:
-    """Of depths that differ in so many bits."""
+    """Return the digits of depths whose bits, minus `base`, are `bits` wide."""
     passes = max(1, -(-bits // DIGIT_BITS))
     return _Digits(base, np.uint64(-(-bits // passes)), passes)
 
 
 def _sorted_by_depth(splats: Splats, digits: _Digits) -> np.ndarray:
-    """Indices [V] uint32 of the splats that are drawn."""
+    """Return the indices [V] uint32 of the drawn splats, nearest first."""
     keys, parts, count = splats.keys, splats.drawn.tolist(), splats.visible
     for k in range(digits.passes):
         counts = np.zeros((len(parts), 1 << int(digits.width)), np.int64)
         run_parallel(_count_digits, [(*part, keys, digits, k, row) for part, row in zip(parts, counts, strict=True)])
         _to_cursors(counts)
-        out = np.empty(count, np.uint32 if k == digits.passes - 1 else np.uint64)  # in the end without the depths
+        out = np.empty(count, np.uint32 if k == digits.passes - 1 else np.uint64)  # the last pass drops the depths
         run_parallel(
             _scatter_by_digit, [(*part, keys, digits, k, row, out) for part, row in zip(parts, counts, strict=True)]
         )
@@ -90,8 +90,8 @@ def _sorted_by_depth(splats: Splats, digits: _Digits) -> np.ndarray:
 
 
 def _parts(count: int) -> list[tuple[int, int]]:
-    most = 1 + count // SPLATS_A_PART
-    return split_evenly(count, min(threads_to_use(), most) if most > 1 else 1) or [(0, 0)]
+    max_parts = 1 + count // SPLATS_PER_PART
+    return split_evenly(count, min(threads_to_use(), max_parts) if max_parts > 1 else 1) or [(0, 0)]
 
 
 @kernel
@@ -105,9 +105,9 @@ def _bin_few(
     columns: int,
     offsets: np.ndarray,
 ) -> np.ndarray:
-    """All of it in one call, on one thread; returns the ids and writes where tiles begin.
+    """Do all steps in one call on one thread. Write the tiles' offsets and return the splat ids.
 
-    Called one by one, the kernels of 10,000 splats at 400 × 400 take 1.3 times as long, and the frame 1.03 times.
+    Called one by one, the kernels for 10,000 splats at 400 × 400 take 1.3 times as long, and the frame 1.03 times.
     """
     order = np.empty(count, np.uint32)
     for k in range(digits.passes):
@@ -131,7 +131,7 @@ def _bin_few(
     cursors = np.empty((1, columns * rows), np.int64)
     _place_parts(corners, offsets, cursors)
     splat_ids = np.empty(offsets[-1], np.uint32)
-    _deal_out(0, count, order, ordered, cursors[0], columns, splat_ids)
+    _append_to_tiles(0, count, order, ordered, cursors[0], columns, splat_ids)
     return splat_ids
 
 
@@ -150,7 +150,7 @@ def _count_digits(start: int, stop: int, keys: np.ndarray, digits: _Digits, k: i
 
 @kernel
 def _to_cursors(counts: np.ndarray) -> None:
-    """In place of how many numbers a part [P] has of each digit [D], where it writes the first of them."""
+    """Replace the counts of each digit [D] in each part [P] by the position where the part writes its first."""
     start = np.int64(0)
     for digit in range(np.uint64(counts.shape[1])):
         for part in range(np.uint64(counts.shape[0])):
@@ -173,12 +173,12 @@ def _scatter_by_digit(
 def _gather_rectangles(
     start: int, stop: int, order: np.ndarray, rectangles: np.ndarray, out: np.ndarray, corners: np.ndarray
 ) -> None:
-    """The rectangles of the splats in their order, and where these begin and end: second differences of the number
-    of splats on each tile, four additions however large a rectangle is."""
+    """Write the rectangles of the splats in sorted order, and add their corners to `corners`: second differences of the
+    number of splats per tile, four additions for a rectangle of any size."""
     flat = rectangles.reshape(-1)
     for k in range(np.uint64(start), np.uint64(stop)):
-        ahead = min(k + AHEAD, np.uint64(stop) - np.uint64(1))
-        prefetch(flat, np.uint64(order[ahead]) * np.uint64(4))
+        upcoming = min(k + PREFETCH_DISTANCE, np.uint64(stop) - np.uint64(1))
+        prefetch(flat, np.uint64(order[upcoming]) * np.uint64(4))
         i = np.uint64(order[k])
         left, right, top, bottom = (
             np.uint64(rectangles[i, 0]),
@@ -195,8 +195,8 @@ def _gather_rectangles(
 
 @kernel
 def _place_parts(corners: np.ndarray, offsets: np.ndarray, cursors: np.ndarray) -> None:
-    """Where each part [P] writes its first splat of each tile, and where tiles begin, from second differences of the
-    parts' counts [P, rows + 1, columns + 1], which become sums along each row."""
+    """Compute where each part [P] writes its first splat of each tile, and the tiles' offsets, from second differences
+    of the parts' counts [P, rows + 1, columns + 1], which are replaced by sums along each row."""
     parts, rows, columns = np.uint64(corners.shape[0]), corners.shape[1] - 1, corners.shape[2] - 1
     above = np.zeros((corners.shape[0], columns), np.int32)
     start, tile = np.int64(0), np.uint64(0)
@@ -214,7 +214,7 @@ def _place_parts(corners: np.ndarray, offsets: np.ndarray, cursors: np.ndarray) 
 
 
 @kernel
-def _deal_out(
+def _append_to_tiles(
     start: int,
     stop: int,
     order: np.ndarray,
@@ -225,7 +225,7 @@ def _deal_out(
 ) -> None:
     """Append each splat, in order, to the lists of its tiles.
 
-    One loop over a rectangle's tiles, since its end is guessed wrong once a splat, and once more a row with two.
+    One loop over a rectangle's tiles mispredicts one branch per splat; nested loops mispredict one more per row.
     """
     for k in range(np.uint64(start), np.uint64(stop)):
         left, top = np.uint64(rectangles[k, 0]), np.uint64(rectangles[k, 2])

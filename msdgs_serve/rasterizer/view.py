@@ -1,4 +1,4 @@
-"""What the kernels need to know of a camera, and the constants of a rasterizer."""
+"""The kernels' form of a camera, and the options of the rasterizer."""
 
 import math
 from typing import NamedTuple, get_args
@@ -18,10 +18,10 @@ class RasterizerOptions(NamedTuple):
 
     near_plane: float  # scene units; Gaussians at this depth or nearer are not drawn
     eps2d: float  # px², added to the diagonal of the projected covariance
-    alpha_min: float  # a Gaussian adds nothing to a pixel where its alpha is less
-    alpha_max: float  # alpha is cut to this
+    alpha_min: float  # a Gaussian is skipped in pixels where its alpha is smaller
+    alpha_max: float  # alpha is clamped to this
     transmittance_min: float  # a pixel stops before the Gaussian that would take it to this or less
-    mip: bool = False  # dim what eps2d has spread, by √(det before / det after), as Mip-Splatting does
+    mip: bool = False  # scale opacity by √(det before eps2d / det after), as Mip-Splatting does
 
 
 GSPLAT = RasterizerOptions(near_plane=0.01, eps2d=0.3, alpha_min=1 / 255, alpha_max=0.999, transmittance_min=1e-4)
@@ -29,7 +29,7 @@ INRIA = RasterizerOptions(near_plane=0.2, eps2d=0.3, alpha_min=1 / 255, alpha_ma
 
 
 def as_trained(metadata: SceneMetadata, options: RasterizerOptions = GSPLAT) -> RasterizerOptions:
-    """`options` with the anti-aliasing that a scene was trained with."""
+    """Return `options` with the anti-aliasing that a scene was trained with."""
     return options._replace(eps2d=metadata.eps2d, mip=metadata.antialiasing == "mip")
 
 
@@ -65,7 +65,7 @@ class View(NamedTuple):
 
 
 def view_of(camera: Camera, options: RasterizerOptions) -> View:
-    """The kernels' form of a camera; options out of range raise `InvalidInput`."""
+    """Return the kernels' form of a camera. Raises `InvalidInput` for options out of range."""
     _check(options)
     rotation, position = np.ascontiguousarray(camera.camera_to_world[:3, :3].T), camera.position
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy

@@ -1,4 +1,4 @@
-"""The shared vocabulary: what a scene, a camera and an error are. NumPy only; every other room imports it."""
+"""Shared types: scenes, cameras, Gaussians and errors. Depends on NumPy only; all other packages import it."""
 
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound

@@ -1,4 +1,4 @@
-"""The ONNX scene, contract `msdgs/1`: the arrays of a scene file that don't depend on time, and their checks."""
+"""The arrays of a scene file (contract `msdgs/1`) that don't depend on time, and their checks."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ INPUTS = ("t", "ids")
 OPTIONAL_INPUT = "steps"
 MOVING_OUTPUTS = ("means", "quats", "scales")
 MAX_SH = 1e30
-"""Sums of coefficients, and blends of what they give, stay finite in float32."""
+"""Limit of SH coefficients, within which sums and blends of colors stay finite in float32."""
 CONSTANT_OUTPUTS = ("static_means", "static_quats", "static_scales", "opacities", "sh")
 
 
@@ -48,7 +48,7 @@ class BakedScene:
         return self.moving_count + self.static_count
 
     def validate(self, file: str) -> "BakedScene":
-        """Return self if shapes agree and all is finite, else raise `SceneFileInvalid`; `file` is for messages."""
+        """Return self, or raise `SceneFileInvalid` if shapes or values are invalid. `file` is its name in messages."""
         n, s = len(self), self.static_count
         coefficients = sh_coefficients(self.metadata.sh_degree)
         shapes = {
@@ -62,7 +62,7 @@ class BakedScene:
             array = getattr(self, name)
             if array.shape != shape:
                 counts = f"{self.moving_count} moving and {s} static Gaussians"
-                raise SceneFileInvalid(file, name, f"has shape {array.shape}, {counts} need {shape}")
+                raise SceneFileInvalid(file, name, f"has shape {array.shape}; {counts} need {shape}")
             if array.dtype != np.float32:
                 raise SceneFileInvalid(file, name, f"holds {array.dtype}, not float32")
         if max(self.sh.max(initial=0), -self.sh.min(initial=0)) > MAX_SH:
@@ -81,7 +81,7 @@ class BakedScene:
         return self
 
     def gaussians(self, means: FloatArray, quats: FloatArray, scales: FloatArray) -> Gaussians:
-        """All Gaussians at one time, given the posed moving ones."""
+        """Return all Gaussians at one time, from the posed moving ones."""
         if not self.moving_count:
             return Gaussians(self.static_means, self.static_quats, self.static_scales, self.opacities, self.sh)
         if self.static_count:

@@ -1,4 +1,4 @@
-"""Cameras in OpenCV axes: x right, y down, z forward; pixel centres at half-integers."""
+"""Cameras in OpenCV axes: x right, y down, z forward; pixel centers at half-integers."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,15 +9,15 @@ import numpy as np
 from msdgs_serve.scene.errors import InvalidInput
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Right-multiplied to a camera-to-world matrix: turns the camera's own y and z axes around."""
+"""Multiply a camera-to-world matrix by it from the right to flip the camera's y and z axes."""
 
 MAX_PIXELS_PER_SIDE = 16384
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye"]
-"""Where a point (x, y, z) in camera axes is drawn: at fx x / z + cx; at fx x + cx, fx in pixels a scene unit; at
-fx rho(theta) x / r + cx, with r the distance from the axis, theta the angle to it, and
-rho = theta (1 + k1 theta² + k2 theta⁴ + k3 theta⁶ + k4 theta⁸), as OpenCV's fisheye cameras. What is not in front of
-the camera is not drawn."""
+"""Projection of a point (x, y, z) in camera axes. Pinhole: fx x / z + cx. Orthographic: fx x + cx, with fx in pixels
+per scene unit. Fisheye: fx rho(theta) x / r + cx, with r the distance from the axis, theta the angle to it, and rho =
+theta (1 + k1 theta² + k2 theta⁴ + k3 theta⁶ + k4 theta⁸), as in OpenCV. Only points in front of the camera are
+drawn."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Camera:
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # k1 to k4 of a fisheye camera
 
     def __post_init__(self) -> None:
-        self._take_numbers()
+        self._convert_numbers()
         for name in ("fx", "fy"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InvalidInput(f"camera.{name}", "finite and above 0 pixels", getattr(self, name))
@@ -54,8 +54,8 @@ class Camera:
         if any(self.distortion) and self.model != "fisheye":
             raise InvalidInput("camera.distortion", "0 unless camera.model is fisheye", self.distortion)
 
-    def _take_numbers(self) -> None:
-        """Plain Python numbers, whatever array they came from: kernels are compiled for one type."""
+    def _convert_numbers(self) -> None:
+        """Convert NumPy scalars to Python numbers: kernels are compiled for one type."""
         for name in ("fx", "fy", "cx", "cy"):
             try:
                 object.__setattr__(self, name, float(getattr(self, name)))
@@ -75,9 +75,9 @@ class Camera:
         return inverse
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where world points [N, 3] are drawn, [N, 2] pixels, and how far along the axis they are, [N] scene units.
+        """Project world points [N, 3]. Return pixels [N, 2] and depths along the axis [N] in scene units.
 
-        Pixels of points at depth 0 or less mean nothing.
+        Pixels are undefined for depths of 0 or less.
         """
         world_to_camera = self.world_to_camera
         seen = np.asarray(points, np.float64) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
@@ -94,11 +94,11 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """[3] the centre of projection in world space; of an orthographic camera, any point of its axis."""
+        """[3] center of projection in world space; for an orthographic camera, a point on its axis."""
         return self.camera_to_world[:3, 3]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view drawn with other numbers of pixels."""
+        """Return a camera with the same view and another image size."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
@@ -106,7 +106,7 @@ class Camera:
 
     @classmethod
     def from_fov(cls, camera_to_world: np.ndarray, width: int, height: int, fov_y: float) -> "Camera":
-        """Square pixels, centred principal point; `fov_y` is the vertical field of view in degrees."""
+        """Return a camera with square pixels and centered principal point; `fov_y` is vertical, in degrees."""
         if not 0 < fov_y < 180:
             raise InvalidInput("camera.fov_y", "in (0, 180) degrees", fov_y)
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov_y))
@@ -116,19 +116,19 @@ class Camera:
     def from_look_at(
         cls, eye: np.ndarray, target: np.ndarray, up: np.ndarray, width: int, height: int, fov_y: float
     ) -> "Camera":
-        """A camera at `eye` that sees `target` in its centre, with `up` (world direction) upwards in the image."""
+        """Return a camera at `eye` that looks at `target`, with the world direction `up` upwards in the image."""
         return cls.from_fov(look_at(eye, target, up), width, height, fov_y)
 
     @classmethod
     def from_opengl(
         cls, camera_to_world: np.ndarray, width: int, height: int, *, fx: float, fy: float, cx: float, cy: float
     ) -> "Camera":
-        """From a camera-to-world matrix in OpenGL axes (x right, y up, z backward), as NeRF, Blender and D-NeRF use."""
+        """Return a camera from a pose in OpenGL axes (x right, y up, z backward), as in NeRF, Blender and D-NeRF."""
         return cls(fx, fy, cx, cy, width, height, np.asarray(camera_to_world, float) @ OPENGL_TO_OPENCV)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The camera-to-world matrix, [4, 4], of a camera at `eye` looking at `target`."""
+    """Return the camera-to-world matrix, [4, 4], of a camera at `eye` looking at `target`."""
     eye, target, up = (_vector(v, name) for v, name in ((eye, "eye"), (target, "target"), (up, "up")))
     forward = target - eye
     right = _cross(forward, up)
@@ -144,9 +144,9 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def orbit(target: np.ndarray, distance: float, azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:
-    """The camera-to-world matrix, [4, 4], of a camera on a sphere around `target`.
+    """Return the camera-to-world matrix, [4, 4], of a camera on a sphere around `target`.
 
-    Angles in degrees. Azimuth turns around `up`, elevation rises above the horizon, in (-90, 90).
+    Angles in degrees: azimuth around `up`, elevation above the horizon in (-90, 90).
     """
     if not (math.isfinite(distance) and distance > 0):
         raise InvalidInput("camera.distance", "finite and above 0", distance)
@@ -158,18 +158,18 @@ def orbit(target: np.ndarray, distance: float, azimuth: float, elevation: float,
     if not up.any():
         raise InvalidInput("camera.up", "a direction", up.tolist())
     up = up / np.linalg.norm(up)
-    # azimuth 0 lies along the world axis that is most level, made exactly level
+    # azimuth 0 is the world axis most perpendicular to `up`, made exactly perpendicular
     level = np.eye(3)[np.argmin(np.abs(up))]
     level = level - up * (level @ up)
     level = level / np.linalg.norm(level)
     a, e = math.radians(azimuth), math.radians(elevation)
-    outwards = math.cos(e) * (math.cos(a) * level + math.sin(a) * _cross(up, level)) + math.sin(e) * up
+    outward = math.cos(e) * (math.cos(a) * level + math.sin(a) * _cross(up, level)) + math.sin(e) * up
     target = _vector(target, "target")
-    return look_at(target + distance * outwards, target, up)
+    return look_at(target + distance * outward, target, up)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two vectors [3]: `np.cross` takes 40 µs for them, this 5."""
+    """Return the cross product of two vectors [3]; takes 5 µs, `np.cross` 40 µs."""
     return a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
 
 
@@ -181,7 +181,7 @@ def _vector(value: np.ndarray, name: str) -> np.ndarray:
 
 
 def _rigid(matrix: np.ndarray) -> np.ndarray:
-    """A rotation and a position, as float64, read-only; float32 noise in the rotation is tolerated."""
+    """Return a rigid pose as float64, read-only; rounding of float32 rotations is tolerated."""
     matrix = np.array(matrix, dtype=np.float64)
     field = "camera.camera_to_world"
     if matrix.shape != (4, 4):

@@ -1,18 +1,18 @@
-"""Domain errors, raised low and mapped to an HTTP status in one table of `msdgs_serve.api.errors`.
+"""Domain errors. `msdgs_serve.api.errors` maps them to HTTP statuses.
 
 MsdgsError
-├── InvalidInput      a value that a caller gave is wrong; `field` names it
-├── SceneNotFound     no scene of that name
-└── SceneFileInvalid  a scene file breaks the contract; `field` names what
+├── InvalidInput      an argument is invalid; `field` names it
+├── SceneNotFound     there is no scene of that name
+└── SceneFileInvalid  a scene file violates the contract; `field` names the part of it
 """
 
 
 class MsdgsError(Exception):
-    """Base of every error that this project raises on purpose."""
+    """Base of all errors that this project raises."""
 
 
 class InvalidInput(MsdgsError, ValueError):
-    """A value breaks its contract, as in "`camera.fov_y` must be in (0, 180) degrees, got 190"."""
+    """An argument is invalid, as in "`camera.fov_y` must be in (0, 180) degrees, got 190"."""
 
     def __init__(self, field: str, expected: str, got: object) -> None:
         super().__init__(f"`{field}` must be {expected}, got {got}")
@@ -23,7 +23,7 @@ class SceneNotFound(MsdgsError, KeyError):
     """No scene of this name is being served."""
 
     def __init__(self, name: str, known: list[str]) -> None:
-        super().__init__(f"no scene `{name}`; there are: {', '.join(known) or 'none'}")
+        super().__init__(f"no scene `{name}`; known scenes: {', '.join(known) or 'none'}")
         self.name = name
 
     def __str__(self) -> str:
@@ -31,10 +31,10 @@ class SceneNotFound(MsdgsError, KeyError):
 
 
 class SceneFileInvalid(MsdgsError):
-    """A scene file lacks something of contract `msdgs/1`, or says what can't be true."""
+    """A scene file violates contract `msdgs/1`: a part is missing, invalid or contradictory."""
 
     def __init__(self, file: str, field: str, problem: str, details: str = "") -> None:
-        """`details` are for logs alone, such as a library's own words."""
+        """`details` are for logs only, such as a library's message."""
         super().__init__(f"{file}: `{field}` {problem}{': ' if details else ''}{details}")
         self.file = file
         self.field = field
@@ -42,5 +42,5 @@ class SceneFileInvalid(MsdgsError):
         self.details = details
 
     def again(self) -> "SceneFileInvalid":
-        """The same without its traceback, which holds on to all that was being read."""
+        """Return a copy without the traceback, which would keep the file's contents in memory."""
         return SceneFileInvalid(self.file, self.field, self.problem, self.details)

@@ -1,4 +1,4 @@
-"""A set of 3D Gaussians, activated and posed: what a rasterizer draws."""
+"""A set of posed 3D Gaussians with activated parameters, the input of the rasterizer."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,9 @@ FloatArray = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians in world space. Arrays share one dtype, float32 unless a test asks for float64."""
+    """N Gaussians in world space. Arrays share one dtype: float32, or float64 in tests."""
 
-    means: FloatArray  # [N, 3] centres, scene units
+    means: FloatArray  # [N, 3] centers, scene units
     quats: FloatArray  # [N, 4] rotations, wxyz, unit
     scales: FloatArray  # [N, 3] standard deviations, scene units, > 0
     opacities: FloatArray  # [N] in [0, 1]
@@ -29,7 +29,7 @@ class Gaussians:
         return SH_DEGREES[self.sh.shape[1]]
 
     def validate_shapes(self) -> None:
-        """Raise `InvalidInput` naming the array if shapes disagree; doesn't look at values."""
+        """Raise `InvalidInput` naming the array if shapes are inconsistent; values are not checked."""
         n = len(self.means)
         expected_shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
         for name, shape in expected_shapes.items():
@@ -40,7 +40,7 @@ class Gaussians:
             raise InvalidInput("gaussians.sh", f"of shape ({n}, one of {counts}, 3)", self.sh.shape)
 
     def validate(self) -> "Gaussians":
-        """Return self if shapes agree and every value is usable, else raise `InvalidInput` naming the array."""
+        """Return self, or raise `InvalidInput` naming the array if shapes or values are invalid."""
         self.validate_shapes()
         n = len(self.means)
         for name in ("means", "quats", "scales", "opacities", "sh"):

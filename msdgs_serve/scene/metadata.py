@@ -1,4 +1,4 @@
-"""What a scene file says about itself, contract `msdgs/1`: its `metadata_props`, each checked on reading."""
+"""Metadata of a scene file (contract `msdgs/1`): the `metadata_props`, checked on reading."""
 
 import json
 import re
@@ -14,30 +14,30 @@ from msdgs_serve.scene.plain_json import parse
 
 CONTRACT = "msdgs/1"
 MAX_NUMBER = 1e9
-"""Of times, coordinates, pixels and so on: far beyond any sensible value, and within single precision."""
+"""Limit of times, coordinates and pixels: beyond any sensible value, within single precision."""
 MAX_LIST = 1000
-"""Layers, cameras and entries of other lists."""
+"""Limit of the length of lists, such as layers and cameras."""
 MAX_WORD = 100
-"""Characters of a text that may become an HTTP header."""
+"""Limit of characters in a text that may become an HTTP header."""
 
 
 @dataclass(frozen=True)
 class SceneCamera:
-    """A camera to start from, and the time it saw."""
+    """A camera that is stored in the scene, with its time."""
 
     name: str
     t: float
     camera: Camera
 
     def to_plain(self) -> dict[str, Any]:
-        """Nested plain values, as the file stores it."""
+        """Return the camera as JSON values, as the file stores it."""
         c = self.camera
         intrinsics = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "width": int(c.width), "height": int(c.height)}
         return {"name": self.name, "t": self.t, **intrinsics, "camera_to_world": c.camera_to_world.tolist()}
 
     @classmethod
     def from_plain(cls, value: Mapping[str, Any]) -> "SceneCamera":
-        """The inverse of `to_plain`. Raises ValueError (`InvalidInput` is one) or KeyError."""
+        """Return the camera from the values of `to_plain`. Raises ValueError or KeyError."""
         rows = _list(value["camera_to_world"])
         camera = Camera(
             *(_number(value[key]) for key in ("fx", "fy", "cx", "cy")),
@@ -50,34 +50,34 @@ class SceneCamera:
 
 @dataclass(frozen=True)
 class SceneMetadata:
-    """`metadata_props` of a scene file. Each value is JSON under the field's own name; only what has a default here may
-    be missing."""
+    """`metadata_props` of a scene file. Each value is JSON under the field's name; only fields with a default may be
+    missing."""
 
     contract: str
-    layers: tuple[str, ...]  # the kind of each deformation layer, in order; empty where nothing moves
+    layers: tuple[str, ...]  # kinds of the deformation layers, in order; empty if nothing moves
     plan: str  # how the deformation is computed, e.g. "network"
     time_range: tuple[float, float]  # t0 <= t1
     bounds: tuple[tuple[float, ...], tuple[float, ...]]  # two opposite corners, scene units
     sh_degree: int  # 0 to 3
-    delta_space: str  # where deltas were added in training, e.g. "raw"
+    delta_space: str  # space in which deltas were added in training, e.g. "raw"
     background: tuple[float, float, float]  # sRGB in [0, 1], as trained
-    antialiasing: str  # "dilate": `eps2d` on the projected covariance; "mip": that, and dimmed by as much
-    cameras: tuple[SceneCamera, ...]  # to start from
-    left_out: tuple[Any, ...]  # what the export left out of the model
-    measured_error: dict[str, Any]  # of the plan, against the model it was made from
+    antialiasing: str  # "dilate": `eps2d` added to projected covariances; "mip": also scales opacities
+    cameras: tuple[SceneCamera, ...]
+    left_out: tuple[Any, ...]  # parts of the model that the export pruned
+    measured_error: dict[str, Any]  # of the plan against the model
     package_version: str
     checkpoint_sha256: str  # of the model file
     eps2d: float = 0.3  # px², as trained
 
     def to_properties(self) -> dict[str, str]:
-        """The `metadata_props` of a file."""
+        """Return the `metadata_props` of a file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         values["cameras"] = [camera.to_plain() for camera in self.cameras]
         return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}
 
     @classmethod
     def from_properties(cls, properties: Mapping[str, str], file: str) -> "SceneMetadata":
-        """Read and check them; `file` is for messages. Raises `SceneFileInvalid` naming the field."""
+        """Read and check `metadata_props`. Raises `SceneFileInvalid` naming `file` and the field."""
         values = {}
         optional = {field.name for field in fields(cls) if field.default is not MISSING}
         for name, reader in _READERS.items():
@@ -110,12 +110,12 @@ def _numbers(value: Any, count: int) -> tuple[float, ...]:
 
 def _text(value: Any) -> str:
     if not isinstance(value, str) or not value:
-        raise ValueError(f"{_shown(value)} isn't a text")
+        raise ValueError(f"{_shown(value)} isn't a non-empty text")
     return value
 
 
 def _word(value: Any) -> str:
-    """Text that may be a header's value."""
+    """Read a text that may become an HTTP header."""
     if not (_text(value).isascii() and len(value) <= MAX_WORD):
         raise ValueError(f"{_shown(value)} isn't at most {MAX_WORD} printable ASCII characters")
     return value
@@ -138,7 +138,7 @@ def _mapping(value: Any) -> dict[str, Any]:
 
 
 def _shown(value: Any) -> str:
-    """For a message: its beginning."""
+    """Return the beginning of a value for a message."""
     text = repr(value)
     return text if len(text) <= MAX_WORD else f"{text[:MAX_WORD]}…"
 
@@ -146,7 +146,7 @@ def _shown(value: Any) -> str:
 def _one_of(*known: str) -> Callable[[Any], str]:
     def read(value: Any) -> str:
         if value not in known:
-            raise ValueError(f"{_shown(value)} isn't known to this reader, which knows {', '.join(known)}")
+            raise ValueError(f"{_shown(value)} is unknown; known values: {', '.join(known)}")
         return value
 
     return read

@@ -1,4 +1,4 @@
-"""JSON from strangers: bounded in length, depth, numbers and texts."""
+"""Parse JSON of untrusted files, with limits on length, depth, numbers and texts."""
 
 import json
 import math
@@ -8,19 +8,21 @@ from typing import Any
 MAX_CHARACTERS = 1 << 18
 MAX_DEPTH = 16
 MAX_DIGITS = 15
-"""Of a whole number: more than a double holds exactly aren't needed."""
+"""Limit of digits in an integer, which a double represents exactly."""
 MAX_TEXT = 2000
-"""Characters of a text inside."""
+"""Limit of characters in a text value."""
 
 _TOKENS = re.compile(r'"(?:[^"\\]|\\.?)*(?:"|$)|[\[{]|[\]}]', re.DOTALL)
 
 
 def parse(text: str, max_characters: int = MAX_CHARACTERS) -> Any:
-    """Plain values; every text in them is printable and every number finite. Raises ValueError saying what isn't."""
+    """Return parsed values with printable texts and finite numbers. Raises ValueError with the reason otherwise."""
     if len(text) > max_characters:
         raise ValueError(f"it has {len(text):,} characters, more than {max_characters:,}")
     _check_depth(text)
-    value = json.loads(text, parse_int=_whole, parse_float=_decimal, parse_constant=_decimal, object_pairs_hook=_object)
+    value = json.loads(
+        text, parse_int=_integer, parse_float=_decimal, parse_constant=_decimal, object_pairs_hook=_object
+    )
     _check_texts(value)
     return value
 
@@ -33,9 +35,9 @@ def _check_depth(text: str) -> None:
             raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
 
 
-def _whole(digits: str) -> int:
+def _integer(digits: str) -> int:
     if len(digits.lstrip("-")) > MAX_DIGITS:
-        raise ValueError(f"a whole number has {len(digits):,} digits, more than {MAX_DIGITS}")
+        raise ValueError(f"an integer has {len(digits):,} digits, more than {MAX_DIGITS}")
     return int(digits)
 
 
@@ -49,7 +51,7 @@ def _decimal(digits: str) -> float:
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) != len(pairs):
-        raise ValueError("an object has one key twice")
+        raise ValueError("an object has a duplicate key")
     return result
 
 

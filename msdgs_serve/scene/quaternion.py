@@ -9,7 +9,7 @@ MIN_NORM = 1e-8
 
 
 def normalize(quats: np.ndarray) -> np.ndarray:
-    """Scale wxyz quaternions, shape (*, 4), to unit length. Raises `InvalidInput` where a norm is under 1e-8."""
+    """Scale wxyz quaternions, shape (*, 4), to unit length. Raises `InvalidInput` if a norm is below 1e-8."""
     quats = np.asarray(quats)
     # divided by the largest entry first: 1e-30 squared is 0, 1e30 squared is infinite in float32
     largest = np.abs(quats).max(axis=-1, keepdims=True, initial=0.0)
@@ -20,7 +20,7 @@ def normalize(quats: np.ndarray) -> np.ndarray:
 
 
 def to_matrix(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices, shape (*, 3, 3), of unit wxyz quaternions, shape (*, 4)."""
+    """Return rotation matrices, shape (*, 3, 3), of unit wxyz quaternions, shape (*, 4)."""
     w, x, y, z = np.moveaxis(np.asarray(quats), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -31,10 +31,10 @@ def to_matrix(quats: np.ndarray) -> np.ndarray:
 
 
 def from_matrix(matrices: np.ndarray) -> np.ndarray:
-    """Unit wxyz quaternions, shape (*, 4), w >= 0, of rotation matrices, shape (*, 3, 3).
+    """Return unit wxyz quaternions, shape (*, 4), w >= 0, of rotation matrices, shape (*, 3, 3).
 
-    The largest of the four components is found from the diagonal and the others are divided by it, so that no
-    rotation is near a division by zero.
+    The largest component is computed from the diagonal and the others are divided by it, which avoids divisions by
+    numbers near zero.
     """
     m = np.asarray(matrices)
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]

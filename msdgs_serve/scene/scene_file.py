@@ -1,4 +1,4 @@
-"""A scene file, contract `msdgs/1`, from its bytes: checked as a whole before anything in it runs."""
+"""Read a scene file (contract `msdgs/1`) from bytes, and check all of it before any part runs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,12 +8,25 @@ import numpy as np
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, INPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_serve.scene.metadata import SceneMetadata
-from msdgs_serve.scene.onnx import GraphLimits, Model, ModelInvalid, Tensor, Value, infer, read_model, write_model
+from msdgs_serve.scene.onnx import (
+    UNLIMITED,
+    GraphLimits,
+    Model,
+    ModelInvalid,
+    Tensor,
+    Value,
+    infer,
+    read_model,
+    write_model,
+)
 from msdgs_serve.scene.onnx.model import FLOAT, INT64, Port, element_name
 from msdgs_serve.scene.onnx.shapes import IDS, Shape, fixed, text
 
 CHUNK = 2048
-"""Gaussians a call where layers run. The widest activation of a call is CHUNK × width, whatever the scene's size."""
+"""Gaussians per call of a graph that runs layers on Gaussians. The largest activation of a call is CHUNK × width."""
+PER_ID_FACTOR = 2
+"""A graph computes all Gaussians in any case if a call for all of them takes less than this times the operations of a
+call for one."""
 
 _INPUTS: Mapping[str, tuple[int, Shape]] = {
     "t": (FLOAT, fixed([1])),
@@ -22,40 +35,41 @@ _INPUTS: Mapping[str, tuple[int, Shape]] = {
 }
 _COLUMNS = {"means": 3, "quats": 4, "scales": 3}
 _POSED_BYTES = 4 * sum(_COLUMNS.values())
-_AT_A_TIME = 1 << 22
-"""Values that are looked at at once, so that looking takes no memory to speak of."""
+_CHUNK_VALUES = 1 << 22
+"""Values that are checked at a time, to bound the memory of the checks."""
 
 
 @dataclass(frozen=True)
 class SceneCost:
-    """Upper bounds, known before anything runs and the same at all times, beside what is allowed."""
+    """Upper bounds of a scene's cost, which are known before it runs and hold at all times, and the limits."""
 
     memory_bytes: int  # of the values of one call and of all poses
     operations: int  # of posing all moving Gaussians once
-    calls: int  # that this takes
+    calls: int  # of the graph for one pose of all moving Gaussians
     limits: GraphLimits
 
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a file holds. `graph` and `constant_graph` are models that this package has written."""
+    """The contents of a scene file. `graph` and `constant_graph` are ONNX models written by this package."""
 
     metadata: SceneMetadata
     moving_count: int
-    steps: float | None  # by default; None where the plan doesn't run layers
-    constants: Mapping[str, np.ndarray]  # those of CONSTANT_OUTPUTS that are stored as they are
-    graph: bytes  # inputs of the contract, without defaults, to MOVING_OUTPUTS
-    constant_graph: bytes | None  # no inputs, to the rest of CONSTANT_OUTPUTS
+    steps: float | None  # the default input; None if the plan doesn't run layers
+    poses_all: bool  # whether a call computes all Gaussians in any case
+    constants: Mapping[str, np.ndarray]  # those of CONSTANT_OUTPUTS that are stored directly
+    graph: bytes  # computes MOVING_OUTPUTS from the inputs of the contract, which have no defaults
+    constant_graph: bytes | None  # computes the remaining CONSTANT_OUTPUTS, without inputs
     cost: SceneCost
 
     @property
     def computed(self) -> list[str]:
-        """Outputs of `constant_graph`."""
+        """Names of the outputs of `constant_graph`."""
         return [name for name in CONSTANT_OUTPUTS if name not in self.constants]
 
 
 def read_scene_file(contents: bytes, file: str, limits: GraphLimits) -> SceneFile:
-    """`file` is for messages. Raises `SceneFileInvalid` naming the field, the node or the constant."""
+    """Read and check a scene file. Raises `SceneFileInvalid` naming `file` and the field, node or constant."""
     if not contents:
         raise SceneFileInvalid(file, "file", "is empty")
     try:
@@ -71,21 +85,24 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
         _check_finite(tensor)
     inputs = _inputs(model)
     moving_count, steps = _default_ids(model), _default_steps(model)
-    ids = moving_count if steps is None else min(CHUNK, moving_count)
+    returned = moving_count * _POSED_BYTES
+    poses_all = steps is None or _poses_all(model, inputs, moving_count)
+    ids = moving_count if poses_all else min(CHUNK, moving_count)
     calls = -(-moving_count // max(ids, 1))
-    values, cost = infer(model, inputs, limits, ids, calls, moving_count * _POSED_BYTES)
+    values, cost = infer(model, inputs, limits, ids, calls, returned)
     _check_outputs(model, values, moving_count)
     _check_count(moving_count + values["static_means"].shape[0].fixed, limits)
     constants = {}
     for name in CONSTANT_OUTPUTS:
         stored = values[name].constant
         if stored is not None:
-            constants[name] = stored.array().copy()  # aligned, and nothing holds on to the whole file
+            constants[name] = stored.array().copy()  # aligned, and doesn't keep the whole file in memory
     computed = [name for name in CONSTANT_OUTPUTS if name not in constants]
     return SceneFile(
         metadata,
         moving_count,
         steps,
+        poses_all,
         constants,
         write_model(model, MOVING_OUTPUTS, inputs, values),
         write_model(model, computed, {}, values) if computed else None,
@@ -93,11 +110,17 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
     )
 
 
+def _poses_all(model: Model, inputs: Mapping[str, Value], moving_count: int) -> bool:
+    """Whether all Gaussians take hardly more operations than one."""
+    one, every = (infer(model, inputs, UNLIMITED, ids, 1, 0)[1].operations for ids in (1, moving_count))
+    return every < PER_ID_FACTOR * one
+
+
 def _check_finite(tensor: Tensor) -> None:
     if tensor.element != FLOAT:
         return
     flat = tensor.array().reshape(-1)
-    parts = (flat[start : start + _AT_A_TIME] for start in range(0, flat.size, _AT_A_TIME))
+    parts = (flat[start : start + _CHUNK_VALUES] for start in range(0, flat.size, _CHUNK_VALUES))
     bad = sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts)
     if bad:
         raise ModelInvalid(tensor.name, f"holds {bad:,} values that are NaN or infinite")
@@ -119,7 +142,7 @@ def _inputs(model: Model) -> dict[str, Value]:
 
 
 def _is_of_shape(port: Port, shape: Shape) -> bool:
-    """A dimension that is no number stands for any."""
+    """Whether a port has a shape; dimensions without a number match any."""
     if port.shape is None:
         return True
     if len(port.shape) != len(shape):
@@ -132,12 +155,12 @@ def _is_of_shape(port: Port, shape: Shape) -> bool:
 
 def _default_ids(model: Model) -> int:
     if "t" in model.constants:
-        raise ModelInvalid("t", "has a default, which only `ids` and `steps` may have")
+        raise ModelInvalid("t", "has a default value; only `ids` and `steps` may have one")
     ids = model.constants.get("ids")
     if ids is None:
-        raise ModelInvalid("ids", "has no default of all moving Gaussians")
+        raise ModelInvalid("ids", "has no default value, which must be all moving Gaussians")
     if ids.element != INT64 or len(ids.shape) != 1 or not np.array_equal(ids.array(), np.arange(ids.shape[0])):
-        raise ModelInvalid("ids", "has a default that isn't all moving Gaussians in order")
+        raise ModelInvalid("ids", "has a default value that isn't all moving Gaussians in order")
     return ids.shape[0]
 
 
@@ -146,15 +169,15 @@ def _default_steps(model: Model) -> float | None:
         return None
     steps = model.constants.get(OPTIONAL_INPUT)
     if steps is None:
-        raise ModelInvalid(OPTIONAL_INPUT, "has no default of all layers")
+        raise ModelInvalid(OPTIONAL_INPUT, "has no default value, which must be the number of layers")
     if steps.element != FLOAT or steps.shape != (1,):
-        raise ModelInvalid(OPTIONAL_INPUT, "has a default that isn't one float32")
+        raise ModelInvalid(OPTIONAL_INPUT, "has a default value that isn't one float32")
     return float(steps.array()[0])
 
 
 def _check_count(gaussians: int, limits: GraphLimits) -> None:
     if gaussians > limits.gaussians:
-        raise ModelInvalid("ids", f"and `static_means` are {gaussians:,} Gaussians; allowed are {limits.gaussians:,}")
+        raise ModelInvalid("ids", f"and `static_means` are {gaussians:,} Gaussians; the limit is {limits.gaussians:,}")
 
 
 def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int) -> None:
@@ -167,7 +190,7 @@ def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int)
             raise ModelInvalid(name, f"is {element_name(wrong)}, not float32")
     for name in CONSTANT_OUTPUTS:
         if values[name].varies:
-            raise ModelInvalid(name, "depends on an input, where it has to be constant")
+            raise ModelInvalid(name, "depends on an input, but must be constant")
         if not values[name].shape:
             raise ModelInvalid(name, "is a single number")
     for name, columns in _COLUMNS.items():

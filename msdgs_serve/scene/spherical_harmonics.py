@@ -15,16 +15,16 @@ SH_C3 = (
     -0.5900435899266435,
 )
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
-"""Degree by number of coefficients."""
+"""Degree for each number of coefficients per color channel."""
 
 
 def sh_coefficients(degree: int) -> int:
-    """Number of coefficients a color channel has up to and including `degree`."""
+    """Return the number of coefficients per color channel up to and including `degree`."""
     return (degree + 1) ** 2
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """The basis functions, shape (*, (degree + 1)²), at unit directions, shape (*, 3), from the eye to the Gaussian."""
+    """Return basis functions, shape (*, (degree + 1)²), at unit directions from eye to Gaussian, shape (*, 3)."""
     x, y, z = np.moveaxis(np.asarray(directions), -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     basis = [np.full_like(x, SH_C0)]
@@ -52,11 +52,11 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def sh_to_rgb(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Colors, shape (*, 3), of coefficients, shape (*, (degree + 1)², 3), seen along unit directions, shape (*, 3)."""
+    """Return colors, shape (*, 3), of coefficients, shape (*, (degree + 1)², 3), in unit directions, shape (*, 3)."""
     basis = sh_basis(directions, SH_DEGREES[sh.shape[-2]])
     return np.maximum(np.einsum("...k,...kc->...c", basis, sh) + 0.5, 0)
 
 
 def rgb_to_sh_dc(rgb: np.ndarray) -> np.ndarray:
-    """The degree-0 coefficient that gives `rgb` in every direction."""
+    """Return the degree-0 coefficient that gives `rgb` in every direction."""
     return (np.asarray(rgb) - 0.5) / SH_C0

@@ -1,10 +1,10 @@
-// Calls of the service. Addresses are relative, so that the page works behind a proxy's prefix.
+// Calls of the service. URLs are relative, so that the page works behind a proxy's prefix.
 
 const KEY = "msdgs-key";
 
 export class Unreachable extends Error {}
 
-/** An answer that is an error; `detail` is for people, `fields` are those of the request that are wrong. */
+/** An error response; `detail` is for people, `fields` are the invalid fields of the request. */
 export class Refusal extends Error {
   constructor(status, problem, retryAfter) {
     super(problem.detail ?? `The service answered ${status}.`);
@@ -21,7 +21,7 @@ export function keepKey(key) {
   else sessionStorage.removeItem(KEY);
 }
 
-/** The answer, if it is a good one or "not modified". Throws `Unreachable`, `Refusal`, or an AbortError. */
+/** Return the response, if it is a success or "not modified". Throws `Unreachable`, `Refusal`, or an AbortError. */
 export async function call(path, { headers = {}, ...options } = {}) {
   const key = readKey();
   const authorization = key ? { Authorization: `Bearer ${key}` } : {};
@@ -33,7 +33,7 @@ export async function call(path, { headers = {}, ...options } = {}) {
     throw new Unreachable();
   }
   if (response.ok || response.status === 304) return response;
-  if (response.status === 502) throw new Unreachable(); // a proxy whose service is away
+  if (response.status === 502) throw new Unreachable(); // a proxy that doesn't reach the service
   const problem = await response.json().catch(() => ({}));
   throw new Refusal(response.status, problem, Number(response.headers.get("Retry-After")) || 1);
 }

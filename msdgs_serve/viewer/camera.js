@@ -1,4 +1,4 @@
-// The camera: on a sphere around a target, with the angles of the service's `orbit`. Flying moves the target along.
+// An orbit camera with the angles of the service's `orbit`. Flying moves the target too.
 
 import { add, cross, dot, length, scaled, unit } from "./vector.js";
 
@@ -6,12 +6,12 @@ const STEEPEST = 89;
 const DEGREES = 180 / Math.PI;
 
 export class Camera {
-  /** `view` is that of GET /scenes/{name}. */
+  /** `view` is `view` of GET /scenes/{name}. */
   constructor(view) {
     this.view = view;
     this.up = unit(view.up);
-    this.aspect = 1; // of the image, width to height; the stage sets it
-    // azimuth 0 lies along the world axis that is most level, as the service has it
+    this.aspect = 1; // width / height of the image; set by the stage
+    // azimuth 0 is the world axis most perpendicular to `up`, as in the service
     const tilts = this.up.map(Math.abs);
     const axis = [0, 0, 0];
     axis[tilts.indexOf(Math.min(...tilts))] = 1;
@@ -30,12 +30,12 @@ export class Camera {
     this.sceneCamera = null;
   }
 
-  /** Stand where a camera of the scene stands: exactly there, until something is moved. */
+  /** Use the exact pose of a stored camera of the scene, until the camera is moved. */
   take(sceneCamera, index) {
     const columns = [0, 1, 2, 3].map((j) => sceneCamera.camera_to_world.slice(0, 3).map((row) => row[j]));
     const [, , forward, eye] = columns;
-    const ahead = dot(add(this.view.target, eye, -1), forward);
-    this.distance = Math.max(ahead, 0.1 * this.view.distance);
+    const inFront = dot(add(this.view.target, eye, -1), forward);
+    this.distance = Math.max(inFront, 0.1 * this.view.distance);
     this.target = add(eye, forward, this.distance);
     this.elevation = limited(-Math.asin(dot(forward, this.up)) * DEGREES);
     this.azimuth = Math.atan2(-dot(forward, this.side), -dot(forward, this.level)) * DEGREES;
@@ -44,7 +44,7 @@ export class Camera {
     this.sceneCamera = index;
   }
 
-  /** From the target to the camera, of length 1. */
+  /** Unit vector from the target to the camera. */
   get outwards() {
     const [a, e] = [this.azimuth / DEGREES, this.elevation / DEGREES];
     const level = add(scaled(this.level, Math.cos(a)), this.side, Math.sin(a));
@@ -55,42 +55,42 @@ export class Camera {
     return add(this.target, this.outwards, this.distance);
   }
 
-  /** Right, up and forward in the image, world. */
+  /** Right, up and forward of the image in world space. */
   get axes() {
     const forward = scaled(this.outwards, -1);
     const right = unit(cross(forward, this.up));
     return { right, above: cross(right, forward), forward };
   }
 
-  /** Degrees. */
+  /** Orbit by angles in degrees. */
   orbit(azimuth, elevation) {
     this.sceneCamera = null;
     this.azimuth = (((this.azimuth + azimuth) % 360) + 360) % 360;
     this.elevation = limited(this.elevation + elevation);
   }
 
-  /** Turn the head, in degrees; the eye stays where it is. */
+  /** Rotate the camera about its position, in degrees. */
   look(azimuth, elevation) {
     const eye = this.eye;
     this.orbit(azimuth, elevation);
     this.target = add(eye, this.outwards, -this.distance);
   }
 
-  /** Parts of the image's height, to the right and up. */
+  /** Pan to the right and up, in fractions of the image's height. */
   pan(right, above) {
     this.sceneCamera = null;
     const height = 2 * this.distance * this.half;
     this.target = add(add(this.target, this.axes.right, right * height), this.axes.above, above * height);
   }
 
-  /** Farther from the target where `factor` is above 1. */
+  /** Multiply the distance from the target by `factor`. */
   zoom(factor) {
     this.sceneCamera = null;
     const all = this.view.distance;
     this.distance = Math.min(Math.max(this.distance * factor, 1e-3 * all), 1e3 * all);
   }
 
-  /** Parts of the scene's distance, along the image's axes. */
+  /** Move along the image's axes, in fractions of the scene's distance. */
   fly(right, above, forward) {
     this.sceneCamera = null;
     const axes = this.axes;
@@ -100,12 +100,12 @@ export class Camera {
     }
   }
 
-  /** Half the height of the image at distance 1; in a narrow one a square of the scene stays visible. */
+  /** Half the height of the image at distance 1; narrow images keep a square of the scene visible. */
   get half() {
     return Math.tan(this.fovY / DEGREES / 2) * Math.max(1, Math.min(this.proportion, 1) / this.aspect);
   }
 
-  /** As `camera` of a request. */
+  /** Return `camera` of a request. */
   get spec() {
     if (this.sceneCamera !== null) return { type: "scene", index: this.sceneCamera };
     return {
@@ -119,7 +119,7 @@ export class Camera {
   }
 }
 
-/** Depths between which the scene lies, steady while the camera moves; a few Gaussians far out don't count. */
+/** Return a depth range of the scene that is stable while the camera moves; ignores a few distant Gaussians. */
 export function depthRange(camera, bounds) {
   const [low, high] = bounds;
   const radius = Math.min(length(add(high, low, -1)) / 2, camera.view.distance / 2);
@@ -130,7 +130,7 @@ export function depthRange(camera, bounds) {
 
 const limited = (elevation) => Math.min(Math.max(elevation, -STEEPEST), STEEPEST);
 
-/** So many digits that a copied request can be read; far finer than a pixel at `size`, in scene units. */
+/** Round numbers of a copied request to readable lengths, far below a pixel at `size`, in scene units. */
 export function short(x, size = 1) {
   return Number(x.toFixed(Math.min(Math.max(5 - Math.floor(Math.log10(size)), 0), 12)));
 }

@@ -1,13 +1,13 @@
-// Whether the service answers: a line that says when it doesn't, and the way back.
+// Connection state: a banner while the service doesn't answer, and reconnection.
 
 import { Refusal, Unreachable, call } from "./api.js";
 
 const SHORTEST_WAIT = 1000;
-const LONGEST_WAIT = 5000;
+const MAX_WAIT = 5000;
 const GROWTH = 1.5;
 
 export class Connection {
-  /** `banner` is the line's element; `recovered` is called when the service is back, `keyNeeded` when it asks for one. */
+  /** `banner` is an element; `recovered` is called when the service answers again, `keyNeeded` when it needs a key. */
   constructor(banner, { recovered, keyNeeded }) {
     this.banner = banner;
     this.recovered = recovered;
@@ -16,7 +16,7 @@ export class Connection {
     this.timer = 0;
   }
 
-  /** Say what is wrong, and come back where waiting helps. */
+  /** Show an error, and retry later if that can help. */
   failed(error) {
     if (error instanceof Unreachable) this.#lose("The service doesn’t answer. Trying again…");
     else if (error instanceof Refusal && error.status === 503) this.#lose(error.message, error.retryAfter * 1000);
@@ -48,7 +48,7 @@ export class Connection {
       await call("ready");
     } catch (error) {
       if (error instanceof Refusal) this.say(error.message);
-      this.#tryAfter(Math.min(wait * GROWTH, LONGEST_WAIT));
+      this.#tryAfter(Math.min(wait * GROWTH, MAX_WAIT));
       return;
     }
     this.isLost = false;

@@ -1,10 +1,10 @@
-// Mouse, touch and keys, as movements of the camera and commands.
+// Mouse, touch and keyboard: camera movements and commands.
 
-const ORBIT_SPEED = 200; // degrees for a drag as long as the image is high
+const ORBIT_SPEED = 200; // degrees per image height of dragging
 const LOOK_SPEED = 50;
-const WHEEL_SPEED = 0.0012; // of a pixel of scrolling, as a logarithm of the distance
+const WHEEL_SPEED = 0.0012; // change of log distance per pixel of scrolling
 const WHEEL_PIXELS = [1, 16, 400]; // by the event's deltaMode: pixels, lines, pages
-const FLY_SPEED = 0.5; // scene distances a second
+const FLY_SPEED = 0.5; // scene distances per second
 const FAST = 4;
 const KEY_TURN = 5; // degrees
 const KEY_ZOOM = 1.1;
@@ -17,7 +17,7 @@ const TURNING = {
 }; // prettier-ignore
 
 export class Controls {
-  /** `host` has: camera(), or null while there is none; moved(); command(key), true where it knows the key. */
+  /** `host` has: camera(), which may return null; moved(); command(key), true if it handles the key. */
   constructor(canvas, host) {
     this.canvas = canvas;
     this.host = host;
@@ -35,7 +35,7 @@ export class Controls {
     window.addEventListener("blur", () => this.flying.clear());
   }
 
-  /** Fly on for so many seconds; whether any key is held. */
+  /** Fly for some seconds. Return whether any key is held. */
   advance(seconds, isFast) {
     const camera = this.host.camera();
     if (!camera || this.flying.size === 0) return false;
@@ -70,7 +70,7 @@ export class Controls {
     this.host.moved();
   }
 
-  /** Between two fingers, in pixels. */
+  /** Distance between two fingers, in pixels. */
   #spread() {
     const [a, b] = [...this.pointers.values()];
     return b ? Math.hypot(a.x - b.x, a.y - b.y) : 0;
@@ -108,5 +108,5 @@ export class Controls {
 const isTyping = (target) =>
   target.closest("select, textarea, dialog, input:not([type=range], [type=radio])") !== null;
 
-/** Whether no other element waits for this key. */
+/** Whether no other element handles this key. */
 const isFree = (target, canvas) => target === canvas || target === document.body;

@@ -1,4 +1,4 @@
-// The work-precision diagram of a report: milliseconds across, error of the worst frame upwards.
+// The work-precision diagram of a report: milliseconds on the x axis, PSNR of the worst frame on the y axis.
 
 const SVG = "http://www.w3.org/2000/svg";
 const WIDTH = 320;
@@ -8,12 +8,12 @@ const RIGHT = 12;
 const TOP = 10;
 const BOTTOM = 36;
 const DB_STEP = 10;
-const HIGHEST = 110; // dB; what is exact is drawn here
-const PLACES = [[1, 1.5, 2, 3, 4, 5, 6, 7, 8], [1, 2, 5], [1]]; // of a decade, as many as there is room for
-const MOST_TICKS = 6;
+const MAX_DB = 110; // dB; exact plans are drawn here
+const PLACES = [[1, 1.5, 2, 3, 4, 5, 6, 7, 8], [1, 2, 5], [1]]; // ticks per decade, as many as fit
+const MAX_TICKS = 6;
 const KINDS = ["network", "prefix", "int8", "lowrank", "keyframes"];
 
-/** Draw into an <svg>; `tell(text)` gets a sentence about the point that is looked at. */
+/** Draw into an <svg>; `tell(text)` is called with a description of the selected point. */
 export function drawDiagram(svg, report, tell) {
   const points = report.points.map(pointOf).sort((a, b) => a.milliseconds - b.milliseconds);
   const across = scale(points.map((point) => Math.log(point.milliseconds)), [LEFT + 8, WIDTH - RIGHT - 8]);
@@ -38,12 +38,12 @@ function pointOf(point) {
     chosen: point.chosen,
     pruned: point.pruning_db,
     milliseconds: point.milliseconds.total.min,
-    psnr: Math.min(point.error.psnr_worst ?? HIGHEST, HIGHEST),
+    psnr: Math.min(point.error.psnr_worst ?? MAX_DB, MAX_DB),
     bytes: point.bytes,
   };
 }
 
-/** From values to places between the two ends. */
+/** Return a linear scale from values to coordinates. */
 function scale(values, [first, last]) {
   const [low, high] = [Math.min(...values), Math.max(...values)];
   return (value) => (high > low ? first + ((value - low) / (high - low)) * (last - first) : (first + last) / 2);
@@ -51,7 +51,7 @@ function scale(values, [first, last]) {
 
 function timeAxis(points, x) {
   const [fastest, slowest] = [points[0].milliseconds, points.at(-1).milliseconds];
-  const inside = PLACES.map((decade) => ticksOf(decade, fastest, slowest)).find((ticks) => ticks.length <= MOST_TICKS);
+  const inside = PLACES.map((decade) => ticksOf(decade, fastest, slowest)).find((ticks) => ticks.length <= MAX_TICKS);
   const marked = inside?.length > 1 ? inside : [fastest, slowest].map((place) => Number(place.toPrecision(2)));
   const ticks = marked.flatMap((place) => [
     make("line", { class: "grid", x1: x(place), x2: x(place), y1: TOP, y2: HEIGHT - BOTTOM }),
@@ -104,7 +104,7 @@ function dot(point, x, y, tell) {
 
 function sentence(point) {
   const pruned = point.pruned === null ? "all of it" : `pruned to ${point.pruned} dB`;
-  const error = point.psnr >= HIGHEST ? "exact" : `${point.psnr.toFixed(1)} dB in the worst frame`;
+  const error = point.psnr >= MAX_DB ? "exact" : `${point.psnr.toFixed(1)} dB in the worst frame`;
   const served = point.chosen ? "Chosen: " : "";
   return `${served}${point.plan}, ${pruned}. ${point.milliseconds.toFixed(1)} ms, ${error}, ${(point.bytes / 1e6).toFixed(2)} MB.`;
 }

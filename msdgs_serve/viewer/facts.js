@@ -1,4 +1,4 @@
-// What the scene's file says of itself.
+// Facts about the scene from its file.
 
 const number = new Intl.NumberFormat("en");
 
@@ -9,7 +9,7 @@ export function showFacts(list, scene) {
     ["Gaussians", still ? `${number.format(total)}, ${number.format(moving)} of them moving` : number.format(total)],
     ["Deformation", scene.layers.join(", then ") || "none"],
     ["Plan", scene.plan],
-    ["Its error", largestError(scene.measured_error)],
+    ["Error", largestError(scene.measured_error)],
     ["Time", scene.time_range.map(Number).join(" to ")],
     ["Cameras", number.format(scene.cameras.length)],
     ["Left out", scene.left_out.map(({ what, count }) => `${what}: ${number.format(count)}`).join("; ")],
@@ -19,7 +19,7 @@ export function showFacts(list, scene) {
   list.replaceChildren(...shown.flatMap(([term, value]) => [element("dt", term), element("dd", value)]));
 }
 
-/** Of where Gaussians are; plans other than `network` measure it in scene units. */
+/** Return the largest error of the means; plans other than `network` measure it in scene units. */
 function largestError({ position, means }) {
   if (position !== undefined) return `at most ${position.toExponential(1)} scene units`;
   return means === undefined ? "" : `at most ${means.toExponential(1)} of the scene’s size`;

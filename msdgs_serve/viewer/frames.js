@@ -1,12 +1,12 @@
-// Frames, one request at a time: small ones while something moves, a full one once all is still.
-// What is newest wins: a full frame in work is given up when something moves, and the service stops drawing it.
+// Requests frames one at a time: small ones during motion, a full one after it.
+// A full frame in progress is aborted when something moves, and the service cancels its render.
 
 import { Refusal, Unreachable, render } from "./api.js";
 
-const STILL_AFTER = 150; // milliseconds
-const IMPATIENCE = 500; // milliseconds after which a moving frame that is out of date is given up
-const SHRINK = 0.5; // of the pixels, where the service says that they are too many
-const FEWEST_PIXELS = 64 * 64;
+const FULL_AFTER = 150; // milliseconds
+const ABORT_AFTER = 500; // milliseconds after which an outdated frame is aborted during motion
+const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
+const MIN_PIXELS = 64 * 64;
 
 export class Frames {
   /**
@@ -15,7 +15,7 @@ export class Frames {
   constructor(host, pace) {
     this.host = host;
     this.pace = pace;
-    this.mostPixels = 2.5e6;
+    this.maxPixels = 2.5e6;
     this.inFlight = null;
     this.wanted = false;
     this.changedAt = 0;
@@ -23,13 +23,13 @@ export class Frames {
     this.paused = true;
   }
 
-  /** Something to be seen has changed. `cut`: so much that the frame in work is of no use. */
+  /** The view has changed. `cut`: the frame in progress is useless. */
   change({ cut = false } = {}) {
     this.changedAt = performance.now();
     this.wanted = true;
     this.shown = null;
     const flight = this.inFlight;
-    if (flight && (cut || flight.full || performance.now() - flight.asked > IMPATIENCE)) flight.abort.abort();
+    if (flight && (cut || flight.full || performance.now() - flight.asked > ABORT_AFTER)) flight.abort.abort();
     this.#next();
   }
 
@@ -44,7 +44,7 @@ export class Frames {
     this.change();
   }
 
-  /** Ask again for what is shown; costs nothing while it is the same. */
+  /** Revalidate the frame that is shown, by its ETag. */
   async check() {
     if (this.paused || this.inFlight || !this.shown || this.#isMoving()) return;
     await this.#fetch({ full: true, etag: this.shown.etag });
@@ -53,12 +53,12 @@ export class Frames {
   /** Width and height of a frame in full quality. */
   fullSize() {
     const { width, height } = this.host.size();
-    const scale = Math.min(1, Math.sqrt(this.mostPixels / (width * height)));
+    const scale = Math.min(1, Math.sqrt(this.maxPixels / (width * height)));
     return { width: Math.max(1, Math.floor(width * scale)), height: Math.max(1, Math.floor(height * scale)) };
   }
 
   #isMoving() {
-    return this.host.isMoving() || performance.now() - this.changedAt < STILL_AFTER;
+    return this.host.isMoving() || performance.now() - this.changedAt < FULL_AFTER;
   }
 
   #next() {
@@ -68,7 +68,7 @@ export class Frames {
       this.wanted = false;
       this.#fetch({ full: false });
     } else if (this.wanted || !this.shown) {
-      const wait = this.host.isMoving() ? STILL_AFTER : STILL_AFTER - (performance.now() - this.changedAt);
+      const wait = this.host.isMoving() ? FULL_AFTER : FULL_AFTER - (performance.now() - this.changedAt);
       if (wait > 0) {
         this.timer = setTimeout(() => this.#next(), wait + 1);
         return;
@@ -116,7 +116,7 @@ export class Frames {
       this.wanted = true;
       this.paused = true;
     } else if (error instanceof Refusal && this.#isTooLarge(error)) {
-      this.mostPixels *= SHRINK;
+      this.maxPixels *= SHRINK;
       this.wanted = true;
       return;
     } else if (error instanceof Refusal && error.status === 503) {
@@ -130,11 +130,11 @@ export class Frames {
 
   #isTooLarge(error) {
     const aboutSize = error.fields.some((field) => field === "width" || field === "height");
-    return error.status === 422 && aboutSize && this.mostPixels > FEWEST_PIXELS;
+    return error.status === 422 && aboutSize && this.maxPixels > MIN_PIXELS;
   }
 }
 
-/** Seconds by stage, from a Server-Timing header. */
+/** Return seconds by stage from a Server-Timing header. */
 export function timings(header) {
   const stages = {};
   for (const part of (header ?? "").split(",")) {

@@ -1,19 +1,19 @@
-// The slider of deformation layers: what moves the scene, one layer after the other.
+// The slider of deformation layers that are applied.
 
 export class Layers {
-  /** `host` has changed(), after the slider was moved. */
+  /** `host` has changed(), which is called after the slider was moved. */
   constructor(host) {
     const find = (id) => document.getElementById(id);
     [this.section, this.slider, this.text] = ["layers", "steps", "steps-text"].map(find);
     this.count = 0;
-    this.steps = null; // how many are applied; null is all
+    this.steps = null; // number of applied layers; null for all
     this.slider.addEventListener("input", () => {
       this.set(Number(this.slider.value));
       host.changed();
     });
   }
 
-  /** A scene's number of layers; 0 where its plan doesn't run them. */
+  /** Set a scene's number of layers; 0 if its plan doesn't run layers. */
   open(count) {
     this.count = count;
     this.slider.max = count;

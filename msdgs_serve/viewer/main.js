@@ -1,4 +1,4 @@
-// The page: what is shown, and what its parts say to each other.
+// The page: its state and the connections between its parts.
 
 import { getJson, keepKey, readKey, scenePath } from "./api.js";
 import { Camera } from "./camera.js";
@@ -16,7 +16,7 @@ import { copy, curlCommand, download, fromHash, toHash } from "./share.js";
 import { Stage } from "./stage.js";
 import { Timeline } from "./timeline.js";
 
-const LOOK_EVERY = 3000; // milliseconds, for changed scenes
+const REFRESH_EVERY = 3000; // milliseconds, for changed scenes
 const NOTICE_FOR = 2500;
 const VIEWS = ["rgb", "depth", "motion", "gaussians"];
 
@@ -96,7 +96,7 @@ async function showReport({ name, report: isThere }) {
   drawDiagram(find("diagram"), report, (text) => (find("report-point").textContent = text));
 }
 
-/** Something to be seen is different. */
+/** The view has changed. */
 function changed() {
   if (state.camera) frames.change();
 }
@@ -116,12 +116,12 @@ function show(bitmap, facts) {
   if (facts.isNews) scenes.renew(state.scene.name);
 }
 
-/** Whether there is nothing better to do than small images. */
+/** Whether thumbnails may be rendered now. */
 function isIdle() {
   return !connection.isLost && (frames.shown || frames.paused) && !frames.inFlight;
 }
 
-/** Time and flight go on with the screen's frames, as long as there are any. */
+/** Advance playback and flight with animation frames, while either is active. */
 function run() {
   if (running) return;
   let before = performance.now();
@@ -170,7 +170,7 @@ async function recovered() {
   });
 }
 
-/** Look whether scenes have come, changed or gone. */
+/** Check for added, changed and removed scenes. */
 async function lookAgain() {
   if (document.hidden || connection.isLost || find("key-dialog").open) return;
   await guarded(async () => {
@@ -186,7 +186,7 @@ async function start() {
   await scenes.refresh();
   const look = fromHash(location.hash);
   const name = scenes.names.includes(look.scene) ? look.scene : scenes.names[0];
-  if (name === undefined) connection.say("No scene yet. A file that is put into the service’s folder appears here.");
+  if (name === undefined) connection.say("No scenes. Files that are added to the service’s folder appear here.");
   else await open(name, look);
 }
 
@@ -244,7 +244,7 @@ function listen() {
     if (state.camera) state.camera.aspect = stage.aspect();
     changed();
   });
-  setInterval(lookAgain, LOOK_EVERY);
+  setInterval(lookAgain, REFRESH_EVERY);
 }
 
 find("key").value = readKey();

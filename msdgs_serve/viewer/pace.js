@@ -1,33 +1,33 @@
-// How many pixels a frame may have while something moves, from what frames have taken so far.
+// Chooses the size of frames during motion from the measured times of earlier frames.
 
-const TARGET = 1 / 18; // seconds a frame: 15 a second, and some air
-const FEWEST = 128 * 96;
-const DRAWING_SHARE = 0.3; // of the target, at least, where posing alone takes longer
-const CAUTION = 0.5; // how far one measurement moves the estimate
+const TARGET = 1 / 18; // seconds per frame: 15 frames per second with a margin
+const MIN_PIXELS = 128 * 96;
+const DRAWING_SHARE = 0.3; // minimal fraction of the target for drawing, even if posing takes longer
+const SMOOTHING = 0.5; // weight of the newest measurement
 
 export class Pace {
   constructor() {
-    this.secondsAPixel = null;
-    this.rest = 0; // seconds a frame that pixels don't change: posing, the network, showing
+    this.secondsPerPixel = null;
+    this.rest = 0; // seconds per frame independent of its pixels: posing, network, display
   }
 
-  /** A moving frame took `seconds` from asking to showing, `drawing` of them for its pixels. */
+  /** Record a frame that took `seconds` from request to display, `drawing` of them for its pixels. */
   measured(pixels, seconds, drawing) {
-    const aPixel = drawing / pixels;
-    if (this.secondsAPixel === null) {
-      this.secondsAPixel = aPixel;
+    const perPixel = drawing / pixels;
+    if (this.secondsPerPixel === null) {
+      this.secondsPerPixel = perPixel;
       this.rest = seconds - drawing;
       return;
     }
-    this.secondsAPixel += CAUTION * (aPixel - this.secondsAPixel);
-    this.rest += CAUTION * (seconds - drawing - this.rest);
+    this.secondsPerPixel += SMOOTHING * (perPixel - this.secondsPerPixel);
+    this.rest += SMOOTHING * (seconds - drawing - this.rest);
   }
 
-  /** A size of the proportions of `full`, and not above it. */
+  /** Return a size with the aspect ratio of `full`, and at most `full`. */
   size(full) {
     const all = full.width * full.height;
-    const affordable = this.secondsAPixel === null ? all / 4 : this.#budget() / this.secondsAPixel;
-    const pixels = Math.min(all, Math.max(affordable, FEWEST));
+    const affordable = this.secondsPerPixel === null ? all / 4 : this.#budget() / this.secondsPerPixel;
+    const pixels = Math.min(all, Math.max(affordable, MIN_PIXELS));
     const scale = steps(Math.sqrt(pixels / all));
     return { width: sized(full.width * scale), height: sized(full.height * scale) };
   }
@@ -37,7 +37,7 @@ export class Pace {
   }
 }
 
-/** Few different sizes, so that the image's sharpness doesn't flicker. */
+/** Quantize the scale, so that the sharpness doesn't flicker. */
 const steps = (scale) => (scale >= 1 ? 1 : 2 ** (Math.floor(4 * Math.log2(scale)) / 4));
 
 const sized = (pixels) => Math.max(1, Math.round(pixels));

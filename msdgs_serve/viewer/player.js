@@ -1,13 +1,13 @@
-// The scene's time: where it is, and how it runs.
+// Playback of the scene's time.
 
-const SECONDS_A_RUN = 4; // through all of the scene's time, at speed 1
-const MOMENTS = 240; // that are shown while it runs; the service keeps what it has computed for them
+const RUN_SECONDS = 4; // for the whole time range at speed 1
+const TIME_STEPS = 240; // distinct times during playback, whose poses the service caches
 export const SPEEDS = [0.25, 0.5, 1, 2];
 
 export class Player {
   constructor() {
     this.range = [0, 1];
-    this.place = 0; // 0 to 1 of the range
+    this.place = 0; // fraction of the time range
     this.playing = false;
     this.loop = true;
     this.speed = 1;
@@ -17,7 +17,7 @@ export class Player {
     return this.at(this.place);
   }
 
-  /** The scene's time at a place from 0 to 1, exactly the range's ends there. */
+  /** Return the scene's time at a fraction of its range, exact at both ends. */
   at(place) {
     const [first, last] = this.range;
     if (place >= 1) return last;
@@ -34,7 +34,7 @@ export class Player {
   }
 
   step(count) {
-    this.seek(Math.round(this.place * MOMENTS + count) / MOMENTS);
+    this.seek(Math.round(this.place * TIME_STEPS + count) / TIME_STEPS);
   }
 
   start() {
@@ -43,15 +43,15 @@ export class Player {
     this.exact = this.place;
   }
 
-  /** Go on by so many seconds. */
+  /** Advance playback by some seconds. */
   advance(seconds) {
-    this.exact += (seconds * this.speed) / SECONDS_A_RUN;
+    this.exact += (seconds * this.speed) / RUN_SECONDS;
     if (this.exact >= 1 && !this.loop) {
       this.place = 1;
       this.playing = false;
       return;
     }
     this.exact %= 1;
-    this.place = Math.floor(this.exact * MOMENTS) / MOMENTS;
+    this.place = Math.floor(this.exact * TIME_STEPS) / TIME_STEPS;
   }
 }

@@ -1,10 +1,10 @@
-// What is asked of POST /render for what the page shows.
+// Bodies of POST /render for the current view.
 
 import { depthRange } from "./camera.js";
 
-const MOTION_SHARE = 1 / 50; // of the scene's time, over which motion is shown
+const MOTION_SHARE = 1 / 50; // dt of the motion channel, as a fraction of the time range
 
-/** A body without size and format. `state` has the scene's detail, camera, player, layers and the view's name. */
+/** Return a body without size and format. `state` has the scene's detail, camera, player, layers and channel. */
 export function frameBody({ scene, camera, player, layers, view }) {
   const some = layers.steps === null ? {} : { steps: layers.steps };
   const body = { scene: scene.name, camera: camera.spec, t: player.t, ...some };
@@ -14,14 +14,14 @@ export function frameBody({ scene, camera, player, layers, view }) {
   return body;
 }
 
-/** Motion leads to `t + dt`, which must lie in the scene's time too. */
+/** Return `dt` such that `t + dt` is in the scene's time range. */
 function motionTimes(player) {
   const last = player.at(1 - MOTION_SHARE);
   const dt = player.at(1) - last;
   return { t: Math.min(player.t, last), dt };
 }
 
-/** The same for a file that holds numbers: color, alpha and depth, and what else is looked at. */
+/** Return the body for a file of numbers: color, alpha, depth and the current channel. */
 export function numbersBody(state) {
   const { depth_range: _, channels, ...body } = frameBody(state);
   const all = new Set(["rgb", "alpha", "depth", ...(channels ?? [])]);

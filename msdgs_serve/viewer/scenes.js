@@ -1,11 +1,11 @@
-// The list of scenes, with a small image of each.
+// The list of scenes with thumbnails.
 
 import { call, getJson } from "./api.js";
 
 const THUMBNAIL = { width: 96, height: 72 };
 
 export class SceneList {
-  /** `host` has: open(name); isIdle(), whether an image may be asked for now. */
+  /** `host` has: open(name); isIdle(), whether a thumbnail may be requested now. */
   constructor(list, host) {
     this.list = list;
     this.host = host;
@@ -25,7 +25,7 @@ export class SceneList {
     return [...this.items.keys()];
   }
 
-  /** Ask which there are. Throws what `call` throws. */
+  /** Update the list from the service. Throws the errors of `call`. */
   async refresh() {
     const { scenes } = await getJson("scenes");
     const names = new Set(scenes.map((scene) => scene.name));
@@ -41,7 +41,7 @@ export class SceneList {
     }
   }
 
-  /** Mark the one that is shown. */
+  /** Mark the current scene. */
   mark(name) {
     for (const [each, item] of this.items) {
       const button = item.querySelector("button");
@@ -50,7 +50,7 @@ export class SceneList {
     }
   }
 
-  /** Draw a scene's small image again. */
+  /** Render a scene's thumbnail again. */
   renew(name) {
     if (this.items.has(name)) this.waiting.add(name);
   }
@@ -86,7 +86,7 @@ export class SceneList {
       image.getContext("2d").drawImage(bitmap, 0, 0);
       this.observer.unobserve(this.items.get(name) ?? image);
     } catch {
-      // the frame itself tells what is wrong
+      // the request for the frame itself reports the error
     } finally {
       this.isDrawing = false;
     }

@@ -1,9 +1,9 @@
-// Taking a frame along: as a command, as a file, as an address.
+// Exports a frame as a command, a file or a URL.
 
 import { readKey, render } from "./api.js";
 import { short } from "./camera.js";
 
-/** The command that asks for the same frame. A key is not written into it. */
+/** Return the curl command for the frame, without the API key. */
 export function curlCommand(body) {
   const key = readKey() ? " -H \"Authorization: Bearer $MSDGS_KEY\"" : "";
   const address = quoted(new URL("render", document.baseURI).href);
@@ -11,10 +11,10 @@ export function curlCommand(body) {
   return `curl ${address}${key} -H 'Content-Type: application/json' ${output} -d ${quoted(JSON.stringify(body))}`;
 }
 
-/** For a shell. */
+/** Quote a text for a shell. */
 const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
 
-/** Whether the clipboard took it; it doesn't on pages that came without encryption from other machines. */
+/** Copy a text. Return whether that worked; browsers forbid it on pages without HTTPS from other machines. */
 export async function copy(text) {
   try {
     await navigator.clipboard.writeText(text);
@@ -24,7 +24,7 @@ export async function copy(text) {
   }
 }
 
-/** Ask for the frame and hand it to the browser as a file. */
+/** Request the frame and save it as a file. */
 export async function download(body, name) {
   const blob = await (await render(body)).blob();
   const link = document.createElement("a");
@@ -34,7 +34,7 @@ export async function download(body, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
 }
 
-/** What is shown, as the part of the address after #. */
+/** Return the view as the fragment of the URL. */
 export function toHash({ scene, camera, player, layers, view }) {
   const { azimuth, elevation, distance, target, sceneCamera } = camera;
   const lengths = [distance, ...target].map((x) => short(x, distance));
@@ -44,7 +44,7 @@ export function toHash({ scene, camera, player, layers, view }) {
   return `#${new URLSearchParams({ scene: scene.name, t: player.t, ...steps, view, ...at })}`.replaceAll("%2C", ",");
 }
 
-/** The reverse; what is missing or makes no sense is left out. */
+/** Parse a fragment; missing and invalid values are left out. */
 export function fromHash(hash) {
   const given = new URLSearchParams(hash.slice(1));
   const at = (given.get("at") ?? "").split(",").map(Number);

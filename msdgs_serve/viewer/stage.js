@@ -1,6 +1,6 @@
-// The image, and the line below that says what it took.
+// The image, and the status line with its times.
 
-const SHARPEST = 2; // device pixels to one of the page, more than that nobody sees
+const MAX_PIXEL_RATIO = 2; // limit of device pixels per CSS pixel; more isn't visible
 
 export class Stage {
   constructor(canvas, status) {
@@ -16,9 +16,9 @@ export class Stage {
     return Math.max(clientWidth, 1) / Math.max(clientHeight, 1);
   }
 
-  /** Of a full frame, in pixels; one of the scene's own cameras keeps its proportions. */
+  /** Return the size of a full frame in pixels; stored cameras keep their aspect ratio. */
   size({ scene, camera }) {
-    const sharpness = Math.min(window.devicePixelRatio || 1, SHARPEST);
+    const sharpness = Math.min(window.devicePixelRatio || 1, MAX_PIXEL_RATIO);
     let [width, height] = [this.canvas.clientWidth * sharpness, this.canvas.clientHeight * sharpness];
     if (camera.sceneCamera !== null) {
       const stored = scene.cameras[camera.sceneCamera];
@@ -28,7 +28,7 @@ export class Stage {
     return { width: Math.max(1, Math.round(width)), height: Math.max(1, Math.round(height)) };
   }
 
-  /** Around the image: the scene's own, sRGB from 0 to 1. */
+  /** Set the color around the image to the scene's background, sRGB from 0 to 1. */
   background(color) {
     this.canvas.style.background = `rgb(${color.map((x) => Math.round(255 * x)).join(" ")})`;
   }

@@ -1,9 +1,9 @@
-// The slider of time, and its buttons.
+// The time slider and its buttons.
 
 import { SPEEDS } from "./player.js";
 
 export class Timeline {
-  /** `host` has: changed(), after the time was set; started(), when it begins to run. */
+  /** `host` has: changed(), called after the time was set; started(), called when playback starts. */
   constructor(player, host) {
     this.player = player;
     this.host = host;

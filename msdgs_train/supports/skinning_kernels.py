@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 
+from msdgs_serve.rasterizer.geometry import rotation_columns
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
-from msdgs_serve.rasterizer.lanes import fma, spread
-from msdgs_serve.rasterizer.lanes_memory import load, store, sums_of
-from msdgs_serve.rasterizer.projection import rotation_columns
 from msdgs_serve.rasterizer.projection_backward import quaternion_gradient
+from msdgs_serve.rasterizer.vector_memory import load, store
+from msdgs_serve.rasterizer.vectors import fma, spread, sums_of
 from msdgs_serve.scene.quaternion import MIN_NORM
 
 MAX_NEAREST = 8

@@ -52,13 +52,13 @@ def print_and_return(path: Path) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("read", "problem"),
     [
-        (crash, r"a.sog: is damaged: it ends the process that reads it \(-11\)"),
+        (crash, r"a.sog: is damaged: it crashes the process that reads it \(-11\)"),
         (hang, r"a.sog: is damaged: it isn't read within 1 s"),
         (refuse, r"a.sog: has no end$"),
         (write_much, r"a.sog: can't be read: File too large"),
         pytest.param(
             take_memory,
-            r"a.sog: is damaged: it ends the process that reads it \(1\), which may have 2,048 MiB",
+            r"a.sog: is damaged: it crashes the process that reads it \(1\), within a limit of 2,048 MiB",
             marks=pytest.mark.skipif(sys.platform != "linux", reason="other systems don't keep to a limit of memory"),
         ),
     ],

@@ -19,7 +19,7 @@ from export.measure.verify import VerificationFailed, times_to_verify, verify
 from export.plans.base import Plan
 from export.plans.network import network
 from export.plans.registry import PLANS, build, parse
-from export.supports import SUPPORTS, SupportInputs
+from export.supports import SUPPORTS, SupportExport, SupportInputs
 from export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
@@ -151,7 +151,7 @@ def test_both_ends_of_time_are_exact(tmp_path: Path, plan: str):
 @pytest.mark.parametrize(("plan", "most"), [("network", 2), ("int8", 2), ("prefix:1", 1), ("keyframes:4", 0)])
 def test_plans_that_run_layers_can_stop_after_each(tmp_path: Path, plan: str, most: int):
     baked = bake(random_model(60, layers=("mlp", "mlp")), SCENE, "0" * 64)
-    assert opened(tmp_path / "scene.onnx", build(plan, baked)).most_steps == most
+    assert opened(tmp_path / "scene.onnx", build(plan, baked)).max_steps == most
 
 
 @pytest.mark.parametrize("plan", ["prefix:1", "prefix:2", "int8", "lowrank:4", "keyframes:9"])
@@ -304,10 +304,7 @@ class Rigid(Support):
         return gaussians.means.new_zeros(1, 3)
 
 
-class RigidExport:
-    heads_are_removable = True
-    bytes_per_gaussian = 0
-
+class RigidExport(SupportExport):
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         origin = graph.constant("rigid.origin", np.zeros((1, 3), np.float32))
         return summed_deltas(graph, inputs.layers, origin, inputs.time, inputs.steps, list(HEAD_COLUMNS))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msdgs_serve.blocks import LARGEST, View, plan_blocks
+from msdgs_serve.blocks import MAX_FRAMES, View, plan_blocks
 from msdgs_serve.camera_path import read_scene_names
 from msdgs_serve.render_cli import main
 from msdgs_serve.scene import Camera, InvalidInput
@@ -27,7 +27,7 @@ def test_every_frame_is_in_one_block_by_scene_and_time(views: list[View], worker
     blocks = plan_blocks(views, numbers, workers)
     assert sorted(frame.number for block in blocks for frame in block.frames) == numbers
     for block in blocks:
-        assert 1 <= len(block.frames) <= LARGEST
+        assert 1 <= len(block.frames) <= MAX_FRAMES
         assert all(views[frame.number] == (block.scene, frame.camera, frame.t) for frame in block.frames)
         assert [frame.t for frame in block.frames] == sorted(frame.t for frame in block.frames)
     scenes = [block.scene for block in blocks]

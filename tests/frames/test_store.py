@@ -162,7 +162,7 @@ def test_only_names_of_scenes_open_anything(tmp_path: Path, name: str):
 def test_files_with_separators_in_their_names_are_refused(tmp_path: Path):
     path = write_scene(tmp_path / "a\\b.onnx")
     assert SceneStore([tmp_path]).names() == []
-    with pytest.raises(InvalidInput, match="plain names"):
+    with pytest.raises(InvalidInput, match="unhidden names"):
         SceneStore([path])
 
 

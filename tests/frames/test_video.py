@@ -225,4 +225,4 @@ def test_what_is_wrong_is_said_in_one_line(
 def test_frames_of_another_command_are_not_mixed(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run(scene, tmp_path / "out", "--frames", 2, "--width", 8, "--height", 8) == 0
     assert run(scene, tmp_path / "out", "--frames", 3, "--width", 8, "--height", 8) == 2
-    assert "made by another command" in capsys.readouterr().err
+    assert "frames of another command" in capsys.readouterr().err

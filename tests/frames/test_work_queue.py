@@ -7,9 +7,9 @@ from contextlib import ExitStack
 
 import pytest
 
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.work import WorkQueue
-from msdgs_serve.watch import Watch
+from msdgs_serve.render_job import RenderJob
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def is_full(queue: WorkQueue) -> bool:
     try:
         with queue.admitted("another"):
             return False
-    except Refused:
+    except RequestRejected:
         return True
 
 
@@ -43,7 +43,7 @@ def test_a_place_is_free_when_the_work_is_done_though_its_answer_is_still_sent(q
     async def call() -> None:
         with queue.admitted("one"), queue.admitted("two"):
             assert is_full(queue)
-            await queue.run(lambda: None, Watch())
+            await queue.run(lambda: None, RenderJob())
             while queue.waiting > 1:  # the future is done a moment before its callbacks have run
                 await asyncio.sleep(0.001)
             assert not is_full(queue)
@@ -54,19 +54,19 @@ def test_a_place_is_free_when_the_work_is_done_though_its_answer_is_still_sent(q
 def test_later_work_of_a_call_is_never_refused(queue: WorkQueue):
     async def call() -> bool:
         with queue.admitted("three"):
-            await queue.run(lambda: None, Watch())
+            await queue.run(lambda: None, RenderJob())
             while queue.waiting:
                 await asyncio.sleep(0.001)
             with queue.admitted("one"), queue.admitted("two"):
-                return await queue.run(lambda: is_full(queue), Watch())
+                return await queue.run(lambda: is_full(queue), RenderJob())
 
     assert asyncio.run(call())
 
 
 def test_work_of_a_call_that_was_not_admitted_is_refused_where_all_places_are_taken(queue: WorkQueue):
     async def work() -> None:
-        with pytest.raises(Refused):
-            await queue.run(lambda: None, Watch())
+        with pytest.raises(RequestRejected):
+            await queue.run(lambda: None, RenderJob())
 
     with queue.admitted("one"), queue.admitted("two"):
         contextvars.Context().run(lambda: asyncio.run(work()))

@@ -18,7 +18,7 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from msdgs_serve.api.keys import SHORTEST_KEY
+from msdgs_serve.api.keys import MIN_KEY_LENGTH
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.work import WorkQueue
@@ -44,7 +44,7 @@ def test_every_requirement_is_a_tested_version_with_hashes(name: str):
     tested, locked = pins(ROOT / "constraints.txt"), pins(path)
     assert locked
     differing = {name: version for name, version in locked.items() if tested.get(name, version) != version}
-    assert not differing, "docker/lock.sh makes them anew"
+    assert not differing, "docker/lock.sh renews them"
     blocks = re.split(r"\n(?=\S)", path.read_text().strip())
     assert len(blocks) == len(locked)
     assert all("--hash=sha256:" in block for block in blocks)
@@ -55,7 +55,7 @@ def test_everything_that_the_package_asks_for_is_locked(name: str, extras: tuple
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [*project["dependencies"], *(d for extra in extras for d in project["optional-dependencies"][extra])]
     names = {canonicalize_name(Requirement(text).name) for text in asked}
-    assert names - pins(DOCKER / "requirements" / f"{name}.txt").keys() <= {"torch"}, "docker/lock.sh makes them anew"
+    assert names - pins(DOCKER / "requirements" / f"{name}.txt").keys() <= {"torch"}, "docker/lock.sh renews them"
 
 
 def test_what_serves_has_no_torch():
@@ -110,7 +110,7 @@ def test_prometheus_has_a_key_where_keys_are_asked_for():
     assert job["authorization"]["credentials_file"] == f"/run/secrets/{secret}"
     default = re.search(r":-(\S+)}", document["secrets"][secret]["file"])
     assert default
-    assert len((DOCKER / default[1]).read_text().strip()) < SHORTEST_KEY, "what is there by default is nobody's key"
+    assert len((DOCKER / default[1]).read_text().strip()) < MIN_KEY_LENGTH, "the default must not be a valid key"
 
 
 def test_the_proxy_says_whom_it_asks_for_and_is_believed():

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from msdgs_serve.ray_tasks import MAX_LOSSES, RayTasks, WorkLost, in_turns, ray_cluster
+from msdgs_serve.ray_tasks import MAX_LOSSES, RayTasks, WorkLost, ray_cluster, run_tasks
 from msdgs_serve.render_cli import main
 from msdgs_serve.scene import MsdgsError
 from tests.support.scene_files import write_scene
@@ -82,16 +82,16 @@ def test_a_node_that_is_lost_costs_no_frame(tmp_path: Path, cluster: Any):
 
 def test_a_worker_that_dies_costs_its_task_alone(tmp_path: Path):
     with ray_cluster("auto") as cores:
-        results = dict(in_turns(RayTasks(dies_once, tmp_path), list(range(12)), cores))
+        results = dict(run_tasks(RayTasks(dies_once, tmp_path), list(range(12)), cores))
     assert results == {number: number * number for number in range(12)}
     assert (tmp_path / "died").exists()
 
 
 def test_work_that_always_kills_its_worker_ends():
     with ray_cluster("auto") as cores, pytest.raises(WorkLost, match=f"{MAX_LOSSES} times"):
-        list(in_turns(RayTasks(always_dies), [1], cores))
+        list(run_tasks(RayTasks(always_dies), [1], cores))
 
 
 def test_errors_of_ours_come_back_as_such():
     with ray_cluster("auto") as cores, pytest.raises(MsdgsError, match="`number` must be another, got 1"):
-        list(in_turns(RayTasks(refuses), [1], cores))
+        list(run_tasks(RayTasks(refuses), [1], cores))

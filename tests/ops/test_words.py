@@ -18,12 +18,18 @@ RETIRED = {
     "shared motions?": "motion bases",
     "basis_(logits|ids|weights|count|knots|stretches)": "skinning_logits, node_ids, num_nodes, num_knots, affine",
     "warmup_fraction|still_steps|grown_steps": "static_fraction, deform_start_step, full_window_step",
-    "densify_\\w+|opacity_reset_every": "refine_*, grow_*, reset_every",
+    "densify_\\w+|opacity_reset_every": "refine_*, grow_*, reset_every_fraction",
     "\\w+_rate_(start|end)": "*_lr_init, *_lr_final",
     "max_error": "min_psnr",
     "delta_spaces?_raw|detach_means|embedding_size": "scale_space, detach_deform_input, embedding_dim",
     "trimmed|trimming": "pruned, pruning",
     "half_extent|floored": "scene_half_size, clamped scales",
+    "doorman": "early rejection",
+    "lanes_memory|lane_types|LanesType|parts?_of_lanes": "vector_memory, vector_types, VectorType, part_count",
+    "serve[./]watch|stopped watch|rasterizer[./]ahead": "render_job, precompile",
+    "(?:most|least)_(?!common)\\w+|at_most": "max_*, min_*",
+    "[a-z]+_a_(?:byte|pair|part|round|turn)": "*_per_*",
+    "anew|nobody|whoever": "again, no one, the one that",
 }
 """Regular expressions of whole words, and what is said instead."""
 

@@ -19,7 +19,7 @@ from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
 
 FILES = (
-    "test_lanes.py",
+    "test_vectors.py",
     "test_rasterizer_oracle.py",
     "test_rasterizer_gsplat.py",
     "test_gradients.py",
@@ -38,12 +38,12 @@ def kernel_files() -> list[Path]:
     """The rasterizer's files with kernels, and those with the operations that kernels are written in."""
     folder = ROOT / "msdgs_serve" / "rasterizer"
     return [path for path in sorted(folder.glob("*.py")) if "@kernel" in path.read_text()] + [
-        folder / name for name in ("atomic.py", "lanes.py", "lanes_memory.py")
+        folder / name for name in ("atomic.py", "vectors.py", "vector_memory.py", "vector_squares.py")
     ]
 
 
 def main() -> int:
-    """Start anew with the compiler off, as it can't be switched off later."""
+    """Start again with the compiler off, as it can't be switched off later."""
     if os.environ.get("NUMBA_DISABLE_JIT") != "1":
         environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
         return subprocess.call([sys.executable, "-m", "tests.rasterizer.kernel_coverage"], cwd=ROOT, env=environment)

@@ -221,7 +221,7 @@ KERNELS_AFTER = """
 import importlib, json, pkgutil, sys
 from numba.core.dispatcher import Dispatcher
 import msdgs_serve.rasterizer as rasterizer
-from msdgs_serve.rasterizer.ahead import compile_kernels
+from msdgs_serve.rasterizer.precompile import compile_kernels
 
 def compiled():
     names = [f"{rasterizer.__name__}.{module.name}" for module in pkgutil.iter_modules(rasterizer.__path__)]
@@ -233,7 +233,7 @@ def compiled():
     }
 
 compile_kernels()
-ahead = compiled()
+precompiled = compiled()
 """
 
 FRAMES = (
@@ -263,16 +263,16 @@ for model in ("pinhole", "orthographic", "fisheye"):
         RenderOptions(shutter=Shutter(0.0, 0.1, 3)),
     ):
         renderer.render(session, view, 0.5, options)
-print(json.dumps([ahead, compiled()]))
+print(json.dumps([precompiled, compiled()]))
 """
 )
 
 
 def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
-    ahead, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
-    assert ahead["msdgs_serve.rasterizer.projection._project_parts"]
-    assert ahead["msdgs_serve.rasterizer.compositing._composite_tiles"]
-    assert after == ahead
+    precompiled, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
+    assert precompiled["msdgs_serve.rasterizer.projection._project_parts"]
+    assert precompiled["msdgs_serve.rasterizer.compositing._composite_tiles"]
+    assert after == precompiled
 
 
 def test_compiling_says_where_the_kernels_are() -> None:

@@ -5,7 +5,8 @@ import pytest
 
 from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.rasterizer.counts import count_splats
-from msdgs_serve.rasterizer.projection import LOG2_OPACITY, ROOT_A, ROOT_B, ROOT_C, X, Y, project
+from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.splats import LOG2_OPACITY, ROOT_A, ROOT_B, ROOT_C, X, Y
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from tests.support.scenes import as_dtype, random_scene
 
@@ -39,4 +40,4 @@ def test_pairs_are_counted_exactly(count: int, width: int, height: int):
     np.testing.assert_array_equal(image.counts, blended_one_by_one(splats.records, order, width, height))
     np.testing.assert_array_equal(counts.blended, image.counts)
     assert splats.visible == len(order)
-    assert counts.blended.sum() <= counts.lanes <= 256 * len(tiles.splat_ids)
+    assert counts.blended.sum() <= counts.evaluated <= 256 * len(tiles.splat_ids)

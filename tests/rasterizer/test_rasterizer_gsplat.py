@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from msdgs_serve.rasterizer import GSPLAT, rasterize
-from msdgs_serve.rasterizer.projection import (
+from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.splats import (
     BLUE,
     DEPTH,
     GREEN,
@@ -20,7 +21,6 @@ from msdgs_serve.rasterizer.projection import (
     Splats,
     X,
     Y,
-    project,
 )
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.quaternion import to_matrix

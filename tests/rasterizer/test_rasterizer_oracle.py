@@ -17,10 +17,10 @@ BACKGROUND = (0.2, 0.6, 0.9)
 EXACT_DEPTHS = {"equal_depths"}
 
 
-def assert_same_image(got: Rendering, want: Reference, row: str, least_clean: float = 0.5):
+def assert_same_image(got: Rendering, want: Reference, row: str, min_clean: float = 0.5):
     """Tight where every decision is clear; bounded by the decisions' own effect in the band where it is not."""
     clean = want.slack == 0
-    assert clean.mean() >= least_clean, "the comparison would be empty"
+    assert clean.mean() >= min_clean, "the comparison would be empty"
     for name in ("rgb", "alpha"):
         channel, expected = getattr(got, name), getattr(want, name)
         assert np.isfinite(channel).all(), name

@@ -53,7 +53,7 @@ def bytes_of(image: Rendering) -> list[bytes]:
 
 @pytest.mark.parametrize("threads", ["1", "2", "3", "7"])
 def test_same_bytes_for_any_number_of_threads(threads: str, monkeypatch: pytest.MonkeyPatch):
-    """The pool is as large as it was first asked for; the work is split anew by each number."""
+    """The pool is as large as it was first asked for; the work is split by each number."""
     gaussians, camera = random_scene(41, 500, 150, 90)
     expected = bytes_of(draw(gaussians, camera))
     monkeypatch.setenv("MSDGS_THREADS", threads)

@@ -76,7 +76,7 @@ def test_times_outside_the_range_are_refused(session: DeformationSession, t: flo
 def test_layers_may_be_applied_one_after_the_other(tmp_path: Path):
     model = random_model(200, layers=("mlp", "plane", "mlp"))
     session = DeformationSession(written(tmp_path / "scene.onnx", model))
-    assert session.most_steps == 3
+    assert session.max_steps == 3
     for steps in range(4):
         with torch.no_grad():
             want = model.pose(0.37, num_layers=steps)
@@ -97,15 +97,15 @@ def test_a_layer_may_be_applied_in_part(tmp_path: Path):
 
 @pytest.mark.parametrize("steps", [-0.1, 3.1, float("nan"), float("inf")])
 def test_steps_that_the_scene_has_not_are_refused(session: DeformationSession, steps: float):
-    with pytest.raises(InvalidInput, match=rf"`steps` must be in \[0, {session.most_steps}\], the scene's layers"):
+    with pytest.raises(InvalidInput, match=rf"`steps` must be in \[0, {session.max_steps}\], the scene's layers"):
         session.gaussians(0.5, steps)
 
 
 @pytest.mark.parametrize("steps", [0.0, 1.0, float("nan")])
 def test_a_scene_without_layers_has_no_steps(tmp_path: Path, steps: float):
     session = DeformationSession(write_scene(tmp_path / "scene.onnx"))
-    assert session.most_steps == 0
-    with pytest.raises(InvalidInput, match="`steps` must be left out: the plan network doesn't run layers one by one"):
+    assert session.max_steps == 0
+    with pytest.raises(InvalidInput, match="`steps` must be left out, as the plan network runs no layers"):
         session.pose(0.5, steps=steps)
 
 

@@ -25,8 +25,8 @@ NAMED = {
     "six_gigabytes_by_constantofshape": "the operator ConstantOfShape",
     "six_gigabytes_by_range": "the operator Range",
     "six_gigabytes_by_resize": "the operator Resize",
-    "six_gigabytes_by_broadcasting": "`vast` (Add) takes a frame to 6,104 MiB of values; allowed are 2,048 MiB",
-    "a_quadrillion_operations": "(MatMul) takes a call to 2.1e+11 operations; allowed are 2e+11",
+    "six_gigabytes_by_broadcasting": "`vast` (Add) brings a frame to 6,104 MiB of values; the limit is 2,048 MiB",
+    "a_quadrillion_operations": "(MatMul) brings a call to 2.1e+11 operations; the limit is 2e+11",
     "whole_numbers_divided_by_zero": "`quotient` (Div) reads int64, not float32",
     "a_shape_that_depends_on_time": "`largest` (Reshape) reads `whole`, which must be a constant of the file",
     "another_domain": "com.microsoft",
@@ -131,10 +131,10 @@ def test_limits_of_cost_are_those_given(tmp_path: Path):
     exact = GraphLimits(2, cost.memory_bytes, cost.operations, cost.operations)
     assert DeformationSession("sound.onnx", contents=contents, limits=exact).cost.memory_bytes == cost.memory_bytes
     for less, word in (
-        (GraphLimits(gaussians=1), "2 Gaussians; allowed are 1"),
+        (GraphLimits(gaussians=1), "2 Gaussians; the limit is 1"),
         (GraphLimits(memory_bytes=cost.memory_bytes - 1), "MiB of values"),
-        (GraphLimits(operations=cost.operations - 1), "takes a frame"),
-        (GraphLimits(call_operations=cost.operations - 1), "takes a call"),
+        (GraphLimits(operations=cost.operations - 1), "brings a frame"),
+        (GraphLimits(call_operations=cost.operations - 1), "brings a call"),
     ):
         with pytest.raises(SceneFileInvalid, match=word):
             DeformationSession("sound.onnx", contents=contents, limits=less)

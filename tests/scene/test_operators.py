@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -37,14 +38,14 @@ def test_the_graph_that_is_written_again_computes_the_same_bits(name: str):
         np.testing.assert_array_equal(got.opacities, want["opacities"])
 
 
-def emitted() -> dict[str, dict[str, set[int]]]:
+def emitted() -> dict[str, dict[str, set[Any]]]:
     """Operators of all sound scenes and their attributes."""
-    found: dict[str, dict[str, set[int]]] = {}
+    found: dict[str, dict[str, set[Any]]] = {}
     for contents in SCENES.values():
         for node in onnx.load_from_string(contents).graph.node:
             attributes = found.setdefault(node.op_type, {})
             for attribute in node.attribute:
-                attributes.setdefault(attribute.name, set()).add(attribute.i)
+                attributes.setdefault(attribute.name, set()).add(attribute.i or tuple(attribute.ints))
     return found
 
 
@@ -65,7 +66,10 @@ def row(name: str, operator: Operator) -> str:
         inputs[-1] += ", once or several times"
     attributes = []
     for attribute, values in operator.attributes.items():
-        shown = [element_name(v) for v in values] if attribute == "to" else values
+        shown = [element_name(v) for v in values if isinstance(v, int)] if attribute == "to" else values
+        if attribute == "perm":
+            attributes.append("`perm` of three axes")
+            continue
         span = f"{values[0]} to {values[-1]}" if len(values) > 2 else " or ".join(map(str, shown))
         attributes.append(f"`{attribute}` {span}")
     return f"| {'; '.join([f'`{name}`', *attributes])} | {'; '.join(inputs)} |"

@@ -13,18 +13,18 @@ import httpx
 import pytest
 
 from msdgs_serve.api.app import create_app
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.routes import batch, video
 from msdgs_serve.api.schemas import VideoRequest
 from msdgs_serve.api.server import Server
 from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
-from msdgs_serve.api.turns import PART_TURN, Turns
+from msdgs_serve.api.turns import PART_INTERVAL, Turns
 from msdgs_serve.api.work import WorkQueue
 from msdgs_serve.imaging import Image
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
-from msdgs_serve.watch import Watch
 from tests.support.scene_files import write_scene
 from tests.support.service import in_this_process, serving
 
@@ -49,13 +49,13 @@ def test_single_frames_come_in_between_parts_which_have_their_turns_too():
     turns: Turns[str] = Turns()
     for number in range(3):
         turns.add(f"part of {number}", str(number), part=True)
-    for _ in range(2 * PART_TURN):
+    for _ in range(2 * PART_INTERVAL):
         turns.add("single", "x", part=False)
     done = order(turns)
-    assert done[: 2 * PART_TURN] == ["single"] * (PART_TURN - 1) + ["part of 0"] + ["single"] * (PART_TURN - 1) + [
-        "part of 1"
-    ]
-    assert done[2 * PART_TURN :] == ["single", "single", "part of 2"]
+    assert done[: 2 * PART_INTERVAL] == ["single"] * (PART_INTERVAL - 1) + ["part of 0"] + ["single"] * (
+        PART_INTERVAL - 1
+    ) + ["part of 1"]
+    assert done[2 * PART_INTERVAL :] == ["single", "single", "part of 2"]
 
 
 def test_who_leaves_the_line_is_in_nobodys_way():
@@ -82,7 +82,7 @@ def places(queue: WorkQueue, calls: ExitStack, client: str, *, streamed: bool = 
         while True:
             calls.enter_context(queue.admitted(client, streamed=streamed))
 
-    with pytest.raises(Refused, match="places") as refused:
+    with pytest.raises(RequestRejected, match="places") as refused:
         take_all()
     assert (refused.value.status, refused.value.headers["Retry-After"].isdecimal()) == (503, True)
     return queue.waiting - before
@@ -112,9 +112,9 @@ def test_parts_keep_their_place_until_the_call_and_its_work_have_ended(queue: Wo
 
     async def call() -> None:
         with queue.admitted("one", streamed=True):
-            await queue.run(lambda: None, Watch(), part=True)
+            await queue.run(lambda: None, RenderJob(), part=True)
             assert queue.waiting == 1
-            last = asyncio.ensure_future(queue.run(lambda: begun.set() or go_on.wait(20), Watch(), part=True))
+            last = asyncio.ensure_future(queue.run(lambda: begun.set() or go_on.wait(20), RenderJob(), part=True))
             assert await asyncio.to_thread(begun.wait, 20)
         last.cancel()
         assert queue.running == 1
@@ -199,7 +199,7 @@ def times(count: int) -> list[float]:
 def film(service: Service) -> AsyncGenerator[bytes]:
     frames = [{"camera": ORBIT, "t": t} for t in times(MANY)]
     body = VideoRequest.model_validate({"frames": frames, "width": 32, "height": 32})
-    return video._film(service, body, *video._path(service, body))
+    return video._stream_video(service, body, *video._path(service, body))
 
 
 def lines(service: Service) -> AsyncGenerator[Any]:
@@ -251,9 +251,9 @@ def test_a_list_of_times_is_drawn_in_parts(service: Service, scene: Path):
     parts = []
     original = service.queue.run
 
-    async def run(work: Any, watch: Watch, *, part: bool = False) -> Any:
+    async def run(work: Any, job: RenderJob, *, part: bool = False) -> Any:
         parts.append(part)
-        return await original(work, watch, part=part)
+        return await original(work, job, part=part)
 
     service.queue.run = run  # pyright: ignore[reportAttributeAccessIssue]
     app_frames = [{**FRAME, "t": [0.0, 0.5, 1.0], "format": name} for name in ("png", "npy")]

@@ -68,7 +68,7 @@ def test_refusals_say_which_node_what_it_takes_and_what_is_allowed(client: httpx
     contents = ATTACKS["six_gigabytes_by_broadcasting"](model, tmp_path)
     answer = client.post("/scenes", params={"name": "hostile"}, content=contents)
     detail = answer.json()["detail"]
-    assert "`vast` (Add) takes a frame to 6,104 MiB of values; allowed are 2,048 MiB" in detail
+    assert "`vast` (Add) brings a frame to 6,104 MiB of values; the limit is 2,048 MiB" in detail
 
 
 def test_what_a_scene_takes_is_shown(client: httpx.Client):
@@ -83,7 +83,7 @@ def test_limits_are_settings(tmp_path: Path):
     with serving(tmp_path, max_scene_operations=1) as client:
         entry = client.get("/scenes").json()["scenes"][0]
         assert (entry["problem"], entry["loaded"]) == (True, False)
-        assert entry["reason"].endswith("allowed are 1")
+        assert entry["reason"].endswith("the limit is 1")
 
 
 @pytest.mark.parametrize("what", POISON)
@@ -138,7 +138,7 @@ def test_a_file_that_ends_its_process_is_refused_at_upload(tmp_path: Path, monke
         monkeypatch.setattr(Settings, "graph_limits", dying)
         answer = client.post("/scenes", params={"name": "walk"}, content=contents)
         assert (answer.status_code, list(folder.iterdir())) == (422, [])
-        assert "ends the process that reads it" in answer.json()["detail"]
+        assert "crashes the process that reads it" in answer.json()["detail"]
         monkeypatch.undo()
         assert client.post("/scenes", params={"name": "walk"}, content=contents).status_code == 201
 

@@ -81,7 +81,7 @@ def test_a_key_may_have_several_scopes(tmp_path: Path):
         ("# ours\nread 0123456789abcdef\nfedcba9876543210\n", "line 3"),
         ("admin 0123456789abcdef", "line 1"),
         ("read,,write 0123456789abcdef", "line 1"),
-        ("read 0123456789abcde", "16 or more letters"),
+        ("read 0123456789abcde", "16 or more characters"),
         ("read 0123456789abcdef extra", "line 1"),
         ("read 0123456789abcdef\nwrite 0123456789abcdef", "different keys"),
         ("", "0 keys"),
@@ -98,7 +98,7 @@ def test_a_file_that_says_no_scopes_is_refused_with_the_line_that_it_needs(tmp_p
 def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
     (tmp_path / "keys").write_bytes(b"\xff\xfe")
     for path in (tmp_path / "keys", tmp_path / "missing", tmp_path):
-        with pytest.raises(InvalidInput, match="a text file"):
+        with pytest.raises(InvalidInput, match="a readable text file"):
             read_keys(path)
 
 

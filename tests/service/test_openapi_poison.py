@@ -1,4 +1,4 @@
-"""Bodies, links and headers made from the OpenAPI document, with a value at one leaf that nobody should send.
+"""Bodies, links and headers made from the OpenAPI document, with an invalid value at one leaf.
 
 The answer is what the document allows: never a 5xx but 501, 503, 504 and 507, and a 422 names the leaf. A few hundred
 cases, drawn with a seed; `MSDGS_FUZZ=all pytest -n 0 tests/service/test_openapi_poison.py` tries every one.

@@ -77,7 +77,7 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "which scene?"),
+        ([], "no scene given"),
         (["missing.onnx"], "missing.onnx, which does not exist"),
         (["model.pt"], "export/to_onnx.py"),
         (["broken.onnx"], "broken.onnx: `file`"),

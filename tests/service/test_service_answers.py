@@ -19,8 +19,8 @@ from starlette.types import Receive, Scope, Send
 from msdgs_serve.api.body_limit import BodyLimit
 from msdgs_serve.api.keys import KeyCheck, read_keys
 from msdgs_serve.api.observe import JsonLines, request_id
+from msdgs_serve.imaging.display import FARTHEST_BRIGHTNESS
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
-from msdgs_serve.imaging.images import FARTHEST_GREY
 from tests.service.test_api import eventually
 from tests.service.test_api_poison import check_problem
 from tests.support.images import decode
@@ -170,14 +170,14 @@ def test_channels_come_in_the_order_asked_for(client: httpx.Client):
 
 
 def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
-    """White where nearest, `FARTHEST_GREY` where farthest, darker where it is thin, black where nothing is."""
+    """White where nearest, `FARTHEST_BRIGHTNESS` where farthest, darker where it is thin, black where nothing is."""
     depth, alpha = (array(client, channels=[name])[..., 0] for name in ("depth", "alpha"))
     seen = np.isfinite(depth)
     assert 0 < seen.mean() < 1
     for asked, (near, far) in (({}, (depth[seen].min(), depth[seen].max())), ({"depth_range": [0, 10]}, (0, 10))):
         grey = decode(post(client, channels=["depth"], **asked).content, "png")[0][..., 0].astype(int)
         place = (np.where(seen, depth, far) - near) / (far - near)
-        want = 255 * alpha * np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0)
+        want = 255 * alpha * np.where(seen, 1 - (1 - FARTHEST_BRIGHTNESS) * place, 0)
         assert np.abs(grey - want).max() <= 1
 
 

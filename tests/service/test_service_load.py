@@ -16,23 +16,23 @@ import pytest
 from msdgs_serve.api.server import Server
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.pose_cache import PoseCache
+from msdgs_serve.render_job import RenderCancelled, RenderJob
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Gaussians
-from msdgs_serve.watch import Interrupted, Watch
 from tests.service.test_api_poison import check_problem
 from tests.support.service import serving
 
 pytestmark = pytest.mark.slow
 
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
-AT_MOST = 60.0  # seconds, whatever else the machine does
+MAX_SECONDS = 60.0  # seconds, whatever else the machine does
 FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 
 
 class SlowPoses(PoseCache):
     """Poses that wait until they may go on, once `slow` is set, and are never remembered.
 
-    From the `last` on that may begin, they wait until nobody wants them any more.
+    From the `last` on that may begin, they wait until they are cancelled.
     """
 
     def __init__(self) -> None:
@@ -42,13 +42,13 @@ class SlowPoses(PoseCache):
         self.begun = 0
         self.last = math.inf
 
-    def get(self, session: DeformationSession, t: float, watch: Watch, steps: float | None = None) -> Gaussians:
-        watch.check()
+    def get(self, session: DeformationSession, t: float, job: RenderJob, steps: float | None = None) -> Gaussians:
+        job.check()
         if self.slow:
             self.begun += 1
-            assert self.go_on.wait(AT_MOST)
+            assert self.go_on.wait(MAX_SECONDS)
             if self.begun >= self.last:
-                until(lambda: has_stopped(watch))
+                until(lambda: is_cancelled(job))
         return session.gaussians(t)
 
 
@@ -67,16 +67,16 @@ def renderer_with(poses: SlowPoses) -> Renderer:
 
 def until(condition: Callable[[], bool]) -> None:
     """Wait for it."""
-    deadline = time.monotonic() + AT_MOST
+    deadline = time.monotonic() + MAX_SECONDS
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
 
 
-def has_stopped(watch: Watch) -> bool:
+def is_cancelled(job: RenderJob) -> bool:
     try:
-        watch.check()
-    except Interrupted:
+        job.check()
+    except RenderCancelled:
         return True
     return False
 
@@ -105,7 +105,7 @@ def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, po
         assert client.get("/live").status_code == 200
         assert client.get("/ready").status_code == 200
         poses.go_on.set()
-        assert [future.result(AT_MOST).status_code for future in accepted] == [200] * 5
+        assert [future.result(MAX_SECONDS).status_code for future in accepted] == [200] * 5
         assert client.post("/render", json=FRAME).status_code == 200
 
 
@@ -130,7 +130,7 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
 
 
 def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
-    """A request on a connection of its own; whoever closes that is gone."""
+    """A request on a connection of its own; closing it disconnects the client."""
     request = client.build_request("POST", path, json=body)
     request.read()
     host = client.base_url.host
@@ -173,7 +173,7 @@ def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: Sl
         connection.close()
         until(lambda: queue.waiting == 0)
         poses.go_on.set()
-        assert first.result(AT_MOST).status_code == 200
+        assert first.result(MAX_SECONDS).status_code == 200
         assert poses.begun == 1
 
 
@@ -195,7 +195,7 @@ def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses
         assert refused.status_code == 503
         assert refused.headers["Retry-After"]
         poses.go_on.set()
-        assert [frame.result(AT_MOST).status_code for frame in frames] == [200] * 8
+        assert [frame.result(MAX_SECONDS).status_code for frame in frames] == [200] * 8
         until(lambda: not server[0].started or not _listens(client))
 
 
@@ -209,11 +209,11 @@ def _listens(client: httpx.Client) -> bool:
 
 
 def test_one_who_gives_up_does_not_spoil_the_pose_for_others(scene: Path):
-    """The pose that a stopped watch was computing is claimed by the next who waits for it."""
+    """The pose that a cancelled job was computing is claimed by the next who waits for it."""
     cache, session = PoseCache(1 << 20), DeformationSession(scene)
-    stopped = Watch()
-    stopped.stop()
-    assert cache.get(session, 0.5, Watch()) is cache.get(session, 0.5, Watch())
+    cancelled = RenderJob()
+    cancelled.cancel()
+    assert cache.get(session, 0.5, RenderJob()) is cache.get(session, 0.5, RenderJob())
     assert (cache.use.hits, cache.use.misses, cache.use.poses) == (1, 1, 1)
-    with pytest.raises(Exception, match="nobody waits"):
-        cache.get(session, 0.5, stopped)
+    with pytest.raises(Exception, match="cancelled"):
+        cache.get(session, 0.5, cancelled)

@@ -1,6 +1,7 @@
 """Scenes that clients add and delete: whole or not at all, and nothing but scenes."""
 
 import hashlib
+import logging
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from tests.service.test_api import eventually
 from tests.service.test_api_poison import check_problem
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
-from tests.support.service import own_connection, serving
+from tests.support.service import in_this_process, own_connection, serving
 
 FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
 
@@ -84,6 +85,17 @@ def test_what_is_no_scene_is_refused_and_leaves_nothing(client: httpx.Client, fo
     assert response.status_code == 422
     check_problem(response)
     assert files(folder) == []
+
+
+@in_this_process
+def test_an_invalid_file_is_no_error_of_the_service(client: httpx.Client, caplog: pytest.LogCaptureFixture):
+    """One line of the log with the scene's name, not the temporary file's."""
+    caplog.set_level(logging.INFO, "msdgs_serve")
+    assert add(client, b"no scene", "a walk").status_code == 422
+    ((level, text),) = [(each.levelno, each.getMessage()) for each in caplog.records if each.name == "msdgs_serve"]
+    assert level == logging.INFO
+    assert "'a walk'" in text
+    assert ".incoming" not in text
 
 
 def test_a_file_that_was_damaged_on_its_way_is_refused(client: httpx.Client, folder: Path, file: bytes):

@@ -17,7 +17,7 @@ Rng = np.random.Generator
 Mutation = Callable[[onnx.ModelProto, Rng], object]
 
 CANARY = Path("/tmp/msdgs-canary")
-"""Where external tensors point to: nobody may open it."""
+"""Where external tensors point to: it must never be opened."""
 
 OPERATORS = (
     "Add", "Cast", "Clip", "Concat", "Cos", "DequantizeLinear", "Div", "Equal", "Exp", "Floor", "Gather", "Gemm",

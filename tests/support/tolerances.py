@@ -25,8 +25,8 @@ TABLE = (
     Row("float32.relative", 1e-6, "a handful of float32 operations"),
     Row("pixel", 1e-9, "projecting a known point through float64 matrices, in pixels"),
     # 16 numbers at once
-    Row("lanes.float32", 3e-5, "some roundings of numbers and sums up to 100; NumPy rounds products first"),
-    Row("lanes.float64", 2e-14, "as in float32"),
+    Row("vectors.float32", 3e-5, "some roundings of numbers and sums up to 100; NumPy rounds products first"),
+    Row("vectors.float64", 2e-14, "as in float32"),
     Row("exp2.float32", 4e-7, "the polynomial's own 2e-7, and some roundings of float32"),
     Row("exp2.float64", 2e-15, "some roundings of float64"),
     Row("log2.float32", 8e-6, "a rounding of 100"),
@@ -79,6 +79,11 @@ TABLE = (
     Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
     Row("neighbor_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
+    Row(
+        "export.nodes.relative",
+        1e-4,
+        "4 weights of 16 bits, 1.5e-5 each, times motions of size 1; and as export.relative",
+    ),
     Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
     Row("fitted_beside_others", 1e-6, "float32 positions of size 1; how products round depends on how many there are"),
     Row("between_samples.factor", 2.0, "times a promise made at samples: between them a cubic is off by as much again"),

@@ -1,11 +1,13 @@
-"""Networks of other trainers: tensors by name out of a torch file, no code of which is run."""
+"""The networks and settings of another trainer's run, read without running any code in its files."""
 
+import ast
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from export.importers.errors import ImportFailed
 from export.importers.guard import read_guarded
@@ -13,7 +15,7 @@ from msdgs_train.gaussians.model_file import CheckpointInvalid, load, refuse_unl
 
 
 class State:
-    """The finite tensors of a file, float32."""
+    """The finite tensors of a torch file by name, as float32."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -26,7 +28,7 @@ class State:
         return list(self._values)
 
     def read(self, name: str, *shape: int | None) -> Tensor:
-        """The tensor, of the shape given, of which None is any size. Raises `ImportFailed`."""
+        """A tensor. Raises `ImportFailed` if it is missing or has another shape; None is any size."""
         if name not in self._values:
             raise ImportFailed(self.file, f"lacks `{name}`")
         tensor = self._values[name]
@@ -36,11 +38,17 @@ class State:
             raise ImportFailed(self.file, f"`{name}` has shape {tuple(tensor.shape)}, not {expected}")
         return tensor
 
+    def fill(self, linear: nn.Module, name: str) -> None:
+        """Set weight and bias of a Linear to those stored under `name`."""
+        for kind in ("weight", "bias"):
+            parameter = linear.get_parameter(kind)
+            parameter.copy_(self.read(f"{name}.{kind}", *parameter.shape))
+
 
 def read_network(file: Path) -> dict[str, np.ndarray]:
-    """The tensors, in a process of its own. Raises `ImportFailed`.
+    """Read the tensors, in a subprocess. Takes no more memory than a small multiple of the file's size.
 
-    What is read takes no more memory than a small multiple of the file's size.
+    Raises `ImportFailed`.
     """
     try:
         values = load(file)
@@ -53,3 +61,27 @@ def read_network(file: Path) -> dict[str, np.ndarray]:
         if not torch.isfinite(tensor).all():
             raise ImportFailed(file, f"`{name}` holds NaN or infinity")
     return {str(name): tensor.detach().to(torch.float32).numpy() for name, tensor in values.items()}
+
+
+class RunFolder:
+    """One iteration of a run: its networks and the plain values of its cfg_args."""
+
+    def __init__(self, folder: Path, iteration: int, networks: str) -> None:
+        """`networks` is their path in the folder, with `*` for the iteration."""
+        name = networks.replace("*", str(iteration))
+        if not (folder / name).is_file():
+            raise ImportFailed(folder, f"has point_cloud/iteration_{iteration} but no {name}")
+        self.state = State(folder / name)
+        self.settings = _settings(folder / "cfg_args")
+
+
+def _settings(file: Path) -> dict[str, Any]:
+    """The plain values of cfg_args, the text of a Namespace; it isn't executed."""
+    try:
+        call = ast.parse(file.read_text(), mode="eval").body
+    except FileNotFoundError:
+        return {}
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise ImportFailed(file, f"can't be read: {error}") from error
+    keywords = call.keywords if isinstance(call, ast.Call) else ()
+    return {str(k.arg): k.value.value for k in keywords if isinstance(k.value, ast.Constant)}

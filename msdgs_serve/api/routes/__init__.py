@@ -1,1 +1,1 @@
-"""The calls of the service. What takes long is done off the event loop."""
+"""The routes of the service. Long work runs in threads, not on the event loop."""

@@ -1,4 +1,4 @@
-"""Many frames in one call, each with an answer of its own."""
+"""Many frames in one call, each with a response of its own."""
 
 import base64
 import json
@@ -18,8 +18,8 @@ from msdgs_serve.api.frames import FramePlan, draw_frame, plan_frame, server_tim
 from msdgs_serve.api.openapi import BATCH_RESPONSE, problems
 from msdgs_serve.api.schemas import BatchItem, BatchRequest, RenderRequest
 from msdgs_serve.api.service import Service, SharedService
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.scene import InvalidInput, MsdgsError
-from msdgs_serve.watch import Watch
 
 BOUNDARY = "msdgs-frame"
 NDJSON = "application/x-ndjson"
@@ -29,13 +29,13 @@ router = APIRouter(tags=["frames"])
 
 
 class Item:
-    """One frame of a batch, or what is wrong with it."""
+    """One frame of a batch, or its problem."""
 
     def __init__(self, index: int, status: int, *, plan: FramePlan | None = None, body: bytes = b"") -> None:
         self.index = index
         self.status = status
         self.plan = plan
-        self.body = body  # the image, for a line in base64; the problem where there is no plan
+        self.body = body  # the image, in base64 for a JSON line; or the problem if there is no plan
         self.timing = ""
 
 
@@ -57,10 +57,10 @@ class Item:
 async def render_batch(
     body: BatchRequest, service: SharedService, accept: Annotated[str | None, Header(max_length=1000)] = None
 ) -> StreamingResponse:
-    """Streams the frames as they are ready, one JSON object a line, or as `multipart/mixed` where that is accepted.
+    """Streams the frames as they are ready, as one JSON object per line, or as `multipart/mixed` if that is accepted.
 
-    A frame that fails has its problem in its place; the others are drawn. Equal frames are drawn once, and frames of
-    one time share its Gaussians. The time limit holds for each frame.
+    A frame that fails has a problem instead of an image; the others are rendered. Equal frames are rendered once, and
+    frames of one time are posed once. The time limit holds per frame.
     """
     if len(body.frames) > service.settings.max_batch:
         raise InvalidInput("frames", f"at most {service.settings.max_batch}", len(body.frames))
@@ -78,9 +78,9 @@ async def _written(service: Service, frames: list[dict[str, Any]], multipart: bo
 
 
 async def _items(service: Service, frames: list[dict[str, Any]], multipart: bool) -> AsyncGenerator[Item]:
-    """First those that are wrong, then equal ones together, in the order of scenes and times.
+    """Yield invalid frames first, then the others sorted by scene and time, equal ones together.
 
-    A frame is drawn when the one before has been sent on.
+    A frame is rendered when the previous one was sent.
     """
     planned: dict[str, list[tuple[int, FramePlan]]] = {}
     for index, frame in enumerate(frames):
@@ -91,31 +91,31 @@ async def _items(service: Service, frames: list[dict[str, Any]], multipart: bool
         else:
             planned.setdefault(plan.etag, []).append((index, plan))
     for same in sorted(planned.values(), key=lambda plans: (plans[0][1].scene.name, plans[0][1].times[0])):
-        plan, watch = same[0][1], Watch()
+        plan, job = same[0][1], RenderJob()
         try:
-            work = partial(_drawn, service, plan, watch, multipart)
-            image = await service.queue.run(work, watch, part=True)
+            work = partial(_drawn, service, plan, job, multipart)
+            image = await service.queue.run(work, job, part=True)
         except Exception as error:
             for index, _ in same:
                 yield _failed(index, error)
             continue
-        service.metrics.count_stages(watch.seconds)
+        service.metrics.count_stages(job.seconds)
         for index, _ in same:
             item = Item(index, HTTPStatus.OK, plan=plan, body=image)
-            item.timing = server_timing(watch)
+            item.timing = server_timing(job)
             yield item
 
 
-def _drawn(service: Service, plan: FramePlan, watch: Watch, multipart: bool) -> bytes:
-    """As it is sent, made where it is drawn: base64 of a large frame would keep all other calls waiting."""
-    image = draw_frame(service, plan, plan.times[0], watch)
+def _drawn(service: Service, plan: FramePlan, job: RenderJob, multipart: bool) -> bytes:
+    """Render a frame, and encode it in base64 here: on the event loop that would delay all other calls."""
+    image = draw_frame(service, plan, plan.times[0], job)
     return image if multipart else base64.b64encode(image)
 
 
 def _plan(service: Service, frame: dict[str, Any]) -> FramePlan:
     request = RenderRequest.model_validate(frame)
     if isinstance(request.t, list):
-        raise InvalidInput("t", "a single time; a batch has a frame for each", "a list")
+        raise InvalidInput("t", "a single time; use one frame per time", "a list")
     return plan_frame(service, request)
 
 

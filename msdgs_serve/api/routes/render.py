@@ -1,4 +1,4 @@
-"""One frame, or one for each time."""
+"""Render a frame, or one for each of several times."""
 
 from collections.abc import Callable
 from http import HTTPStatus
@@ -14,10 +14,10 @@ from msdgs_serve.api.queries import request_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
-from msdgs_serve.watch import Watch
+from msdgs_serve.render_job import RenderJob
 
 IfNoneMatch = Annotated[
-    str | None, Header(max_length=8192, description="`ETag`s of frames that the client has", examples=['"0123"'])
+    str | None, Header(max_length=8192, description="`ETag`s of the client's cached frames", examples=['"0123"'])
 ]
 RESPONSES = {
     **IMAGE_RESPONSE,
@@ -40,10 +40,10 @@ router = APIRouter(tags=["frames"])
 async def render(
     body: RenderRequest, service: SharedService, request: Request, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """Draws the scene as `camera` sees it at `t` and answers with the image file.
+    """Renders the scene with `camera` at `t` and returns the image file.
 
-    The same body gives the same bytes, as long as the scene's file stays the same; `ETag` says whether it did.
-    `Server-Timing` says what took how long, `Msdgs-Plan` how the scene's motion is computed.
+    Equal bodies give equal bytes while the scene's file is unchanged, which `ETag` identifies. `Server-Timing` has the
+    times of the stages, `Msdgs-Plan` the way in which the scene's motion is computed.
     """
     return await answer(service, request, lambda: plan_frame(service, body), if_none_match)
 
@@ -55,7 +55,7 @@ async def render_link(
     request: Request,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """The same for browsers and proxies: `/render?azimuth=30&t=0.5`. Without a camera the scene is seen from aside."""
+    """The same for browsers and proxies: `/render?azimuth=30&t=0.5`. The default camera is an orbit view."""
 
     def plan() -> FramePlan:
         metadata = service.scene(query.scene).session.scene.metadata
@@ -67,13 +67,13 @@ async def render_link(
 async def answer(
     service: Service, request: Request, make_plan: Callable[[], FramePlan], if_none_match: str | None
 ) -> Response:
-    """Draw what is planned, unless the client has it already or goes away."""
+    """Render a plan, unless the client has the frame already or disconnects."""
     plan = await anyio.to_thread.run_sync(make_plan)
     headers = plan.headers(service.settings.frame_max_age)
     if is_unchanged(if_none_match, plan.etag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    watch = Watch()
-    image = await unless_gone(request, draw_plan(service, plan, watch))
-    service.metrics.count_stages(watch.seconds)
-    headers["Server-Timing"] = server_timing(watch)
+    job = RenderJob()
+    image = await unless_gone(request, draw_plan(service, plan, job))
+    service.metrics.count_stages(job.seconds)
+    headers["Server-Timing"] = server_timing(job)
     return Response(image, media_type=plan.media_type, headers=headers)

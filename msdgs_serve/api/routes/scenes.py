@@ -1,4 +1,4 @@
-"""The scenes that are served: listed, described, added, deleted."""
+"""List, describe, add and delete scenes."""
 
 import asyncio
 import hashlib
@@ -16,7 +16,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
-from msdgs_serve.api.errors import ClientGone, Refused
+from msdgs_serve.api.errors import ClientGone, RequestRejected
 from msdgs_serve.api.keys import CLIENT
 from msdgs_serve.api.numbers import Name
 from msdgs_serve.api.openapi import SCENE_BODY, problems
@@ -40,27 +40,29 @@ from msdgs_serve.store import SceneStatus, SceneStore
 
 MAX_REASON = 300
 
-SceneName = Annotated[Name, Path(description="as in `GET /scenes`", examples=["toybench"])]
-NewName = Annotated[Name, Query(description="plain text, no separators", examples=["walk"])]
-Sha256 = Annotated[str | None, Query(pattern="^[0-9a-f]{64}$", description="of the file; checked where it is given")]
+SceneName = Annotated[Name, Path(description="name of a scene, see `GET /scenes`", examples=["toybench"])]
+NewName = Annotated[Name, Query(description="printable text without separators", examples=["walk"])]
+Sha256 = Annotated[
+    str | None, Query(pattern="^[0-9a-f]{64}$", description="SHA-256 of the file, which is checked if given")
+]
 
 router = APIRouter(tags=["scenes"])
 
 
 @router.get("/scenes", summary="The scenes that are served", responses=problems(HTTPStatus.UNPROCESSABLE_ENTITY))
 def list_scenes(service: SharedService) -> SceneList:
-    """Names, without loading anything."""
+    """Names and states, without loading scenes."""
     statuses = service.store.statuses()
     return SceneList(scenes=[SceneEntry(name=each.name, loaded=each.loaded, **_problem(each)) for each in statuses])
 
 
 @router.get(
     "/scenes/{name}",
-    summary="What a scene is",
+    summary="Description of a scene",
     responses=problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
 )
 def describe_scene(name: SceneName, service: SharedService) -> SceneDetail:
-    """Time range, cameras to start from, plan, counts and measured error. Loads the scene if it isn't yet."""
+    """Time range, cameras, plan, counts and measured error. Loads the scene if necessary."""
     return _describe(service.store, name)
 
 
@@ -70,12 +72,12 @@ def describe_scene(name: SceneName, service: SharedService) -> SceneDetail:
     responses=problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
 )
 def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
-    """What the exporter measured of the ways to store this scene: the `.report.json` beside its file, format
-    `msdgs-report/1`. 404 where there is none, or where it is of another model."""
+    """The exporter's measurements of the plans for this scene: the `.report.json` beside its file, in the format
+    `msdgs-report/1`. 404 if there is none, or if it belongs to another model."""
     served = service.store.get(name)
     report = read_report(service.store.file(name), served.session.scene.metadata.checkpoint_sha256)
     if report is None:
-        raise Refused(HTTPStatus.NOT_FOUND, "not_found", "There is no report of this scene.")
+        raise RequestRejected(HTTPStatus.NOT_FOUND, "not_found", "There is no report for this scene.")
     return report
 
 
@@ -102,23 +104,23 @@ async def add_scene(
     replace: Annotated[bool, Query(description="whether a scene of this name may be replaced")] = False,
     sha256: Sha256 = None,
 ) -> SceneAdded:
-    """Takes a scene file as the body. It is checked, and posed in a process of its own, before it takes its place;
-    who draws the scene that it replaces is not disturbed. Only where the service was started with `--uploads`."""
+    """Takes a scene file as the body, which is checked and tested in a subprocess before it is added. Renders of a
+    scene that it replaces are finished. Requires that the service runs with `--uploads`."""
     service.check_uploads()
     incoming, uploads = service.store.incoming(uuid.uuid4().hex), service.uploads
     await anyio.to_thread.run_sync(uploads.scan)
     try:
-        with uploads.room(name, request.scope.get(CLIENT)) as upload:
+        with uploads.receiving(name, request.scope.get(CLIENT)) as upload:
             digest = await _receive(request, incoming, service, upload)
             if sha256 is not None and not hmac.compare_digest(digest, sha256):
-                raise InvalidInput("sha256", "that of the file", "another")
+                raise InvalidInput("sha256", "the SHA-256 of the file", "another one")
             add = partial(service.add_scene, name, incoming, replace=replace)
             added = await anyio.to_thread.run_sync(add, limiter=uploads.opening)
             uploads.added(upload)
     except SceneFileInvalid as error:
-        service.log_problem(error)
-        detail = f"The file breaks the contract msdgs/1: `{error.field}` {error.problem}"
-        raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
+        service.log_rejected_upload(name, error)
+        detail = f"The file violates the contract msdgs/1: `{error.field}` {error.problem}"
+        raise RequestRejected(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
     response.headers["Location"] = f"/scenes/{quote(name, safe='')}"
@@ -132,14 +134,14 @@ async def add_scene(
     responses=problems(HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY),
 )
 async def delete_scene(name: SceneName, service: SharedService) -> None:
-    """Deletes its file; frames in work are finished. Only where the service was started with `--uploads`."""
+    """Deletes the scene's file; renders in progress are finished. Requires that the service runs with `--uploads`."""
     service.check_uploads()
     await anyio.to_thread.run_sync(service.store.remove, name, limiter=service.uploads.opening)
     service.uploads.removed(name)
 
 
 async def _receive(request: Request, target: FilePath, service: Service, upload: Stored) -> str:
-    """Write the body to a file, and return its SHA-256."""
+    """Write the request body to a file and return its SHA-256."""
     digest = hashlib.sha256()
     async with await anyio.open_file(target, "xb") as file:
         async for part in _parts(request, service.settings.body_seconds):
@@ -150,7 +152,7 @@ async def _receive(request: Request, target: FilePath, service: Service, upload:
 
 
 async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
-    """The body as it comes; each part within the time."""
+    """Yield the parts of the request body, each within `seconds`."""
     stream = aiter(request.stream())
     while True:
         try:
@@ -162,7 +164,7 @@ async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
             raise ClientGone("the client closed the connection") from None
         except TimeoutError:
             detail = f"The next part of the body must come within {seconds:g} s."
-            raise Refused(HTTPStatus.REQUEST_TIMEOUT, "slow_body", detail, field="body") from None
+            raise RequestRejected(HTTPStatus.REQUEST_TIMEOUT, "slow_body", detail, field="body") from None
 
 
 def _describe(store: SceneStore, name: str) -> SceneDetail:
@@ -179,7 +181,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         contract=metadata.contract,
         plan=metadata.plan,
         layers=list(metadata.layers),
-        steps=served.session.most_steps,
+        steps=served.session.max_steps,
         gaussians=counts,
         sh_degree=metadata.sh_degree,
         time_range=metadata.time_range,

@@ -1,4 +1,4 @@
-"""A film along a camera path."""
+"""Render a video along a camera path."""
 
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
@@ -17,18 +17,18 @@ from msdgs_serve.api.schemas import RenderRequest, VideoRequest
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
 from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, read_nerfstudio
+from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import RenderOptions, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
-from msdgs_serve.video import VIDEO_FORMATS, FilmWriter, check_video
-from msdgs_serve.watch import Watch
+from msdgs_serve.video import VIDEO_FORMATS, VideoWriter, check_video
 
 router = APIRouter(tags=["frames"])
 
 
 @router.post(
     "/render/video",
-    summary="A film along a camera path",
+    summary="A video along a camera path",
     response_class=Response,
     responses={
         **VIDEO_RESPONSE,
@@ -45,20 +45,20 @@ router = APIRouter(tags=["frames"])
     },
 )
 async def render_video(body: VideoRequest, service: SharedService, request: Request) -> Response:
-    """Draws every frame, and sends the film while it does. The time limit holds for each frame, others draw in between;
-    where one fails the connection is closed, so that the film is known to be incomplete.
+    """Streams the video while its frames are rendered, with renders of other requests in between. The time limit holds
+    per frame; if one fails, the connection is closed, so that the client knows that the video is incomplete.
 
-    For long films `msdgs-render` on the machine itself shows its progress and goes on where it was stopped.
+    For long videos use `msdgs-render` on the machine itself, which shows its progress and can be resumed.
     """
     check_video(body.format)
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
-    film = _film(service, body, scene, path)
-    first = await unless_gone(request, anext(film))  # what goes wrong at once still has its status
-    return StreamingResponse(_joined(first, film), media_type=VIDEO_FORMATS[body.format].media_type)
+    stream = _stream_video(service, body, scene, path)
+    first = await unless_gone(request, anext(stream))  # an error in the first frame still gets its status
+    return StreamingResponse(_joined(first, stream), media_type=VIDEO_FORMATS[body.format].media_type)
 
 
-class _Unsent:
-    """A file that can only be written to, and what of it nobody has taken yet."""
+class _OutputBuffer:
+    """A write-only file whose new contents are taken piece by piece."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
@@ -73,14 +73,16 @@ class _Unsent:
         return taken
 
 
-async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath) -> AsyncGenerator[bytes]:
-    """The file in pieces. Each frame is drawn and encoded when its turn comes and the piece before has been sent on."""
-    options, watch, unsent = RenderOptions(body.background), Watch(), _Unsent()
-    writer = FilmWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
+async def _stream_video(
+    service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath
+) -> AsyncGenerator[bytes]:
+    """Yield the file in pieces. Each frame is rendered when its turn comes and the previous piece was sent."""
+    options, job, unsent = RenderOptions(body.background), RenderJob(), _OutputBuffer()
+    writer = VideoWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
 
     def add(camera: Camera, t: float) -> bytes:
-        pixels = service.renderer.render(scene.session, camera, t, options, watch).display_pixels()
-        with watch.stage("encode"):
+        pixels = service.renderer.render(scene.session, camera, t, options, job).display_pixels()
+        with job.stage("encode"):
             writer.add(pixels)
         return unsent.take()
 
@@ -89,9 +91,9 @@ async def _film(service: Service, body: VideoRequest, scene: ServedScene, path: 
         return unsent.take()
 
     for camera, t in path.frames:
-        yield await service.queue.run(partial(add, camera, t), watch, part=True)
-    yield await service.queue.run(close, watch, part=True)
-    service.metrics.count_stages(watch.seconds)
+        yield await service.queue.run(partial(add, camera, t), job, part=True)
+    yield await service.queue.run(close, job, part=True)
+    service.metrics.count_stages(job.seconds)
 
 
 async def _joined(first: bytes, rest: AsyncGenerator[bytes]) -> AsyncGenerator[bytes]:
@@ -108,7 +110,7 @@ def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath
     if (body.frames is None) == (body.path is None):
         raise InvalidInput("frames", "given, or path", "neither" if body.frames is None else "both")
     if (body.width is None) != (body.height is None):
-        raise InvalidInput("width", "given together with height", "one of them")
+        raise InvalidInput("width", "given together with height", "only one of them")
     size = None if body.width is None or body.height is None else (body.width, body.height)
     if body.path is not None:
         path = read_nerfstudio(body.path.model_dump(exclude_none=True), metadata.time_range, size)

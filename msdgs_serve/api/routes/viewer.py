@@ -1,4 +1,4 @@
-"""The page at `/`: a scene in a browser. Its files are those of `msdgs_serve/viewer`, as they are."""
+"""The viewer at `/`, which shows scenes in a browser: the static files of `msdgs_serve/viewer`."""
 
 import hashlib
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header
 from fastapi.responses import Response
 
-from msdgs_serve.api.errors import Refused
+from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.frames import is_unchanged
 
 FOLDER = Path(__file__).parents[2] / "viewer"
@@ -27,7 +27,7 @@ IfNoneMatch = Annotated[str | None, Header(max_length=8192)]
 
 @dataclass(frozen=True)
 class PageFile:
-    """A file of the page, in memory."""
+    """A file of the viewer, in memory."""
 
     content: bytes
     media_type: str
@@ -35,7 +35,7 @@ class PageFile:
 
 
 def _read(folder: Path) -> dict[str, PageFile]:
-    """By name; nothing else is ever opened, so that no path of a request can lead elsewhere."""
+    """Read the viewer's files by name. Requests never open files, so that no path can escape the folder."""
     files: dict[str, PageFile] = {}
     for path in folder.iterdir():
         if path.suffix in MEDIA_TYPES:
@@ -52,15 +52,15 @@ router = APIRouter(include_in_schema=False)
 
 @router.get("/")
 async def page(if_none_match: IfNoneMatch = None) -> Response:
-    """The page itself."""
+    """Return the page."""
     return _answer(FILES[PAGE], if_none_match)
 
 
 @router.get("/viewer/{name}")
 async def page_file(name: str, if_none_match: IfNoneMatch = None) -> Response:
-    """What the page is made of."""
+    """Return a file of the page."""
     if name not in FILES:
-        raise Refused(HTTPStatus.NOT_FOUND, "not_found", "The page has no such file.")
+        raise RequestRejected(HTTPStatus.NOT_FOUND, "not_found", "The viewer has no such file.")
     return _answer(FILES[name], if_none_match)
 
 

@@ -1,4 +1,4 @@
-"""Types, shapes and cost of a graph before it runs: every node is looked up in the table of operators."""
+"""Infer types, shapes and cost of a graph before it runs, by the table of operators."""
 
 import math
 from collections.abc import Mapping
@@ -17,21 +17,21 @@ from msdgs_serve.scene.onnx.wire import ModelInvalid
 
 @dataclass(frozen=True)
 class Value:
-    """What is known of an array before the graph runs."""
+    """The properties of an array that are known before the graph runs."""
 
     element: int
     shape: Shape
     varies: bool  # whether it depends on an input of the graph
-    constant: Tensor | None = None  # where it is stored in the file
+    constant: Tensor | None = None  # if it is stored in the file
 
 
 def infer(
     model: Model, inputs: Mapping[str, Value], limits: GraphLimits, ids: int, calls: int, returned: int
 ) -> tuple[dict[str, Value], CallCost]:
-    """All values by name, and the cost of one of `calls` calls of a frame, each of at most `ids` ids; all return so
-    many bytes.
+    """Return all values by name and the cost of one call.
 
-    Raises `ModelInvalid` naming a node whose operator, attributes, types, shapes or cost a scene file may not have.
+    A frame makes `calls` calls of at most `ids` ids each, which return `returned` bytes in all. Raises `ModelInvalid`
+    naming a node whose operator, attributes, types, shapes or cost are not allowed.
     """
     values = dict(inputs)
     for name, tensor in model.constants.items():
@@ -40,7 +40,7 @@ def infer(
     for node in model.nodes:
         operator = OPERATORS.get(node.operator)
         if operator is None:
-            raise ModelInvalid(node.name, f"is the operator {node.operator}, which scene files don't have")
+            raise ModelInvalid(node.name, f"is the operator {node.operator}, which scene files may not contain")
         operands = _operands(node, operator, values)
         _check_attributes(node, operator)
         try:
@@ -51,7 +51,7 @@ def infer(
         element = _element(node, operator, operands)
         for name, shape in zip(node.outputs, result.shapes, strict=True):
             if not name or name in values:
-                raise ModelInvalid(node.name, f"writes `{name}`, which is there already or has no name")
+                raise ModelInvalid(node.name, f"writes `{name}`, which has no name or exists already")
             if len(shape) > MAX_RANK or math.prod(max(dim.at(ids), 1) for dim in shape) > MAX_ELEMENTS:
                 raise ModelInvalid(node.name, f"makes an array of shape {text(shape)}, which is too large")
             values[name] = Value(element, shape, varies)
@@ -84,13 +84,15 @@ def _operands(node: Node, operator: Operator, values: Mapping[str, Value]) -> li
 def _element(node: Node, operator: Operator, operands: list[Value]) -> int:
     if operator.result is None:
         return operands[operator.like].element
-    return node.attributes[operator.result] if isinstance(operator.result, str) else operator.result
+    element = node.attributes[operator.result] if isinstance(operator.result, str) else operator.result
+    assert isinstance(element, int)  # `_check_attributes` has looked at the table
+    return element
 
 
 def _check_attributes(node: Node, operator: Operator) -> None:
     for name, value in node.attributes.items():
         if name not in operator.attributes:
-            raise ModelInvalid(node.name, f"({node.operator}) has the attribute `{name}`, which is unknown here")
+            raise ModelInvalid(node.name, f"({node.operator}) has the unknown attribute `{name}`")
         if value not in operator.attributes[name]:
             raise ModelInvalid(node.name, f"({node.operator}) has {name} = {value}, not {operator.attributes[name]}")
     for name in operator.needed:
@@ -106,7 +108,7 @@ def _call(node: Node, operands: list[Value]) -> Call:
 
 
 def _cost(operator: Operator, result: Result, element: int, ids: int) -> tuple[int, int]:
-    """Bytes and operations of a node."""
+    """Return bytes and operations of a node."""
     elements = sum(count(shape, ids) for shape in result.shapes)
     each = 2 * count(result.inner, ids) if result.inner else operator.work
     products = PRODUCT * count(result.products, ids) if result.products else 0

@@ -1,4 +1,4 @@
-"""A model as a scene file may hold it, from its bytes."""
+"""Parse the ONNX model of a scene file."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from msdgs_serve.scene.onnx import schema
 from msdgs_serve.scene.onnx.wire import ModelInvalid, read_message
 
 FLOAT, UINT8, INT8, INT16, INT32, INT64, BOOL = 1, 2, 3, 5, 6, 7, 9
-"""Element types, by their numbers in onnx.proto."""
+"""Element types in onnx.proto."""
 
 DTYPES = {
     FLOAT: np.dtype("<f4"),
@@ -25,20 +25,23 @@ DTYPES = {
 CONSTANT_ELEMENTS = (FLOAT, UINT8, INT8, INT16, INT32, INT64)
 
 OPSETS = range(18, 21)
-"""Versions of the operator set: the operators of a scene file mean the same in all of them."""
+"""Versions of the operator set in which the operators of scene files are the same."""
 IR_VERSIONS = range(8, 11)
 
-_INT_ATTRIBUTE = 2  # AttributeProto.INT
+INT_ATTRIBUTE, INTS_ATTRIBUTE = 2, 7
+"""Types of attributes, by their numbers in onnx.proto."""
+
+Attribute = int | tuple[int, ...]
 
 
 def element_name(element: int) -> str:
-    """As in `float32`."""
+    """Return the name of an element type, such as `float32`."""
     return DTYPES[element].name if element in DTYPES else f"element type {element}"
 
 
 @dataclass(frozen=True)
 class Tensor:
-    """A constant. `data` is a part of the file's bytes."""
+    """A constant. `data` is a view of the file's bytes."""
 
     name: str
     element: int
@@ -46,24 +49,24 @@ class Tensor:
     data: memoryview
 
     def array(self) -> np.ndarray:
-        """Its values, without a copy; not writable, and at any address."""
+        """Return a view of the values, read-only and unaligned."""
         return np.frombuffer(self.data, DTYPES[self.element]).reshape(self.shape)
 
 
 @dataclass(frozen=True)
 class Node:
-    """A call of an operator of the default domain."""
+    """A node with an operator of the default domain."""
 
     operator: str
     name: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    attributes: Mapping[str, int]
+    attributes: Mapping[str, Attribute]
 
 
 @dataclass(frozen=True)
 class Port:
-    """An input or output of the graph; dimensions that are no fixed number have a name or an empty text."""
+    """An input or output of the graph. Dimensions are numbers, names or empty texts."""
 
     name: str
     element: int
@@ -72,7 +75,7 @@ class Port:
 
 @dataclass(frozen=True)
 class Model:
-    """Names in `constants`, `inputs` and `outputs` are unique among themselves; `infer` looks at the rest."""
+    """A parsed model. Names are unique within each of `constants`, `inputs` and `outputs`; `infer` checks the graph."""
 
     opset: int
     nodes: tuple[Node, ...]
@@ -83,7 +86,7 @@ class Model:
 
 
 def read_model(contents: bytes | memoryview) -> Model:
-    """Raises `ModelInvalid` naming what a scene file may not have. Constants are parts of `contents`, not copies."""
+    """Parse a model; its constants are views of `contents`. Raises `ModelInvalid` for parts that are not allowed."""
     fields = read_message(memoryview(contents), schema.MODEL, "the model")
     if fields.get("ir_version") not in IR_VERSIONS:
         raise _invalid(f"it is of IR version {fields.get('ir_version')}, not {_span(IR_VERSIONS)}")
@@ -117,7 +120,7 @@ def _properties(parts: list[memoryview]) -> dict[str, str]:
         entry = read_message(part, schema.PROPERTY, "the metadata")
         key = entry.get("key", "")
         if key in properties:
-            raise ModelInvalid(key, "is there twice in the metadata")
+            raise ModelInvalid(key, "is in the metadata twice")
         properties[key] = entry.get("value", "")
     return properties
 
@@ -129,27 +132,36 @@ def _node(part: memoryview) -> Node:
     name = fields.get("name") or (outputs[0] if outputs else operator)
     if fields.get("domain", "") or fields.get("overload", ""):
         raise ModelInvalid(name, f"is {operator} of another domain, not of ONNX")
-    attributes: dict[str, int] = {}
-    for attribute in fields["attribute"]:
-        values = read_message(attribute, schema.ATTRIBUTE, f"an attribute of node `{name}`")
-        key = values.get("name", "")
-        if values.get("type") != _INT_ATTRIBUTE or "i" not in values or key in attributes:
-            raise ModelInvalid(name, f"has the attribute `{key}` that isn't one whole number")
-        attributes[key] = values["i"]
+    attributes: dict[str, Attribute] = {}
+    for part in fields["attribute"]:
+        key, value = _attribute(part, name)
+        if key in attributes:
+            raise ModelInvalid(name, f"has the attribute `{key}` more than once")
+        attributes[key] = value
     return Node(operator, name, tuple(fields["input"]), outputs, attributes)
+
+
+def _attribute(part: memoryview, node: str) -> tuple[str, Attribute]:
+    values = read_message(part, schema.ATTRIBUTE, f"an attribute of node `{node}`")
+    key, kind, single, several = values.get("name", ""), values.get("type"), values.get("i"), tuple(values["ints"])
+    if kind == INT_ATTRIBUTE and single is not None and not several:
+        return key, single
+    if kind == INTS_ATTRIBUTE and single is None and several:
+        return key, several
+    raise ModelInvalid(node, f"has the attribute `{key}` that isn't an integer or a list of integers")
 
 
 def _tensor(part: memoryview) -> Tensor:
     fields = read_message(part, schema.TENSOR, "a constant")
     name, element, shape = fields.get("name", ""), fields.get("data_type", 0), tuple(fields["dims"])
     if fields.get("data_location", 0):
-        raise ModelInvalid(name, "lies in another file")
+        raise ModelInvalid(name, "is stored in another file")
     if element not in CONSTANT_ELEMENTS:
         known = ", ".join(element_name(each) for each in CONSTANT_ELEMENTS)
         raise ModelInvalid(name, f"is a constant of {element_name(element)}, not of {known}")
     data, size = fields.get("raw_data", memoryview(b"")), DTYPES[element].itemsize
     if min(shape, default=0) < 0 or math.prod(max(length, 1) for length in shape) > schema.MAX_ELEMENTS:
-        raise ModelInvalid(name, f"has the lengths {shape}, which no array has")
+        raise ModelInvalid(name, f"has the impossible shape {shape}")
     if len(data) != math.prod(shape) * size:
         raise ModelInvalid(name, f"of shape {shape} has {len(data):,} bytes")
     return Tensor(name, element, shape, data)
@@ -172,13 +184,13 @@ def _dimension(fields: dict[str, Any]) -> int | str:
     return fields.get("dim_value", fields.get("dim_param", ""))
 
 
-def _by_name(parts: list[Any], what: str) -> dict[str, Any]:
+def _by_name(parts: list[Any], kind: str) -> dict[str, Any]:
     named: dict[str, Any] = {}
     for part in parts:
         if not part.name:
-            raise _invalid(f"it has a nameless {what}")
+            raise _invalid(f"it has a nameless {kind}")
         if part.name in named:
-            raise ModelInvalid(part.name, f"names more than one {what}")
+            raise ModelInvalid(part.name, f"names more than one {kind}")
         named[part.name] = part
     return named
 

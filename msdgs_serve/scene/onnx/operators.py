@@ -1,24 +1,25 @@
-"""The operators of a scene file: this table is all that there is. A plan that needs another adds a row here and in
+"""The table of operators that scene files may contain. A plan that needs another adds a row here and in
 docs/contract.md.
 
-No operator's output shape depends on values that are computed: shapes, axes and lengths are constants of the file.
-Whole numbers aren't divided, and rows that are replaced are constants, since processors and libraries fail there.
+Output shapes don't depend on computed values: shapes, axes and lengths are constants of the file. There is no integer
+division, and indices of replaced rows are constants, as errors in them would crash.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import permutations
 
 from msdgs_serve.scene.onnx import rules
-from msdgs_serve.scene.onnx.model import BOOL, FLOAT, INT8, INT16, INT32, INT64, UINT8
+from msdgs_serve.scene.onnx.model import BOOL, FLOAT, INT8, INT16, INT32, INT64, UINT8, Attribute
 from msdgs_serve.scene.onnx.rules import Call, Result
 
 FUNCTION = 16
-"""Operations that an exponential, a sine and the like count as."""
+"""Operations that a transcendental function counts as."""
 
 
 @dataclass(frozen=True)
 class Operand:
-    """An input: its element types, and whether it has to be a constant of the file."""
+    """An input of an operator: its element types, and whether it must be a constant of the file."""
 
     elements: tuple[int, ...]
     constant: bool = False
@@ -26,17 +27,17 @@ class Operand:
 
 @dataclass(frozen=True)
 class Operator:
-    """A row of the table. Results are of the first input's element type, unless `result` is another, or the attribute
-    that says it; `like` is the input whose type they have otherwise."""
+    """A row of the table. The element type of results is `result`, or that in the attribute `result`, or else that of
+    the input `like`."""
 
     operands: tuple[Operand, ...]
     rule: Callable[[Call], Result] = rules.elementwise
-    attributes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # and the values that each may have
-    needed: tuple[str, ...] = ()  # attributes that may not be missing
+    attributes: Mapping[str, tuple[Attribute, ...]] = field(default_factory=dict)  # allowed values by attribute
+    needed: tuple[str, ...] = ()  # required attributes
     result: int | str | None = None
     like: int = 0
-    repeated: bool = False  # whether the last operand may come several times
-    work: int = 1  # operations for each element of the result
+    repeated: bool = False  # whether the last operand may be repeated
+    work: int = 1  # operations per element of the result
 
 
 _FLOAT = Operand((FLOAT,))
@@ -55,7 +56,7 @@ def _function(work: int = FUNCTION) -> Operator:
 OPERATORS: Mapping[str, Operator] = {
     "Add": Operator((_NUMBER, _NUMBER)),
     "Cast": Operator(
-        (Operand((FLOAT, UINT8, INT16, INT64, BOOL)),), rules.alike, {"to": (FLOAT, INT64)}, ("to",), "to"
+        (Operand((FLOAT, UINT8, INT16, INT32, INT64, BOOL)),), rules.alike, {"to": (FLOAT, INT64)}, ("to",), "to"
     ),
     "Clip": Operator((_FLOAT, _FLOAT, _FLOAT), rules.clip),
     "Concat": Operator((_FLOAT,), rules.concat, _AXIS, ("axis",), repeated=True),
@@ -95,6 +96,7 @@ OPERATORS: Mapping[str, Operator] = {
     "Sqrt": _function(1),
     "Squeeze": Operator((_FLOAT, _LENGTHS), rules.squeeze),
     "Sub": Operator((_FLOAT, _FLOAT)),
+    "Transpose": Operator((_FLOAT,), rules.transpose, {"perm": tuple(permutations(range(3)))}, ("perm",)),
     "Unsqueeze": Operator((Operand((FLOAT, BOOL)), _LENGTHS), rules.unsqueeze),
     "Where": Operator((Operand((BOOL,)), _FLOAT, _FLOAT), like=1),
 }

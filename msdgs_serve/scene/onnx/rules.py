@@ -1,10 +1,11 @@
-"""What each operator makes of shapes, and how much it computes for each element of its results."""
+"""Shape and cost rules of the operators."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from msdgs_serve.scene.onnx.model import Attribute
 from msdgs_serve.scene.onnx.shapes import (
     ONE,
     Dim,
@@ -22,24 +23,30 @@ from msdgs_serve.scene.onnx.shapes import (
 
 @dataclass(frozen=True)
 class Call:
-    """One node: shapes of its inputs, the values of those that are constants, its attributes and number of outputs."""
+    """A node: shapes of its inputs, values of constant inputs, attributes and number of outputs."""
 
     shapes: Sequence[Shape]
     constants: Sequence[np.ndarray | None]
-    attributes: Mapping[str, int]
+    attributes: Mapping[str, Attribute]
     outputs: int
 
     def constant(self, index: int) -> np.ndarray:
-        """The values of an input that the operator table says is a constant."""
+        """Return the values of an input that must be a constant by the table of operators."""
         values = self.constants[index]
-        assert values is not None  # `infer` has looked at the table
+        assert values is not None  # `infer` has checked this
         return values
+
+    def attribute(self, name: str, default: int) -> int:
+        """Return an integer attribute."""
+        value = self.attributes.get(name, default)
+        assert isinstance(value, int)  # `infer` has checked this
+        return value
 
 
 @dataclass(frozen=True)
 class Result:
-    """Shapes of the outputs; `inner` is what is summed or multiplied for each element of the first, and `products` how
-    many matrix products that are."""
+    """Shapes of the outputs; `inner` is the shape that is reduced for each element of the first output, and `products`
+    the shape of a stack of matrix products."""
 
     shapes: Sequence[Shape]
     inner: Shape = ()
@@ -47,39 +54,39 @@ class Result:
 
 
 def elementwise(call: Call) -> Result:
-    """Add and the like."""
+    """Return the broadcast shape of all inputs."""
     return Result([broadcast(*call.shapes)])
 
 
 def alike(call: Call) -> Result:
-    """Operators of one array: further inputs are single numbers or, of quantisers, lists along an axis."""
+    """Return the shape of the first input."""
     return Result([call.shapes[0]])
 
 
 def clip(call: Call) -> Result:
-    """Limits are single numbers."""
+    """Return the shape of the first input; limits must be single numbers."""
     if not {call.shapes[1], call.shapes[2]} <= {(), (ONE,)}:
         raise ShapeInvalid(f"clips to limits of shapes {text(call.shapes[1])} and {text(call.shapes[2])}, not [1]")
     return alike(call)
 
 
 def quantize(call: Call) -> Result:
-    """Scale and zero point are single numbers, or one for each index along an axis."""
+    """Return the shape of the first input; scales and zero points are single numbers or one per index of an axis."""
     shape, scale, zero = call.shapes
-    if scale != zero or (scale and scale != (shape[axis_of(call.attributes.get("axis", 1), len(shape))],)):
-        raise ShapeInvalid(f"quantises {text(shape)} with scales {text(scale)} and zero points {text(zero)}")
+    if scale != zero or (scale and scale != (shape[axis_of(call.attribute("axis", 1), len(shape))],)):
+        raise ShapeInvalid(f"quantizes {text(shape)} with scales {text(scale)} and zero points {text(zero)}")
     return alike(call)
 
 
 def gather(call: Call) -> Result:
-    """Rows, columns or the like by index."""
+    """Return the shape of elements along an axis by index."""
     data, indices = call.shapes
-    axis = axis_of(call.attributes.get("axis", 0), len(data))
+    axis = axis_of(call.attribute("axis", 0), len(data))
     return Result([(*data[:axis], *indices, *data[axis + 1 :])])
 
 
 def scatter(call: Call) -> Result:
-    """Rows of an array replaced: indices [k, 1] are constant and within it."""
+    """Return the shape of an array with replaced rows; their indices [k, 1] must be constant and valid."""
     data, indices, updates = call.shapes
     rows = call.constant(1)
     if len(indices) != 2 or indices[1] != ONE or not data or updates != (indices[0], *data[1:]) or data[0].per_id:
@@ -90,30 +97,39 @@ def scatter(call: Call) -> Result:
 
 
 def concat(call: Call) -> Result:
-    """Arrays side by side."""
+    """Return the shape of arrays concatenated along an axis."""
     first = call.shapes[0]
-    axis = axis_of(call.attributes.get("axis", 0), len(first))
+    axis = axis_of(call.attribute("axis", 0), len(first))
     if any(len(s) != len(first) or s[:axis] + s[axis + 1 :] != first[:axis] + first[axis + 1 :] for s in call.shapes):
-        raise ShapeInvalid(f"can't put {' and '.join(text(shape) for shape in call.shapes)} side by side")
+        raise ShapeInvalid(f"can't concatenate {' and '.join(text(shape) for shape in call.shapes)}")
     return Result([(*first[:axis], added(shape[axis] for shape in call.shapes), *first[axis + 1 :])])
 
 
 def split(call: Call) -> Result:
-    """The reverse of `concat`, in parts of constant lengths."""
+    """Return the shapes of parts of constant lengths along an axis."""
     shape, parts = call.shapes[0], numbers(call.constant(1), "lengths")
-    axis = axis_of(call.attributes.get("axis", 0), len(shape))
+    axis = axis_of(call.attribute("axis", 0), len(shape))
     if len(parts) != call.outputs or min(parts, default=-1) < 0 or shape[axis] != Dim(sum(parts)):
         raise ShapeInvalid(f"splits {text(shape)} into {call.outputs} parts of {parts}")
     return Result([(*shape[:axis], Dim(part), *shape[axis + 1 :]) for part in parts])
 
 
+def transpose(call: Call) -> Result:
+    """Return the shape with its axes in another order."""
+    shape, order = call.shapes[0], call.attributes["perm"]
+    assert isinstance(order, tuple)
+    if len(order) != len(shape):
+        raise ShapeInvalid(f"orders {len(order)} axes of {text(shape)}")
+    return Result([tuple(shape[axis] for axis in order)])
+
+
 def reshape(call: Call) -> Result:
-    """To a constant shape."""
+    """Return a constant shape, with the same number of elements."""
     return Result([reshaped(call.shapes[0], numbers(call.constant(1), "lengths"))])
 
 
 def unsqueeze(call: Call) -> Result:
-    """New axes of length 1."""
+    """Return the shape with new axes of length 1."""
     rest, axes = list(call.shapes[0]), numbers(call.constant(1), "axes")
     rank = len(rest) + len(axes)
     new = axes_of(axes, rank)
@@ -121,7 +137,7 @@ def unsqueeze(call: Call) -> Result:
 
 
 def squeeze(call: Call) -> Result:
-    """Axes of length 1 less."""
+    """Return the shape without some axes of length 1."""
     shape = call.shapes[0]
     gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
     if any(shape[axis] != ONE for axis in gone):
@@ -130,15 +146,15 @@ def squeeze(call: Call) -> Result:
 
 
 def reduce(call: Call) -> Result:
-    """One value along some axes."""
-    shape, keep = call.shapes[0], call.attributes.get("keepdims", 1)
+    """Return the shape of a reduction along some axes."""
+    shape, keep = call.shapes[0], call.attribute("keepdims", 1)
     gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
     left = tuple(ONE if i in gone else dim for i, dim in enumerate(shape) if keep or i not in gone)
     return Result([left], inner=tuple(shape[axis] for axis in gone))
 
 
 def matmul(call: Call) -> Result:
-    """Products of matrices, or of stacks of them."""
+    """Return the shape of a product of matrices or of stacks of matrices."""
     left, right = call.shapes
     if len(left) < 2 or len(right) < 2 or left[-1] != right[-2]:
         raise ShapeInvalid(f"can't multiply {text(left)} by {text(right)}")
@@ -147,9 +163,9 @@ def matmul(call: Call) -> Result:
 
 
 def gemm(call: Call) -> Result:
-    """A product of two matrices and what is added to it."""
+    """Return the shape of a product of two matrices plus a summand."""
     left, right, summand = call.shapes
-    right = right[::-1] if call.attributes.get("transB", 0) else right
+    right = right[::-1] if call.attribute("transB", 0) else right
     if len(left) != 2 or len(right) != 2 or left[1] != right[0]:
         raise ShapeInvalid(f"can't multiply {text(left)} by {text(right)}")
     product = (left[0], right[1])

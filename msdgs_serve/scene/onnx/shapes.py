@@ -1,4 +1,4 @@
-"""Shapes that are known before a graph runs: each dimension is a fixed number, or some for each id asked for."""
+"""Shapes that are known before a graph runs: dimensions are fixed or proportional to the number of ids of a call."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -10,7 +10,7 @@ from msdgs_serve.scene.onnx.schema import MAX_OPERANDS
 
 
 class ShapeInvalid(ValueError):
-    """Shapes that don't fit; whoever knows the node adds its name."""
+    """Shapes don't fit; the caller adds the name of the node."""
 
 
 class Dim(NamedTuple):
@@ -20,7 +20,7 @@ class Dim(NamedTuple):
     per_id: int = 0
 
     def at(self, ids: int) -> int:
-        """For so many ids."""
+        """Return the length for a number of ids."""
         return self.fixed + self.per_id * ids
 
     def __str__(self) -> str:
@@ -36,22 +36,22 @@ Shape = tuple[Dim, ...]
 
 
 def fixed(shape: Iterable[int]) -> Shape:
-    """A shape without ids."""
+    """Return a shape of fixed lengths."""
     return tuple(Dim(length) for length in shape)
 
 
 def text(shape: Shape) -> str:
-    """As in `[M, 3]`."""
+    """Return a shape as text, such as `[M, 3]`."""
     return f"[{', '.join(str(dim) for dim in shape)}]"
 
 
 def count(shape: Shape, ids: int) -> int:
-    """Elements for so many ids."""
+    """Return the number of elements for a number of ids."""
     return math.prod(dim.at(ids) for dim in shape)
 
 
 def broadcast(*shapes: Shape) -> Shape:
-    """The shape of what is computed element by element, as NumPy has it; M is taken to differ from any number."""
+    """Return the broadcast shape, as in NumPy; M counts as different from any number."""
     rank = max(len(shape) for shape in shapes)
     result = [ONE] * rank
     for shape in shapes:
@@ -59,36 +59,36 @@ def broadcast(*shapes: Shape) -> Shape:
             if result[i] == ONE:
                 result[i] = dim
             elif dim not in (ONE, result[i]):
-                raise ShapeInvalid(f"can't join {' and '.join(text(each) for each in shapes)}")
+                raise ShapeInvalid(f"can't broadcast {' and '.join(text(each) for each in shapes)}")
     return tuple(result)
 
 
 def axis_of(axis: int, rank: int) -> int:
-    """Counted from the front."""
+    """Return a non-negative axis."""
     if not -rank <= axis < rank:
         raise ShapeInvalid(f"has no axis {axis} among {rank}")
     return axis % rank
 
 
-def numbers(values: np.ndarray, what: str) -> list[int]:
-    """A list of lengths or axes, as short as shapes are."""
+def numbers(values: np.ndarray, name: str) -> list[int]:
+    """Return a list of lengths or axes; `name` is for messages."""
     if values.ndim != 1 or len(values) > MAX_OPERANDS:
-        raise ShapeInvalid(f"has {what} of shape {values.shape}, not a short list")
+        raise ShapeInvalid(f"has {name} of shape {values.shape}, not a short list")
     return values.tolist()
 
 
 def axes_of(axes: Sequence[int], rank: int) -> set[int]:
-    """Several that differ."""
+    """Return non-negative axes, which must be different."""
     found = {axis_of(axis, rank) for axis in axes}
     if len(found) != len(axes):
-        raise ShapeInvalid(f"has axes {axes} that aren't different ones")
+        raise ShapeInvalid(f"has duplicate axes {axes}")
     return found
 
 
 def reshaped(shape: Shape, target: Sequence[int]) -> Shape:
-    """`shape` as `target`, of whose numbers one may be −1: what is left."""
+    """Return `shape` reshaped to `target`, in which one length may be −1 for the remaining elements."""
     if any(length < 1 and length != -1 for length in target) or list(target).count(-1) > 1:
-        raise ShapeInvalid(f"reshapes to {list(target)}; lengths above 0 and one −1 are known here")
+        raise ShapeInvalid(f"reshapes to {list(target)}; lengths must be above 0, and one may be −1")
     total = _linear(shape)
     known = math.prod(length for length in target if length != -1)
     if -1 not in target:
@@ -102,13 +102,13 @@ def reshaped(shape: Shape, target: Sequence[int]) -> Shape:
 
 
 def added(dims: Iterable[Dim]) -> Dim:
-    """Lengths side by side."""
+    """Return the sum of lengths."""
     dims = list(dims)
     return Dim(sum(dim.fixed for dim in dims), sum(dim.per_id for dim in dims))
 
 
 def _linear(shape: Shape) -> Dim:
-    """The number of elements, where at most one dimension depends on the ids."""
+    """Return the number of elements; at most one dimension may depend on the ids."""
     varying = [dim for dim in shape if dim.per_id]
     if len(varying) > 1:
         raise ShapeInvalid(f"reshapes {text(shape)}, in which several lengths depend on the ids")

@@ -1,13 +1,12 @@
-"""A model in canonical form: what some outputs need of it, each value in the one way that this module writes it."""
+"""Write the part of a model that some outputs need, in a canonical encoding."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
 from msdgs_serve.scene.onnx.infer import Value
-from msdgs_serve.scene.onnx.model import Model, Node, Tensor
+from msdgs_serve.scene.onnx.model import INT_ATTRIBUTE, INTS_ATTRIBUTE, Attribute, Model, Node, Tensor
 from msdgs_serve.scene.onnx.shapes import IDS
 
 IR_VERSION = 9
-_INT_ATTRIBUTE = 2
 _VARINT, _LENGTH = 0, 2
 
 Parts = list[bytes | memoryview]
@@ -16,7 +15,7 @@ Parts = list[bytes | memoryview]
 def write_model(
     model: Model, outputs: Sequence[str], inputs: Mapping[str, Value], values: Mapping[str, Value]
 ) -> bytes:
-    """The graph that computes `outputs` from `inputs`, none of which has a default. Large constants are copied once."""
+    """Return a model that computes `outputs` from `inputs`, without defaults. Large constants are copied once."""
     nodes, names = _needed(model, outputs)
     graph = _Message()
     for node in nodes:
@@ -39,7 +38,7 @@ def write_model(
 
 
 def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]:
-    """Nodes, in order, and names of values without which the outputs can't be computed."""
+    """Return the nodes, in order, and the names of values that the outputs depend on."""
     names, nodes = set(outputs), []
     for node in reversed(model.nodes):
         if names.intersection(node.outputs):
@@ -49,7 +48,7 @@ def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]
 
 
 class _Message:
-    """Fields, one after the other."""
+    """A Protobuf message in construction."""
 
     def __init__(self) -> None:
         self.parts: Parts = []
@@ -79,11 +78,20 @@ def _node(node: Node) -> _Message:
     message.text(3, node.name)
     message.text(4, node.operator)
     for name, value in node.attributes.items():
-        attribute = _Message()
-        attribute.text(1, name)
-        attribute.number(3, value)
-        attribute.number(20, _INT_ATTRIBUTE)
-        message.message(5, attribute)
+        message.message(5, _attribute(name, value))
+    return message
+
+
+def _attribute(name: str, value: Attribute) -> _Message:
+    message = _Message()
+    message.text(1, name)
+    if isinstance(value, int):
+        message.number(3, value)
+        message.number(20, INT_ATTRIBUTE)
+    else:
+        for number in value:
+            message.number(8, number)
+        message.number(20, INTS_ATTRIBUTE)
     return message
 
 

@@ -1,4 +1,4 @@
-"""Lane-wise operations: the compiled ones against NumPy's, which are their definition."""
+"""SIMD vector operations: the compiled ones against NumPy's, which are their definition."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from msdgs_serve.rasterizer import lanes
-from msdgs_serve.rasterizer import lanes_memory as memory
+from msdgs_serve.rasterizer import vector_memory as memory
+from msdgs_serve.rasterizer import vector_squares, vectors
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial, log2
 from msdgs_serve.rasterizer.jit import kernel
@@ -25,35 +25,35 @@ def plain(compiled: Callable) -> Callable:
 def operations(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> tuple[int, int]:
     """One row of `out` for each operation."""
     x, y = memory.load(a, 0), memory.load(b, np.uint64(1))
-    two = lanes.pair(x, y)
-    both = lanes.minimum(two * 2 + 1, lanes.filled(0.5, two))
+    two = vectors.pair(x, y)
+    both = vectors.minimum(two * 2 + 1, vectors.filled(0.5, two))
     mask = (x < y) | (x >= 1.5) & ~(y <= -1)
-    wide = lanes.pair(two, both) > 0.25
+    wide = vectors.pair(two, both) > 0.25
     rows = (
         x + y,
         x - 2,
         3 * x,
         x / y,
         -x,
-        lanes.fma(x, y, lanes.spread(a[3])),
-        lanes.minimum(x, y),
-        lanes.maximum(x, y),
-        lanes.square_root(x * x),
-        lanes.negative(x),
-        lanes.select(mask, x, y),
-        lanes.first_of(both),
-        lanes.second_of(both),
-        lanes.select(lanes.second_of(lanes.first_of(wide)), x, y),
-        lanes.exponent_of(x * x + 0.125),
-        lanes.mantissa_of(x * x + 0.125),
+        vectors.fma(x, y, vectors.spread(a[3])),
+        vectors.minimum(x, y),
+        vectors.maximum(x, y),
+        vectors.square_root(x * x),
+        vectors.negative(x),
+        vectors.select(mask, x, y),
+        vectors.first_of(both),
+        vectors.second_of(both),
+        vectors.select(vectors.second_of(vectors.first_of(wide)), x, y),
+        vectors.exponent_of(x * x + 0.125),
+        vectors.mantissa_of(x * x + 0.125),
     )
     for k in range(16):
         memory.store(out, 16 * k, rows[k])
-    memory.store(out, 256, lanes.times_power_of_two(x, y + lanes.rounder(y)))
+    memory.store(out, 256, vectors.times_power_of_two(x, y + vectors.rounder(y)))
     memory.store(out, 272, memory.load_or(a, 40, x))
-    memory.store(out, 288, memory.sums_of(rows))
-    bits = lanes.bits_of(mask)
-    return bits, lanes.lowest_bit(bits)
+    memory.store(out, 288, vectors.sums_of(rows))
+    bits = vectors.bits_of(mask)
+    return bits, vectors.lowest_bit(bits)
 
 
 @DTYPES
@@ -63,7 +63,7 @@ def test_operations_are_what_numpy_says(dtype: type):
     b[5] = a[4]
     got, want = np.zeros(304, dtype), np.zeros(304, dtype)
     assert operations(a, b, got) == plain(operations)(a, b, want)
-    assert_close(got, want, f"lanes.{np.dtype(dtype).name}")
+    assert_close(got, want, f"vectors.{np.dtype(dtype).name}")
 
 
 @kernel
@@ -79,14 +79,14 @@ def rows_and_columns(
 ) -> None:
     block = memory.load_columns(matrix, 3)
     memory.store_columns(out, 5, 3, block)
-    memory.store_square(squares, 2, 7, block[0])
-    memory.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
+    vector_squares.store_square(squares, 2, 7, block[0])
+    vector_squares.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
     memory.store_columns(picked, 0, 0, memory.load_columns_of(picked, rows, 1))
     memory.store_rows(loaded, 1, memory.load_four_columns(matrix, 2, 7))
     memory.store_rows(loaded, 17, memory.load_triples(points, 2))
     memory.store_rows(loaded, 33, memory.load_triples(points, 1))
-    memory.store_rows(loaded, 50, (memory.load_square(squares, 2, 7),))
-    memory.store_rows(loaded, 66, memory.load_square_of_triples(triples, 1, 13))
+    memory.store_rows(loaded, 50, (vector_squares.load_square(squares, 2, 7),))
+    memory.store_rows(loaded, 66, vector_squares.load_square_of_triples(triples, 1, 13))
     memory.prefetch(squares, 3)
 
 
@@ -119,7 +119,7 @@ def test_memory(dtype: type):
 @kernel
 def whole_numbers(columns: np.ndarray, row: int, out: np.ndarray) -> None:
     a, b, c, d = (memory.load(columns, 0), memory.load(columns, 16), memory.load(columns, 32), memory.load(columns, 48))
-    memory.store_whole_numbers(out, row, (a, b, c, d))
+    memory.store_uint16(out, row, (a, b, c, d))
 
 
 @DTYPES

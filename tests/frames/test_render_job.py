@@ -1,4 +1,4 @@
-"""Work that nobody waits for any more ends, wherever it is."""
+"""Cancelled render jobs end, between stages and inside of them."""
 
 import threading
 
@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import rasterize
-from msdgs_serve.rasterizer.compositing import TILES_A_ROUND
+from msdgs_serve.rasterizer.compositing import TILES_PER_ROUND
 from msdgs_serve.rasterizer.view import TILE
+from msdgs_serve.render_job import RenderCancelled, RenderJob
 from msdgs_serve.threads import checking, run_parallel
-from msdgs_serve.watch import Interrupted, Watch
 from tests.support.scenes import front_camera, gaussians_of
 
 
-def test_a_stopped_watch_lets_no_stage_begin():
-    watch = Watch()
-    watch.stop()
-    with pytest.raises(Interrupted), watch.stage("draw"):
+def test_a_cancelled_job_lets_no_stage_begin():
+    job = RenderJob()
+    job.cancel()
+    with pytest.raises(RenderCancelled), job.stage("draw"):
         pytest.fail("must not begin")
 
 
@@ -24,20 +24,20 @@ def test_a_stopped_watch_lets_no_stage_begin():
 def test_parts_on_the_pool_end_with_it(threads: str, monkeypatch: pytest.MonkeyPatch):
     """The part that runs ends by itself, those after it don't begin."""
     monkeypatch.setenv("MSDGS_THREADS", threads)
-    watch, begun = Watch(), []
+    job, begun = RenderJob(), []
 
     def part(number: int) -> None:
         begun.append(number)
-        watch.stop()
+        job.cancel()
 
-    with pytest.raises(Interrupted), watch.stage("draw"):
+    with pytest.raises(RenderCancelled), job.stage("draw"):
         run_parallel(part, [(number,) for number in range(100)])
     assert 1 <= len(begun) < 10
     run_parallel(part, [(0,)])  # outside of the stage nothing is checked
 
 
 def test_a_large_frame_can_be_given_up_between_its_rounds():
-    side = TILE * int(np.sqrt(3 * TILES_A_ROUND))
+    side = TILE * int(np.sqrt(3 * TILES_PER_ROUND))
     gaussians, camera = gaussians_of([[0, 0, 2]]), front_camera(side, side)
     caller, checks = threading.get_ident(), [0]
 
@@ -53,8 +53,8 @@ def test_a_large_frame_can_be_given_up_between_its_rounds():
     def give_up() -> None:
         check()
         if checks[0] == last and threading.get_ident() == caller:
-            raise Interrupted("enough")
+            raise RenderCancelled("enough")
 
-    with pytest.raises(Interrupted), checking(give_up):
+    with pytest.raises(RenderCancelled), checking(give_up):
         rasterize(gaussians, camera)
     assert checks[0] == last >= 5

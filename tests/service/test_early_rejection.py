@@ -1,4 +1,4 @@
-"""Calls that are refused before they are parsed: when that is, and that nobody can tell the difference."""
+"""Requests that are rejected before they are parsed, with the same answer as from the application."""
 
 import logging
 import socket
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from msdgs_serve.api.doorman import Doorman
+from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.server import Server
 from msdgs_serve.api.work import WorkQueue
@@ -42,19 +42,19 @@ def queue() -> Iterator[WorkQueue]:
 
 
 @pytest.fixture
-def doorman(queue: WorkQueue) -> Doorman:
+def early_rejection(queue: WorkQueue) -> EarlyRejection:
     """Of that queue."""
     renderer = Renderer()
-    return Doorman(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
+    return EarlyRejection(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
 
 
-def test_only_a_full_queue_has_calls_turned_away(doorman: Doorman, queue: WorkQueue):
-    assert doorman.answer(CALL, ("1.2.3.4", 5), ()) is None
+def test_only_a_full_queue_has_calls_turned_away(early_rejection: EarlyRejection, queue: WorkQueue):
+    assert early_rejection.answer(CALL, ("1.2.3.4", 5), ()) is None
     with full(queue, 2):
-        answer = doorman.answer(CALL, ("1.2.3.4", 5), [(b"date", b"today")])
+        answer = early_rejection.answer(CALL, ("1.2.3.4", 5), [(b"date", b"today")])
     assert answer is not None
     assert answer.startswith(b"HTTP/1.1 503 Service Unavailable\r\ndate: today\r\n")
-    assert doorman.answer(CALL, None, ()) is None
+    assert early_rejection.answer(CALL, None, ()) is None
 
 
 @pytest.mark.parametrize(
@@ -87,9 +87,9 @@ def test_only_a_full_queue_has_calls_turned_away(doorman: Doorman, queue: WorkQu
         HEAD.replace(b"Host", b"Host ") + b"\r\n" + BODY,
     ],
 )
-def test_what_is_not_plain_is_for_the_application(doorman: Doorman, queue: WorkQueue, data: bytes):
+def test_what_is_not_plain_is_for_the_application(early_rejection: EarlyRejection, queue: WorkQueue, data: bytes):
     with full(queue, 2):
-        assert doorman.answer(data, None, ()) is None
+        assert early_rejection.answer(data, None, ()) is None
 
 
 def sent(connection: socket.socket, data: bytes) -> tuple[bytes, dict[str, str], bytes]:
@@ -107,10 +107,10 @@ def sent(connection: socket.socket, data: bytes) -> tuple[bytes, dict[str, str],
 
 
 @in_this_process
-def test_nobody_can_tell_the_difference(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_the_answer_is_that_of_the_application(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """The same answer, line in the log and counts as the application's; the connection is as good as before."""
     write_scene(tmp_path / "ball.onnx")
-    slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # a header that the doorman doesn't know
+    slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # an unknown header
     named = HEAD + b"X-Request-ID: mine\r\n\r\n" + BODY
     servers: list[Server] = []
     caplog.set_level(logging.INFO, "msdgs_serve.access")

@@ -1,4 +1,4 @@
-"""A channel of an image as an image that people look at."""
+"""Display images of single channels."""
 
 from typing import NamedTuple
 
@@ -8,29 +8,24 @@ from msdgs_serve.imaging.formats import Channel
 from msdgs_serve.imaging.image import Image
 from msdgs_serve.scene import InvalidInput
 
-FARTHEST_GREY = 0.15
-"""Of the farthest depth, so that it differs from nothing at all, which is black."""
+FARTHEST_BRIGHTNESS = 0.15
+"""Brightness of the farthest depth; empty pixels are black."""
 
 
 class DepthRange(NamedTuple):
-    """The depths that are drawn white and darkest."""
+    """The depths that are drawn brightest and darkest."""
 
     near: float
     far: float
 
 
 def display_image(image: Image, channel: Channel, depth_range: DepthRange | None = None) -> np.ndarray:
-    """0 to 1, where it isn't beyond what can be shown: [H, W, 3], [H, W, 4] with straight alpha for transparent color,
-    or [H, W, 1] for all of one number.
+    """Return a display image of a channel: [H, W, 3], [H, W, 4] with straight alpha for transparent color, or [H, W, 1]
+    for a scalar channel. Values are in [0, 1], except for colors above 1.
 
-    Motion is black where nothing moves; the hue is its direction, and the brightest is the fastest of this very image.
-
-    Depth is lighter the nearer it is, over `depth_range` or, where None, over the depths of this very image.
-
-    These two are darker where the image is thin (alpha below 1), so that what is hardly seen in color is hardly seen
-    here.
-
-    Numbers of Gaussians are white where they are highest in this very image.
+    The hue of motion is its direction; its brightness is relative to the fastest motion in the image. Depth is brighter
+    the nearer it is, over `depth_range` or the depths of the image. Both are multiplied by alpha. Numbers of Gaussians
+    are relative to the highest in the image.
     """
     if channel == "rgb":
         return image.as_shown()
@@ -45,11 +40,11 @@ def display_image(image: Image, channel: Channel, depth_range: DepthRange | None
     near, far = depth_range or depths_of(depth)
     seen = np.isfinite(depth)
     place = np.clip((np.where(seen, depth, far) - near) / max(far - near, 1e-12), 0, 1)
-    return (np.where(seen, 1 - (1 - FARTHEST_GREY) * place, 0) * image.alpha)[..., None]
+    return (np.where(seen, 1 - (1 - FARTHEST_BRIGHTNESS) * place, 0) * image.alpha)[..., None]
 
 
 def channel_of(image: Image, channel: Channel) -> np.ndarray:
-    """The numbers of a channel. Raises `InvalidInput` for one that the image was drawn without."""
+    """Return the values of a channel. Raises `InvalidInput` if it was not drawn."""
     values = getattr(image, channel)
     if values is None:
         raise InvalidInput("channels", f"without {channel}, which was not drawn", channel)
@@ -64,6 +59,6 @@ def _motion_colors(motion: np.ndarray) -> np.ndarray:
 
 
 def depths_of(depth: np.ndarray) -> DepthRange:
-    """The nearest and farthest depth of an image; 0 and 1 where there is nothing."""
+    """Return the nearest and farthest depth of an image; 0 and 1 if it is empty."""
     seen = depth[np.isfinite(depth)]
     return DepthRange(float(seen.min()), float(seen.max())) if seen.size else DepthRange(0.0, 1.0)

@@ -1,4 +1,4 @@
-"""All kernels that drawing needs, compiled before the first request: when a container image is built, say."""
+"""Compile all kernels of the rasterizer before the first request, for example while a container image is built."""
 
 import os
 from pathlib import Path
@@ -9,31 +9,34 @@ from numba.core import config
 from msdgs_serve.rasterizer.jit import RASTERIZER
 from msdgs_serve.rasterizer.kernel_files import is_writable
 from msdgs_serve.rasterizer.rasterize import rasterize
-from msdgs_serve.rasterizer.tiles import SPLATS_A_PART
+from msdgs_serve.rasterizer.tiles import SPLATS_PER_PART
 from msdgs_serve.scene.camera import Camera, look_at
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
 
 SIZE = 32
-"""Pixels along a side: several tiles."""
-COUNTS = (40, SPLATS_A_PART + 40)
-"""Gaussians: more than one group of lanes, and a rest; few, and so many that they are sorted in parts."""
+"""Pixels along a side of the image: several tiles."""
+COUNTS = (40, SPLATS_PER_PART + 40)
+"""Numbers of Gaussians: several vectors and a remainder, sorted serially and sorted in parallel parts."""
 
 
 class KernelsNotStored(MsdgsError):
-    """Compiling would be lost: nothing can be written where kernels are looked for."""
+    """The folder in which compiled kernels are looked for can't be written."""
 
 
 def compile_kernels() -> Path:
-    """Draw tiny float32 frames, so that every kernel of `rasterize` is on disk: one serves all cameras and scenes.
+    """Draw tiny float32 frames, so that every kernel of `rasterize` is compiled and stored on disk.
 
-    They are good for processors of the kind of this one. Returns the folder that has them. Raises `KernelsNotStored`.
+    The kernels serve all cameras and scenes on processors of this kind. Return the folder in which they are. Raises
+    `KernelsNotStored`.
     """
     folder = Path(os.environ.get("NUMBA_CACHE_DIR") or RASTERIZER.parent)
     if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
-        raise KernelsNotStored("nothing is compiled while NUMBA_DISABLE_JIT is set")
+        raise KernelsNotStored("kernels are not compiled while NUMBA_DISABLE_JIT is set")
     if not is_writable(folder):
-        raise KernelsNotStored(f"kernels are kept in {folder}, which can't be written; NUMBA_CACHE_DIR names another")
+        raise KernelsNotStored(
+            f"compiled kernels are stored in {folder}, which can't be written; set NUMBA_CACHE_DIR to another folder"
+        )
     pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
     for count in COUNTS:
         for depth in (False, True):

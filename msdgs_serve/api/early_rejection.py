@@ -1,14 +1,13 @@
-"""Calls that are refused before anybody has parsed them.
+"""Rejection of requests before they are parsed, while the queue is full.
 
-Under four times too much load most calls are refused, and frames wait for the interpreter meanwhile: of the frames that
-the service draws at its peak, 83 % are still answered with the doorman and 69 to 76 % without (`benchmarks.service
---only overload`).
+Under 4x overload most requests are rejected, and renders wait for the interpreter meanwhile: goodput is 83 % of the
+peak with early rejection and 69 to 76 % without (`benchmarks.service --only overload`).
 """
 
 import time
 from collections.abc import Iterable, Mapping
 
-from msdgs_serve.api.errors import Refused, refusal
+from msdgs_serve.api.errors import RequestRejected, rejection
 from msdgs_serve.api.keys import address_of
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.observe import IDENTITY, Answered, record, request_id, usable_id
@@ -23,30 +22,30 @@ KNOWN = frozenset(
 Headers = Iterable[tuple[bytes, bytes]]
 
 
-class Doorman:
-    """Answers for the application while its queue is full, where a call is of the plainest kind.
+class EarlyRejection:
+    """Rejects simple requests in place of the application while its queue is full.
 
-    That is `POST /render` that comes whole, in one piece, with headers that change nothing about a refusal. It gets the
-    same answer, line in the log and counts as from the application.
+    A simple request is a `POST /render` that arrives in one piece, with headers that don't affect a rejection.
+    Response, access log and metrics are the same as from the application.
     """
 
     def __init__(self, queue: WorkQueue, metrics: Metrics, max_body_bytes: int) -> None:
-        """Bodies of more than `max_body_bytes` are refused for that, by the application."""
+        """Bodies of more than `max_body_bytes` are left to the application, which rejects them for their size."""
         self._queue = queue
         self._metrics = metrics
         self._max_body_bytes = max_body_bytes
 
     def answer(self, data: bytes, client: tuple[str, int] | None, always: Headers) -> bytes | None:
-        """What to write to a connection that has sent `data` between two calls, with the headers `always`.
+        """Return the response to `data` that a client sent as a new request, or None to pass it to the application.
 
-        None: `data` is for the application.
+        `always` are headers of every response.
         """
         if not data.startswith(START):
             return None
         started = time.perf_counter()
         try:
-            self._queue.refuse_if_full(address_of(client))
-        except Refused as error:
+            self._queue.reject_if_full(address_of(client))
+        except RequestRejected as error:
             refused = error
         else:
             return None
@@ -57,7 +56,7 @@ class Doorman:
         identity = usable_id(headers.get(IDENTITY, b""))
         token = request_id.set(identity)
         try:
-            response = refusal(refused)
+            response = rejection(refused)
             seconds = time.perf_counter() - started
             answered = Answered(METHOD, PATH, PATH, response.status_code, refused.kind, seconds, len(response.body))
             record(self._metrics, answered, client)
@@ -69,7 +68,7 @@ class Doorman:
 
 
 def _known_headers(head: bytes) -> Mapping[bytes, bytes]:
-    """By names in small letters; none where one is broken, there twice or not known to change nothing."""
+    """Return headers by lower-case name; none if any of them is malformed, repeated or not in `KNOWN`."""
     found: dict[bytes, bytes] = {}
     for line in head.split(b"\r\n"):
         name, colon, value = line.partition(b":")

@@ -1,0 +1,72 @@
+"""Gaussians on control nodes in blocks: neighbors in space follow nearly the same nodes, so that skinning a block is
+one product of a small dense matrix of weights with the motions of a few nodes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from export.spatial_order import morton_order
+from export.supports.base import Layout
+
+BLOCK_SIZES = (64, 128, 256)
+BLOCK_NODES = 8
+"""Nodes of a block are padded to a multiple of this."""
+SORTING_GAIN = 0.9
+"""Rows are sorted if this makes the matrices of weights smaller than this times those in the order given, which needs
+no index from Gaussians to rows."""
+WEIGHT_ONE = 32767
+"""A skinning weight of 1 as it is stored, in 16 bits: one of 4 weights is off by 1.5e-5 at most."""
+
+
+class Blocks(NamedTuple):
+    """B blocks of S rows that follow U nodes each."""
+
+    nodes: np.ndarray  # int64 [B, U]
+    ids: np.ndarray  # int64 [B, F, S], indices into a row of `nodes`
+    weights: np.ndarray  # int16 [B, F, S], fractions of `WEIGHT_ONE`
+
+    @property
+    def size(self) -> int:
+        """Elements of all matrices of weights."""
+        return self.nodes.size * self.ids.shape[2]
+
+
+def block_layout(means: np.ndarray, node_ids: np.ndarray, skinning_weights: np.ndarray) -> Layout:
+    """Rows in the order given, if neighbors in it are neighbors in space, or along a Z-order curve; the last row is
+    repeated until the last block is full.
+
+    Args:
+        means: [N, 3] canonical, N > 0.
+        node_ids: [N, F] nodes that each Gaussian follows.
+        skinning_weights: [N, F]; rows sum to 1.
+    """
+    stored = _stored_weights(skinning_weights)
+    given, sorted_ = (_smallest(order, node_ids, stored) for order in (np.arange(len(means)), morton_order(means)))
+    rows, blocks = sorted_ if sorted_[1].size < SORTING_GAIN * given[1].size else given
+    return Layout(rows, blocks._asdict())
+
+
+def _smallest(order: np.ndarray, node_ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, Blocks]:
+    """Padded rows and blocks of the size whose matrices are smallest."""
+    layouts = []
+    for size in sorted({min(size, len(order)) for size in BLOCK_SIZES}):
+        rows = np.append(order, np.repeat(order[-1:], -len(order) % size))
+        layouts.append((rows, _blocks(node_ids[rows], weights[rows], size)))
+    return min(layouts, key=lambda layout: layout[1].size)
+
+
+def _blocks(node_ids: np.ndarray, weights: np.ndarray, size: int) -> Blocks:
+    members = node_ids.reshape(-1, size, node_ids.shape[1])
+    distinct = [np.unique(block, return_inverse=True) for block in members]
+    width = -(-max(len(nodes) for nodes, _ in distinct) // BLOCK_NODES) * BLOCK_NODES
+    nodes = np.stack([np.pad(nodes, (0, width - len(nodes)), mode="edge") for nodes, _ in distinct])
+    ids = np.stack([local.reshape(size, -1).T for _, local in distinct])
+    return Blocks(nodes, ids, weights.reshape(members.shape).transpose(0, 2, 1))
+
+
+def _stored_weights(weights: np.ndarray) -> np.ndarray:
+    """int16 [N, F] whose rows sum to `WEIGHT_ONE`: the largest weight takes what rounding leaves."""
+    stored = np.round(weights.astype(np.float64) * WEIGHT_ONE).astype(np.int64)
+    largest = stored.argmax(axis=1)
+    stored[np.arange(len(stored)), largest] += WEIGHT_ONE - stored.sum(axis=1)
+    return stored.astype(np.int16)

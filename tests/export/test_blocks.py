@@ -1,0 +1,79 @@
+"""Blocks of Gaussians on control nodes: every Gaussian keeps its nodes and weights, whatever the order."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from export.jobs.bake import bake
+from export.plans.registry import build
+from export.spatial_order import morton_order
+from export.supports.blocks import WEIGHT_ONE, block_layout
+from msdgs_serve.deformation import DeformationSession
+from tests.support.models import NODES, SCENE, random_model
+from tests.support.tolerances import tolerance
+
+
+def skinning(count: int, nodes: int, follows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, the nearest of some nodes at random places, and weights that sum to 1."""
+    rng = np.random.default_rng(seed)
+    means, places = rng.random((count, 3), np.float32), rng.random((nodes, 3), np.float32)
+    distances = np.linalg.norm(means[:, None] - places, axis=2)
+    weights = rng.random((count, follows)) + 1e-3
+    return means, np.argsort(distances, axis=1)[:, :follows], weights / weights.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("count", "nodes", "follows"), [(1, 1, 1), (5, 3, 3), (257, 40, 4), (1000, 300, 8), (64, 900, 8)]
+)
+def test_each_row_has_the_nodes_and_weights_of_its_gaussian(count: int, nodes: int, follows: int):
+    means, node_ids, weights = skinning(count, nodes, follows)
+    layout = block_layout(means, node_ids, weights)
+    stored = layout.attributes
+    assert set(layout.rows) == set(range(count))
+    blocks, _, size = stored["ids"].shape
+    dense = np.zeros((blocks * size, nodes))
+    for block in range(blocks):
+        for row in range(size):
+            of_row = stored["nodes"][block][stored["ids"][block, :, row]]
+            np.add.at(dense[block * size + row], of_row, stored["weights"][block, :, row] / WEIGHT_ONE)
+    want = np.zeros((count, nodes))
+    np.put_along_axis(want, node_ids, weights, axis=1)
+    np.testing.assert_allclose(dense, want[layout.rows], atol=follows / WEIGHT_ONE)
+    np.testing.assert_array_equal(stored["weights"].sum(axis=1), WEIGHT_ONE)
+
+
+def test_gaussians_in_spatial_order_keep_their_order():
+    means, node_ids, weights = skinning(3000, 200, 4)
+    order = morton_order(means)
+    sorted_ = block_layout(means[order], node_ids[order], weights[order])
+    np.testing.assert_array_equal(sorted_.rows[:3000], np.arange(3000))
+    assert not np.array_equal(block_layout(means, node_ids, weights).rows[:3000], np.arange(3000))
+
+
+def test_morton_order_of_a_grid_visits_each_octant_at_once():
+    grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+    shuffled = grid[np.random.default_rng(1).permutation(64)]
+    octants = (shuffled[morton_order(shuffled)] // 2) @ np.array([1, 2, 4])
+    np.testing.assert_array_equal(octants, np.repeat(np.arange(8), 8))
+
+
+@pytest.mark.parametrize("means", [np.zeros((0, 3), np.float32), np.full((3, 3), 2.0, np.float32)])
+def test_morton_order_of_points_without_extent(means: np.ndarray):
+    np.testing.assert_array_equal(morton_order(means), np.arange(len(means)))
+
+
+def test_a_scene_on_nodes_is_posed_in_one_call():
+    """However many Gaussians there are; any of them, after any number of layers."""
+    count = 5000
+    model = random_model(count, noise=0.02, support=replace(NODES, num_nodes=30), sh_degree=0)
+    contents = build("network", bake(model, SCENE, "0" * 64)).SerializeToString()
+    session = DeformationSession("nodes.onnx", contents=contents)
+    assert session.cost.calls == 1
+    ids = np.random.default_rng(2).permutation(count)[:700]
+    for steps, layers in ((None, None), (1.0, 1), (0.0, 0)):
+        with torch.no_grad():
+            posed = model.pose(0.3, layers, ids=torch.from_numpy(ids))
+        for got, want in zip(session.pose(0.3, ids, steps), (posed.means, posed.quats, posed.scales), strict=True):
+            np.testing.assert_allclose(got, want.numpy(), rtol=0, atol=tolerance("export.nodes.relative"))
