@@ -245,6 +245,7 @@ from msdgs_serve.api.cameras import resolve_camera
 from msdgs_serve.api.schemas import RenderRequest
 from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
 from msdgs_serve.store import SceneStore
+from msdgs_serve.threads import sharing_cores
 
 served = SceneStore([Path(sys.argv[1])]).get("toybench")
 session = served.session
@@ -263,6 +264,8 @@ for model in ("pinhole", "orthographic", "fisheye"):
         RenderOptions(shutter=Shutter(0.0, 0.1, 3)),
     ):
         renderer.render(session, view, 0.5, options)
+with sharing_cores():  # with two callers at once, each computes on one thread
+    renderer.render(session, camera, 0.5)
 print(json.dumps([precompiled, compiled()]))
 """
 )
