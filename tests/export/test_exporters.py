@@ -20,8 +20,8 @@ from export.exporters.gltf import EXTENSION, read_gltf
 from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
-from export.importers import read_splats
 from export.importers.sequence import read_sequence, sequence_scene
+from export.importers.splats.formats import read_splats
 from export.jobs.bake import bake
 from export.options import ConvertOptions
 from export.plans.registry import build

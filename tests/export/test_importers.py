@@ -12,10 +12,11 @@ import pytest
 from rich.console import Console
 
 from export.exporters.spz import write_spz
-from export.importers import ImportFailed, detect_format, read_splats
 from export.importers.command import model_or_import
-from export.importers.detect import frame_files
+from export.importers.detect import detect_format, frame_files
+from export.importers.errors import ImportFailed
 from export.importers.sequence import read_sequence
+from export.importers.splats.formats import read_splats
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.renderer import Renderer

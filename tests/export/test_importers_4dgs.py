@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from export.importers import detect_format
+from export.importers.detect import detect_format
 from export.importers.runs.model import write_model
 from export.jobs.write import properties
 from export.options import ExportOptions

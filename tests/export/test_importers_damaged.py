@@ -14,9 +14,10 @@ import pytest
 import torch
 from rich.console import Console
 
-from export.importers import ImportFailed, read_splats
 from export.importers.command import model_or_import
+from export.importers.errors import ImportFailed
 from export.importers.runs.model import write_model
+from export.importers.splats.formats import read_splats
 from export.measure.poses import posed as posed_model
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput

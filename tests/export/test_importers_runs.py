@@ -11,7 +11,8 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from export.importers import ImportFailed, detect_format
+from export.importers.detect import detect_format
+from export.importers.errors import ImportFailed
 from export.importers.runs import base
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model

@@ -222,6 +222,7 @@ import dataclasses, json, sys
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer.precompile import compile_kernels
 from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
+from msdgs_serve.threads import sharing_cores
 from tests.rasterizer.test_rasterizer_threads import kernels
 
 def compiled():
@@ -241,6 +242,8 @@ for model in ("pinhole", "orthographic", "fisheye"):
         RenderOptions(shutter=Shutter(0.0, 0.1, 3)),
     ):
         renderer.render(session, view, 0.5, options)
+with sharing_cores():  # with two callers at once, each computes on one thread
+    renderer.render(session, camera, 0.5)
 print(json.dumps([precompiled, compiled()]))
 """
 

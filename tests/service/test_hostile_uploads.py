@@ -110,7 +110,7 @@ def test_mutated_files_are_refused_or_served_without_a_server_error(folder: Path
 def test_a_file_that_takes_too_long_is_refused(tmp_path: Path):
     path = write_scene(tmp_path / "scene.onnx")
     try_scene(path, GraphLimits(), 60)
-    with pytest.raises(SceneFileInvalid, match=r"isn't opened and posed within 0.01 s"):
+    with pytest.raises(SceneFileInvalid, match=r"isn't read within 0.01 s"):
         try_scene(path, GraphLimits(), 0.01)
 
 
@@ -122,7 +122,7 @@ def test_a_file_that_ends_its_process_is_refused_at_upload(folder: Path, file: b
         monkeypatch.setattr(Settings, "graph_limits", dying)
         answer = client.post("/scenes", params={"name": "walk"}, content=file)
         assert (answer.status_code, list(folder.iterdir())) == (422, [])
-        assert "crashes the process that tests it" in answer.json()["detail"]
+        assert "crashes the process that reads it" in answer.json()["detail"]
         monkeypatch.undo()
         assert client.post("/scenes", params={"name": "walk"}, content=file).status_code == 201
 

@@ -1,4 +1,5 @@
-"""The OpenAPI document held against the service: by schemathesis, by random bodies, and by one wrong value at a time.
+"""The OpenAPI document held against the service: by schemathesis, by random bodies, and by one wrong value at a time,
+in bodies, links and headers.
 
 Every answer is one that the document allows, never a 5xx but 501, 503, 504 and 507, and the service goes on. Cases are
 drawn with a seed; `MSDGS_FUZZ=100000 pytest -n 0 tests/service/test_openapi.py` sets their number in each test.
@@ -8,6 +9,7 @@ import json
 import os
 import random
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -43,6 +45,16 @@ PARTNERS: dict[str, dict[str, Any]] = {
     "cy": {"fx": 16.0}, "axes": {"fx": 16.0}, "model": {"fx": 16.0},
 }  # fmt: skip
 SIZE = {"width": 16, "height": 16}
+LINK = {"scene": "balls", "t": "0.5", "width": "16", "height": "16"}
+SMALL = {"camera": ORBIT, "t": 0.5}
+BODIES = {
+    "/render": {**SMALL, **SIZE},
+    "/render/batch": {"frames": [{**SMALL, **SIZE}]},
+    "/render/video": {"frames": [SMALL], **SIZE},
+}
+"""Valid bodies by path."""
+
+KEY = "everything-0123456789"
 MATRIX = {"type": "matrix", "camera_to_world": [[0, 0, -1, 5], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], "fx": 50}
 
 Document = dict[str, Any]
@@ -57,6 +69,19 @@ POISON: list[Any] = [
 QUERY_POISON = [
     "", "1" * 400, "-" + "1" * 5000, "1e999", "nan", "-inf", "1e-400", "0x10", "1,2", "1,2," + "9" * 90, "\0", "../x",
     "\U0001f600" * 200, "x" * 10_000, "[1]", "{}", "true",
+]  # fmt: skip
+HEADERS = [
+    "accept-encoding", "access-control-request-headers", "access-control-request-method", "authorization",
+    "content-encoding", "content-type", "cookie", "expect", "forwarded", "host", "if-match", "if-modified-since",
+    "origin", "range", "referer", "user-agent", "x-api-key", "x-forwarded-for", "x-forwarded-proto", "x-request-id",
+]  # fmt: skip
+"""Headers that apply to all calls, which the document doesn't list."""
+
+HEADER_POISON = [
+    b"", b"*", b'"', b'W/"', b'"x", ' * 2000, b"1" * 5000, b"-1", b"nan", b"\xff\xfe", "\U0001f600".encode() * 200,
+    b"x" * 100_000, b"../x", b"a/b;q=nan, */*;q=-1e999", b"application/json; charset=none", b"multipart/form-data",
+    b"Bearer \xff", b"Bearer " + b"x" * 5000, b"bytes=5-1,-,9999999999999999999-", b"gzip", b"100-continue",
+    b"1.2.3.4, x, ::", b"Thu, 99 Xyz 99999 99:99:99 GMT", b"[", b"http://[::", b"@:99999",
 ]  # fmt: skip
 
 
@@ -187,8 +212,7 @@ def bodies(document: Document) -> list[tuple[str, Any, Leaf]]:
                 frames = instances({"$ref": "#/components/schemas/RenderRequest"}, document)
                 whole = [{"frames": [{**SIZE, **frame}]} for frame in frames]
             if path == "/render/video":
-                film = {"frames": [{"camera": ORBIT, "t": 0.5}], **SIZE}
-                whole = [{**(SIZE if {"frames", "path"} & set(body) else film), **body} for body in whole]
+                whole = [{**(SIZE if {"frames", "path"} & set(body) else BODIES[path]), **body} for body in whole]
             elif path == "/render":
                 whole = [{**SIZE, **body} for body in whole]
             found += [(path, body, leaf) for body in whole for leaf in leaves(body)]
@@ -258,7 +282,7 @@ def test_a_leaf_that_no_float_holds_is_named(client: httpx.Client):
         assert any(named(error["field"], within) for error in found[0]["errors"]), where
 
 
-def test_no_value_in_a_link_breaks_the_service(client: httpx.Client):
+def test_no_value_in_a_link_breaks_the_service(client: httpx.Client, tmp_path: Path):
     document, cases = client.get("/openapi.json").json(), []
     for path, calls in document["paths"].items():
         for method, call in calls.items():
@@ -266,13 +290,37 @@ def test_no_value_in_a_link_breaks_the_service(client: httpx.Client):
                 if parameter["in"] in ("query", "path"):
                     cases += [(method, path, parameter, value) for value in QUERY_POISON]
     assert len(cases) > 300
+    scene = write_scene(tmp_path / "other.onnx").read_bytes()
     for number, (method, path, parameter, value) in enumerate(chosen(cases)):
         name = parameter["name"]
         query = [(name, value)] * (1 + number % 2) if parameter["in"] == "query" else []
-        if path == "/scenes" and name != "name":
-            query.append(("name", "other"))
+        beside = {"/scenes": {"name": "other"}, "/render": LINK}.get(path, {})
+        query += [(key, valid) for key, valid in beside.items() if key != name]
         where = path.replace(f"{{{name}}}", str(httpx.URL(params={"v": value}).query.decode().removeprefix("v=")))
-        response = client.request(method, where, params=query)
+        response = client.request(method, where, params=query, content=scene if path == "/scenes" else None)
         assert response.status_code < 500 or response.status_code in ALLOWED, (method, path, name, value[:60])
         if response.status_code >= 400:
             check_problem(response)
+
+
+def test_no_header_breaks_the_service(tmp_path: Path):
+    write_scene(tmp_path / "balls.onnx")
+    (tmp_path / "keys").write_text(f"read,write,operate {KEY}")
+    origins = ["https://example.org"]
+    with serving(
+        tmp_path / "balls.onnx", api_keys_file=tmp_path / "keys", proxies="*", cors_origins=origins, log_level="error"
+    ) as client:
+        client.headers["x-api-key"] = KEY
+        cases = []
+        for path, calls in client.get("/openapi.json").json()["paths"].items():
+            for method, call in calls.items():
+                own = [parameter["name"] for parameter in call.get("parameters", ()) if parameter["in"] == "header"]
+                cases += [(method, path, name, value) for name in [*own, *HEADERS] for value in HEADER_POISON]
+        assert len(cases) > 2000
+        for number, (method, path, name, value) in enumerate(chosen(cases)):
+            headers = [(name.encode(), value)] * (1 + number % 2)
+            if name != "content-type":
+                headers.append((b"content-type", b"application/json"))
+            where, content = path.replace("{name}", "balls"), json.dumps(BODIES.get(path))
+            response = client.request(method, where, headers=headers, content=content)
+            assert response.status_code < 500 or response.status_code in ALLOWED, (method, path, name, value[:60])
