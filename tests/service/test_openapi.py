@@ -90,7 +90,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     """Yield a client; at the end the service must still render a valid frame."""
     folder = tmp_path_factory.mktemp("scenes")
     write_scene(folder / "balls.onnx", steps=True, measured_error={"rendered": {"psnr_worst": 45.0}})
-    limits = {"max_pixels": 64 * 64, "max_samples": 8, "max_batch": 4, "max_video_frames": 4}
+    limits: dict[str, Any] = {"max_pixels": 64 * 64, "max_samples": 8, "max_batch": 4, "max_video_frames": 4}
     with serving(folder, uploads=True, log_level="error", **limits) as client:
         yield client
         assert client.post("/render", json={**FRAME, "scene": "balls"}).status_code == 200

@@ -82,6 +82,7 @@ def _messages(message: Message) -> Iterator[Message]:
 
 def _value(field: FieldDescriptor, model: onnx.ModelProto, rng: Rng) -> Any:
     """Return a value for a field that is not a message."""
+    assert field.containing_type is not None
     name = f"{field.containing_type.name}.{field.name}"
     if name in VALUES:
         return pick(rng, VALUES[name])
