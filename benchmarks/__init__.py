@@ -1,1 +1,1 @@
-"""Measurements: `python -m benchmarks.NAME --help` says what each tells. Tests import none of this."""
+"""Measurements; `python -m benchmarks.NAME --help` describes each. Tests don't import them."""

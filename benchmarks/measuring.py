@@ -1,20 +1,25 @@
-"""What benchmarks share: times of things that take turns, PSNR of two images, where and when a run was made."""
+"""Common parts of the benchmarks: times of functions that take turns, PSNR, tables, and the machine's name."""
 
-import contextlib
 import platform
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
+from export.measure.machine import processor
 from msdgs_serve.threads import thread_count
+
+REPORT_WIDTH = 170
+"""Characters per line of a report that isn't printed to a terminal."""
 
 
 class Times:
-    """Seconds of things that take turns, by name."""
+    """Seconds by name, of functions that are measured in turns."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
@@ -24,18 +29,18 @@ class Times:
         self.seconds[name].append(seconds)
 
     def time(self, name: str, function: Callable, *arguments: Any) -> Any:
-        """Call the function, keep its time, return its result."""
+        """Call the function, store its time, return its result."""
         start = self._clock()
         result = function(*arguments)
         self.add(name, self._clock() - start)
         return result
 
     def minimum(self, name: str) -> float:
-        """Milliseconds."""
+        """The shortest time in milliseconds."""
         return 1e3 * min(self.seconds[name])
 
     def milliseconds(self) -> dict[str, dict[str, float]]:
-        """Minimum and median of each."""
+        """Minimum and median by name."""
         return {
             name: {"min": self.minimum(name), "median": 1e3 * float(np.median(seconds))}
             for name, seconds in self.seconds.items()
@@ -43,25 +48,29 @@ class Times:
 
 
 def minimum_and_median(times: dict[str, float]) -> str:
-    """A table's cell."""
+    """Milliseconds as a cell of a table."""
     return f"{times['min']:.1f} ({times['median']:.1f})"
 
 
 def psnr(image: np.ndarray, other: np.ndarray) -> float:
-    """dB of two images, clipped to [0, 1]; infinite if they are the same."""
+    """PSNR in dB of two images, clipped to [0, 1]; infinite if they are equal."""
     error = float(np.mean((np.clip(image, 0, 1).astype(float) - np.clip(other, 0, 1)) ** 2))
     return -10 * np.log10(error) if error else float("inf")
 
 
 def machine() -> str:
     """Processor, threads, Python and date, for the head of a report."""
-    return f"{cpu_name()}, {thread_count()} threads, Python {platform.python_version()}, {time.strftime('%Y-%m-%d')}"
+    return f"{processor()}, {thread_count()} threads, Python {platform.python_version()}, {time.strftime('%Y-%m-%d')}"
 
 
-def cpu_name() -> str:
-    """From Linux, or else what Python knows."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+def report_console() -> Console:
+    """The terminal, or plain text wide enough for the tables if the output goes to a file."""
+    return Console(highlight=False, width=None if sys.stdout.isatty() else REPORT_WIDTH)
+
+
+def table(title: str, *columns: str) -> Table:
+    """A table with names in its first column and numbers, aligned to the right, in the others."""
+    made = Table(title=title, title_justify="left")
+    for k, column in enumerate(columns):
+        made.add_column(column, justify="right" if k else "left")
+    return made

@@ -1,4 +1,4 @@
-"""The options of `to_onnx.py`. Without torch, so that `--help` is printed at once."""
+"""The options of `to_onnx.py` and `convert.py`, without importing torch, so that `--help` is printed at once."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -66,7 +66,7 @@ class ExportOptions:
 
     @property
     def scene_file(self) -> Path:
-        """Where the scene file is written."""
+        """The path of the scene file."""
         return self.model.with_suffix(".onnx") if self.output is None else self.output
 
     @property
@@ -79,3 +79,37 @@ class ExportOptions:
         """Names of the pruning rules that are switched off."""
         names = [field.name for field in fields(self) if field.name.startswith("keep_")]
         return frozenset(name.removeprefix("keep_") for name in names if getattr(self, name))
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """Convert a scene file for other viewers. The written file is read back, rendered and compared with the scene.
+
+    The suffix of OUT selects the format:
+
+    python export/convert.py ball.onnx ball.ply          one time, as INRIA's trainer writes it
+
+    python export/convert.py ball.onnx ball.spz          one time, ten times smaller
+
+    python export/convert.py ball.onnx ball.glb          one time, as glTF with KHR_gaussian_splatting
+
+    python export/convert.py ball.onnx ball.usdc         the whole time range, as OpenUSD with a time sample per frame
+
+    python export/convert.py ball.onnx frames/           a folder of numbered PLY files over the scene's time
+
+    python export/convert.py ball.onnx ball.visionary.onnx     the whole scene, for Visionary in a browser
+
+    For videos use msdgs-render: msdgs-render ball.onnx turn.mp4. docs/formats.md lists what each format keeps.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A scene file (.onnx)."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The output: name.ply, name.spz, name.glb, name.usdc (or .usda, .usd), name.visionary.onnx, or a folder."""
+    t: float | None = None
+    """The time of a single file; by default the start of the scene's time range."""
+    frames: int = 30
+    """The number of files in a folder or frames of OpenUSD, evenly over the time range, including both ends."""
+    min_psnr: float | None = None
+    """PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and Visionary
+    and 60 for the others, which are lossless."""

@@ -1,7 +1,6 @@
 """`python export/stability.py model.pt`: whether float32, or less, shows what the model would show in float64."""
 
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -9,17 +8,8 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     folder = Path(__file__).resolve().parent
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
-try:
-    import tyro
-    from rich.console import Console
-    from rich.progress import Progress
-
-    if find_spec("torch") is None:  # not loaded yet: --help is printed at once
-        raise ModuleNotFoundError(name="torch")
-except ModuleNotFoundError as error:
-    raise SystemExit(f"stability.py needs {error.name}, which serving alone doesn't: pip install '.[export]'") from None
-
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from export.command_line import Console, run, tyro
+from msdgs_serve.scene.errors import InvalidInput
 
 UNSTABLE = 3
 """Exit status if the model is unstable; 1 is an error."""
@@ -34,10 +24,10 @@ def main(
 ) -> int:
     """Measure how stable a trained model's deformation is in float32 and in less.
 
-    A chain of layers multiplies round-off: each layer sees the means that the layers before it have moved. For
-    Gaussians spread over the scene, at times between the frames as well, this measures how much a small displacement
-    grows on its way, and how far the pose is off from float64 in float32, bfloat16 and float16; then it draws the worst
-    times in each. docs/stability.md explains the table.
+    A chain of layers multiplies round-off: each layer reads the means that the layers before it have moved. For
+    Gaussians spread over the scene, also at times between the frames, this measures how much a small displacement
+    grows from layer to layer, and the errors of poses in float32, bfloat16 and float16 against float64. Then it renders
+    the worst times in each format. docs/stability.md explains the table.
 
     Type this:
 
@@ -52,47 +42,18 @@ def main(
         times: The number of times to compare at, both ends of the scene's time range among them.
         min_psnr: PSNR in dB of the worst frame against float64, below which an error counts as visible.
     """
-    console = Console(soft_wrap=True, highlight=False)
-    errors = Console(stderr=True, soft_wrap=True, highlight=False)
-    try:
-        return _report(model, json, plot, times, min_psnr, console, errors)
-    except KeyboardInterrupt:
-        errors.print("stopped; nothing was written", markup=False)
-        return 130
-    except (MsdgsError, OSError) as error:
-        errors.print(f"error: {error}", style="red", markup=False)
-        return 1
 
+    def assessed(messages: Console) -> int:
+        if times < 2:
+            raise InvalidInput("times", "2 or more", times)
+        if not 0 < min_psnr < 100:
+            raise InvalidInput("min_psnr", "between 0 and 100 dB", min_psnr)
+        with messages.status("loading torch and the kernels"):
+            from export.precision.show import assess_and_show  # slow to import: not before --help
+        report = assess_and_show(model, times, min_psnr, json, plot, messages)
+        return 0 if report.stable else UNSTABLE
 
-def _report(
-    model: Path, json: Path | None, plot: Path | None, times: int, min_psnr: float, console: Console, errors: Console
-) -> int:
-    if times < 2:
-        raise InvalidInput("times", "2 or more", times)
-    if not 0 < min_psnr < 100:
-        raise InvalidInput("min_psnr", "between 0 and 100 dB", min_psnr)
-    with errors.status("loading torch and the kernels"):
-        from export.measure.stability import assess  # heavy: seconds, so not before --help
-        from export.precision.formats import FORMATS
-        from export.precision.show import draw, print_report, write_json
-        from msdgs_train.gaussians.model_file import load_model
-    loaded = load_model(model)
-    with Progress(console=errors, transient=True) as progress:
-        task = progress.add_task("comparing with float64", total=times)
-        report = assess(
-            loaded.model,
-            loaded.scene,
-            min_psnr=min_psnr,
-            times=times,
-            formats=FORMATS,
-            on_time=lambda: progress.advance(task),
-        )
-    print_report(report, console)
-    if json is not None:
-        write_json(report, json)
-    if plot is not None:
-        draw(report, plot)
-    return 0 if report.stable else UNSTABLE
+    return run(assessed, "stopped; nothing was written")
 
 
 if __name__ == "__main__":

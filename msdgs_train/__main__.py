@@ -1,4 +1,4 @@
-"""`msdgs-train` and `python -m msdgs_train`: the command line, or what has to be installed first."""
+"""`msdgs-train` and `python -m msdgs_train`: the command line, or a message that names a missing package."""
 
 import sys
 

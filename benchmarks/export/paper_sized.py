@@ -1,10 +1,8 @@
-"""A scene of the paper's size from a small trained one: 106,500 Gaussians, ten layers, motion and image as trained.
+"""A scene of the paper's size from a small trained one: 106,500 Gaussians and ten layers, with its motion and images.
 
-Each Gaussian is split into smaller ones, which the small model's field moves from where they are. A field of the size
-of `msdgs-mlp` begins as the small one, its layers made wider and deeper without a change of what they compute (Net2Net,
-Chen et al. 2016), and all ten layers are trained: regression on these trajectories, smoothed in time, over batches
-drawn by lot.
-"""
+Each Gaussian is split into smaller ones, which the small model's layers move. Ten layers of the size of `msdgs-mlp`
+start with the small model's function, made wider and deeper without changing it (Net2Net, Chen et al. 2016), and are
+trained by regression on these trajectories, smoothed in time."""
 
 import math
 import sys
@@ -18,7 +16,7 @@ import numpy as np
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 from scipy.interpolate import BSpline
 from torch import Tensor, nn
 from torch.nn import functional
@@ -27,7 +25,8 @@ from benchmarks.measuring import machine
 from export.measure.frames import compare, render
 from export.measure.poses import posed
 from export.measure.views import cameras_of, selection_views
-from export.trajectories.splines import fitting
+from export.trajectories.sampling import give_one_sign
+from export.trajectories.splines import along_time, fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -39,21 +38,21 @@ from msdgs_train.systems.registry import preset
 from tests.support.models import SCENE, random_model
 
 SHRINK = 0.6
-"""Of a part's axes against those of the Gaussian it is a part of. Centres are spread by √(1 − 0.6²) of them, so that
-all parts together are as wide as the whole."""
+"""Axes of a part relative to those of its Gaussian. Centers are spread by √(1 − 0.6²) of them, so that all parts
+together are as wide as the whole."""
 
 MAX_OPACITY = 0.999
 
 SAMPLES = 257
-"""Times at which the small model is asked for its poses."""
+"""Times at which the small model is posed."""
 
-TIMES_A_STEP, GAUSSIANS_PER_TIME = 4, 384
-MOVING_SHARE = 0.75
-"""Of a batch, drawn from Gaussians whose motion is more than a pixel."""
+TIMES_PER_STEP, GAUSSIANS_PER_TIME = 4, 384
+MOVING_FRACTION = 0.75
+"""Fraction of a batch drawn from Gaussians that move by more than a pixel."""
 
-RATE, LAST_RATE = 1e-4, 1e-6
+LR_INIT, LR_FINAL = 1e-4, 1e-6
 OCTAVE_DAMPING = 0.5
-"""First weights of each next octave of the encoding, of those before it: a new field is smooth in place and time."""
+"""Initial weights of each octave of the encoding relative to the one below: new layers are smooth in space and time."""
 
 CHUNK = 8192
 """Gaussians whose trajectories are held at a time."""
@@ -62,17 +61,18 @@ MEANS, LOG_SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
 
 
 class SmoothMotion:
-    """Trajectories of a model through a low-pass: cubic splines of few control points, least squares."""
+    """Trajectories of a model, smoothed by least-squares cubic splines of few control points."""
 
     def __init__(self, model: DynamicGaussians, info: SceneInfo, control: int) -> None:
-        self._time_range = info.time_range
-        matrix = torch.from_numpy(fitting(control, SAMPLES)).float()
+        self._time_range, matrix = info.time_range, fitting(control, SAMPLES).astype(np.float32)
         controls, travels = [], []
-        for ids in torch.arange(len(model.gaussians)).split(CHUNK):
-            samples = self._sampled(model, ids)
-            controls.append(torch.einsum("ct,tnk->nck", matrix, samples))
-            travels.append((samples[..., MEANS].amax(0) - samples[..., MEANS].amin(0)).norm(dim=1))
-        self._control, self.travel = torch.cat(controls), torch.cat(travels)  # [N, n, 10], [N]
+        for ids in np.array_split(np.arange(len(model.gaussians)), -(-len(model.gaussians) // CHUNK)):
+            poses = [posed(model, t, ids) for t in np.linspace(*info.time_range, SAMPLES)]
+            samples = np.stack([np.concatenate([p.means, np.log(p.scales), p.quats], axis=1) for p in poses], axis=1)
+            give_one_sign(samples)
+            controls.append(along_time(matrix, samples))
+            travels.append(np.linalg.norm(np.ptp(samples[..., MEANS], axis=1), axis=1))
+        self._control, self.travel = (torch.from_numpy(np.concatenate(each)) for each in (controls, travels))
         self._knots = np.concatenate([np.zeros(3), np.linspace(0, 1, control - 2), np.ones(3)])
 
     def at(self, t: float, ids: Tensor) -> Tensor:
@@ -82,60 +82,54 @@ class SmoothMotion:
         pose = torch.einsum("c,mck->mk", torch.from_numpy(weights).float(), self._control[ids])
         return torch.cat([pose[:, :6], unit_or_identity(pose[:, QUATS])], dim=1)
 
-    @torch.no_grad()
-    def _sampled(self, model: DynamicGaussians, ids: Tensor) -> Tensor:
-        """[T, M, 10] the same, of one sign along time."""
-        poses = [model.pose(t, ids=ids) for t in np.linspace(*self._time_range, SAMPLES)]
-        samples = torch.stack([torch.cat([p.means, p.scales.log(), p.quats], dim=1) for p in poses])
-        same = torch.where((samples[1:, :, QUATS] * samples[:-1, :, QUATS]).sum(-1) < 0, -1.0, 1.0)
-        samples[1:, :, QUATS] *= same.cumprod(0)[..., None]
-        return samples
 
-
-class Fit:
-    """The large model, and how far its training is."""
+class Training:
+    """Training of the large model."""
 
     def __init__(self, model: DynamicGaussians, motion: SmoothMotion, info: SceneInfo) -> None:
-        self.model, self.motion, self.info = model, motion, info
-        self.seconds, self.steps, self.pixels = 0.0, 0, float("nan")
+        self.model, self.motion, self.info, self.steps = model, motion, info, 0
         self.pixel = _pixel(model, info)
         self._moving = torch.nonzero(motion.travel > self.pixel)[:, 0]
         self._parameters = [p.requires_grad_(True) for p in model.deformation.parameters()]
-        self._optimizer = torch.optim.Adam(self._parameters, lr=RATE, eps=1e-15)
+        self._optimizer = torch.optim.Adam(self._parameters, lr=LR_INIT, eps=1e-15)
         self._generator = torch.Generator().manual_seed(1)
 
-    def step(self, part: float) -> None:
-        """One batch; `part` of the training time is over."""
-        start = process_time()
-        rate = LAST_RATE + (RATE - LAST_RATE) * (1 + math.cos(math.pi * part)) / 2
+    def run(self, seconds: float, console: Console) -> None:
+        """Train for so much processor time."""
+        with Progress(console=console) as progress:
+            task, start, spent = progress.add_task("training", total=seconds), process_time(), 0.0
+            while spent < seconds:
+                error = self.step(spent / seconds)
+                spent = process_time() - start
+                described = f"step {self.steps:,}, median error of the batch {error:.2f} pixels"
+                progress.update(task, completed=spent, description=described)
+
+    def step(self, part: float) -> float:
+        """Train on one batch after a `part` of the training time; returns the median error of means in pixels."""
+        rate = LR_FINAL + (LR_INIT - LR_FINAL) * (1 + math.cos(math.pi * part)) / 2
         self._optimizer.param_groups[0]["lr"] = rate * min(1.0, (self.steps + 1) / 50)
         self._optimizer.zero_grad()
         t0, t1 = self.info.time_range
-        errors = []
-        for _ in range(TIMES_A_STEP):
-            t = t0 + (t1 - t0) * float(torch.rand((), generator=self._generator))
-            errors.append(self.errors(t, self._batch()))
-        error = torch.cat(errors)
+        times = t0 + (t1 - t0) * torch.rand(TIMES_PER_STEP, generator=self._generator)
+        error = torch.cat([self.errors(t, self._batch()) for t in times.tolist()])
         functional.smooth_l1_loss(error, torch.zeros_like(error)).backward()
         torch.nn.utils.clip_grad_norm_(self._parameters, 1.0)
         self._optimizer.step()
         self.steps += 1
-        pixels = float(error.detach()[:, MEANS].norm(dim=1).median())
-        self.pixels = pixels if self.steps == 1 else 0.98 * self.pixels + 0.02 * pixels
-        self.seconds += process_time() - start
+        return float(error.detach()[:, MEANS].norm(dim=1).median())
 
     def errors(self, t: float, ids: Tensor) -> Tensor:
-        """[M, 10] pixels that means, axes and ends of turned axes are off."""
-        wanted = self.motion.at(t, ids)
+        """[M, 10] errors of means, scales and ends of rotated axes in pixels."""
+        target = self.motion.at(t, ids)
         pose = self.model.pose(t, ids=ids)
-        scales = wanted[:, LOG_SCALES].exp()
+        scales = target[:, LOG_SCALES].exp()
         spread = (scales.amax(1, keepdim=True) - scales.amin(1, keepdim=True)) * 2
-        sign = torch.where((pose.quats.detach() * wanted[:, QUATS]).sum(1, keepdim=True) < 0, -1.0, 1.0)
-        turned = (sign * pose.quats - wanted[:, QUATS]) * spread
-        return torch.cat([pose.means - wanted[:, MEANS], pose.scales - scales, turned], dim=1) / self.pixel
+        sign = torch.where((pose.quats.detach() * target[:, QUATS]).sum(1, keepdim=True) < 0, -1.0, 1.0)
+        turned = (sign * pose.quats - target[:, QUATS]) * spread
+        return torch.cat([pose.means - target[:, MEANS], pose.scales - scales, turned], dim=1) / self.pixel
 
     def _batch(self) -> Tensor:
-        moving = round(MOVING_SHARE * GAUSSIANS_PER_TIME) if len(self._moving) else 0
+        moving = round(MOVING_FRACTION * GAUSSIANS_PER_TIME) if len(self._moving) else 0
         any_ = torch.randint(len(self.model.gaussians), (GAUSSIANS_PER_TIME - moving,), generator=self._generator)
         if not moving:
             return any_
@@ -154,22 +148,22 @@ def main(
 ) -> int:
     """Make a scene of the paper's size from a small trained one, to measure exports on (docs/work_precision.md).
 
-    Its Gaussians are split until there are as many as in the paper, 106,500. A field of ten MLP layers of 4 × 256, the
-    preset msdgs-mlp, learns how the small one moves them, smoothed in time. How near it came is printed.
+    Its Gaussians are split until there are 106,500, as in the paper. The ten MLP layers of the preset msdgs-mlp are
+    trained on their motion, smoothed in time, and the remaining error is printed.
 
     python -m benchmarks.export.paper_sized runs/toybench/model.pt runs/paper_sized/model.pt
 
     python export/to_onnx.py runs/paper_sized/model.pt
 
     Args:
-        model: A trained `model.pt` of MLP layers, as of toybench.
+        model: A trained `model.pt` of MLP layers.
         output: The `model.pt` to write.
-        count: Gaussians of the new scene, at least as many as there are.
-        minutes: Processor time to train for.
-        size: Width in pixels of the new scene's cameras, which are the old ones otherwise.
-        control: Control points of the splines that smooth a trajectory.
-        threads: Of torch.
-        check: Only see that this works, on a random model of 40 Gaussians.
+        count: Gaussians of the new scene, at least those of the model.
+        minutes: Processor time of the training.
+        size: Width in pixels of the new scene's cameras.
+        control: Control points of a smoothed trajectory.
+        threads: Threads of torch.
+        check: Test this script on a random model of 40 Gaussians.
     """
     if check:
         return self_test()
@@ -182,10 +176,10 @@ def main(
             raise InvalidInput("count", f"{len(small.gaussians):,} or more, the model's Gaussians", count)
         info = replace(info, cameras=[_resized(camera, size) for camera in info.cameras])
         parts = split(small, count, torch.Generator().manual_seed(0))
-        fit = Fit(grown(parts), SmoothMotion(parts, info, control), info)
-        _train(fit, 60 * minutes, console)
-        save_model(output, fit.model, info, fit.steps)
-        _describe(fit, small, console)
+        training = Training(grown(parts), SmoothMotion(parts, info, control), info)
+        training.run(60 * minutes, console)
+        save_model(output, training.model, info, training.steps)
+        _describe(training, small, console)
     except (MsdgsError, OSError) as error:
         console.print(f"error: {error}", style="red", markup=False)
         return 1
@@ -194,24 +188,20 @@ def main(
 
 @torch.no_grad()
 def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> DynamicGaussians:
-    """The model with `count` Gaussians, as many parts of each as of any other or one more, under the same layers.
+    """The model with `count` Gaussians, each split into the same number of parts or one more; the layers are the same.
 
-    Opacities are such that a ray through all parts of a Gaussian loses as much light as through the whole.
+    All parts of a Gaussian together absorb as much light of a ray as the whole.
     """
     g, parents = small.gaussians, torch.arange(count) * len(small.gaussians) // count
     places = (1 - SHRINK**2) ** 0.5 * torch.randn(count, 3, generator=generator).clamp(-2.5, 2.5)
     offsets = rotate(unit_or_identity(g.raw_quats[parents]), places * g.log_scales[parents].exp())
     parts = torch.bincount(parents, minlength=len(g))[parents]
     clear = (1 - g.raw_opacities[parents].sigmoid().clamp_max(MAX_OPACITY)).log() / (parts * SHRINK**2)
-    tensors = {
+    tensors = {name: parameter[parents] for name, parameter in g.named_parameters()} | {
         "means": g.means[parents] + offsets,
         "log_scales": g.log_scales[parents] + np.log(SHRINK),
-        "raw_quats": g.raw_quats[parents],
         "raw_opacities": torch.logit((1 - clear.exp()).clamp(1e-6, MAX_OPACITY)),
-        "sh_dc": g.sh_dc[parents],
-        "sh_rest": g.sh_rest[parents],
     }
-    tensors |= {name: values[parents] for name, values in g.attributes.items()}
     model = DynamicGaussians(small.config, CanonicalGaussians(**tensors)).requires_grad_(requires_grad=False)
     model.deformation, model.modulation = small.deformation, small.modulation
     return model
@@ -219,8 +209,7 @@ def split(small: DynamicGaussians, count: int, generator: torch.Generator) -> Dy
 
 @torch.no_grad()
 def grown(small: DynamicGaussians) -> DynamicGaussians:
-    """A model of the preset msdgs-mlp that does what the small one does; of its ten layers the last ones move nothing
-    yet."""
+    """A model of the preset msdgs-mlp that computes what the small one does; its last layers move nothing yet."""
     paper = preset("msdgs-mlp").model
     config = replace(
         paper,
@@ -250,9 +239,9 @@ def _mlp_layers(model: DynamicGaussians) -> list[MLPLayer]:
 
 
 def _grown(layer: MLPLayer, trained: MLPLayer) -> None:
-    """Make a larger layer compute what a smaller one does. Its other hidden units stay as they are drawn, unread."""
+    """Make a larger layer compute what a smaller one does. No output reads its other hidden units."""
     if layer.outputs != trained.outputs or len(layer.trunk) < len(trained.trunk):
-        raise InvalidInput("model", "of layers with the paper's heads, four hidden layers at most", "others")
+        raise InvalidInput("model", "of layers with the heads of msdgs-mlp and at most four hidden layers", "others")
     width, places = trained.first.out_features, _columns(layer.xyz_frequency_matrix, trained.xyz_frequency_matrix)
     times = layer.xyz_features + torch.arange(trained.time_output.out_features)
     _copy(layer.time_hidden, trained.time_hidden, _columns(layer.time_frequency_matrix, trained.time_frequency_matrix))
@@ -261,7 +250,7 @@ def _grown(layer: MLPLayer, trained: MLPLayer) -> None:
     for i, linear in enumerate(_linears(layer)):
         if i < len(trained.trunk):
             _copy(linear, _linears(trained)[i], torch.arange(width))
-        else:  # hidden units aren't negative, so a ReLU of the same changes nothing
+        else:  # hidden units aren't negative, so an identity and a ReLU change nothing
             same = nn.Linear(width, width)
             nn.init.eye_(same.weight)
             nn.init.zeros_(same.bias)
@@ -274,7 +263,7 @@ def _linears(layer: MLPLayer) -> list[nn.Linear]:
 
 
 def _columns(frequency_matrix: Tensor, fewer: Tensor) -> Tensor:
-    """Columns of a longer encoding, value, sines, cosines, that are those of a shorter one."""
+    """Columns of a longer encoding (value, sines, cosines) that a shorter one also has."""
     size, many, few = frequency_matrix.shape[0], frequency_matrix.shape[1], fewer.shape[1]
     if few > many:
         raise InvalidInput("model", f"with at most {many // size} frequencies", few // size)
@@ -283,46 +272,28 @@ def _columns(frequency_matrix: Tensor, fewer: Tensor) -> Tensor:
 
 
 def _copy(linear: nn.Linear, source: nn.Linear, columns: Tensor) -> None:
-    """The first outputs of a Linear read these columns as another one does, and no others."""
+    """Let the first outputs of a Linear read these columns with the weights of another one, and no other columns."""
     outputs = source.out_features
     if outputs > linear.out_features or len(columns) > linear.in_features:
-        raise InvalidInput("model", "no wider than the preset msdgs-mlp", outputs)
+        raise InvalidInput("model", "as wide as the preset msdgs-mlp at most", outputs)
     linear.weight[:outputs] = 0
     linear.weight[:outputs, columns] = source.weight
     linear.bias[:outputs] = source.bias
 
 
-def _train(fit: Fit, seconds: float, console: Console) -> None:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("training", total=seconds)
-        while fit.seconds < seconds:
-            fit.step(fit.seconds / seconds)
-            described = f"step {fit.steps:,}, median {fit.pixels:.2f} pixels"
-            progress.update(task, completed=fit.seconds, description=described)
-
-
 @torch.no_grad()
-def _describe(fit: Fit, small: DynamicGaussians, console: Console) -> None:
-    """How near the field came to the smoothed motion and to the small model's images, and what each layer adds."""
-    ids = torch.arange(0, len(fit.model.gaussians), 37)
-    t0, t1 = fit.info.time_range
-    errors = torch.cat([fit.errors(t, ids)[:, MEANS].norm(dim=1) for t in np.linspace(t0, t1, 17)])
+def _describe(training: Training, small: DynamicGaussians, console: Console) -> None:
+    """Print the errors against the smoothed motion and the small model's images."""
+    ids, info = torch.arange(0, len(training.model.gaussians), 37), training.info
+    errors = torch.cat([training.errors(t, ids)[:, MEANS].norm(dim=1) for t in np.linspace(*info.time_range, 17)])
     quantiles = ", ".join(f"{float(errors.quantile(q)):.2f}" for q in (0.5, 0.9, 0.99))
-    console.print(f"pixels off the smoothed motion: {quantiles} (50, 90, 99 % of Gaussians)", markup=False)
-    means, adds = fit.model.gaussians.means[ids], []
-    for t in np.linspace(t0, t1, 5):
-        at, moved = torch.tensor(t, dtype=means.dtype), torch.zeros_like(means)
-        for layer in fit.model.deformation.layers:
-            step = layer(means + moved, at)
-            moved = moved + step.weight * step.delta_means
-            adds.append((step.weight * step.delta_means).norm(dim=1).mean() / fit.pixel)
-    layers = torch.stack(adds).view(5, -1).mean(0)
-    console.print(f"pixels that a layer moves, mean: {', '.join(f'{v:.2f}' for v in layers)}", markup=False)
+    console.print(f"error against the smoothed motion: {quantiles} pixels (50, 90, 99 % of Gaussians)", markup=False)
     psnrs = []
-    for view in selection_views(cameras_of(fit.info), fit.info.time_range, 9):
-        frames = [render(posed(m, view.t), view.camera, fit.info.background, m.rasterizer) for m in (small, fit.model)]
-        psnrs.append(compare(*frames).psnr)
+    for view in selection_views(cameras_of(info), info.time_range, 9):
+        models = (small, training.model)
+        psnrs.append(
+            compare(*(render(posed(m, view.t), view.camera, info.background, m.rasterizer) for m in models)).psnr
+        )
     console.print(f"images against the small model's: {np.mean(psnrs):.1f} dB, worst {min(psnrs):.1f}", markup=False)
 
 
@@ -338,7 +309,7 @@ def _resized(entry: dict, width: int) -> dict:
 
 
 def self_test() -> int:
-    """Larger layers compute what the smaller ones did, to rounding; a short run writes what it should."""
+    """Larger layers compute what the smaller ones do, except for rounding; a short run writes a model."""
     small = random_model(40, layers=("mlp", "mlp"))
     parts = split(small, 100, torch.Generator().manual_seed(0))
     large = grown(parts).double()

@@ -1,8 +1,4 @@
-"""Our PLY and SPZ in the hands of PlayCanvas' splat-transform, and what it writes of them read here again.
-
-python -m benchmarks.export.splat_transform playbot.onnx; needs Node.js: npx fetches @playcanvas/splat-transform. Ends
-with 1 if a file is refused or comes back as less than it was.
-"""
+"""PLY and SPZ files of this project through PlayCanvas' splat-transform, and its PLY files read back here."""
 
 import subprocess
 import sys
@@ -14,23 +10,28 @@ import tyro
 from rich.console import Console
 
 from benchmarks.measuring import machine
-from export.exporters.command import LOSSY, Settings, convert
+from export.exporters.command import LOSSY, convert
 from export.exporters.round_trip import RoundTrip, require
 from export.importers import read_splats
+from export.options import ConvertOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 
 WRITTEN = (".ply", ".spz")
 TURN = ["-r", "180,0,0"]
-"""Version 3 takes the numbers of an SPZ as they are, where version 2 turned them from SPZ's axes to those of a PLY."""
+"""Version 3 doesn't convert the axes of an SPZ file to those of a PLY; version 2 did."""
 
 
 def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanvas/splat-transform@3.7.0") -> int:
-    """Convert a scene's first moment, let splat-transform make a PLY of it, print how far that is from the scene.
+    """Convert the first frame of a scene, let splat-transform write it as PLY, and print its PSNR against the scene.
+
+    python -m benchmarks.export.splat_transform playbot.onnx
+
+    Needs Node.js; npx downloads splat-transform. The exit status is 1 if a file is refused or comes back worse.
 
     Args:
         scene: A scene file.
-        package: What npx runs.
+        package: The package that npx runs.
     """
     console = Console(soft_wrap=True, highlight=False)
     console.print(machine(), markup=False)
@@ -41,12 +42,12 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
         with tempfile.TemporaryDirectory() as folder:
             for suffix in WRITTEN:
                 ours, theirs = Path(folder) / f"ours{suffix}", Path(folder) / f"theirs{suffix}.ply"
-                convert(Settings(scene, ours, t0, 1, None), Console(quiet=True))
+                convert(ConvertOptions(scene, ours, t0), Console(quiet=True))
                 turn = TURN if suffix == ".spz" else []
                 subprocess.run(["npx", "--yes", package, "-w", ours, *turn, theirs], check=True, capture_output=True)
                 read = read_splats(theirs)
                 psnr = proof.psnr(read.gaussians, t0)
-                console.print(f"{suffix}: {len(read):,} Gaussians, {psnr:.1f} dB from the scene", markup=False)
+                console.print(f"{suffix}: {len(read):,} Gaussians, {psnr:.1f} dB against the scene", markup=False)
                 require(psnr, LOSSY, theirs.name)
     except subprocess.CalledProcessError as error:
         console.print(f"{package} refused: {error.stderr.decode(errors='replace').strip()}", markup=False)

@@ -1,10 +1,9 @@
 """A renderer written by hand for AVX-512, built by the machine's own g++ and called through ctypes.
 
-python -m benchmarks.rasterizer.avx512 --check                  that it draws our images
-python -m benchmarks.rasterizer.renderers --avx512 --repeats 20  how long both take
+python -m benchmarks.rasterizer.avx512                          compare its images with ours
+python -m benchmarks.rasterizer.renderers --avx512 --repeats 20  compare times
 """
 
-import argparse
 import ctypes
 import hashlib
 import os
@@ -28,9 +27,9 @@ BUILT = Path(__file__).resolve().parents[2] / "out" / "avx512"
 FLAGS = ("-std=c++20", "-O3", "-march=native", "-ffp-contract=fast", "-shared", "-fPIC", "-pthread")
 NEEDED = {"avx512f", "avx512bw", "avx512dq", "avx512vl"}
 STAGES = ("project", "bin", "composite")
-"""Sorting is in `bin`, as in our stages."""
+"""`bin` includes sorting, as in `benchmarks.rasterizer.stages`."""
 CHECKED = ((1, 64, 48), (1001, 150, 101), (10_000, 400, 400))  # Gaussians, width, height
-MIN_PSNR = 70  # dB: at thresholds some decisions fall the other way
+MIN_PSNR = 70  # dB: at thresholds some decisions differ by round-off
 
 
 class _Scene(ctypes.Structure):
@@ -59,7 +58,7 @@ class Drawn(NamedTuple):
 
 
 def why_not() -> str | None:
-    """What keeps this machine from having the renderer; None if nothing does."""
+    """Why the renderer can't be built or run on this machine; None if it can."""
     if shutil.which("g++") is None:
         return "there is no g++"
     try:
@@ -71,7 +70,7 @@ def why_not() -> str | None:
 
 
 class Avx512Renderer:
-    """Draws pinhole frames of float32 Gaussians with harmonics of degree 3, on as many threads as ours."""
+    """Draws pinhole frames of float32 Gaussians with SH of degree 3, on as many threads as the service."""
 
     def __init__(self) -> None:
         self._library = ctypes.CDLL(str(_built()))
@@ -85,15 +84,15 @@ class Avx512Renderer:
         self.close()
 
     def close(self) -> None:
-        """Give its memory back."""
+        """Free its memory."""
         self._library.delete_renderer(self._renderer)
 
     def draw(self, gaussians: Gaussians, camera: Camera, options: RasterizerOptions) -> Drawn:
-        """Over black."""
+        """Draw a frame over black."""
         g = gaussians
         arrays = (g.means, g.quats, g.scales, g.opacities, g.sh)
         if camera.model != "pinhole" or options.mip or g.sh_degree != 3:
-            raise ValueError("a pinhole camera, no mip filter and harmonics of degree 3 are all that it can draw")
+            raise ValueError("it draws only with a pinhole camera, without mip filter and with SH of degree 3")
         if not all(array.dtype == np.float32 and array.flags.c_contiguous for array in arrays):
             raise ValueError("the Gaussians must be float32 in C order")
         view = view_of(camera, options)._asdict() | options._asdict() | {"background": np.zeros(3)}
@@ -111,7 +110,7 @@ class Avx512Renderer:
 
 
 def _built() -> Path:
-    """The library of this source, made where it isn't there yet."""
+    """The compiled library, compiled first if the source has changed."""
     library = BUILT / f"renderer-{hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]}.so"
     if not library.exists():
         BUILT.mkdir(parents=True, exist_ok=True)
@@ -121,11 +120,8 @@ def _built() -> Path:
     return library
 
 
-def main() -> int:
-    """Draw small scenes with both, twice."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", required=True, help="draw small scenes and compare")
-    parser.parse_args()
+def check() -> int:
+    """Draw small scenes with both renderers and compare; twice, since threads must not change the image."""
     if reason := why_not():
         print(f"not checked: {reason}")
         return 0
@@ -141,4 +137,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(check())

@@ -1,10 +1,9 @@
-"""What each constant of the rasterizer costs and buys: error against float64, and time, one changed at a time."""
+"""The rasterizer's constants, changed one at a time: error against float64, and time."""
 
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
 from unittest import mock
 
 import numpy as np
@@ -12,90 +11,66 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from benchmarks.measuring import Times, machine, minimum_and_median, psnr
-from benchmarks.rasterizer.report import table
-from benchmarks.rasterizer.scenes import object_camera, object_scene
+from benchmarks.measuring import Times, machine, minimum_and_median, psnr, report_console, table
+from benchmarks.rasterizer.scenes import SH_DEGREE, object_camera, object_scene
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, alpha, rasterize
 from msdgs_serve.rasterizer.exponential import exp2_polynomial
 from msdgs_serve.scene import Camera, Gaussians
 from tests.support.reference import render
 
 WITHOUT_THRESHOLDS = GSPLAT._replace(alpha_min=1e-6, transmittance_min=0.0)
-ALPHAS, TRANSMITTANCES = (0.25, 0.5, 2, 4), (0.0, 1e-5, 1e-3, 1e-2)  # alphas in 1/255
 
 
 @dataclass(frozen=True)
 class Constants:
-    """Draw one seeded scene with each constant changed in turn, in another order each turn.
+    """Draw one seeded scene with each constant changed in turn, in a new random order each turn.
 
     python -m benchmarks.rasterizer.constants
 
-    Times are those of the processor, all threads together: waiting for other programs would hide what a constant costs.
-    Errors are against float64 with the usual constants, and against float64 without any threshold (alpha 1e-6,
-    transmittance 0).
+    Times are processor times of all threads, which hardly depend on other programs. Errors are against float64 with
+    the default constants, and against float64 without thresholds (alpha 1e-6, transmittance 0).
     """
 
     count: int = 100_000
-    """Gaussians."""
+    """Number of Gaussians."""
     size: tuple[int, int] = (800, 800)
     """Width and height in pixels."""
     seed: int = 0
     repeats: int = 60
     """Turns."""
     check: bool = False
-    """Only see that this benchmark works, on a small scene."""
+    """Test this benchmark on a small scene."""
 
 
-class Variant(NamedTuple):
-    """One way to draw."""
-
-    constant: str
-    value: str
-    draw: Callable[[Gaussians, Camera], np.ndarray]  # to rgb [H, W, 3]
-
-
-def variants() -> list[Variant]:
-    """The first is how frames are drawn."""
-    return [
-        Variant("as it is", "", with_options(GSPLAT)),
-        *(Variant("α ≥", f"{a:g}/255", with_options(GSPLAT._replace(alpha_min=a / 255))) for a in ALPHAS),
-        *(Variant("T >", f"{t:g}", with_options(GSPLAT._replace(transmittance_min=t))) for t in TRANSMITTANCES),
-        *(Variant("degree of 2^x", str(degree), with_polynomial(degree)) for degree in (3, 4, 6, 7)),
-        *(Variant("degree of harmonics", str(degree), with_harmonics(degree)) for degree in (2, 1, 0)),
-    ]
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RasterizerOptions = GSPLAT,
+    exp2_degree: int = 5,
+    sh_degree: int = SH_DEGREE,
+) -> np.ndarray:
+    """[H, W, 3] a frame with other options, another polynomial for 2^x, or fewer SH bands."""
+    sh = np.ascontiguousarray(gaussians.sh[:, : (sh_degree + 1) ** 2])
+    with mock.patch.object(alpha, "exp2_polynomial", return_value=exp2_polynomial(exp2_degree)):
+        return rasterize(replace(gaussians, sh=sh), camera, options=options).rgb
 
 
-def with_options(options: RasterizerOptions) -> Callable[[Gaussians, Camera], np.ndarray]:
-    return lambda gaussians, camera: rasterize(gaussians, camera, options=options).rgb
-
-
-def with_polynomial(degree: int) -> Callable[[Gaussians, Camera], np.ndarray]:
-    """2^x of another degree in the compositing."""
-
-    def draw(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-        with mock.patch.object(alpha, "exp2_polynomial", return_value=exp2_polynomial(degree)):
-            return rasterize(gaussians, camera).rgb
-
-    return draw
-
-
-def with_harmonics(degree: int) -> Callable[[Gaussians, Camera], np.ndarray]:
-    """None above a degree."""
-
-    def draw(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-        sh = np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2])
-        return rasterize(replace(gaussians, sh=sh), camera).rgb
-
-    return draw
+VARIANTS = {
+    ("default", ""): draw,
+    **{("α ≥", f"{a:g}/255"): partial(draw, options=GSPLAT._replace(alpha_min=a / 255)) for a in (0.25, 0.5, 2, 4)},
+    **{("T >", f"{t:g}"): partial(draw, options=GSPLAT._replace(transmittance_min=t)) for t in (0.0, 1e-5, 1e-3, 1e-2)},
+    **{("degree of 2^x", f"{degree}"): partial(draw, exp2_degree=degree) for degree in (3, 4, 6, 7)},
+    **{("degree of harmonics", f"{degree}"): partial(draw, sh_degree=degree) for degree in (2, 1, 0)},
+}
+"""Ways to draw, by constant and value."""
 
 
 def as_float64(gaussians: Gaussians) -> Gaussians:
-    g = gaussians
-    return Gaussians(*(array.astype(np.float64) for array in (g.means, g.quats, g.scales, g.opacities, g.sh)))
+    return Gaussians(**{name: array.astype(np.float64) for name, array in vars(gaussians).items()})
 
 
 def agreement_with_reference(seed: int) -> float:
-    """Largest difference between our float64 and the slow, obvious renderer of the tests, on a small scene."""
+    """Largest difference between the float64 rasterizer and the slow reference of the tests, on a small scene."""
     scene, camera = as_float64(object_scene(1000, seed)), object_camera(96, 80)
     return float(np.abs(rasterize(scene, camera).rgb - render(scene, camera).rgb).max())
 
@@ -103,37 +78,31 @@ def agreement_with_reference(seed: int) -> float:
 def main(options: Constants) -> int:
     """Draw in turns, print the table."""
     if options.check:
-        return check()
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 170)
+        assert agreement_with_reference(0) < 1e-12
+        return main(Constants(300, (64, 48), repeats=2))
     scene, camera = object_scene(options.count, options.seed), object_camera(*options.size)
-    exact, known = as_float64(scene), variants()
-    reference = rasterize(exact, camera).rgb
-    unlimited = rasterize(exact, camera, options=WITHOUT_THRESHOLDS).rgb
-    images, times = [variant.draw(scene, camera) for variant in known], Times(time.process_time)
-    rng = np.random.default_rng(0)
+    reference = rasterize(as_float64(scene), camera).rgb
+    unlimited = rasterize(as_float64(scene), camera, options=WITHOUT_THRESHOLDS).rgb
+    images = [variant(scene, camera) for variant in VARIANTS.values()]
+    known, times, rng = list(VARIANTS.values()), Times(time.process_time), np.random.default_rng(0)
     for _ in track(range(options.repeats), "turns", console=Console(stderr=True)):
         for k in rng.permutation(len(known)):
-            times.time(str(k), known[k].draw, scene, camera)
+            times.time(str(k), known[k], scene, camera)
     made = table(
         f"{options.count:,} Gaussians, {options.size[0]}×{options.size[1]}, one constant changed at a time",
-        *("constant", "value", "processor ms", "of usual", "dB to float64", "worst pixel"),
+        *("constant", "value", "processor ms", "relative", "dB to float64", "worst pixel"),
         "dB to float64 without thresholds",
     )
-    for k, (variant, image) in enumerate(zip(known, images, strict=True)):
+    for k, (name, image) in enumerate(zip(VARIANTS, images, strict=True)):
         ratio = f"{times.minimum(str(k)) / times.minimum('0'):.2f}"
-        worst = f"{np.abs(image - reference).max():.1e}"
-        errors = f"{psnr(image, reference):.1f}", worst, f"{psnr(image, unlimited):.1f}"
-        made.add_row(variant.constant, variant.value, minimum_and_median(times.milliseconds()[str(k)]), ratio, *errors)
+        errors = f"{psnr(image, reference):.1f}", f"{np.abs(image - reference).max():.1e}"
+        milliseconds = minimum_and_median(times.milliseconds()[str(k)])
+        made.add_row(*name, milliseconds, ratio, *errors, f"{psnr(image, unlimited):.1f}")
+    console = report_console()
     console.print(machine(), made)
     difference = agreement_with_reference(options.seed)
-    console.print(f"float64 against tests/reference.py on a small scene: {difference:.1e} at most")
+    console.print(f"float64 against tests/support/reference.py on a small scene: largest difference {difference:.1e}")
     return 0
-
-
-def check() -> int:
-    """Float64 against the reference, then a small run."""
-    assert agreement_with_reference(0) < 1e-12
-    return main(Constants(300, (64, 48), repeats=2))
 
 
 if __name__ == "__main__":

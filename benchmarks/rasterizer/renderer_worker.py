@@ -1,4 +1,4 @@
-"""Draws one view of one file, a frame for each line that it reads: renderers.py starts this in other interpreters.
+"""Draws one view of one file, a frame for each line of its input; renderers.py runs this in other interpreters.
 
 Its argument is JSON: renderer ("F3D", "Open3D" or "msdgs"), file, image, size [2], position, focal_point and view_up
 [3], view_angle (vertical, degrees). First it prints {"version": …}; for a line `draw` it draws and prints
@@ -12,17 +12,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 Drawing = tuple[str, Callable[[], float], Callable[[str], object]]
-"""Version, draw a frame and return its seconds, write the last frame to a file."""
+"""Version; a function that draws a frame and returns its seconds; one that writes the last frame to a file."""
 
 
 def f3d(job: dict) -> Drawing:
-    """A .splat file by OpenGL."""
+    """Draw a .splat file by OpenGL."""
     import f3d  # pyright: ignore[reportMissingImports]
 
     engine = f3d.Engine.create_egl()
     engine.options.update({
         "model.point_sprites.type": "gaussian",
-        "model.point_sprites.absolute_size": True,  # scales are in scene units, not in parts of the scene's size
+        "model.point_sprites.absolute_size": True,  # scales are in scene units, not relative to the scene's size
         "model.point_sprites.size": 1.0,
         "model.coloring": "direct",  # each splat's own color and opacity, without light
         "render.effect.blending.mode": "sort",
@@ -36,12 +36,12 @@ def f3d(job: dict) -> Drawing:
     images = []
 
     def draw() -> float:
-        window = engine.window  # it lives as long as its engine
+        window = engine.window  # valid as long as its engine
         window.camera.state = view
         start = time.perf_counter()
         images[:] = [window.render_to_image()]
         seconds = time.perf_counter() - start
-        window.camera.azimuth(20)  # F3D keeps its depth order until the view has turned by 3°
+        window.camera.azimuth(20)  # F3D sorts again only if the view has turned by 3°
         window.render_to_image()
         return seconds
 
@@ -49,7 +49,7 @@ def f3d(job: dict) -> Drawing:
 
 
 def open3d(job: dict) -> Drawing:
-    """A .splat file by Vulkan compute."""
+    """Draw a .splat file by Vulkan compute."""
     import open3d  # pyright: ignore[reportMissingImports]
 
     rendering = open3d.visualization.rendering
@@ -78,7 +78,7 @@ def open3d(job: dict) -> Drawing:
 
 
 def msdgs(job: dict) -> Drawing:
-    """A .npz of Gaussians with the rasterizer that PYTHONPATH leads to."""
+    """Draw an .npz of Gaussians with the rasterizer on PYTHONPATH."""
     import numpy as np
 
     import msdgs_serve
@@ -101,7 +101,7 @@ def msdgs(job: dict) -> Drawing:
 
 
 def main() -> None:
-    """One answer per line."""
+    """Answer each line of the input."""
     job = json.loads(sys.argv[1])
     version, draw, save = {"F3D": f3d, "Open3D": open3d, "msdgs": msdgs}[job["renderer"]](job)
     print(json.dumps({"version": version}), flush=True)

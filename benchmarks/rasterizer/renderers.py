@@ -1,4 +1,4 @@
-"""This rasterizer beside others, in turns: times, and how far the images differ."""
+"""This rasterizer and others in turns: times, and the PSNR between their images."""
 
 import contextlib
 import json
@@ -10,30 +10,28 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 import OpenImageIO as oiio
 import tyro
-from rich.console import Console
 
-from benchmarks.measuring import Times, machine, minimum_and_median, psnr
+from benchmarks.measuring import Times, machine, minimum_and_median, psnr, report_console, table
 from benchmarks.rasterizer.avx512 import Avx512Renderer, why_not
-from benchmarks.rasterizer.report import table
 from benchmarks.rasterizer.scenes import Case, file_cases, seeded_cases, write_splat
 from benchmarks.rasterizer.stages import STAGES, draw_in_stages
 from msdgs_serve.rasterizer import GSPLAT, rasterize
 
 WORKER, ROOT = Path(__file__).with_name("renderer_worker.py"), Path(__file__).resolve().parents[2]
 LONG_ENOUGH = 0.03
-"""Seconds that each draws a case in a turn: the minimum over single frames of 1 ms is the machine's mood."""
+"""Seconds that each renderer draws a case in a turn: minima over a few frames of 1 ms vary too much."""
 
 NEAREST = {
-    # F3D adds 0.3 / size² to a covariance in clip space, where the image is 2 wide and not 1. It has neither the cut
-    # at alpha 1/255 nor that at transmittance 1e-4, but ends a splat at 3 sigma.
+    # F3D adds 0.3 / size² to a covariance in clip space, in which the image is 2 wide and not 1. It has no threshold of
+    # alpha or transmittance, but ends a splat at 3 sigma.
     "F3D": GSPLAT._replace(eps2d=0.3 / 4)
 }
-"""Our options that come nearest to another renderer's constants, if they are not gsplat's."""
+"""Options of this rasterizer that are closest to the constants of another renderer, if these aren't gsplat's."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,8 @@ class Compare:
 
     F3D (https://f3d.app, 80 MB, glibc 2.34 or newer) draws by OpenGL through EGL; without a GPU, Mesa's software does
     (Debian: apt install libegl1 libgl1-mesa-dri). Open3D (https://www.open3d.org, 400 MB, 0.20 or newer) draws by
-    Vulkan (apt install mesa-vulkan-drivers libusb-1.0-0). Both get a .splat file: 8 bits for color, opacity and
-    rotation, no harmonics beyond the constant; they are compared with our frames of that file.
+    Vulkan (apt install mesa-vulkan-drivers libusb-1.0-0). Both read a .splat file (8 bits for color, opacity and
+    rotation, SH of degree 0) and are compared with frames of the same file.
     """
 
     counts: tuple[int, ...] = (100_000, 300_000)
@@ -64,29 +62,29 @@ class Compare:
     repeats: int = 5
     """Turns."""
     avx512: bool = False
-    """A renderer written by hand for AVX-512; needs g++ and such a processor."""
+    """Compare with the renderer written by hand for AVX-512; needs g++ and such a processor."""
     against: Path | None = None
-    """Another checkout of this project: its times are against those of this one in a process of its own, too."""
+    """Another checkout of this project. Both checkouts run in processes of their own."""
     f3d_python: Path | None = None
     """An interpreter that can import f3d."""
     open3d_python: Path | None = None
     """An interpreter that can import open3d."""
     alpha_min: float = GSPLAT.alpha_min
-    """At which alpha our splats end in the image that F3D's and Open3D's are compared with; F3D has no such cut."""
+    """Alpha threshold of the frames that F3D and Open3D are compared with; F3D itself has none."""
     check: bool = False
-    """Only see that this benchmark works: this checkout against itself, and AVX-512 if there is."""
+    """Test this benchmark: this checkout against itself, and AVX-512 if the processor has it."""
 
 
 class Renderer(NamedTuple):
-    """One way to draw one case."""
+    """A renderer of one case."""
 
-    draw: Callable[[Times], Any]  # one frame, adds its seconds as "total" and maybe as stages
+    draw: Callable[[Times], Any]  # draws a frame; adds its seconds as "total", and those of its stages if known
     image: Callable[[], np.ndarray]  # [H, W, 3]
     version: str = ""
 
 
 def ours(case: Case) -> Renderer:
-    """The rasterizer of this checkout, as a whole and in stages."""
+    """The rasterizer of this checkout."""
     return Renderer(lambda times: draw_in_stages(case, times), lambda: rasterize(case.gaussians, case.camera).rgb)
 
 
@@ -105,21 +103,29 @@ def by_hand(renderer: Avx512Renderer, case: Case) -> Renderer:
 def in_a_process(
     name: str, python: Path | str, case: Case, file: Path, checkout: Path | None = None
 ) -> Iterator[Renderer]:
-    """F3D, Open3D or a checkout of this project, which draws the case's file as renderer_worker.py says."""
+    """F3D, Open3D or a checkout of this project, which draws `file` through renderer_worker.py."""
+    camera, pose = case.camera, case.camera.camera_to_world
     with tempfile.TemporaryDirectory() as temporary, tempfile.TemporaryFile("w+") as errors:
         image = Path(temporary, "frame.npy" if checkout else "frame.png")
-        job = {"renderer": "msdgs" if checkout else name, "file": str(file), "image": str(image), **_view(case)}
+        job = {
+            "renderer": "msdgs" if checkout else name,
+            "file": str(file),
+            "image": str(image),
+            "size": [camera.width, camera.height],
+            "position": pose[:3, 3].tolist(),
+            "focal_point": (pose[:3, 3] + pose[:3, 2]).tolist(),
+            "view_up": (-pose[:3, 1]).tolist(),
+            "view_angle": float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
+        }
         process = subprocess.Popen(
             [str(python), str(WORKER), json.dumps(job)],
             env={**os.environ, "PYTHONPATH": str(checkout)} if checkout else None,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
         )  # fmt: skip
-        assert process.stdin
-        assert process.stdout
-        orders, answers = process.stdin, process.stdout
+        orders, answers = cast(IO[str], process.stdin), cast(IO[str], process.stdout)
 
         def ask(order: str, key: str) -> Any:
-            with contextlib.suppress(BrokenPipeError):  # what it died of is in its errors
+            with contextlib.suppress(BrokenPipeError):  # its standard error has the reason
                 print(order, end="", file=orders, flush=True)
             for line in answers:
                 if line.startswith(f'{{"{key}"'):  # the libraries print too
@@ -139,19 +145,8 @@ def in_a_process(
             process.communicate()
 
 
-def _view(case: Case) -> dict[str, Any]:
-    camera, pose = case.camera, case.camera.camera_to_world
-    return {
-        "size": [camera.width, camera.height],
-        "position": pose[:3, 3].tolist(),
-        "focal_point": (pose[:3, 3] + pose[:3, 2]).tolist(),
-        "view_up": (-pose[:3, 1]).tolist(),
-        "view_angle": float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
-    }
-
-
 def in_turns(renderers: dict[str, Renderer], repeats: int) -> dict[str, Times]:
-    """Each draws the case for a while, in another order each turn; the first turn loads and compiles."""
+    """Each renderer draws the case for a while, in alternating order; the first turn loads and compiles."""
     times: dict[str, Times] = {}
     for turn in range(repeats + 1):
         times = times if turn > 1 else {name: Times() for name in renderers}
@@ -163,8 +158,8 @@ def in_turns(renderers: dict[str, Renderer], repeats: int) -> dict[str, Times]:
     return times
 
 
-def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterator[dict[str, Any]]:
-    """Ours, then the others, of one case."""
+def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterator[list[str]]:
+    """Rows of the table for one case: this rasterizer, then the others."""
     pythons = {"F3D": options.f3d_python, "Open3D": options.open3d_python}
     checkouts = {"this checkout": ROOT, "the other": options.against.resolve()} if options.against else {}
     with contextlib.ExitStack() as stack:
@@ -173,7 +168,7 @@ def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterat
         np.savez(exact, **vars(case.gaussians))
         write_splat(rounded, case.gaussians)
         others = {"by hand": by_hand(hand, case)} if hand else {}
-        for name, checkout in checkouts.items():  # both in processes, so that they differ in nothing else
+        for name, checkout in checkouts.items():  # both in processes of their own, so that nothing else differs
             others[name] = stack.enter_context(in_a_process(name, sys.executable, case, exact, checkout))
         yield from _rows(case, others, options.repeats)
         (coarse,) = file_cases((rounded,))
@@ -184,52 +179,45 @@ def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterat
 
 def _rows(
     case: Case, others: dict[str, Renderer], repeats: int, alpha_min: float = GSPLAT.alpha_min
-) -> Iterator[dict[str, Any]]:
-    if not others:
-        return
-    times = in_turns({"msdgs": ours(case), **others}, repeats)
+) -> Iterator[list[str]]:
+    times = in_turns({"msdgs": ours(case), **others}, repeats) if others else {}
     for name, taken in times.items():
-        base = "this checkout" if name == "the other" else "msdgs"
-        ratio = taken.minimum("total") / times[base].minimum("total")
-        row = {"name": name, "case": case, "milliseconds": taken.milliseconds(), "ratio": ratio}
+        base, milliseconds = times["this checkout" if name == "the other" else "msdgs"], taken.milliseconds()
+        ratio, title, agreement = f"{taken.minimum('total') / base.minimum('total'):.2f}", name, ""
+        cells = [minimum_and_median(milliseconds[stage]) if stage in milliseconds else "" for stage in STAGES]
         if name in others:
             nearest = NEAREST.get(name, GSPLAT)._replace(alpha_min=alpha_min)
-            image = rasterize(case.gaussians, case.camera, options=nearest).rgb
-            row |= {"psnr": psnr(image, others[name].image()), "name": f"{name} {others[name].version}".strip()}
-        yield row
+            db = psnr(rasterize(case.gaussians, case.camera, options=nearest).rgb, others[name].image())
+            title = f"{name} {others[name].version}".strip()
+            agreement = "same" if db == float("inf") else f"{db:.1f} dB"
+        yield [title, case.title(), case.size(), *cells, ratio, agreement]
 
 
 def main(options: Compare) -> int:
     """Draw in turns, print one table."""
     if options.check:
         return check()
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 170)
     cases = seeded_cases(options.counts, options.sizes, options.seed)
     if options.splats:
         cases = file_cases(options.splats, *map(int, options.sizes[0].split("x")))
     if not (options.avx512 or options.against or options.f3d_python or options.open3d_python):
         raise SystemExit("nothing to compare with: --avx512, --against, --f3d-python or --open3d-python")
     if options.avx512 and (reason := why_not()):
-        raise SystemExit(f"no renderer written by hand for AVX-512: {reason}")
-    with Avx512Renderer() if options.avx512 else contextlib.nullcontext() as hand:
-        rows = [row for case in cases for row in rows_of(case, options, hand)]
-    console.print(machine())
+        raise SystemExit(f"the renderer for AVX-512 can't run: {reason}")
     made = table("Milliseconds, minimum (median)", "renderer", "scene", "size", *STAGES, "× ours", "PSNR to ours")
-    for row in rows:
-        cells = [minimum_and_median(row["milliseconds"][n]) if n in row["milliseconds"] else "" for n in STAGES]
-        agreement = ("same" if row["psnr"] == float("inf") else f"{row['psnr']:.1f} dB") if "psnr" in row else ""
-        made.add_row(row["name"], row["case"].title(), row["case"].size(), *cells, f"{row['ratio']:.2f}", agreement)
-    console.print(made)
+    with Avx512Renderer() if options.avx512 else contextlib.nullcontext() as hand:
+        for row in (row for case in cases for row in rows_of(case, options, hand)):
+            made.add_row(*row)
+    report_console().print(machine(), made)
     return 0
 
 
 def check() -> int:
-    """The other checkout is this one, so its images are the same, bit by bit."""
+    """Compare this checkout with itself: the images are bit-identical."""
     options = Compare((300,), ("64x48",), repeats=1, against=ROOT, avx512=why_not() is None)
     (case,) = seeded_cases(options.counts, options.sizes, 0)
-    rows = {row["name"].split(" /")[0]: row for row in rows_of(case, options, None)}
-    assert {"msdgs", "this checkout", "the other"} == set(rows)
-    assert rows["the other"]["psnr"] == rows["this checkout"]["psnr"] == float("inf")
+    agreement = {row[0].split(" /")[0]: row[-1] for row in rows_of(case, options, None)}
+    assert agreement == {"msdgs": "", "this checkout": "same", "the other": "same"}
     return main(options)
 
 

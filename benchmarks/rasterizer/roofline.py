@@ -1,4 +1,4 @@
-"""What this machine can do at most: two kernels on the rasterizer's own threads and SIMD vectors."""
+"""The limits of this machine, measured by two kernels on the rasterizer's own threads and SIMD vectors."""
 
 import time
 from typing import NamedTuple
@@ -12,8 +12,9 @@ from msdgs_serve.rasterizer.vectors import fma, spread
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
 FLOPS_PER_PAIR = 37
-"""Of one splat in one pixel, an fma counted twice: dx, dy 2; root times that 4; squares and log2 of the opacity 4;
-2^x 13 (rounding 3, polynomial of degree 5: 10); two cuts 2; transmittance 3, going on 1; three colors and depth 8."""
+"""Operations of one splat in one pixel, an fma counted twice: dx, dy 2; root times that 4; squares and log2 of the
+opacity 4; 2^x 13 (rounding 3, polynomial of degree 5: 10); two thresholds 2; transmittance 3, end test 1; three colors
+and depth 8."""
 
 CHAINS = 8
 ROUNDS = 200_000
@@ -21,14 +22,14 @@ BANDWIDTH_BYTES = 1 << 28
 
 
 class Machine(NamedTuple):
-    """The most that was seen in any repeat."""
+    """The highest rates of any repeat."""
 
     gflops: float  # float32, an fma counted twice
-    gigabytes: float  # a second, read and written
+    gigabytes: float  # per second, read and written
 
 
 class Roofline:
-    """Measures a little more at each `sample`, so that it sees the same moods of the machine as what it is beside."""
+    """Takes a sample in each turn of a benchmark, so that both see the same speed of the machine."""
 
     def __init__(self) -> None:
         self.machine = Machine(0.0, 0.0)
@@ -37,7 +38,7 @@ class Roofline:
         self._scratch = [np.linspace(0, 1, CHAINS * NUM_LANES, dtype=np.float32) for _ in range(thread_count())]
 
     def sample(self) -> None:
-        """About 0.1 s."""
+        """Measure both rates for about 0.1 s."""
         flops = 2 * NUM_LANES * CHAINS * ROUNDS * thread_count()
         rate = flops / _seconds(_multiply_add, [(scratch, ROUNDS) for scratch in self._scratch]) / 1e9
         groups = split_evenly(len(self._source) // NUM_LANES, thread_count())
@@ -54,7 +55,7 @@ def _seconds(function: object, items: list[tuple]) -> float:
 
 @kernel
 def _multiply_add(numbers: np.ndarray, rounds: int) -> None:
-    """Eight chains side by side: enough for two units of a latency of four."""
+    """Eight independent chains: enough for two units with a latency of four cycles."""
     factor, term = spread(np.float32(0.999)), spread(np.float32(0.001))
     a, b, c, d = load(numbers, 0), load(numbers, 16), load(numbers, 32), load(numbers, 48)
     e, f, g, h = load(numbers, 64), load(numbers, 80), load(numbers, 96), load(numbers, 112)

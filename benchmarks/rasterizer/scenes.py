@@ -1,4 +1,4 @@
-"""Scenes of the rasterizer's benchmarks: seeded ones with the footprint of a trained object, and files of splats."""
+"""Scenes of the rasterizer's benchmarks: seeded ones with the footprint of a trained object, and splat files."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -6,17 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from export.importers import read_splats
+from export.importers.splats.splat import RECORD
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 
 MEDIAN_SCALES = {10_000: 0.010, 100_000: 0.007, 300_000: 0.005, 1_000_000: 0.0035}
-"""Median standard deviation for a number of Gaussians, as part of the object's diameter."""
+"""Median standard deviation by number of Gaussians, as a fraction of the object's diameter."""
 
 CAMERA_ANGLE_X = 0.6911
 DISTANCE = 4.0
 SH_DEGREE = 3
-SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-"""A record of a .splat file; quaternions wxyz as 128 + 128 q."""
 
 
 class Case(NamedTuple):
@@ -34,20 +33,20 @@ class Case(NamedTuple):
 
 
 def seeded_cases(counts: tuple[int, ...], sizes: tuple[str, ...], seed: int) -> list[Case]:
-    """Every number of Gaussians at every size, WIDTHxHEIGHT in pixels."""
+    """All numbers of Gaussians at all sizes, WIDTHxHEIGHT in pixels."""
     cameras = [object_camera(*map(int, size.split("x"))) for size in sizes]
     return [Case("seeded", scene, camera) for scene in (object_scene(n, seed) for n in counts) for camera in cameras]
 
 
 def file_cases(files: tuple[Path, ...], width: int = 800, height: int = 800) -> list[Case]:
-    """Files that `export/to_onnx.py` reads as one set of Gaussians, each seen from outside."""
+    """Splat files of any format that can be imported, each seen from outside."""
     scenes = [(path.name, read_splats(path).gaussians) for path in files]
     return [Case(name, gaussians, around(gaussians, width, height)) for name, gaussians in scenes]
 
 
 def write_splat(file: Path, gaussians: Gaussians) -> None:
-    """Rounded to 8 bits for color, opacity and rotation, without harmonics beyond the constant."""
-    records = np.zeros(len(gaussians), SPLAT)
+    """Write a .splat file: 8 bits for color, opacity and rotation, and SH of degree 0."""
+    records = np.zeros(len(gaussians), RECORD)
     records["means"], records["scales"] = gaussians.means, gaussians.scales
     colors = 0.5 + SH_C0 * gaussians.sh[:, 0]
     records["rgba"] = np.clip(np.round(255 * np.column_stack([colors, gaussians.opacities])), 0, 255)
@@ -56,7 +55,7 @@ def write_splat(file: Path, gaussians: Gaussians) -> None:
 
 
 def object_scene(count: int, seed: int = 0) -> Gaussians:
-    """A bumpy shell of flat splats, most of them either opaque or faint, and a tenth floating about, float32."""
+    """A bumpy shell of flat Gaussians, most of them either opaque or faint, and a tenth floating around it; float32."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -75,13 +74,13 @@ def object_scene(count: int, seed: int = 0) -> Gaussians:
 
 
 def median_scale(count: int) -> float:
-    """Between the table's counts, on a straight line of logarithms."""
+    """Interpolate `MEDIAN_SCALES` on logarithmic axes."""
     counts, scales = np.log(list(MEDIAN_SCALES)), np.log(list(MEDIAN_SCALES.values()))
     return float(np.exp(np.interp(np.log(count), counts, scales)))
 
 
 def object_camera(width: int, height: int, turn: float = 0.6) -> Camera:
-    """At distance 4, `turn` radians around the object and a little above it; `CAMERA_ANGLE_X` wide."""
+    """A camera at distance 4, `turn` radians around the object and a little above it, `CAMERA_ANGLE_X` wide."""
     eye = DISTANCE * np.array([np.sin(turn) * np.cos(0.4), -np.sin(0.4), -np.cos(turn) * np.cos(0.4)])
     focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)
     pose = Camera.from_look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), width, height, 40.0).camera_to_world
@@ -89,7 +88,7 @@ def object_camera(width: int, height: int, turn: float = 0.6) -> Camera:
 
 
 def around(gaussians: Gaussians, width: int = 800, height: int = 800) -> Camera:
-    """Along +z, so far away that nine in ten Gaussians are in an image `CAMERA_ANGLE_X` wide."""
+    """A camera that looks along +z, so far away that 90 % of the Gaussians are in an image `CAMERA_ANGLE_X` wide."""
     target = np.median(gaussians.means, axis=0).astype(float)
     radius = np.quantile(np.linalg.norm(gaussians.means - target, axis=1), 0.9)
     focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)

@@ -1,4 +1,4 @@
-"""Where a frame's time goes: stages, work, memory, and the gradient."""
+"""The stages, work and memory of a frame, and its gradient."""
 
 import tracemalloc
 from typing import Any, NamedTuple
@@ -8,8 +8,7 @@ import numpy as np
 from benchmarks.measuring import Times
 from benchmarks.rasterizer.roofline import FLOPS_PER_PAIR, Machine
 from benchmarks.rasterizer.scenes import Case
-from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer import GSPLAT, as_trained, rasterize
+from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.counts import count_splats
 from msdgs_serve.rasterizer.projection import project
@@ -19,16 +18,16 @@ STAGES = ("project", "bin", "composite", "total")
 
 
 class Work(NamedTuple):
-    """How much there is to do in one frame, counted exactly and apart from what is timed."""
+    """Exact counts of the work of one frame."""
 
     visible: int  # splats
     tile_entries: int  # splats in tiles
-    evaluated: int  # splats in pixels of the 4 × 4 blocks that they touch and that are not done: the arithmetic
-    blended: int  # splats in pixels to which they add
+    evaluated: int  # pairs of a splat and a pixel of the unfinished 4 × 4 blocks that it touches: the arithmetic
+    blended: int  # pairs of a splat and a pixel to which it contributes
 
 
 def draw_in_stages(case: Case, times: Times) -> None:
-    """Once as a whole, once in stages."""
+    """Draw a frame as a whole, then in stages."""
     gaussians, camera = case.gaussians, case.camera
     size, background = (camera.width, camera.height), np.zeros(3, gaussians.means.dtype)
     times.time("total", rasterize, gaussians, camera)
@@ -38,7 +37,7 @@ def draw_in_stages(case: Case, times: Times) -> None:
 
 
 class Gradient:
-    """A frame and its gradient as training has them, through autograd."""
+    """A frame and its gradient by autograd, as in training."""
 
     def __init__(self, case: Case) -> None:
         import torch
@@ -56,13 +55,13 @@ class Gradient:
         self._autograd = torch.autograd.grad
 
     def draw(self, times: Times) -> None:
-        """Once forward, once backward."""
+        """Draw a frame and compute its gradient."""
         channels = times.time("forward", self._draw)
         times.time("backward", self._autograd, channels, self._tensors, self._gradients)
 
 
 def work_of(case: Case) -> Work:
-    """The decisions of the compositing, counted instead of blended."""
+    """Count the pairs that the compositing would blend."""
     camera = case.camera
     splats = project(case.gaussians, camera, GSPLAT)
     tiles = bin_into_tiles(splats, camera.width, camera.height)
@@ -71,8 +70,8 @@ def work_of(case: Case) -> Work:
 
 
 def memory_of(case: Case) -> int:
-    """Bytes of NumPy's arrays at a frame's peak, beside the Gaussians and the frame itself; threads' scratch, some
-    20 kB each, is numba's and not seen."""
+    """Peak bytes of NumPy arrays while a frame is drawn, without the Gaussians and the frame itself. Scratch memory of
+    the threads, some 20 kB each, belongs to numba and isn't counted."""
     rasterize(case.gaussians, case.camera)
     tracemalloc.start()
     try:
@@ -84,7 +83,7 @@ def memory_of(case: Case) -> int:
 
 
 def row_of(case: Case, times: Times, work: Work, memory: int, machine: Machine) -> dict[str, Any]:
-    """All figures of one scene and size."""
+    """All figures of one case."""
     milliseconds = times.milliseconds()
     gaussians, camera = case.gaussians, case.camera
     total, floor = milliseconds["total"]["min"], floor_of(case, work, machine)
@@ -105,10 +104,10 @@ def row_of(case: Case, times: Times, work: Work, memory: int, machine: Machine) 
 
 
 def floor_of(case: Case, work: Work, machine: Machine) -> dict[str, float]:
-    """Milliseconds that the machine needs at least, at the rates that this run has seen.
+    """Lower bounds in milliseconds at the highest rates of this run.
 
-    `arithmetic`: of the pairs that are blended; `evaluated`: of all pixels of the 4 × 4 blocks that splats touch;
-    `memory`: reading Gaussians, writing and reading records once, tile lists twice, writing the frame.
+    `arithmetic`: of blended pairs; `evaluated`: of all pixels of the 4 × 4 blocks that splats touch; `memory`: of reading
+    Gaussians, writing and reading records once and tile lists twice, and writing the frame.
     """
     g = case.gaussians
     bytes_in = sum(array.nbytes for array in (g.means, g.quats, g.scales, g.opacities, g.sh))
@@ -119,15 +118,3 @@ def floor_of(case: Case, work: Work, machine: Machine) -> dict[str, float]:
         "evaluated": work.evaluated * FLOPS_PER_PAIR / machine.gflops / 1e6,
         "memory": moved / machine.gigabytes / 1e6,
     }
-
-
-def draw_scene(session: DeformationSession, width: int, part: float, times: Times) -> None:
-    """A frame of a scene file at a part of its time, from its first camera: `pose` and `draw`."""
-    metadata = session.scene.metadata
-    t0, t1 = metadata.time_range
-    stored = metadata.cameras[0].camera
-    camera = stored.resized(width, max(1, round(stored.height * width / stored.width)))
-    gaussians = times.time("pose", session.gaussians, t0 + (t1 - t0) * part)
-    times.time(
-        "draw", lambda: rasterize(gaussians, camera, background=metadata.background, options=as_trained(metadata))
-    )

@@ -1,4 +1,4 @@
-"""A client of a few lines, for loads: less work than `http.client` has, and no thread for each connection."""
+"""A minimal asyncio HTTP client for loads: less work per request than `http.client`, and no threads."""
 
 import asyncio
 import json
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 
 class LineAnswer(NamedTuple):
-    """What came back."""
+    """An answer."""
 
     head: bytes
     body: bytes
@@ -19,7 +19,7 @@ class LineAnswer(NamedTuple):
         return int(self.head[9:12])
 
     def header(self, name: str) -> str:
-        """Of a name in small letters, as the service writes them."""
+        """A header by its name in lower case, as the service writes them."""
         found = re.search(rf"^{name}: (.*?)\r$".encode(), self.head, re.MULTILINE)
         assert found, f"no {name} in {self.head!r}"
         return found[1].decode()
@@ -33,7 +33,7 @@ class Line:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def post(self, path: str, body: Any) -> LineAnswer:
-        """JSON; once more where the service has closed the connection, as it does after 5 idle seconds."""
+        """Send JSON; once more if the service has closed the connection, as it does after 5 idle seconds."""
         content = json.dumps(body).encode()
         start = f"POST {path} HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: application/json\r\n"
         message = f"{start}content-length: {len(content)}\r\n\r\n".encode() + content
@@ -53,7 +53,7 @@ class Line:
         return answer._replace(body=await reader.readexactly(int(answer.header("content-length"))))
 
     async def close(self) -> None:
-        """Close it; it is reopened when it is needed."""
+        """Close the connection; the next request opens it again."""
         if self._streams is not None:
             writer, self._streams = self._streams[1], None
             writer.close()
@@ -63,7 +63,7 @@ class Line:
 
 @asynccontextmanager
 async def connected(port: int) -> AsyncIterator[Line]:
-    """A `Line` that is closed in the end."""
+    """A `Line` that is closed at the end."""
     line = Line(port)
     try:
         yield line

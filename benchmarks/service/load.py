@@ -1,6 +1,6 @@
-"""Many clients at once, and what they saw.
+"""Many clients at once, and the answers that they get.
 
-All in one thread, with hardly any HTTP of their own: they are on the service's machine, and what they take it lacks.
+All run in one thread with a minimal HTTP client, since they share the service's machine.
 """
 
 import asyncio
@@ -20,18 +20,17 @@ from benchmarks.service.line import Line, connected
 from benchmarks.service.process import Connection, Running
 from benchmarks.service.requests import Wanted, digest
 
-HEALTH_PAUSE = 0.05
-MEMORY_PAUSE = 0.5
+HEALTH_PAUSE, MEMORY_PAUSE = 0.05, 0.5  # seconds
 
 
 @dataclass
 class Tally:
-    """What clients saw."""
+    """The answers that clients got."""
 
     seconds: list[float] = field(default_factory=list)  # of accepted requests
     statuses: Counter[int] = field(default_factory=Counter)
-    bodies: Counter[tuple[Wanted, str]] = field(default_factory=Counter)  # what was asked for, and the answer's digest
-    resident: list[tuple[float, int]] = field(default_factory=list)  # seconds from the start, bytes of the service
+    bodies: Counter[tuple[Wanted, str]] = field(default_factory=Counter)  # requests with the digest of the answer
+    resident: list[int] = field(default_factory=list)  # bytes of the service at regular intervals
     lasted: float = 0.0
 
     @property
@@ -43,7 +42,7 @@ class Tally:
         return 1000 * float(np.quantile(self.seconds, part)) if self.seconds else float("nan")
 
     def add(self, wanted: Wanted, status: int, body: bytes, seconds: float) -> None:
-        """One answer."""
+        """Count one answer."""
         self.statuses[status] += 1
         if status == 200:
             self.seconds.append(seconds)
@@ -51,14 +50,14 @@ class Tally:
 
 
 class Health(NamedTuple):
-    """Of /live and /ready, asked for in turns on new connections by a process of its own."""
+    """Times and statuses of /live and /ready, requested in turns on new connections by a separate process."""
 
     p99: float  # milliseconds
     statuses: dict[int, int]
 
 
 def saturate(running: Running, requests: Sequence[Wanted], clients: int, seconds: float) -> Tally:
-    """Clients that ask again as soon as they are answered; those refused wait as long as they are told."""
+    """Clients that send the next request as soon as they are answered, or after `Retry-After` if they are refused."""
     tally, stop = Tally(), time.monotonic() + seconds
 
     async def client(seed: int) -> None:
@@ -73,7 +72,7 @@ def saturate(running: Running, requests: Sequence[Wanted], clients: int, seconds
 
 
 def at_rate(running: Running, requests: Sequence[Wanted], clients: int, seconds: float, rate: float) -> Tally:
-    """Requests at evenly spread moments, whatever becomes of those before, as long as one of `clients` is free."""
+    """Requests at regular intervals, independent of the answers, as long as one of `clients` is free."""
     tally, begun = Tally(), time.monotonic()
     moments = iter(enumerate(np.arange(0, seconds, 1 / rate).tolist()))
 
@@ -88,7 +87,7 @@ def at_rate(running: Running, requests: Sequence[Wanted], clients: int, seconds:
 
 
 async def _ask(line: Line, wanted: Wanted, tally: Tally) -> float:
-    """One request; the seconds that its client is told to wait."""
+    """Send one request; returns the seconds that its client has to wait."""
     started = time.perf_counter()
     answer = await line.post("/render", wanted.body())
     tally.add(wanted, answer.status, answer.body, time.perf_counter() - started)
@@ -98,7 +97,7 @@ async def _ask(line: Line, wanted: Wanted, tally: Tally) -> float:
 def overload(
     running: Running, requests: Sequence[Wanted], clients: int, seconds: float, rate: float
 ) -> tuple[Tally, Health]:
-    """`at_rate` while somebody looks after the service's health."""
+    """`at_rate`, while another process requests the service's health."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         pool.submit(int).result()  # started before the load is
         health = pool.submit(watch_health, running.port, seconds)
@@ -106,7 +105,7 @@ def overload(
 
 
 def watch_health(port: int, seconds: float) -> Health:
-    """In turns, for so long."""
+    """Request /live and /ready in turns for `seconds`."""
     took: list[float] = []
     statuses: Counter[int] = Counter()
     stop = time.monotonic() + seconds
@@ -122,11 +121,11 @@ def watch_health(port: int, seconds: float) -> Health:
 
 
 async def _together(running: Running, tally: Tally, clients: Sequence[Coroutine[None, None, None]]) -> None:
-    """Start all, note the service's memory until they end."""
+    """Run all clients and sample the service's memory meanwhile."""
     begun = time.monotonic()
     everyone = asyncio.gather(*clients)
     while not everyone.done():
-        tally.resident.append((time.monotonic() - begun, running.resident_bytes()))
+        tally.resident.append(running.resident_bytes())
         await asyncio.wait([everyone], timeout=MEMORY_PAUSE)
     tally.lasted = time.monotonic() - begun
     await everyone

@@ -1,4 +1,4 @@
-"""Requests for frames and what the renderer makes of them without HTTP."""
+"""Requests for frames, and the same frames from the renderer without HTTP."""
 
 import hashlib
 import random
@@ -19,7 +19,7 @@ ELEVATION = 20.0
 
 
 class Wanted(NamedTuple):
-    """A frame from somewhere around a scene whose time is [0, 1]."""
+    """A request for a frame, from a camera that orbits a scene whose time range is [0, 1]."""
 
     scene: str
     azimuth: float
@@ -28,14 +28,14 @@ class Wanted(NamedTuple):
     image_format: ImageFormat
 
     def body(self) -> dict[str, Any]:
-        """Of `POST /render`."""
+        """The body of `POST /render`."""
         camera = {"type": "orbit", "azimuth": self.azimuth, "elevation": ELEVATION}
         size = {"width": self.size, "height": self.size}
         return {"scene": self.scene, "camera": camera, "t": self.t, "format": self.image_format, **size}
 
 
 def mixed(count: int, scenes: Sequence[str]) -> list[Wanted]:
-    """Of all scenes, times, sizes and formats; the same ones each time."""
+    """Seeded random requests for all scenes, times, sizes and formats."""
     chance = random.Random(0)
     return [
         Wanted(
@@ -47,19 +47,19 @@ def mixed(count: int, scenes: Sequence[str]) -> list[Wanted]:
 
 
 def images(count: int, scene: str) -> list[Wanted]:
-    """JPEGs of 400 × 400 pixels of one moment."""
+    """Requests for 400 × 400 JPEGs at one time, from many azimuths."""
     return [Wanted(scene, float(37 * number % 360), 0.5, 400, "jpeg") for number in range(count)]
 
 
 class Offline:
-    """The renderer alone, over the scenes of a folder."""
+    """The renderer without HTTP, for the scenes of a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._renderer = Renderer()
         self._sessions = {path.stem: DeformationSession(path) for path in folder.glob("*.onnx")}
 
-    def draw(self, wanted: Wanted, *, encoded: bool = True) -> bytes:
-        """The file that the service should answer with; empty where it isn't `encoded`."""
+    def draw(self, wanted: Wanted) -> bytes:
+        """The file that the service must answer with."""
         session = self._sessions[wanted.scene]
         view = framing(session.scene.metadata)
         pose = orbit(view.target, view.distance, wanted.azimuth, ELEVATION, view.up)
@@ -67,9 +67,9 @@ class Offline:
         holds_float = FORMATS[wanted.image_format].holds_float
         options = RenderOptions("transparent" if holds_float else "scene", depth=holds_float)
         image = self._renderer.render(session, camera, wanted.t, options)
-        return encode(image, wanted.image_format) if encoded else b""
+        return encode(image, wanted.image_format)
 
 
 def digest(body: bytes) -> str:
-    """To compare bodies by."""
+    """SHA-256 of a body."""
     return hashlib.sha256(body).hexdigest()

@@ -1,4 +1,4 @@
-"""What one core serves, and what many would."""
+"""Frames per second of one core, and a simulation of many."""
 
 import os
 import shutil
@@ -16,48 +16,50 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 
-from benchmarks.measuring import machine
+from benchmarks.measuring import machine, report_console, table
+from benchmarks.service.levels import SCENE
 from benchmarks.service.process import Connection, Running, service
 from benchmarks.service.simulation import Fleet, Routing, Stages, Trace, simulate, zipf_trace
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.baked import SceneMetadata
 
-SCENES, TIMES = 8, 64  # of the trace that is measured
-IN_TURN = 25  # frames
-MIN_PSNR = 0.15
-LOAD = 0.7  # of what all cores could draw without any cache
-CATALOGUE, MOMENTS = 200, 300  # scenes and times of a large service
+SCENES, TIMES = 8, 64  # of the measured trace
+FRAMES_PER_TURN = 25
+MAX_RATE_ERROR = 0.15
+LOAD = 0.7  # of the rate of all cores without a cache
+CATALOGUE, CATALOGUE_TIMES = 200, 300  # scenes and times of a large service
 LARGE_CACHE = 256  # megabytes
 CORE_HOUR = 0.04  # dollars: an assumption, of rented x86 cores
+ROUTINGS: tuple[Routing, ...] = ("round robin", "affinity", "bounded")
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """Replay a trace of requests, scenes and times with frequency 1 / rank, against services of one core each, and
-    simulate the same.
+    """Replay a trace of requests, scenes and times with frequency 1 / rank, on services of one core each, and simulate
+    the same trace.
 
     python -m benchmarks.service.scaling examples/toybench.onnx
 
-    Seconds per frame are those of one client, and in turns with it four clients at another such service give a rate.
-    The simulation has to reproduce that rate within 15 %, or nothing is extrapolated and the exit status is 1; then
-    comes a table up to a thousand replicas.
+    Seconds per frame are those of one client; in turns with it, four clients of another such service give a rate. If
+    the simulation is off by more than 15 % of this rate, nothing is extrapolated and the exit status is 1. Otherwise a
+    table up to a thousand replicas follows.
     """
 
-    scene: Annotated[Path, tyro.conf.Positional] = Path("examples/toybench.onnx")
+    scene: Annotated[Path, tyro.conf.Positional] = SCENE
+    """A scene file whose time range is [0, 1]."""
     size: int = 400
-    """Pixels a side."""
+    """Width and height in pixels."""
     frames: int = 600
     """Frames of each measurement."""
     repeats: int = 3
-    """Turns; the least disturbed counts."""
+    """Repeats, of which the fastest counts."""
     clients: int = 4
     cache_megabytes: int = 32
     requests: int = 100_000
-    """Requests that are simulated."""
+    """Simulated requests."""
     replicas: tuple[int, ...] = (1, 3, 10, 30, 100, 300, 1000)
-    """Numbers of replicas that are simulated."""
+    """Simulated numbers of replicas."""
     check: bool = False
-    """Only see that this benchmark works: laws of the simulation, a small measurement."""
+    """Test this benchmark: laws of the simulation and a small measurement."""
 
 
 class Frame(NamedTuple):
@@ -69,27 +71,26 @@ class Frame(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """One turn."""
+    """One repeat of the measurement."""
 
     stages: Stages
-    rate: float  # frames a second of several clients
+    rate: float  # frames per second of several clients
     hit_rate: float
     frame_bytes: float
 
 
-def replay(port: int, scene: SceneMetadata, trace: Trace, numbers: range, size: int, clients: int = 1) -> list[Frame]:
-    """Ask for these frames of the trace, which clients share."""
+def replay(port: int, trace: Trace, numbers: range, size: int, clients: int = 1) -> list[Frame]:
+    """Request these frames of the trace with several clients."""
     own = threading.local()
-    first, last = scene.time_range
 
     def ask(number: int) -> Frame:
         if not hasattr(own, "connection"):
             own.connection = Connection(port)
-        t = first + (last - first) * int(trace.times[number]) / TIMES
         camera = {"type": "orbit", "azimuth": 37 * number % 360, "elevation": 20}
-        body = {"scene": f"scene{int(trace.scenes[number])}", "camera": camera, "t": t, "format": "jpeg"}
+        scene, t = f"scene{int(trace.scenes[number])}", int(trace.times[number]) / TIMES
+        body = {"scene": scene, "camera": camera, "t": t, "format": "jpeg", "width": size, "height": size}
         started = time.perf_counter()
-        answer = own.connection.ask("POST", "/render", {**body, "width": size, "height": size})
+        answer = own.connection.ask("POST", "/render", body)
         if answer.status != 200:
             raise SystemExit(f"the service answered {answer.status}: {answer.body[:200]!r}")
         seconds = time.perf_counter() - started
@@ -99,98 +100,85 @@ def replay(port: int, scene: SceneMetadata, trace: Trace, numbers: range, size: 
         return list(pool.map(ask, numbers))
 
 
-class Bench:
-    """A core, over one scene under several names, and its simulation."""
+@contextmanager
+def one_core_service(options: Scaling, scenes: Path) -> Iterator[Running]:
+    """A service of one thread with all scenes open and kernels loaded."""
+    flags = {"threads": 1, "concurrent_renders": 1, "queued_renders": 64, "cache_megabytes": options.cache_megabytes}
+    with service(scenes, **flags) as running:
+        opening = Trace(np.arange(SCENES), np.full(SCENES, TIMES))
+        replay(running.port, opening, range(SCENES), options.size)
+        yield running
 
-    def __init__(self, options: Scaling, folder: Path) -> None:
-        session = DeformationSession(options.scene)
-        self.options, self._folder, self._scene = options, folder, session.scene.metadata
-        self._pose_bytes = 40 * (session.scene.moving_count + len(session.scene.static_means))
-        self._poses = max(1, (options.cache_megabytes << 20) // self._pose_bytes)
-        self._trace = zipf_trace(options.frames, SCENES, TIMES)
-        self._copies = folder / "scenes"
-        self._copies.mkdir()
-        for number in range(SCENES):
-            shutil.copyfile(options.scene, self._copies / f"scene{number}.onnx")
 
-    def run(self) -> int:
-        """Measure, calibrate, extrapolate."""
-        cores = os.sched_getaffinity(0)
-        turns = [self._turn(sorted(cores)) for _ in range(self.options.repeats)]
-        os.sched_setaffinity(0, cores)
-        best = max(turns, key=lambda turn: turn.rate)  # disturbed least
-        simulated = simulate(self._trace, Fleet(1, poses=self._poses), best.stages, clients=self.options.clients)
-        hit, miss = (1e3 * stage.mean() for stage in best.stages)
-        error = simulated.rate / best.rate - 1
-        print(f"one core, JPEG; {self._poses} poses of {self._pose_bytes / 1e6:.2f} MB fit")
-        print(f"a frame: {hit:.1f} ms if it is posed already, {miss:.1f} ms if not")
-        print(f"measured {best.rate:.1f} frames a second, hit rate {best.hit_rate:.2f}")
-        print(f"simulated {simulated.rate:.1f} frames a second, hit rate {simulated.hit_rate:.2f}: {error:+.1%}")
-        if abs(error) > MIN_PSNR:
-            print("the simulation doesn't reproduce what was measured; nothing is extrapolated", file=sys.stderr)
-            return 1
-        self.extrapolate(best)
-        return 0
+def measure(options: Scaling, trace: Trace, scenes: Path) -> Measured:
+    """A few frames of one client, then of several, and so on, so that other load affects both alike. Services run on
+    one core, clients on another."""
+    alone, together, spent, cores = list[Frame](), list[Frame](), 0.0, os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    with one_core_service(options, scenes) as one, one_core_service(options, scenes) as other:
+        os.sched_setaffinity(0, {max(cores)})
+        for start in range(0, options.frames, FRAMES_PER_TURN):
+            numbers = range(start, min(start + FRAMES_PER_TURN, options.frames))
+            alone += replay(one.port, trace, numbers, options.size)
+            started = time.perf_counter()
+            together += replay(other.port, trace, numbers, options.size, options.clients)
+            spent += time.perf_counter() - started
+    os.sched_setaffinity(0, cores)
+    hits, misses = ([f.seconds for f in alone if f.hit == hit] for hit in (True, False))
+    rate, hit_rate = options.frames / spent, float(np.mean([f.hit for f in together]))
+    return Measured(Stages(np.array(hits), np.array(misses)), rate, hit_rate, float(np.mean([f.size for f in alone])))
 
-    def _turn(self, cores: list[int]) -> Measured:
-        """A few frames of one client, then of several, and so on, so that what else runs disturbs both alike. Services
-        are on one core, clients on another."""
-        alone, together, spent, clients = list[Frame](), list[Frame](), 0.0, self.options.clients
-        os.sched_setaffinity(0, {cores[0]})
-        with self._service() as one, self._service() as other:
-            os.sched_setaffinity(0, {cores[-1]})
-            for start in range(0, self.options.frames, IN_TURN):
-                numbers = range(start, min(start + IN_TURN, self.options.frames))
-                alone += replay(one.port, self._scene, self._trace, numbers, self.options.size)
-                started = time.perf_counter()
-                together += replay(other.port, self._scene, self._trace, numbers, self.options.size, clients)
-                spent += time.perf_counter() - started
-        hits, misses = ([f.seconds for f in alone if f.hit == hit] for hit in (True, False))
-        stages = Stages(np.array(hits), np.array(misses))
-        rate, hit_rate = self.options.frames / spent, float(np.mean([f.hit for f in together]))
-        return Measured(stages, rate, hit_rate, float(np.mean([f.size for f in alone])))
 
-    @contextmanager
-    def _service(self) -> Iterator[Running]:
-        """One thread; all scenes are open, kernels are loaded."""
-        flags = {"threads": 1, "concurrent_renders": 1, "queued_renders": 64}
-        with service(self._copies, cache_megabytes=self.options.cache_megabytes, **flags) as running:
-            opening = Trace(np.arange(SCENES), np.full(SCENES, TIMES))
-            replay(running.port, self._scene, opening, range(SCENES), self.options.size)
-            yield running
-
-    def extrapolate(self, measured: Measured) -> None:
-        """A table from one core to a thousand."""
-        trace, stages = zipf_trace(self.options.requests, CATALOGUE, MOMENTS), measured.stages
-        fleet = Fleet(1, poses=max(1, (LARGE_CACHE << 20) // self._pose_bytes))
-        print(f"\n{CATALOGUE} scenes × {MOMENTS} times, 1/rank; {fleet.poses} poses a replica; {LOAD:.0%} load")
-        print("replicas | routing | hits | frames/s | refused | p50 ms | p99 ms | busiest/mean | Mbit/s | $ a million")
-        routings: tuple[Routing, ...] = ("round robin", "affinity", "bounded")
-        for count, routing in ((count, routing) for count in self.options.replicas for routing in routings):
-            rate = LOAD * count / float(stages.miss.mean())
-            found = simulate(trace, replace(fleet, replicas=count, routing=routing), stages, rate=rate)
-            p50, p99 = 1e3 * np.quantile(found.latencies, [0.5, 0.99])
-            megabits, dollars = found.rate * measured.frame_bytes * 8e-6, count * CORE_HOUR / 3.6e-3 / found.rate
-            print(
-                f"{count} | {routing} | {found.hit_rate:.2f} | {found.rate:.0f} | "
-                f"{found.refused / len(trace.scenes):.1%} | {p50:.0f} | {p99:.0f} | {found.busiest:.2f} | "
-                f"{megabits:.0f} | {dollars:.2f}"
-            )
-        one, three = (simulate(trace, replace(fleet, replicas=n), stages, clients=12 * n).rate for n in (1, 3))
-        print(f"three replicas by affinity, all that they can take: {three / one:.2f} × one")
+def extrapolate(options: Scaling, measured: Measured, pose_bytes: int) -> None:
+    """Print a table from one core to a thousand."""
+    trace, stages = zipf_trace(options.requests, CATALOGUE, CATALOGUE_TIMES), measured.stages
+    fleet = Fleet(1, poses=max(1, (LARGE_CACHE << 20) // pose_bytes))
+    made = table(
+        f"{CATALOGUE} scenes × {CATALOGUE_TIMES} times, 1/rank; {fleet.poses} poses a replica; {LOAD:.0%} load",
+        *("replicas", "routing", "hits", "frames/s", "refused", "p50 ms", "p99 ms", "busiest/mean", "Mbit/s"),
+        "$ a million",
+    )
+    for count, routing in ((count, routing) for count in options.replicas for routing in ROUTINGS):
+        rate = LOAD * count / float(stages.miss.mean())
+        found = simulate(trace, replace(fleet, replicas=count, routing=routing), stages, rate=rate)
+        p50, p99 = 1e3 * np.quantile(found.latencies, [0.5, 0.99])
+        megabits, dollars = found.rate * measured.frame_bytes * 8e-6, count * CORE_HOUR / 3.6e-3 / found.rate
+        cells = f"{found.hit_rate:.2f}", f"{found.rate:.0f}", f"{found.refused / len(trace.scenes):.1%}"
+        times = f"{p50:.0f}", f"{p99:.0f}", f"{found.busiest:.2f}"
+        made.add_row(str(count), routing, *cells, *times, f"{megabits:.0f}", f"{dollars:.2f}")
+    report_console().print(made)
+    one, three = (simulate(trace, replace(fleet, replicas=n), stages, clients=12 * n).rate for n in (1, 3))
+    print(f"three replicas by affinity at full load: {three / one:.2f} times the rate of one")
 
 
 def main(options: Scaling) -> int:
-    """Measure, calibrate, extrapolate."""
+    """Measure, compare with the simulation, extrapolate."""
     if options.check:
         return check()
     print(f"{machine()}; {options.scene.name}, {options.size} × {options.size}, {options.frames} frames")
+    scene, trace = DeformationSession(options.scene).scene, zipf_trace(options.frames, SCENES, TIMES)
+    pose_bytes = 40 * len(scene)
+    poses = max(1, (options.cache_megabytes << 20) // pose_bytes)
     with tempfile.TemporaryDirectory() as folder:
-        return Bench(options, Path(folder)).run()
+        for number in range(SCENES):
+            shutil.copyfile(options.scene, Path(folder) / f"scene{number}.onnx")
+        measured = max((measure(options, trace, Path(folder)) for _ in range(options.repeats)), key=lambda m: m.rate)
+    simulated = simulate(trace, Fleet(1, poses=poses), measured.stages, clients=options.clients)
+    hit, miss = (1e3 * stage.mean() for stage in measured.stages)
+    error = simulated.rate / measured.rate - 1
+    print(f"one core, JPEG; the cache holds {poses} poses of {pose_bytes / 1e6:.2f} MB")
+    print(f"a frame: {hit:.1f} ms with a cached pose, {miss:.1f} ms without")
+    print(f"measured {measured.rate:.1f} frames a second, hit rate {measured.hit_rate:.2f}")
+    print(f"simulated {simulated.rate:.1f} frames a second, hit rate {simulated.hit_rate:.2f}: {error:+.1%}")
+    if abs(error) > MAX_RATE_ERROR:
+        print("the simulation differs too much from the measurement; nothing is extrapolated", file=sys.stderr)
+        return 1
+    extrapolate(options, measured, pose_bytes)
+    return 0
 
 
 def check() -> int:
-    """A cache that holds all misses once per pose; affinity adds caches up; a full queue refuses. Then a small run."""
+    """A cache that holds all misses once per pose, affinity adds caches up, a full queue refuses; then a small run."""
     trace, one = zipf_trace(2000, SCENES, TIMES), Stages(np.array([0.01]), np.array([0.02]))
     distinct = len(set(zip(*(column.tolist() for column in trace), strict=True)))
     alone = simulate(trace, Fleet(1, poses=SCENES * TIMES), one, clients=1)
@@ -202,9 +190,8 @@ def check() -> int:
     assert flooded.refused > 500
     assert flooded.latencies.max() <= 17 * 0.02 + 1e-9
     small = Scaling(size=32, frames=40, repeats=1, requests=500, replicas=(1, 3))
-    with tempfile.TemporaryDirectory() as folder:
-        Bench(small, Path(folder)).extrapolate(Measured(one, 100.0, 0.5, 1e4))
-    assert main(small) in (0, 1)  # on a busy machine the simulation may miss the rate
+    extrapolate(small, Measured(one, 100.0, 0.5, 1e4), pose_bytes=400_000)
+    assert main(small) in (0, 1)  # on a busy machine the simulated rate may differ
     return 0
 
 

@@ -1,13 +1,5 @@
-"""Shares of the queue, and a long mixed load on two services, measured: a table of bars and whether they are met.
+"""Shares of the queue, and a long mixed load on two services: a table of bounds and whether they are met."""
 
-python -m benchmarks.service.soak shares               a single frame beside clients of batches and of single frames
-python -m benchmarks.service.soak soak --minutes 30    frames, batches, films, uploads, damaged and hostile files
-
-The mixed load runs on two services that share a folder behind nginx with the settings of docker/. Each client has a key
-of its own. Times mean something on a machine that does nothing else.
-"""
-
-import argparse
 import base64
 import io
 import json
@@ -24,21 +16,20 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal
 
 import av
 import numpy as np
 import onnx
-from rich.console import Console
-from rich.table import Table
+import tyro
 
+from benchmarks.service.levels import SCENE, Row, memory_row, print_rows
 from benchmarks.service.load import watch_health
 from benchmarks.service.process import Answer, Connection, Running, make_scenes, proxy, service
 from benchmarks.service.requests import Offline, Wanted, digest, images, mixed
 from tests.support.scene_files import write_scene
 
-ROOT = Path(__file__).resolve().parents[2]
-CLIENTS, NEIGHBOURS = 16, 8
+CLIENTS, NEIGHBORS = 16, 8
 CATALOGUE, BATCH, BATCH_BESIDE, FILM = 48, 12, 200, 8
 COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 MAX_WAIT = 5.0
@@ -52,23 +43,14 @@ HOSTILE_BODIES = (
 )
 
 
-class Row(NamedTuple):
-    """A line of the table."""
-
-    what: str
-    bar: str
-    measured: str
-    met: bool
-
-
 def key(number: int) -> str:
-    """Of a client."""
+    """The API key of a client."""
     return f"client-{number:02d}-0123456789"
 
 
 @contextmanager
 def services(folder: Path, work: Path, count: int, **flags: Any) -> Iterator[list[Running]]:
-    """So many over one folder, with a key for each client."""
+    """`count` services over one folder, with a key for each client."""
     keys = work / "keys"
     keys.write_text("".join(f"read,write {key(number)}\n" for number in range(CLIENTS)))
     with ExitStack() as stack:
@@ -76,7 +58,7 @@ def services(folder: Path, work: Path, count: int, **flags: Any) -> Iterator[lis
 
 
 class Client:
-    """With a key and a connection of its own."""
+    """A client with a key and a connection of its own."""
 
     def __init__(self, number: int, port: int) -> None:
         self.number = number
@@ -85,7 +67,7 @@ class Client:
         self._connection = Connection(port)
 
     def ask(self, method: str, path: str, content: bytes | None = None) -> Answer:
-        """Again if the service is full, when it says so."""
+        """The answer; if the service is full, the request is repeated after the time that it names."""
         while True:
             answer = self._connection.send(method, path, content, self._headers)
             self.statuses[answer.status] += 1
@@ -112,22 +94,22 @@ def shares(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
     p99 = {path: 1000 * float(np.quantile(took, 0.99)) for path, took in times.items()}
     ratio = p99["/render/batch"] / p99["/render"]
     measured = f"{ratio:.2f}: {p99['/render/batch']:.0f} and {p99['/render']:.0f} ms, of {[*map(len, times.values())]}"
-    what = f"a frame's p99 beside {NEIGHBOURS} clients of batches, of that beside {NEIGHBOURS} of frames"
+    what = f"a frame's p99 beside {NEIGHBORS} clients of batches, relative to {NEIGHBORS} clients of frames"
     yield Row(what, "<= 3", measured, ratio <= 3)
 
 
 def _beside(running: list[Running], seconds: float, frame: Any, path: str, body: Any) -> list[float]:
-    """Seconds of one client's frames while neighbours call without a pause."""
+    """Seconds of each frame of one client while its neighbors call without a pause."""
     stop, took = threading.Event(), list[float]()
 
-    def neighbour(number: int) -> None:
+    def neighbor(number: int) -> None:
         client = Client(number, running[0].port)
         while not stop.is_set():
             client.post(path, body)
         client.close()
 
-    with ThreadPoolExecutor(NEIGHBOURS) as pool:
-        asked = [pool.submit(neighbour, number) for number in range(1, NEIGHBOURS + 1)]
+    with ThreadPoolExecutor(NEIGHBORS) as pool:
+        asked = [pool.submit(neighbor, number) for number in range(1, NEIGHBORS + 1)]
         client, ends = Client(0, running[0].port), time.monotonic() + seconds
         time.sleep(min(2.0, seconds / 5))
         while time.monotonic() < ends:
@@ -141,7 +123,7 @@ def _beside(running: list[Running], seconds: float, frame: Any, path: str, body:
 
 
 class Soak:
-    """What clients do, and what they find wrong."""
+    """The actions of the clients, and the errors that they find."""
 
     def __init__(self, folder: Path, work: Path, port: int, *, seconds: float) -> None:
         offline = Offline(folder)
@@ -157,12 +139,12 @@ class Soak:
         drawn = Offline(work)
         self._small = [(small._replace(scene=path.stem), digest(drawn.draw(small._replace(scene=path.stem))))
                        for path in self._files]  # fmt: skip
-        self._films: dict[int, np.ndarray] = {}  # what the first of its kind showed
+        self._films: dict[int, np.ndarray] = {}  # by first frame: the film as it was first received
         self._bad = [_external(self._files[0]), self._files[0].read_bytes()[:200], b"no scene", b""]
         self._lock = threading.Lock()
 
     def client(self, number: int) -> None:
-        """Until the time is over."""
+        """Random actions of one client until the time is over."""
         chance, client = random.Random(number), Client(number, self.port)
         actions: list[tuple[Callable[[Client, random.Random], None], int]] = [
             (self._frame, 20), (self._batch, 3), (self._film, 1), (self._upload, 2), (self._damaged, 2),
@@ -214,7 +196,7 @@ class Soak:
         self._expect(alike, f"a film of {len(shown)} frames, {answer.status}")
 
     def _upload(self, client: Client, chance: random.Random) -> None:
-        """Added on one service, drawn and deleted on whichever answers, and gone from both."""
+        """A scene is added on one service, drawn and deleted on either, and then missing on both."""
         number = chance.randrange(len(COLORS))
         name = f"soak-{client.number}-{chance.getrandbits(64)}"
         added = client.ask("POST", f"/scenes?name={name}", self._files[number].read_bytes())
@@ -223,11 +205,11 @@ class Soak:
         answer = client.post("/render", wanted._replace(scene=name).body())
         self._expect((answer.status, digest(answer.body)) == (200, expected), f"uploaded scene: {answer.status}")
         deleted = client.ask("DELETE", f"/scenes/{name}")
-        gone = [client.ask("GET", f"/scenes/{name}?t={each}").status for each in range(4)]  # of both: t chooses which
+        gone = [client.ask("GET", f"/scenes/{name}?t={each}").status for each in range(4)]  # t selects the service
         self._expect((deleted.status, gone) == (204, 4 * [404]), f"delete: {deleted.status}, {gone}")
 
     def _damaged(self, client: Client, chance: random.Random) -> None:
-        """A few bits of a scene are other ones: refused, or a scene that is drawn and deleted again."""
+        """A scene file with flipped bits: it is refused, or drawn and deleted."""
         content = bytearray(chance.choice(self._files).read_bytes())
         for _ in range(chance.randint(1, 4)):
             content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
@@ -246,7 +228,7 @@ class Soak:
             self._expect(status in (400, 422), f"hostile body: {status}")
 
     def _leave(self, client: Client, chance: random.Random) -> None:
-        """In the middle of a batch, or of an upload."""
+        """Disconnect in the middle of a batch or an upload."""
         body = json.dumps({"frames": [each.body() for each in self._wanted]}).encode()
         path, length = chance.choice([("/render/batch", len(body)), ("/scenes?name=half", len(body) + 1)])
         head = f"POST {path} HTTP/1.1\r\nHost: x\r\nX-API-Key: {key(client.number)}\r\nContent-Length: {length}\r\n"
@@ -256,7 +238,7 @@ class Soak:
 
 
 def _external(scene: Path) -> bytes:
-    """A scene whose colors lie in a file of the machine."""
+    """A scene whose colors are stored in another file of the machine."""
     model = onnx.load(scene)
     tensor = next(each for each in model.graph.initializer if each.name == "all_sh")
     tensor.ClearField("raw_data")
@@ -268,7 +250,7 @@ def _external(scene: Path) -> bytes:
 
 
 def soak(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
-    """Sixteen clients on two services; nothing may be wrong, lost or left."""
+    """Sixteen clients on two services: no wrong answer, no lost or leftover file, no growing memory."""
     folder = make_scenes(work / "scenes", scene)
     (work / "small").mkdir()
     before = sorted(path.name for path in folder.iterdir())
@@ -289,21 +271,21 @@ def soak(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
         left = [_handles(each) for each in running]
     title = f"{CLIENTS} clients, 2 services behind nginx, {seconds / 60:.1f} min"
     done = ", ".join(f"{count} {name.strip('_')}" for name, count in sorted(mixture.done.items()))
-    yield Row(f"{title}: answers that are wrong", "none", f"{mixture.wrong[:5] or 'none'}; {done}", not mixture.wrong)
+    yield Row(f"{title}: wrong answers", "none", f"{mixture.wrong[:5] or 'none'}; {done}", not mixture.wrong)
     bad = {status: count for status, count in mixture.statuses.items() if status >= 500 and status not in (503, 507)}
-    yield Row(f"{title}: 5xx but 503 and 507", "none", f"{bad or 'none'}; {dict(mixture.statuses)}", not bad)
+    yield Row(f"{title}: 5xx other than 503 and 507", "none", f"{bad or 'none'}; {dict(mixture.statuses)}", not bad)
     after = sorted(path.name for path in folder.iterdir())
-    yield Row(f"{title}: files left or lost", "none", str(set(after) ^ set(before) or "none"), after == before)
+    yield Row(f"{title}: files lost or left", "none", str(set(after) ^ set(before) or "none"), after == before)
     for number in range(len(running)):
-        yield _flat(f"service {number}: memory", [sample[number][0] for sample in samples], 1 << 20, "MiB")
+        yield memory_row(f"service {number}: memory", [sample[number][0] for sample in samples])
         opened = [sample[number][1] for sample in samples]
-        measured = f"{left[number]} after, {max(opened)} at most, {opened[0]} at first"
+        measured = f"{left[number]} after, maximum {max(opened)}, {opened[0]} at the start"
         yield Row(f"service {number}: handles after the load", "as before", measured, left[number] <= opened[0] + 4)
     yield Row("p99 of /live and /ready", "< 250 ms", f"{p99:.0f} ms", p99 < 250)
 
 
 def _samples(running: list[Running], clients: Sequence[Any]) -> Iterator[list[tuple[int, int]]]:
-    """Memory and handles of the services, again and again until the clients have ended."""
+    """Memory and open files of the services at regular intervals until the clients have ended."""
     while not all(each.done() for each in clients):
         yield [(each.resident_bytes(), _handles(each)) for each in running]
         time.sleep(SAMPLE_SECONDS)
@@ -313,32 +295,32 @@ def _handles(running: Running) -> int:
     return len(os.listdir(f"/proc/{running.process.pid}/fd"))
 
 
-def _flat(what: str, values: list[int], unit: int, name: str) -> Row:
-    """The last fifth of the time beside the second."""
-    fifth = max(1, len(values) // 5)
-    second, last = float(np.median(values[fifth : 2 * fifth])), float(np.median(values[-fifth:]))
-    measured = f"{last / second - 1:+.1%} ({second / unit:.0f} to {last / unit:.0f} {name})"
-    return Row(f"{what}, the last fifth of the time beside the second", "within 5 %", measured, last / second <= 1.05)
+def main(
+    part: Annotated[Literal["shares", "soak"], tyro.conf.Positional], scene: Path = SCENE, minutes: float | None = None
+) -> int:
+    """Measure shares of the queue, or a long mixed load on two services. The exit status is 1 if a bound isn't met.
 
+    `shares`: single frames beside clients of batches and beside clients of single frames.
 
-def main() -> None:
-    """Measure, print the table, end with 1 where a bar isn't met."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("shares", "soak"))
-    parser.add_argument("--scene", type=Path, default=ROOT / "examples" / "toybench.onnx", help="its time is [0, 1]")
-    parser.add_argument("--minutes", type=float, help="default 30 for soak, 0.5 for each half of shares")
-    arguments = parser.parse_args()
-    table = Table("promise", "bar", "measured", "met", title=time.strftime("%Y-%m-%d"))
-    met = True
+    `soak`: frames, batches, films, uploads, damaged and hostile files, on two services that share a folder behind
+    nginx with the settings of docker/.
+
+    python -m benchmarks.service.soak shares
+
+    python -m benchmarks.service.soak soak --minutes 30
+
+    Each client has a key of its own. Use an idle machine.
+
+    Args:
+        part: What to measure.
+        scene: A scene file whose time range is [0, 1].
+        minutes: By default 30 for `soak` and 0.5 for each half of `shares`.
+    """
+    measure, default = (soak, 30.0) if part == "soak" else (shares, 0.5)
     with tempfile.TemporaryDirectory() as work:
-        measure, minutes = (soak, 30.0) if arguments.part == "soak" else (shares, 0.5)
-        for row in measure(arguments.scene, Path(work), 60 * (arguments.minutes or minutes)):
-            table.add_row(row.what, row.bar, row.measured, "yes" if row.met else "NO")
-            met &= row.met
-    console = Console()
-    Console(width=max(console.width, 120)).print(table)
-    sys.exit(not met)
+        met = print_rows(measure(scene, Path(work), 60 * (minutes or default)))
+    return 0 if met else 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tyro.cli(main))

@@ -1,5 +1,5 @@
-"""How well the systems of a comparison can follow motion at all: their layers are trained on the
-known trajectories of points of the synthetic scene instead of images."""
+"""How well the systems of a comparison represent motion: their layers are trained on known trajectories of points of
+the synthetic scene instead of images."""
 
 import statistics
 import sys
@@ -10,14 +10,14 @@ import torch
 import tyro
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
-from benchmarks.measuring import machine
+from benchmarks.measuring import machine, report_console, table
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.comparison.matrix import Budget, ComparedSystem, read_systems
+from msdgs_train.comparison.matrix import Budget, read_systems
 from msdgs_train.datasets.synthetic.motion import OBJECTS, world_positions
 from msdgs_train.datasets.synthetic.trajectories import surface_points
+from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -36,44 +36,43 @@ def main(
     points: int = 400,
     check: bool = False,
 ) -> int:
-    """Train each system on the trajectories of points, and print how far from them it ends.
+    """Train each system on the trajectories of points, and print its final distance from them.
 
     python -m benchmarks.training.known_motion benchmarks/training/ablation.toml --steps 1200 --seeds 0 1 2
 
-    The canonical means are the points at the middle of time; learning rates are those of the system's training, all of
-    time takes part from the start. A step is one time and all points.
+    The canonical means are the points at the middle of the time range. Learning rates are those of the system's
+    training, and all times are used from the start. A step is one time and all points.
 
     Args:
         systems: Presets, or files as `msdgs-train compare` takes them.
-        steps: Of the optimiser.
-        seeds: Of the layers' weights and the order of the times.
-        points: Of each of the objects that move.
-        check: Only see that this works: a model that isn't trained stays in the middle, one that is comes nearer.
+        steps: Optimizer steps.
+        seeds: Seeds of the layers' weights and the order of the times.
+        points: Points of each moving object.
+        check: Test this benchmark: an untrained model stays in the middle, a trained one comes closer.
     """
     if check:
         return self_test()
-    console = Console(soft_wrap=True, highlight=False)
     try:
         known = read_systems(systems, Budget(steps))
     except InvalidInput as error:
-        console.print(f"error: {error}", style="red", markup=False)
+        report_console().print(f"error: {error}", style="red", markup=False)
         return 1
     torch.set_num_threads(1)
-    table = Table("system", *MOVING, "all", "± over seeds", box=None, title=f"1/1000 scene units, rms, {steps:,} steps")
-    followed = [system for system in known if system.config.model.layers]
-    for system in track(followed, "systems", console=Console(stderr=True)):
-        errors = np.array([errors_of(system, seed, points) for seed in seeds])
+    made = table(f"RMS in 1/1000 scene units, {steps:,} steps", "system", *MOVING, "all", "± over seeds")
+    moving = [(name, config) for name, config in known.items() if config.model.layers]
+    for name, config in track(moving, "systems", console=Console(stderr=True)):
+        errors = np.array([errors_of(config, seed, points) for seed in seeds])
         overall = np.sqrt((errors**2).mean(axis=1))
         spread = statistics.stdev(overall) if len(seeds) > 1 else 0.0
-        table.add_row(system.name, *(f"{e:.1f}" for e in (*errors.mean(axis=0), overall.mean())), f"{spread:.1f}")
-    console.print(machine(), table)
+        made.add_row(name, *(f"{e:.1f}" for e in (*errors.mean(axis=0), overall.mean())), f"{spread:.1f}")
+    report_console().print(machine(), made)
     return 0
 
 
-def errors_of(system: ComparedSystem, seed: int, points: int) -> np.ndarray:
-    """[objects] rms distance of a trained model's points to where they are, thousandths of a scene unit."""
+def errors_of(config: TrainConfig, seed: int, points: int) -> np.ndarray:
+    """[objects] RMS distance of a trained model's points from their trajectories, thousandths of a scene unit."""
     local = [surface_points(name, points, seed) for name in MOVING]
-    model, config = _new_model(system, seed, _places(local, 0.5)), system.config
+    model = _new_model(config, seed, _places(local, 0.5))
     schedule, groups = Schedule.from_config(config), model.motion_groups()
     optimizer = make_optimizer(groups, schedule)
     random = np.random.default_rng(seed)
@@ -92,8 +91,8 @@ def errors_of(system: ComparedSystem, seed: int, points: int) -> np.ndarray:
     return 1e3 * np.sqrt(squares)
 
 
-def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicGaussians:
-    sizes, generator = system.config.model, torch.Generator().manual_seed(seed)
+def _new_model(config: TrainConfig, seed: int, canonical: Tensor) -> DynamicGaussians:
+    sizes, generator = config.model, torch.Generator().manual_seed(seed)
     gray = torch.full_like(canonical, 0.5)
     gaussians = CanonicalGaussians.from_points(canonical, gray, sizes.sh_degree, generator, sizes.attributes())
     for name in ("means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"):
@@ -103,15 +102,15 @@ def _new_model(system: ComparedSystem, seed: int, canonical: Tensor) -> DynamicG
 
 
 def _places(local: list[np.ndarray], t: float) -> Tensor:
-    """[objects · points, 3] of all objects at a time."""
+    """[objects · points, 3] positions of the points of all objects at a time."""
     places = [world_positions(name, points, t) for name, points in zip(MOVING, local, strict=True)]
     return torch.from_numpy(np.concatenate(places)).float()
 
 
 def self_test() -> int:
-    """Errors before training are those of points at rest in the middle of their way."""
+    """Errors before training are those of points at rest at the middle of the time range."""
     torch.set_num_threads(1)
-    (before,), (after,) = (read_systems(["msdgs-small"], Budget(steps)) for steps in (1, 150))
+    before, after = (read_systems(["msdgs-small"], Budget(steps))["msdgs-small"] for steps in (1, 150))
     at_rest = []
     for name in MOVING:
         local = surface_points(name, 20, 0)

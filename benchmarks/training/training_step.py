@@ -1,24 +1,16 @@
-"""Where the time of a training step goes: deformation, projection, tiles, blending, loss, each with its gradient, and
-the optimizer.
+"""The time of a training step by part: deformation, projection, tiles, blending, loss, their gradients, optimizer."""
 
-python -m benchmarks.training.training_step --gaussians 10000 --size 200
-python -m benchmarks.training.training_step data/scene --preset msdgs-mlp --gaussians 30000 --size 400
-
-Without a folder it trains on a synthetic scene that it makes. The parts are measured one after the other on the same
-step, repeat after repeat; minimum and median of the repeats are printed, and the sum of the parts beside whole steps.
-In turns with them, steps of several images side by side.
-"""
-
-import argparse
+import sys
 import tempfile
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
+import tyro
 
-from benchmarks.measuring import Times, machine
+from benchmarks.measuring import Times, machine, minimum_and_median, report_console, table
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.compositing_backward import composite_backward
 from msdgs_serve.rasterizer.projection import project
@@ -34,61 +26,72 @@ from msdgs_train.losses.photometric import photometric_loss
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from msdgs_train.systems.registry import preset
 
-FORWARD = ("deformation", "projection", "tiles", "blending", "loss")
-BACKWARD = ("loss gradient", "blending gradient", "projection gradient", "deformation gradient", "optimizer")
+PARTS = ("deformation", "projection", "tiles", "blending", "loss", "loss gradient", "blending gradient",
+         "projection gradient", "deformation gradient", "optimizer")  # fmt: skip
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Options:
+    """Measure the parts of a training step one after the other, repeat after repeat, and whole steps of one and of
+    several images in turns with them.
+
+    python -m benchmarks.training.training_step --gaussians 10000 --size 200
+
+    python -m benchmarks.training.training_step data/scene --preset msdgs-mlp --gaussians 30000 --size 400
+    """
+
+    data: Annotated[Path | None, tyro.conf.Positional] = None
+    """A dataset folder; by default a synthetic scene is generated."""
+    preset: str = "msdgs-small"
+    """The preset whose networks are trained."""
+    gaussians: int = 10_000
+    size: int = 200
+    """Width of the images in pixels."""
+    threads: int = torch.get_num_threads()
+    images: int = 4
+    """Images of a step that is compared with a step of one image."""
+    repeats: int = 15
+    check: bool = False
+    """Test this benchmark at a small size."""
+
+
+def main(options: Options) -> int:
     """Measure and print."""
-    arguments = parse_arguments()
+    if options.check:
+        options = replace(options, check=False, gaussians=300, size=32, repeats=2, threads=1)
     with tempfile.TemporaryDirectory() as made:
-        several, trainer = (make_trainer(arguments, Path(made), n) for n in (arguments.images, 1))
-        for _ in range(3):  # compiled, and Adam has its moments
+        several, trainer = (make_trainer(options, Path(made), n) for n in (options.images, 1))
+        for _ in range(3):  # compiles kernels and gives Adam its moments
             trainer.step()
             several.step()
         times = Times()
-        for _ in range(arguments.repeats):
+        for _ in range(options.repeats):
             measure(trainer, several, times)
-    show(times, arguments)
+    show(times, options)
+    return 0
 
 
-def parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, nargs="?", help="a dataset folder; default: a synthetic scene")
-    parser.add_argument("--preset", default="msdgs-small", help="whose networks are trained")
-    parser.add_argument("--gaussians", type=int, default=10_000)
-    parser.add_argument("--size", type=int, default=200, help="width of the images in pixels")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--images", type=int, default=4, help="side by side, to compare with one after the other")
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--check", action="store_true", help="only see that this works, at a small size")
-    arguments = parser.parse_args()
-    if arguments.check:
-        arguments.gaussians, arguments.size, arguments.repeats, arguments.threads = 300, 32, 2, 1
-    return arguments
-
-
-def make_trainer(arguments: argparse.Namespace, made: Path, images: int) -> Trainer:
-    """A trainer at a step at which all of the model takes part."""
-    data = arguments.data
+def make_trainer(options: Options, made: Path, images: int) -> Trainer:
+    """A trainer whose steps train the whole model."""
+    data = options.data
     if data is None:
         data = made / "scene"
         if not data.exists():
-            generate(data, size=arguments.size, train_frames=8, test_frames=2)
-    count = arguments.gaussians
-    config = preset(arguments.preset).updated(
+            generate(data, size=options.size, train_frames=8, test_frames=2)
+    count = options.gaussians
+    config = preset(options.preset).updated(
         init_num_pts=count,
         max_gaussians=count,
         batch_size=images,
-        threads=arguments.threads,
+        threads=options.threads,
         static_fraction=0.0,
         refine_stop_fraction=0.0,
     )
-    return Trainer(config, load_scene(data, arguments.size))
+    return Trainer(config, load_scene(data, options.size))
 
 
 def measure(trainer: Trainer, several: Trainer, times: Times) -> None:
-    """The parts of a step of one image, then a whole one, and one of several images."""
+    """Time the parts of a step of one image, then a whole step, and a step of several images."""
     torch.set_num_threads(trainer.config.run.threads)
     system = trainer.system
     assert isinstance(system, GaussianSplatting)
@@ -116,32 +119,31 @@ def measure(trainer: Trainer, several: Trainer, times: Times) -> None:
     times.time("several", several.step)
 
 
-def show(times: Times, arguments: argparse.Namespace) -> None:
-    """The table, and the ratios that matter."""
+def show(times: Times, options: Options) -> None:
+    """Print the table, and the ratios that matter."""
     found = times.milliseconds()
     least = {name: each["min"] for name, each in found.items()}
-    total = {kind: sum(found[name][kind] for name in (*FORWARD, *BACKWARD)) for kind in ("min", "median")}
-    table = Table("part", "ms, minimum", "ms, median", "share", box=None)
-    for name in (*FORWARD, *BACKWARD):
-        table.add_row(name, f"{least[name]:.1f}", f"{found[name]['median']:.1f}", f"{least[name] / total['min']:.0%}")
-    table.add_row("all of these", f"{total['min']:.1f}", f"{total['median']:.1f}", "")
-    table.add_row("a whole step", f"{least['whole step']:.1f}", f"{found['whole step']['median']:.1f}", "")
-    console = Console(soft_wrap=True)
-    console.print(machine())
-    console.print(
-        f"{arguments.preset}, {arguments.gaussians:,} Gaussians, {arguments.size} pixels wide, "
-        f"{arguments.threads} threads, {arguments.repeats} repeats"
+    found["all parts"] = {kind: sum(found[name][kind] for name in PARTS) for kind in ("min", "median")}
+    made = table(
+        f"{options.preset}, {options.gaussians:,} Gaussians, {options.size} pixels wide, {options.threads} threads, "
+        f"{options.repeats} repeats",
+        *("part", "ms, minimum (median)", "share"),
     )
-    console.print(table)
+    for name in (*PARTS, "all parts", "whole step"):
+        share = f"{least[name] / found['all parts']['min']:.0%}" if name in PARTS else ""
+        made.add_row(name, minimum_and_median(found[name]), share)
     forward = least["projection"] + least["tiles"] + least["blending"]
     gradient = least["blending gradient"] + least["projection gradient"]
-    each, step = least["several"] / arguments.images, least["whole step"]
-    console.print(f"rasterizer: gradient / forward = {gradient / forward:.2f}")
-    console.print(f"whole step / (forward rendering + deformation) = {step / (forward + least['deformation']):.2f}")
-    console.print(
-        f"{arguments.images} images side by side: {each:.1f} ms each, {step / each:.2f} times as many a second"
+    each, step = least["several"] / options.images, least["whole step"]
+    report_console().print(
+        machine(),
+        made,
+        f"rasterizer: gradient / forward = {gradient / forward:.2f}",
+        f"whole step / (forward rendering + deformation) = {step / (forward + least['deformation']):.2f}",
+        f"{options.images} images in one step: {each:.1f} ms each, {step / each:.2f} times as many per second",
+        sep="\n",
     )
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main(tyro.cli(Options)))

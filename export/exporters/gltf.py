@@ -25,7 +25,7 @@ PRIMITIVE = {
 
 
 def write_gltf(file: Path, gaussians: Gaussians) -> None:
-    """All Gaussians, activated, float32; axes right, up, back. Viewers without the extension show colored points."""
+    """Write all Gaussians, activated, float32; axes right, up, back. Viewers without the extension show points."""
     means, quats, sh = from_right_up_back(gaussians.means, gaussians.quats, gaussians.sh)
     colors = np.concatenate([SH_C0 * sh[:, 0] + 0.5, gaussians.opacities[:, None]], axis=1)
     attributes = {
@@ -80,8 +80,7 @@ def read_gltf(file: Path) -> Gaussians:
     degree = max(int(name.split("_")[-3]) for name in primitive["attributes"] if "SH_DEGREE" in name)
     sh = np.stack([read(name) for name in _sh_names(degree)], axis=1)
     quats = read(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]]
-    turned = (array.astype(np.float32) for array in from_right_up_back(read("POSITION"), quats, sh))
-    means, quats, sh = turned
+    means, quats, sh = (array.astype(np.float32) for array in from_right_up_back(read("POSITION"), quats, sh))
     return Gaussians(means, quats, read(f"{EXTENSION}:SCALE"), read(f"{EXTENSION}:OPACITY")[:, 0], sh).validate()
 
 

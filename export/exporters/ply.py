@@ -7,14 +7,14 @@ from plyfile import PlyData, PlyElement
 
 from msdgs_serve.scene.gaussians import Gaussians
 
-NEAREST_TO_END = 1e-7
-"""Opacities 0 and 1 have no finite logit; this far from them no pixel of 8 bits differs."""
+MIN_LOGIT_DISTANCE = 1e-7
+"""Distance of written opacities from 0 and 1, which have no finite logit. No pixel of 8 bits differs by it."""
 
 
 def write_ply(file: Path, gaussians: Gaussians) -> None:
-    """All Gaussians in storage space: logits of opacities, logarithms of scales, wxyz quaternions; normals are 0."""
-    rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)  # a channel's coefficients together
-    opacities = gaussians.opacities.astype(np.float64).clip(NEAREST_TO_END, 1 - NEAREST_TO_END)
+    """Write all Gaussians in storage space: logits of opacities, log-scales, wxyz quaternions; normals are 0."""
+    rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)  # by channel
+    opacities = gaussians.opacities.astype(np.float64).clip(MIN_LOGIT_DISTANCE, 1 - MIN_LOGIT_DISTANCE)
     columns = {
         **_columns("xyz", gaussians.means),
         **{f"n{axis}": np.zeros(len(gaussians), np.float32) for axis in "xyz"},

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime as ort
 
-from export.exporters.visionary import unpacked
-from export.exporters.visionary_rules import COLORS, COUNT, GAUSSIANS
+from export.exporters.visionary import COLORS, COUNT, GAUSSIANS, unpacked
 from export.measure.frames import compare, render
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
@@ -25,7 +24,7 @@ class ConversionFailed(MsdgsError):
 
 
 class RoundTrip:
-    """Frames of a scene to compare a converted one with."""
+    """Frames of a scene, with which those of a converted one are compared."""
 
     def __init__(self, session: DeformationSession, *, mip: bool = True) -> None:
         """`mip`: whether the other format has the anti-aliasing of Mip-Splatting."""
@@ -41,12 +40,12 @@ class RoundTrip:
 
     def psnr(self, got: Gaussians, t: float) -> float:
         """PSNR of the worst view, dB; frames are clamped to [0, 1]."""
-        expected = self._session.gaussians(t)
-        return min(self._psnr(got, expected, camera) for camera in self._cameras)
+        both = (got, self._session.gaussians(t))
 
-    def _psnr(self, got: Gaussians, expected: Gaussians, camera: Camera) -> float:
-        frames = (render(each, camera, self._background, self._options).astype(np.float64) for each in (got, expected))
-        return compare(*frames).psnr
+        def frames(camera: Camera) -> list[np.ndarray]:
+            return [render(each, camera, self._background, self._options).astype(np.float64) for each in both]
+
+        return min(compare(*frames(camera)).psnr for camera in self._cameras)
 
 
 def visionary_of(file: Path) -> Callable[[float], Gaussians]:
@@ -61,7 +60,7 @@ def visionary_of(file: Path) -> Callable[[float], Gaussians]:
     return shown
 
 
-def require(psnr: float, least: float, what: str) -> None:
-    """Raise `ConversionFailed` under `least` dB."""
-    if not psnr >= least:
-        raise ConversionFailed(f"{what} is {psnr:.1f} dB from the scene, and {least:g} dB were asked for")
+def require(psnr: float, minimum: float, what: str) -> None:
+    """Raise `ConversionFailed` if `psnr` is below `minimum` dB."""
+    if not psnr >= minimum:
+        raise ConversionFailed(f"{what} has {psnr:.1f} dB against the scene, and {minimum:g} dB were asked for")

@@ -12,15 +12,15 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 
 VERSION = 3
-LARGEST = 2**23 - 1
+MAX_FIXED = 2**23 - 1
 MAX_FRACTIONAL_BITS = 23
 SIGN, MAGNITUDE = 512, 511
 
 
 def write_spz(file: Path, gaussians: Gaussians, antialiasing: str) -> None:
-    """All Gaussians; positions with as many fractional bits as the furthest of them leaves.
+    """Write all Gaussians; positions have as many fractional bits as the furthest of them allows.
 
-    Raises `InvalidInput` where one is further than 24 bits reach.
+    Raises `InvalidInput` if one is too far away for 24 bits.
     """
     means, quats, sh = from_right_up_back(*(getattr(gaussians, name) for name in ("means", "quats", "sh")))
     bits = _fractional_bits(float(np.abs(means).max(initial=0)))
@@ -40,13 +40,13 @@ def write_spz(file: Path, gaussians: Gaussians, antialiasing: str) -> None:
 
 
 def _fractional_bits(largest: float) -> int:
-    if largest > LARGEST:
-        raise InvalidInput("scene", f"within {LARGEST:,} units of its origin for SPZ", largest)
-    return min(MAX_FRACTIONAL_BITS, math.floor(math.log2(LARGEST / max(largest, 1e-9))))
+    if largest > MAX_FIXED:
+        raise InvalidInput("scene", f"within {MAX_FIXED:,} units of its origin for SPZ", largest)
+    return min(MAX_FRACTIONAL_BITS, math.floor(math.log2(MAX_FIXED / max(largest, 1e-9))))
 
 
 def _fixed_point(means: np.ndarray, bits: int) -> bytes:
-    fixed = np.round(means.astype(np.float64) * 2**bits).clip(-LARGEST, LARGEST).astype("<i4")
+    fixed = np.round(means.astype(np.float64) * 2**bits).clip(-MAX_FIXED, MAX_FIXED).astype("<i4")
     return fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].tobytes()
 
 
@@ -55,7 +55,7 @@ def _bytes(values: np.ndarray) -> bytes:
 
 
 def _rotations(quats: np.ndarray) -> bytes:
-    """[N] 32 bits: the place of the largest of x, y, z, w, then of each other a sign and 9 bits of its size."""
+    """[N] 32 bits: the index of the largest of x, y, z, w, then a sign and 9 bits of each of the others."""
     quats = quats[:, [1, 2, 3, 0]]
     largest = np.abs(quats).argmax(axis=1)
     quats = quats * np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1, 1)

@@ -1,4 +1,4 @@
-"""A scene over its time as OpenUSD: one ParticleField3DGaussianSplat with a sample of its poses a frame."""
+"""A scene as OpenUSD: one ParticleField3DGaussianSplat with a time sample of its poses per frame."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,9 +21,9 @@ def write_usd(
     times: Sequence[float],
     on_frame: Callable[[], object] = lambda: None,
 ) -> None:
-    """The Gaussians at some times, frames 0, 1, …; one time makes a still. float32, activated; y is up.
+    """Write the Gaussians at some times as frames 0, 1, …, or one time without samples. float32, activated; y is up.
 
-    Opacities and harmonics are those of the first time. Raises `InvalidInput` where OpenUSD, or its schema, is missing.
+    Opacities and SH are those of the first time. Raises `InvalidInput` if OpenUSD or its schema is missing.
     """
     usd, vol, geom, vt = _modules(file)
     stage = usd.Stage.CreateInMemory()
@@ -55,9 +55,9 @@ def write_usd(
 
 
 def read_usd(file: Path) -> Callable[[int], Gaussians]:
-    """What `write_usd` has written, by the number of the frame."""
+    """Read a file of `write_usd`; returns a function from frame numbers to Gaussians."""
     usd, *_ = _modules(file)
-    stage = usd.Stage.Open(str(file))  # prims live as long as it does
+    stage = usd.Stage.Open(str(file))  # prims are valid as long as it exists
 
     def read(name: str, frame: int = 0) -> np.ndarray:
         return np.array(stage.GetDefaultPrim().GetAttribute(name).Get(frame))
@@ -74,13 +74,13 @@ def read_usd(file: Path) -> Callable[[int], Gaussians]:
 
 
 def _modules(file: Path) -> tuple[Any, ...]:
-    """Of OpenUSD, typed loosely: it has no stubs."""
+    """Modules of OpenUSD, which has no type stubs."""
     try:
         from pxr import Usd, UsdGeom, UsdVol, Vt
     except ModuleNotFoundError:
-        raise InvalidInput("out", "something else, or pip install '.[usd]'", f"{file.name} without OpenUSD") from None
+        raise InvalidInput("out", "another format, or pip install '.[usd]'", f"{file.name} without OpenUSD") from None
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
-        raise InvalidInput("out", "something else, or OpenUSD of 26.3 and later", f"{file.name} with an older one")
+        raise InvalidInput("out", "another format, or OpenUSD 26.3 or later", f"{file.name} with an older version")
     return Usd, UsdVol, UsdGeom, Vt
 
 

@@ -1,7 +1,7 @@
 """ONNX for Visionary in a browser: time as input, packed Gaussians and colors as outputs.
 
-The graph is the scene's own with its ids fixed to all of them. What doesn't depend on time is computed here, and
-covariances take the place of rotations and scales.
+The graph is the scene's own for all ids. Everything that doesn't depend on time is computed here, and covariances
+replace rotations and scales.
 """
 
 from pathlib import Path
@@ -11,17 +11,6 @@ import onnx
 import onnxruntime as ort
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
-from export.exporters.visionary_rules import (
-    COLOR_COLUMNS,
-    COLORS,
-    COLUMNS,
-    COUNT,
-    GAUSSIANS,
-    MULTIPLE,
-    OPSET,
-    QUANTISED,
-    check_visionary,
-)
 from export.layers.graph import GraphBuilder
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene
@@ -29,17 +18,23 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 
-IR_VERSION = 8
+OPSET, IR_VERSION = 17, 8
+GAUSSIANS, COLORS, COUNT = "gaussian_f32", "color_f16", "num_points"
+COLUMNS, COLOR_COLUMNS = 10, 48
+MULTIPLE = 256
+"""Rows are padded to a multiple of this with Gaussians of opacity 0."""
+
+QUANTIZED = {"QuantizeLinear", "DequantizeLinear"}
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Rows and columns of the covariance that are kept: xx xy xz yy yz zz."""
+"""Rows and columns of the stored entries of a covariance: xx xy xz yy yz zz."""
 
 
 def visionary_model(scene_file: Path) -> onnx.ModelProto:
     """The model of a scene file. Raises `InvalidInput` for the plan `int8`, whose graph no browser runs on its GPU."""
     scene = DeformationSession(scene_file).scene
     source = onnx.load(scene_file)
-    if any(node.op_type in QUANTISED for node in source.graph.node):
-        raise InvalidInput("scene", "of another plan than int8, as lowrank: to_onnx.py --plan lowrank", "int8")
+    if any(node.op_type in QUANTIZED for node in source.graph.node):
+        raise InvalidInput("scene", "of another plan, for example lowrank: to_onnx.py --plan lowrank", "int8")
     graph = GraphBuilder()
     rows = []
     if scene.moving_count:
@@ -54,22 +49,20 @@ def visionary_model(scene_file: Path) -> onnx.ModelProto:
     colors[:count, : 3 * scene.sh.shape[1]] = scene.sh.reshape(count, -1)
     graph.node("Identity", [graph.constant("harmonics", colors)], COLORS)
     graph.node("Identity", [graph.constant("count", np.array([count], np.int32))], COUNT)
-    model = _model(graph, count + padding)
-    check_visionary(model)
-    return model
+    return _model(graph, count + padding)
 
 
 def _moving(graph: GraphBuilder, source: onnx.GraphProto) -> None:
-    """The nodes of a scene's graph that depend on time, which then is `time`; all others become constants."""
+    """Copy the nodes of a scene's graph that depend on time, its input `t` as `time`; all others become constants."""
     known = {each.name: numpy_helper.to_array(each) for each in source.initializer}
     changing, nodes = {"t"}, list[NodeProto]()
     for node in source.node:
         if changing & set(node.input):
             changing |= set(node.output)
             nodes.append(node)
-    still = [node for node in source.node if node not in nodes]
+    static = [node for node in source.node if node not in nodes]
     needed = {name for node in nodes for name in node.input} | {"means", "quats", "scales"}
-    known |= _computed(still, source, sorted(needed & {name for node in still for name in node.output}))
+    known |= _computed(static, source, sorted(needed & {name for node in static for name in node.output}))
     for name in sorted(needed & set(known)):
         values = known[name]
         graph.constant(name, values.astype(np.float32) if values.dtype in (np.int16, np.float16) else values)
@@ -81,11 +74,11 @@ def _moving(graph: GraphBuilder, source: onnx.GraphProto) -> None:
 
 
 _RENAMED = {"t": "time", "time": "scene.time"}
-"""Values of a scene's graph that are called otherwise here."""
+"""Values of a scene's graph that have another name here."""
 
 
 def _computed(nodes: list[NodeProto], source: onnx.GraphProto, names: list[str]) -> dict[str, np.ndarray]:
-    """Values that don't depend on time."""
+    """Compute values that don't depend on time."""
     if not names:
         return {}
     outputs = [onnx.ValueInfoProto(name=name) for name in names]
@@ -98,7 +91,7 @@ def _computed(nodes: list[NodeProto], source: onnx.GraphProto, names: list[str])
 
 
 def _packed(graph: GraphBuilder, opacities: np.ndarray) -> str:
-    """[M, 10] of `means`, `quats` and `scales`: position, opacity, covariance R S Sᵀ Rᵀ."""
+    """[M, 10] position, opacity and covariance R S Sᵀ Rᵀ, from `means`, `quats` and `scales`."""
     first, second, matrix_of = _quadratic()
     monomials = graph.node("Mul", [_take(graph, "quats", first), _take(graph, "quats", second)], "quats.monomials")
     matrix = graph.node("MatMul", [monomials, graph.constant("quats.to_matrix", matrix_of)], "rotation")
@@ -164,7 +157,7 @@ def _model(graph: GraphBuilder, rows: int) -> onnx.ModelProto:
 
 
 def unpacked(gaussians: np.ndarray, colors: np.ndarray, count: int) -> Gaussians:
-    """What a viewer draws of the outputs: rotations and scales are the axes of the covariances."""
+    """The Gaussians that a viewer draws from the outputs: rotations and scales are the axes of the covariances."""
     rows = gaussians[:count].astype(np.float64)
     covariances = np.empty((count, 3, 3))
     for column, (i, j) in enumerate(PAIRS):

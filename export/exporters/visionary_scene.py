@@ -1,4 +1,4 @@
-"""The `scene.json` that opens a model in Visionary's editor: where it stands, and what is behind it."""
+"""The `scene.json` that opens a model in Visionary's editor: its transform and the background."""
 
 from datetime import UTC, datetime
 from typing import Any
@@ -15,9 +15,8 @@ VERSION = 1
 def visionary_scene(model: str, metadata: SceneMetadata) -> dict[str, Any]:
     """A scene of one model, the name of a file beside it.
 
-    The model is turned so that its up is y, as three.js has it, and what its cameras look at is moved to the origin.
-    Rotations are Euler angles in radians, turned about x, then the turned y, then the turned z. Keys and their meaning
-    are those of the example that comes with Visionary.
+    The model is rotated so that up is y, as in three.js, and the target of its cameras is moved to the origin.
+    Rotations are Euler angles in radians, intrinsic, in the order XYZ. The keys are those of Visionary's example.
     """
     view = framing(metadata)
     turn = Rotation.align_vectors([[0.0, 1.0, 0.0]], view.up[None])[0]

@@ -1,6 +1,6 @@
-"""Importers of scenes from other programs: one module a format.
+"""Importers of scenes from other programs, one module per format.
 
-Each reader treats its input as hostile: sizes are checked before memory is allocated, no code in a file is run, and
+All readers treat their input as hostile: sizes are checked before memory is allocated, no code in a file is run, and
 errors name the file.
 """
 

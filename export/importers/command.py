@@ -19,10 +19,10 @@ from msdgs_serve.scene.errors import InvalidInput
 
 @contextmanager
 def model_or_import(path: Path, file_format: str, output: Path, console: Console) -> Iterator[Path | None]:
-    """The model.pt to export: `path` itself, or one made of another trainer's run, there until the end of the block.
+    """The model.pt to export: `path` itself, or a temporary one that is made from another trainer's run.
 
-    Splats and sequences are written as scene files at once; then there is None. `file_format` is one of `FORMATS`, or
-    "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
+    Splats and sequences are written as scene files directly; the result is then None. `file_format` is one of
+    `FORMATS`, or "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
     """
     if file_format == "detect":
         file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
@@ -65,7 +65,7 @@ def _sequence(path: Path, file_format: str, output: Path, console: Console) -> B
             lambda: progress.advance(comparing),
             rows=lambda t: shown_rows(sequence, times.index(t)),
         )
-    way = "blended into each other" if sequence.blended else "switched, since they don't correspond or were not to"
+    way = "blended" if sequence.blended else "switched, since they don't correspond or blending is off"
     console.print(f"{len(times)} frames, {way}")
     return scene
 

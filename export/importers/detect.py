@@ -1,11 +1,11 @@
-"""Which format a file or folder is, by its contents; names decide only where contents can't."""
+"""Detection of the format of a file or folder by its contents, or by its name if the contents don't tell."""
 
 import re
 import zipfile
 from pathlib import Path
 
 from export.importers.errors import ImportFailed
-from export.importers.runs.model import RUNS
+from export.importers.runs.model import RUNS, run_format
 from export.importers.splats.formats import READERS, splat_format
 from msdgs_serve.scene.errors import InvalidInput
 
@@ -16,7 +16,7 @@ FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat")
 
 
 def detect_format(path: Path) -> str:
-    """The format of `path`, one of `FORMATS`. Raises `ImportFailed` if it is none, saying which can be read."""
+    """The format of `path`, one of `FORMATS`. Raises `ImportFailed` listing the formats if it is none."""
     if not path.exists():
         raise ImportFailed(path, "no such file or folder")
     try:
@@ -38,9 +38,9 @@ def checked_format(text: str) -> str:
 
 
 def frame_files(folder: Path) -> list[Path]:
-    """The splat files of a folder in the order of the number in which alone their names differ.
+    """The splat files of a folder in the order of the number in their names.
 
-    Raises `ImportFailed` naming two that differ in anything else: they are scenes of their own, not frames of one.
+    Raises `ImportFailed` naming two whose names differ in anything else: they are separate scenes, not frames.
     """
     if not folder.is_dir():
         raise ImportFailed(folder, "isn't a folder of frames")
@@ -57,7 +57,7 @@ def frame_files(folder: Path) -> list[Path]:
 
 
 def _name_and_numbers(file: Path) -> list[str]:
-    """What is between numbers at even places, numbers at odd ones, the ending last."""
+    """The name split into text at even indices and numbers at odd ones; the last text includes the suffix."""
     parts = re.split(r"([0-9]+)", file.stem)
     return [*parts[:-1], f"{parts[-1]}{file.suffix.lower()}"]
 
@@ -69,7 +69,4 @@ def _model(path: Path) -> str | None:
 def _folder(path: Path) -> str | None:
     if (path / "model.pt").is_file():
         return "model"
-    runs = [name for name, importer in RUNS.items() if importer.detects(path)]
-    if runs:
-        return runs[0]
-    return "sequence" if len(frame_files(path)) > 1 else None
+    return run_format(path) or ("sequence" if len(frame_files(path)) > 1 else None)

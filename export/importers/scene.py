@@ -1,18 +1,17 @@
 """Scene files of imported Gaussians: metadata, and the check of a file before it replaces an old one."""
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
-from onnx import helper
 
 from export.importers.splats.base import Splats
 from export.jobs.bake import Baked, Moving
-from export.jobs.write import properties
+from export.jobs.write import properties, set_properties
+from export.measure.poses import half_diagonal
 from export.plans.base import BASELINE
 from export.plans.registry import build
 from msdgs_serve import __version__
@@ -24,16 +23,15 @@ from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.datasets.common.files import replacing
 
 WITHIN = (0.01, 0.99)
-"""Parts of the Gaussians below and above which, along each axis, their centres may lie outside of the bounds: strays of
-a trained scene are often far away."""
+"""Quantiles of the centers along each axis that make the bounds, since strays of a trained scene are often far away."""
 
 UP = np.array([0.0, -1.0, 0.0])
-"""Of files that don't say: COLMAP's axes, in which INRIA's trainer and most others work."""
+"""Up axis of files that don't name one: COLMAP's, which INRIA's trainer and most others use."""
 
 CAMERAS, SIZE, FOV_Y, ELEVATION = 6, 800, 50.0, 15.0
-"""Starting cameras on a circle, pixels and degrees, since the files hold none."""
+"""Number, pixels and degrees of starting cameras on a circle, since the files hold none."""
 
-NEAR = 2.2
+DISTANCE = 2.2
 """Distance of these cameras from the middle, in half diagonals of the bounds."""
 
 
@@ -73,9 +71,9 @@ def metadata_of(
 
 
 def cameras_around(low: np.ndarray, high: np.ndarray) -> tuple[SceneCamera, ...]:
-    """On a circle about the middle of a box, `UP` upwards."""
-    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
-    poses = [orbit(middle, NEAR * reach, 360 * i / CAMERAS, ELEVATION, UP) for i in range(CAMERAS)]
+    """Cameras on a circle around the middle of a box, with `UP` upwards."""
+    middle, reach = (low + high) / 2, max(half_diagonal((low, high)), 1e-3)
+    poses = [orbit(middle, DISTANCE * reach, 360 * i / CAMERAS, ELEVATION, UP) for i in range(CAMERAS)]
     return tuple(
         SceneCamera(f"around {i}", 0.0, Camera.from_fov(pose, SIZE, SIZE, FOV_Y)) for i, pose in enumerate(poses)
     )
@@ -89,11 +87,11 @@ def write_imported(
     on_time: Callable[[], object] = lambda: None,
     rows: Callable[[float], slice] = lambda t: slice(None),
 ) -> BakedScene:
-    """Write a scene file beside `output`, compare it with what was read at some times, and only then move it there.
+    """Write a scene file beside `output`, compare it at some times with the imported files, then move it there.
 
-    `rows` are those of the scene that `expected` has. The largest differences go into the metadata: of means relative
-    to the half diagonal of the bounds or, further out, to the largest coordinate; of entries of rotation matrices; of
-    scales relative to a Gaussian's largest. Raises `SceneFileInvalid`.
+    `rows` are the rows of the scene that `expected` returns. The largest differences are stored in the metadata: of
+    means relative to the half diagonal of the bounds or, further out, to the largest coordinate; of entries of rotation
+    matrices; of scales relative to a Gaussian's largest. Raises `SceneFileInvalid`.
     """
     with replacing(output) as temporary:
         temporary.write_bytes(contents.SerializeToString())
@@ -105,32 +103,28 @@ def write_imported(
             on_time()
         measured = properties(contents)["measured_error"] | worst
         measured |= {"against": "the files that were imported", "times": len(times)}
-        values = {**properties(contents), "measured_error": measured}
-        helper.set_model_props(contents, {name: json.dumps(value, allow_nan=False) for name, value in values.items()})
+        set_properties(contents, measured_error=measured)
         temporary.write_bytes(contents.SerializeToString())
         return DeformationSession(temporary).scene
 
 
 def note_left_out(file: Path, lost: Sequence[dict[str, Any]]) -> None:
-    """Add to what a scene file lists as left out, before what the export left out of the rest."""
+    """Prepend entries to `left_out` of a scene file."""
     contents = onnx.load(file)
-    values = properties(contents)
-    values["left_out"] = [*lost, *values["left_out"]]
-    helper.set_model_props(contents, {name: json.dumps(value, allow_nan=False) for name, value in values.items()})
+    set_properties(contents, left_out=[*lost, *properties(contents)["left_out"]])
     with replacing(file) as temporary:
         temporary.write_bytes(contents.SerializeToString())
 
 
 def _differences(session: DeformationSession, expected: Gaussians, t: float, rows: slice) -> dict[str, float]:
     means, quats, scales = (getattr(session.gaussians(t), name)[rows] for name in ("means", "quats", "scales"))
-    low, high = np.array(session.scene.metadata.bounds)
-    size = max(float(np.linalg.norm(high - low)) / 2, 1e-30)
+    size = half_diagonal(session.scene.metadata.bounds)
     far = np.maximum(np.abs(expected.means.astype(np.float64)).max(axis=1, initial=0), size)
-    turned = np.abs(to_matrix(quats.astype(np.float64)) - to_matrix(expected.quats.astype(np.float64)))
+    rotated = np.abs(to_matrix(quats.astype(np.float64)) - to_matrix(expected.quats.astype(np.float64)))
     largest = expected.scales.max(axis=1, initial=0).astype(np.float64)
     return {
         "means": float((np.abs(means - expected.means).max(axis=1) / far).max(initial=0)),
-        "quats": float(turned.max(initial=0)),
+        "quats": float(rotated.max(initial=0)),
         "scales": float((np.abs(scales - expected.scales).max(axis=1) / largest).max(initial=0)),
     }
 

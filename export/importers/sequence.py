@@ -1,9 +1,9 @@
-"""A folder of numbered splat files, one a frame, to a scene that moves.
+"""A folder of numbered splat files, one per frame, to a moving scene.
 
-Where the n-th Gaussian of a frame is the n-th of the next, and only poses differ, frames are the points of a cubic
-spline: plan `keyframes`. Elsewhere frames are switched: the scene holds the Gaussians of all of them, and a graph
-shows those of the frame that is nearest in time. Opacities are constants of a scene file, so what isn't shown is
-parked far below the scene, as small as a Gaussian can be: plan `frames`.
+If the n-th Gaussian of a frame is the n-th of the next, and only poses differ, frames are blended: they are points of a
+cubic spline, plan `keyframes`. Otherwise frames are switched: the scene holds the Gaussians of all frames, and a graph
+shows those of the frame nearest in time. Opacities are constants of a scene file, so Gaussians of other frames are
+moved far below the scene and scaled down to the smallest size, plan `frames`.
 """
 
 from collections.abc import Callable
@@ -21,6 +21,7 @@ from export.importers.scene import UP, metadata_of
 from export.importers.splats.base import Splats
 from export.importers.splats.formats import read_splats
 from export.jobs.bake import Baked, Moving
+from export.measure.poses import half_diagonal
 from export.plans.scene_graph import activated, finished, new_graph
 from export.trajectories.sampling import give_one_sign
 from export.trajectories.splines import design
@@ -33,7 +34,7 @@ CONSTANT = 0.02
 """Opacities and SH coefficients may differ by this between frames that are blended: two steps of 8 bits."""
 
 APART = 3.0
-"""How many times as far from its nearest neighbour a Gaussian may be in the next frame, at nine in ten."""
+"""Largest growth of the distance to the nearest neighbor in the next frame, for 90 % of the Gaussians."""
 
 SAMPLED = 5_000
 
@@ -46,7 +47,7 @@ MAX_GAUSSIANS = 1 << 26
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames in the order of time, which runs evenly from 0 to 1."""
+    """Frames at evenly spread times from 0 to 1."""
 
     gaussians: tuple[Gaussians, ...]
     dropped: int
@@ -54,19 +55,18 @@ class Frames:
     blended: bool
 
     def times(self) -> list[float]:
-        """Of the frames."""
+        """The times of the frames."""
         return np.linspace(0, 1, len(self.gaussians)).tolist()
 
 
 def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], object] = lambda: None) -> Frames:
-    """All numbered files of a folder. `how`: `blend`, `switch`, or None to decide by what is in them.
+    """Read all numbered files of a folder. `how`: `blend`, `switch`, or None to decide by their contents.
 
-    Raises `ImportFailed` where a file can't be read, there is only one, or frames that don't correspond are to be
-    blended.
+    Raises `ImportFailed` if a file can't be read, there is only one, or frames that don't correspond are to be blended.
     """
     files = frame_files(folder)
     if len(files) < 2:
-        raise ImportFailed(folder, "holds no sequence: two numbered .ply, .sog, .spz or .splat files at least")
+        raise ImportFailed(folder, "holds no sequence of two or more numbered .ply, .sog, .spz or .splat files")
     read: list[Splats] = []
     for file in files:
         read.append(read_splats(file))
@@ -78,7 +78,7 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     modes, degrees = {each.antialiasing for each in read}, {each.gaussians.sh_degree for each in read}
     if len(modes) > 1 or len(degrees) > 1:
         found = f"anti-aliasing {sorted(modes)} and SH of degrees {sorted(degrees)}"
-        raise ImportFailed(folder, f"its frames differ in what a scene has once: {found}")
+        raise ImportFailed(folder, f"its frames differ in properties of the whole scene: {found}")
     frames, dropped = tuple(each.gaussians for each in read), sum(each.dropped for each in read)
     problem = None if how == "switch" else _why_not_blended(frames, any(each.dropped for each in read))
     if how == "blend" and problem:
@@ -92,12 +92,9 @@ def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:
 
 
 def posed(sequence: Frames, number: int) -> Gaussians:
-    """What the scene shows of one frame, in the order of the scene: without those of other frames if they switch."""
+    """The Gaussians of one frame in the order of the scene, without those of other frames if they are switched."""
     g = sequence.gaussians[number]
-    if not sequence.blended:
-        return g
-    order = np.concatenate(_parts(sequence))
-    return Gaussians(g.means[order], g.quats[order], g.scales[order], g.opacities[order], g.sh[order])
+    return _rows(g, np.concatenate(_parts(sequence))) if sequence.blended else g
 
 
 def shown_rows(sequence: Frames, number: int) -> slice:
@@ -109,22 +106,25 @@ def shown_rows(sequence: Frames, number: int) -> slice:
 
 
 def is_switched(plan: str) -> bool:
-    """Whether a scene of this plan shows one frame after the other, of which nothing lies between."""
+    """Whether a scene of this plan switches from frame to frame without blending."""
     return plan.startswith("frames:")
 
 
 def of_the_moment(gaussians: Gaussians, plan: str) -> Gaussians:
-    """Without those of other frames, which scenes of the plan `frames:n` park far below."""
+    """The Gaussians of the frame that is shown, without those of other frames in a scene of the plan `frames:n`."""
     if not is_switched(plan):
         return gaussians
-    here = np.flatnonzero((gaussians.scales > MIN_SCALE).any(axis=1))
-    return Gaussians(*(getattr(gaussians, part)[here] for part in ("means", "quats", "scales", "opacities", "sh")))
+    return _rows(gaussians, np.flatnonzero((gaussians.scales > MIN_SCALE).any(axis=1)))
+
+
+def _rows(gaussians: Gaussians, ids: np.ndarray) -> Gaussians:
+    return Gaussians(**{name: array[ids] for name, array in vars(gaussians).items()})
 
 
 def _why_not_blended(frames: tuple[Gaussians, ...], dropped: bool) -> str | None:
     first = frames[0]
     if dropped:
-        return "some of its Gaussians can't be drawn, so the n-th of two frames may be different ones"
+        return "some of its Gaussians can't be drawn, so the n-th Gaussians of two frames may differ"
     for number, frame in enumerate(frames[1:], start=1):
         if len(frame) != len(first):
             return f"frame 0 has {len(first):,} Gaussians, frame {number} {len(frame):,}"
@@ -132,13 +132,13 @@ def _why_not_blended(frames: tuple[Gaussians, ...], dropped: bool) -> str | None
             if np.abs(getattr(frame, name) - getattr(first, name)).max() > CONSTANT:
                 return f"{name} change, by frame {number}, and a scene file holds them as constants"
     for number in range(len(frames) - 1):
-        if not _neighbours_stay(frames[number].means, frames[number + 1].means):
+        if not _neighbors_stay(frames[number].means, frames[number + 1].means):
             return f"the n-th Gaussian of frame {number} isn't the n-th of the next"
     return None
 
 
-def _neighbours_stay(now: np.ndarray, later: np.ndarray) -> bool:
-    """Whether what is near in one frame is near in the next: shuffled or newly sorted Gaussians lose each other."""
+def _neighbors_stay(now: np.ndarray, later: np.ndarray) -> bool:
+    """Whether neighbors stay neighbors in the next frame, which they don't if Gaussians are reordered."""
     if len(now) < 2:
         return True
     chosen = np.unique(np.linspace(0, len(now) - 1, min(len(now), SAMPLED)).astype(int))
@@ -161,16 +161,16 @@ def _parts(sequence: Frames) -> tuple[np.ndarray, np.ndarray]:
 
 def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     frames = sequence.gaussians
-    moving, still = _parts(sequence)
+    moving, static = _parts(sequence)
     first, count = frames[0], len(frames)
     metadata = metadata_of(np.concatenate([f.means for f in frames]), first.sh_degree, sha256, sequence.antialiasing)
-    order = np.concatenate([moving, still])
+    order = np.concatenate([moving, static])
     scene = BakedScene(
         replace(metadata, plan=f"keyframes:{count + 2}"),
         len(moving),
-        first.means[still],
-        first.quats[still],
-        first.scales[still],
+        first.means[static],
+        first.quats[static],
+        first.scales[static],
         first.opacities[order],
         first.sh[order],
     ).validate("the imported sequence")
@@ -179,12 +179,13 @@ def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
     baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving]), ())
     graph = new_graph(baked)
-    activated(graph, of_ids(graph, GriddedPoses.on_one(StoredPoses.of(control)), metadata.time_range))
+    stored = GriddedPoses(((np.arange(len(control)), StoredPoses.of(control)),))
+    activated(graph, of_ids(graph, stored, metadata.time_range))
     return finished(graph, baked, f"keyframes:{count + 2}")
 
 
 def _through(count: int) -> np.ndarray:
-    """[n + 2, n] control points of the natural cubic spline through n evenly spread points, a knot at each of them."""
+    """[n + 2, n] from n evenly spread points to control points of the natural cubic spline with a knot at each."""
     rows = design(count + 2, count)
     ends = np.zeros((2, count + 2))
     # second derivatives at the ends of a clamped spline with equal intervals, times a constant
@@ -208,7 +209,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
     baked = Baked(scene, Moving(means, scales, quats), ())
     graph = new_graph(baked)
     low, high = np.array(metadata.bounds)
-    parked = (low + high) / 2 - PARKED_AT * max(float(np.linalg.norm(high - low)) / 2, 1e-3) * UP
+    parked = (low + high) / 2 - PARKED_AT * max(half_diagonal(metadata.bounds), 1e-3) * UP
 
     half = graph.constant("frames.half", np.array([0.5], np.float32))
     last = graph.constant("frames.last", np.array([len(frames) - 1], np.float32))

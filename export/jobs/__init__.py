@@ -1,1 +1,1 @@
-"""From a model file to a scene file: candidates, the sweep over them, and its report."""
+"""The export of a model file: candidates, the sweep over them, its report, and the written scene file."""

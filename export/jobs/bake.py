@@ -25,7 +25,7 @@ STARTING_CAMERAS = 8
 
 
 DELTA_SPACES: dict[ScaleSpace, str] = {"log": "raw", "linear": "activated"}
-"""As scene files name them."""
+"""Names of scale spaces in scene files."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Moving:
     quats: FloatArray  # [M, 4] wxyz, unit
     modulation: dict[str, FloatArray] = field(default_factory=dict)
     """By head: factors of its deltas (equation 12), [M, 3] or [M, 4]."""
-    attributes: dict[str, np.ndarray] = field(default_factory=dict)  # what the support stores per Gaussian
-    baked_attributes: dict[str, np.ndarray] = field(default_factory=dict)  # and as a graph reads it: `Support.baked`
+    attributes: dict[str, np.ndarray] = field(default_factory=dict)  # stored by the support per Gaussian
+    baked_attributes: dict[str, np.ndarray] = field(default_factory=dict)  # as a graph reads it: `Support.baked`
 
     @classmethod
     def none(cls) -> "Moving":
@@ -52,19 +52,19 @@ class Moving:
 
 @dataclass(frozen=True)
 class Baked:
-    """All that a plan needs to write a scene file."""
+    """The input of a plan: everything that a scene file stores."""
 
     scene: BakedScene
     moving: Moving
-    layers: tuple[DeformationLayer, ...]  # float32; empty where nothing moves
+    layers: tuple[DeformationLayer, ...]  # float32; empty if nothing moves
     support: Support = field(default_factory=lambda: GaussiansConfig().build())
 
 
 def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Baked:
-    """Everything that doesn't depend on time, evaluated in float32. The model isn't changed.
+    """Evaluate everything that doesn't depend on time in float32. The model isn't changed.
 
-    Without deformation layers, or without Gaussians, all of the scene is static. Raises `ModelNotExportable` naming
-    what `msdgs/1` has no place for.
+    Without deformation layers, or without Gaussians, the whole scene is static. Raises `ModelNotExportable` for parts
+    that `msdgs/1` can't hold.
     """
     _refuse_heads(model)
     with torch.no_grad():
@@ -124,7 +124,7 @@ def _metadata(
 
 
 def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
-    """At most eight of the training cameras, evenly spread, the first and the last among them."""
+    """Up to eight of the training cameras, evenly spread, including the first and the last."""
     chosen = np.linspace(0, len(info.cameras) - 1, min(STARTING_CAMERAS, len(info.cameras))).round().astype(int)
     try:
         return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)

@@ -14,13 +14,14 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, ExportJob, TargetNotReached, Track
+from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
 from export.jobs.sweep import Sweep
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
 from export.plans.registry import parse
+from export.progress import Track
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.evaluation.metrics import MAX_PSNR
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from export.measure.images import HeldOutImages
 
 LOWEST_MIN_PSNR = 10.0
-"""dB. Frames below it have nothing in common with the scene."""
+"""Smallest `min_psnr`, dB. Frames below it don't resemble the scene."""
 
 WIDE = 180
 """Width of the terminal, in characters, from which the table has all columns."""
@@ -79,7 +80,7 @@ def _tracker(console: Console, progress: Progress) -> Track:
     started = time.monotonic()
 
     def track(what: str, steps: int) -> Callable[[], object]:
-        if steps and not console.is_terminal:  # a log shows no bars
+        if steps and not console.is_terminal:  # no progress bars in a log
             console.print(f"{time.monotonic() - started:5.0f} s  {what} …", markup=False)
         task = progress.add_task(what, total=steps)
         return lambda: progress.advance(task)
@@ -112,7 +113,7 @@ def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutIma
 
 
 def _planned(job: ExportJob, plan: str, min_psnr: float) -> tuple[Candidate, RenderedError]:
-    """The plan asked for, pruned as far as its own error leaves room."""
+    """A candidate of the plan that was asked for, pruned as far as its own error allows."""
     whole = job.candidate(plan, None)
     best = job.error(whole)
     if best.psnr_worst < min_psnr:
@@ -129,13 +130,12 @@ def _planned(job: ExportJob, plan: str, min_psnr: float) -> tuple[Candidate, Ren
 
 
 def _print_table(contents: dict, console: Console) -> None:
-    """All columns if they fit, else the most important ones; the report has them all."""
+    """Print all columns if they fit, else the most important ones; the report has all."""
     names = list(COLUMNS) if console.width >= WIDE else [name for name in COLUMNS if name in NARROW_COLUMNS]
     table = Table(*(Column(name, no_wrap=True) for name in names), box=None)
-    usual = [row for row in rows(contents) if names == list(COLUMNS) or not row[COLUMNS.index("rasterizer")]]
-    for row in usual:
-        cells = [cell for name, cell in zip(COLUMNS, row, strict=True) if name in names]
-        table.add_row(*cells, style="bold" if row[0] == "★" else None)
+    for row in (dict(zip(COLUMNS, cells, strict=True)) for cells in rows(contents)):
+        if "rasterizer" in names or not row["rasterizer"]:
+            table.add_row(*(row[name] for name in names), style="bold" if row[""] == "★" else None)
     console.print(table)
 
 
@@ -150,13 +150,13 @@ def _print_chosen(chosen: Candidate, error: RenderedError, exported: Exported, c
     console.print(
         f"worst of {error.frames} frames against the exact network in float64: {error.psnr_worst:.1f} dB, "
         f"mean {error.psnr_mean:.1f} dB, worst pixel {error.worst_pixel:.3f}\n"
-        f"poses against the layers that are left, {measured['times']} times: means {measured['means']:.1e}, "
+        f"poses against the remaining layers, {measured['times']} times: means {measured['means']:.1e}, "
         f"quats {measured['quats']:.1e}, scales {measured['scales']:.1e}: passed"
     )
     if measured["unstable"]["count"]:
         console.print(
-            f"{measured['unstable']['count']:,} Gaussians are left out of these errors: there the model's own float32 "
-            f"differs from its float64. The worst is off by {measured['unstable']['error']:.1e}"
+            f"{measured['unstable']['count']:,} Gaussians, with poses that differ between the model's own float32 and "
+            f"float64, are excluded from these errors. Their largest error is {measured['unstable']['error']:.1e}"
         )
     console.print(
         f"{exported.path}: plan {chosen.plan}, {exported.size / 1e6:.2f} MB, {exported.moving_count:,} moving and "

@@ -7,11 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullLocator
 
-from export.jobs.points import DEFAULT_RASTERIZER
+from export.jobs.sweep import DEFAULT_RASTERIZER
 from export.plans.registry import PLANS
 
 DB_STEP = 10
-CLOSEST = 100.0
+MAX_DB = 100.0
 LABEL_SIZE = np.array([250, 15])
 """Pixels reserved for a label."""
 
@@ -70,7 +70,7 @@ def _text(point: dict[str, Any]) -> str:
 
 def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> None:
     decibels = [point["error"]["psnr_worst"] for point in points]
-    ticks = np.arange(DB_STEP * np.floor(min(decibels) / DB_STEP), min(max(decibels), CLOSEST) + DB_STEP, DB_STEP)
+    ticks = np.arange(DB_STEP * np.floor(min(decibels) / DB_STEP), min(max(decibels), MAX_DB) + DB_STEP, DB_STEP)
     axes.yaxis.set_major_locator(FixedLocator([_rms(db) for db in ticks]))
     axes.yaxis.set_major_formatter(FixedFormatter([f"{db:.0f} dB\n{100 * _rms(db):.2g} %" for db in ticks]))
     axes.yaxis.set_minor_locator(NullLocator())

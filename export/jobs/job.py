@@ -1,7 +1,7 @@
-"""The exports of one model file: candidates by plan, exact frames and pruning statistics that all of them use."""
+"""The exports of one model file: candidates by plan, and the exact frames and pruning statistics that all use."""
 
 import hashlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +14,10 @@ from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.registry import build, plan_of
+from export.progress import Track, no_progress
 from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
-from export.pruning.bake import bake_pruned
-from export.pruning.mask import in_spatial_order, rows, unpruned, with_sh_degree
-from export.trajectories.sampling import SomeTrajectories, Trajectories, layers_digest
+from export.pruning.mask import bake_pruned, in_spatial_order, rows, unpruned, with_sh_degree
+from export.trajectories.sampling import Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
@@ -28,15 +28,12 @@ from msdgs_train.gaussians.model_file import load_model
 EVALUATION_TIMES, CAMERAS_PER_TIME = 16, 3
 SELECTION_TIMES = 33
 BACK_OFFS = 4
-"""How often pruning is repeated with a smaller error if its rules together cost more than each of them did."""
+"""Repeats of pruning with a smaller error, if its rules together cost more than each of them alone."""
 
 BACK_OFF_DB = 0.5
 STABILITY_TIMES = 8
 SAMPLED_KEPT = 2
-"""Sets of trajectories in the cache; one takes up to 2 GiB."""
-
-Track = Callable[[str, int], Callable[[], object]]
-"""Called with the name of a task and its number of steps; returns a function to call after each step."""
+"""Sets of trajectories that are cached; one takes up to 2 GiB."""
 
 
 class TargetNotReached(InvalidInput):
@@ -48,7 +45,7 @@ class Candidate:
     """A scene file that may be chosen as the export, and how it was made."""
 
     plan: str
-    pruning_db: float | None  # PSNR of the worst frame that pruning alone may lead to, dB; None: not pruned
+    pruning_db: float | None  # dB, lowest PSNR of a frame that pruning alone may cause; None: not pruned
     pruned: PrunedModel
     path: Path
     options: RasterizerOptions  # of its frames
@@ -69,18 +66,13 @@ class Candidate:
 
     @property
     def sh_degree(self) -> int:
-        """Of its colors."""
+        """SH degree of its colors."""
         return self.pruned.moving.config.sh_degree
 
     @property
     def size(self) -> int:
-        """Bytes of the file."""
+        """Size of the file in bytes."""
         return self.path.stat().st_size
-
-
-def no_progress(what: str, steps: int) -> Callable[[], object]:
-    """Ignore progress."""
-    return lambda: None
 
 
 class ExportJob:
@@ -117,13 +109,13 @@ class ExportJob:
 
     @cached_property
     def statistics(self) -> PruningStatistics:
-        """What pruning decides by, computed on first use."""
+        """Visibility and motion by which pruning decides, computed on first use."""
         views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES)
         on_time = self.progress("motion and visibility of the Gaussians", SELECTION_TIMES)
         return PruningStatistics(self.model, views, self.info.background, on_time)
 
     def pruned(self, pruning_db: float | None) -> PrunedModel:
-        """The model without what can be removed while the worst frame stays at `pruning_db` dB.
+        """The model without everything that can be removed while the worst frame stays at `pruning_db` dB.
 
         It is checked again in the evaluation views, at other times than the selection views; if it is worse there,
         pruning is repeated with a smaller error.
@@ -144,12 +136,12 @@ class ExportJob:
 
     @cached_property
     def stability(self) -> StabilityReport:
-        """How far layers in float32 are from float64, computed on first use."""
+        """Whether the layers are exact enough in float32, computed on first use."""
         on_time = self.progress("stability of the layers", STABILITY_TIMES)
         return assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
 
     def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
-        """The error of its frames against exact ones; of all of them or of every n-th."""
+        """The error of a candidate's frames against exact ones, of all frames or of every n-th."""
         pose, ids = candidate.session.gaussians, candidate.pruned.ids
         return self.exact.measure(pose, ids, options=candidate.options, every=every)
 
@@ -194,24 +186,11 @@ class ExportJob:
         return Candidate(plan, pruning_db, pruned, path, self.model.rasterizer)
 
     def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
-        """Of the model's Gaussians `ids`, ascending; sampled once, since pruning doesn't change their motion."""
+        """Trajectories of the Gaussians `ids`, ascending; sampled once, since pruning doesn't change their motion."""
         layers = layers_digest(baked)
         for known_layers, known, sampled in self._sampled:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
-                return SomeTrajectories(sampled, np.searchsorted(known, ids))
-        sampled = Trajectories(baked, self._on_time(len(ids)))
+                return sampled.some(np.searchsorted(known, ids))
+        sampled = Trajectories(baked, self.progress)
         self._sampled = [*self._sampled[1 - SAMPLED_KEPT :], (layers, ids, sampled)]
         return sampled
-
-    def _on_time(self, count: int) -> Callable[[int, int], object]:
-        """Progress of sampling; fast motion is sampled more densely, which is shown as another task."""
-        known, on_step = 0, self.progress("", 0)
-
-        def on_time(done: int, total: int) -> None:
-            nonlocal known, on_step
-            if total != known:
-                what = f"{count:,} trajectories" if not known else "fast ones, sampled more densely"
-                known, on_step = total, self.progress(what, total - known)
-            on_step()
-
-        return on_time

@@ -2,32 +2,54 @@
 
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from export.jobs.figure import draw
 from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, SELECTION_TIMES, ExportJob
-from export.jobs.points import DEFAULT_RASTERIZER, front
-from export.jobs.sweep import SweepResult
+from export.jobs.sweep import DEFAULT_RASTERIZER, SweepResult, front
+from export.measure.machine import processor
 from export.plans.base import BASELINE
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
 from msdgs_train.datasets.common.files import replacing, write_text
 
 FORMAT = "msdgs-report/1"
-COLUMNS = ("", "plan", "pruned to", "SH", "rasterizer", "moving", "static", "ms", "median", "deform", "draw", "MB",
-           "memory", "worst frame", "mean", "worst pixel", "position", "px", "held-out")  # fmt: skip
+COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "": lambda p: "★" if p["chosen"] else "◆" if p["front"] else "",
+    "plan": lambda p: p["plan"],
+    "pruned to": lambda p: "–" if p["pruning_db"] is None else f"{p['pruning_db']:g} dB",
+    "SH": lambda p: str(p["sh_degree"]),
+    "rasterizer": lambda p: "" if p["rasterizer"] == DEFAULT_RASTERIZER else p["rasterizer"],
+    "moving": lambda p: f"{p['moving']:,}",
+    "static": lambda p: f"{p['static']:,}",
+    "ms": lambda p: f"{p['milliseconds']['total']['min']:.1f}",
+    "median": lambda p: f"{p['milliseconds']['total']['median']:.1f}",
+    "deform": lambda p: f"{p['milliseconds']['deformation']['min']:.1f}",
+    "draw": lambda p: f"{p['milliseconds']['rasterization']['min']:.1f}",
+    "MB": lambda p: f"{p['bytes'] / 1e6:.2f}",
+    "memory": lambda p: "–" if p["memory_bytes"] is None else f"{p['memory_bytes'] / 1e6:.0f} MB",
+    "worst frame": lambda p: f"{p['error']['psnr_worst']:.1f}",
+    "mean": lambda p: f"{p['error']['psnr_mean']:.1f}",
+    "worst pixel": lambda p: f"{p['error']['worst_pixel']:.3f}",
+    "position": lambda p: f"{p['error']['position']:.1e}",
+    "px": lambda p: f"{p['error']['position_pixels']:.2g}",
+    "held-out": lambda p: "–" if p["images_psnr"] is None else f"{p['images_psnr']:.2f}",
+}
+"""By name: the text of a point."""
+
 LEGEND = """\
-- **◆ on the front**: no other point is faster and closer. **★ chosen**: the fastest within the error allowed.
-- **pruned to**: PSNR of the worst frame that pruning alone may lead to; "–": not pruned.
+- **◆ on the front**: no other point is faster and has a smaller error. **★ chosen**: the fastest within the error
+  allowed.
+- **pruned to**: lowest PSNR of a frame that pruning alone may cause; "–": not pruned.
 - **ms**: per frame, deformation and rasterization; minimum and median of interleaved repeats, mean of three views.
 - **memory**: peak while loading the file and drawing a frame, above that of the idle process.
 - **worst frame**, **mean**: PSNR in dB against frames of the exact network, deformation and rasterizer in float64.
 - **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
   a Gaussian, in scene units and in pixels, faint and hidden ones included.
 - **held-out**: mean PSNR in dB against held-out images.
-- Points with other rasterizer options show what these would gain; no file can ask for them, so none is chosen.
+- Points with other rasterizer options show what these would gain. A file can't select them, so none is chosen.
 """
 
 
@@ -70,12 +92,12 @@ def write_report(contents: dict[str, Any], scene: Path) -> list[Path]:
 
 
 def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
-    """The report as a page."""
+    """The report as Markdown."""
     machine, views = contents["machine"], contents["views"]
     exact = contents["exact_images_psnr"]
     chosen = next(point for point in contents["points"] if point["chosen"])
     left_out = [f"- {entry['what']}: {entry['count']:,} of {entry['of']:,}" for entry in chosen["left_out"]]
-    where = [
+    summary = [
         f"{machine['processor']}, {machine['threads']} threads.",
         f"{views['evaluation_frames']} frames of {views['width']} × {views['height']} were compared.",
         f"Allowed: {contents['min_psnr']:g} dB on the worst frame.",
@@ -84,7 +106,7 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
     lines = [
         f"# {scene}: error against run time",
         "",
-        " ".join(where).strip(),
+        " ".join(summary).strip(),
         "",
         f"![error against milliseconds per frame]({figure})",
         "",
@@ -95,7 +117,7 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
         LEGEND,
         gain(contents),
         "",
-        f"After a quick estimate {len(contents['dropped'])} more candidates were dropped: others are better.",
+        f"{len(contents['dropped'])} more candidates were dropped after a quick estimate: others are better.",
         "",
         "Pruned from the chosen file:" if left_out else "Nothing was pruned from the chosen file.",
         "",
@@ -119,43 +141,7 @@ def gain(contents: dict[str, Any]) -> str:
     return f"{text}; all layers for all Gaussians take {before:,.1f} ms, {before / max(took, 1e-3):,.1f} times as long."
 
 
-def rows(contents: dict[str, Any]) -> list[Sequence[str]]:
+def rows(contents: dict[str, Any]) -> list[list[str]]:
     """The points as texts, one for each of `COLUMNS`, the slowest first."""
     ordered = sorted(contents["points"], key=lambda point: -point["milliseconds"]["total"]["min"])
-    return [_row(point) for point in ordered]
-
-
-def _row(point: dict[str, Any]) -> list[str]:
-    times, error = point["milliseconds"], point["error"]
-    mark = "★" if point["chosen"] else "◆" if point["front"] else ""
-    memory, images = point["memory_bytes"], point["images_psnr"]
-    return [
-        mark,
-        point["plan"],
-        "–" if point["pruning_db"] is None else f"{point['pruning_db']:g} dB",
-        str(point["sh_degree"]),
-        "" if point["rasterizer"] == DEFAULT_RASTERIZER else point["rasterizer"],
-        f"{point['moving']:,}",
-        f"{point['static']:,}",
-        f"{times['total']['min']:.1f}",
-        f"{times['total']['median']:.1f}",
-        f"{times['deformation']['min']:.1f}",
-        f"{times['rasterization']['min']:.1f}",
-        f"{point['bytes'] / 1e6:.2f}",
-        "–" if memory is None else f"{memory / 1e6:.0f} MB",
-        f"{error['psnr_worst']:.1f}",
-        f"{error['psnr_mean']:.1f}",
-        f"{error['worst_pixel']:.3f}",
-        f"{error['position']:.1e}",
-        f"{error['position_pixels']:.2g}",
-        "–" if images is None else f"{images:.2f}",
-    ]
-
-
-def processor() -> str:
-    """The name of the processor."""
-    cpuinfo = Path("/proc/cpuinfo")
-    names = (
-        [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")] if cpuinfo.exists() else []
-    )
-    return names[0].split(":", 1)[1].strip() if names else platform.processor() or platform.machine()
+    return [[text(point) for text in COLUMNS.values()] for point in ordered]

@@ -1,17 +1,16 @@
-"""The sweep: plans × pruning × SH degree × rasterizer options, dominated ones left after a quick estimate, the rest
-measured in full."""
+"""The sweep: plans × pruning × SH degree × rasterizer options. Dominated ones are dropped after a quick estimate, the
+rest is measured in full."""
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
-from export.jobs.points import DEFAULT_RASTERIZER, Point, QuickEstimate, choose
 from export.measure.frame_memory import frame_memory
 from export.measure.rendered_error import Pose, RenderedError
-from export.measure.timing import REPEATS, time_frame, time_frames
+from export.measure.timing import REPEATS, FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
 from msdgs_serve.rasterizer import RasterizerOptions
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from export.measure.images import HeldOutImages
 
 MAX_RELATIVE_COST = 4.0
-"""A plan that runs layers isn't tried if they take so many times the whole frame of a plan that is good enough."""
+"""A plan that runs layers isn't tried if its layers take this many times the whole frame of a plan within the error."""
 
 PRUNING_STEPS = (20.0, 10.0, 5.0, 1.0, -5.0, -10.0, -15.0)
 """dB above or below `min_psnr` at which pruning is tried."""
@@ -31,8 +30,8 @@ MIN_PRUNING_DB, MIN_USEFUL_DB = 25.0, 20.0
 """Pruning isn't tried below the first; candidates below the second are dropped."""
 
 HEADROOM = (2.0, -3.0)
-"""With pruning to so many dB goes the fastest plan that unvaried is better by the first, and the one by the second; of
-those that are about as fast, the smallest."""
+"""dB. Each level of pruning is tried with the fastest plan whose error, mildly pruned, is better than the level by the
+first value, and by the second. Of plans that are about as fast, the one with the smallest file counts."""
 
 ESTIMATE_STRIDE, ESTIMATE_REPEATS = 6, 3
 """A quick estimate compares every 6th frame and takes the minimum of 3 timings."""
@@ -44,8 +43,90 @@ LOWER_DEGREES = 3
 
 TIMED_VIEWS = 3
 
+DEFAULT_RASTERIZER = "default"
 RASTERIZERS = {"alpha ≥ 2/255": {"alpha_min": 2 / 255}, "ends at 1 %": {"transmittance_min": 1e-2}}
-"""Tried on the chosen point, to show what they would gain."""
+"""Other rasterizer options, tried on the chosen point to show what they would gain."""
+
+
+@dataclass(frozen=True, eq=False)
+class QuickEstimate:
+    """A quick estimate of a candidate: the error of some of its frames, and the processor time of one.
+
+    Processor time is summed over threads; unlike elapsed time it hardly depends on other programs.
+    """
+
+    candidate: Candidate
+    cpu: float  # milliseconds per frame, the minimum of a few
+    cpu_deformation: float  # milliseconds of these
+    worst_db: float  # PSNR of the worst of these frames
+
+    def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
+        """Whether it is faster and has a smaller error than another, by more than the margins."""
+        faster = self.cpu * time_margin < other.cpu
+        return faster and self.worst_db > other.worst_db + db_margin
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        quick = {"cpu_milliseconds": self.cpu, "psnr_worst": self.worst_db}
+        return named(self.candidate, DEFAULT_RASTERIZER) | {"quick_estimate": quick}
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A candidate, measured in full."""
+
+    candidate: Candidate
+    rasterizer: str
+    time: FrameTime
+    error: RenderedError
+    memory: int | None  # bytes at the peak of a frame
+    images_psnr: float | None
+
+    @property
+    def milliseconds(self) -> float:
+        """Minimum over the repeats of a whole frame."""
+        return self.time.total.min
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        scene = self.candidate.session.scene
+        return named(self.candidate, self.rasterizer) | {
+            "moving": scene.moving_count,
+            "static": scene.static_count,
+            "layers": len(scene.metadata.layers),
+            "bytes": self.candidate.size,
+            "memory_bytes": self.memory,
+            "milliseconds": self.time.to_plain(),
+            "error": self.error.to_plain(),
+            "images_psnr": self.images_psnr,
+            "left_out": list(scene.metadata.left_out),
+        }
+
+
+def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
+    """The keys that identify a point."""
+    c = candidate
+    return {"plan": c.plan, "pruning_db": c.pruning_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
+
+
+def front(points: Sequence[Point]) -> list[int]:
+    """Indices of the points on the Pareto front of time and error, the fastest first.
+
+    Only those with default rasterizer options, since a file can't ask for others.
+    """
+    usual = [i for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
+    best, kept = -1.0, []
+    for i in sorted(usual, key=lambda i: (points[i].milliseconds, -points[i].error.psnr_worst)):
+        if points[i].error.psnr_worst > best:
+            best = points[i].error.psnr_worst
+            kept.append(i)
+    return kept
+
+
+def choose(points: Sequence[Point], min_psnr: float) -> int | None:
+    """The index of the fastest point whose worst frame is within `min_psnr` dB, which lies on the front."""
+    within = [i for i in front(points) if points[i].error.psnr_worst >= min_psnr]
+    return within[0] if within else None
 
 
 class SweepResult(NamedTuple):
@@ -79,17 +160,17 @@ class Sweep:
         self._reachable(self.baseline)
         # the mildest pruning that removes anything: plans are then fitted to moving Gaussians only
         mildest = next((level for level in levels if self.job.pruned(level).left_out), None)
-        self._tell("candidates: fitted plans", [(self._estimate, (text, mildest)) for text in self._texts(fitted=True)])
-        self._tell("candidates: network", [(self._estimate, (BASELINE, level)) for level in levels])
-        self._tell("candidates: other plans", [(self._estimate, (text, mildest)) for text in self._texts(fitted=False)])
+        self._estimate_all("fitted plans", [(text, mildest) for text in self._texts(fitted=True)])
+        self._estimate_all("network", [(BASELINE, level) for level in levels])
+        self._estimate_all("other plans", [(text, mildest) for text in self._texts(fitted=False)])
         unvaried = [estimate for estimate in self.estimates if estimate.candidate.pruning_db == mildest]
         pairs = [pair for level in levels if level != mildest for pair in self._pairs(unvaried, level)]
-        self._tell("candidates: plans with pruning", [(self._estimate, pair) for pair in pairs])
-        self._tell("candidates: SH degree", [(self._estimate, what) for what in self._degrees()])
+        self._estimate_all("plans with pruning", pairs)
+        self._estimate_all("SH degree", self._degrees())
         return self._measured()
 
     def _texts(self, fitted: bool) -> list[str]:
-        """Candidates that the plans propose for this model."""
+        """The names that the plans propose for this model."""
         plans = [plan for plan in PLANS.values() if plan.fitted == fitted]
         return [text for plan in plans for text in plan.candidates(len(self.job.model.deformation))]
 
@@ -111,8 +192,15 @@ class Sweep:
         error = self.job.error(candidate, every=ESTIMATE_STRIDE)
         deformation, _, total = (min(run[part] for run in runs) for part in range(3))
         candidate.close()
-        self.estimates.append(QuickEstimate(candidate, DEFAULT_RASTERIZER, total, deformation, error.psnr_worst))
+        self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst))
         return self.estimates[-1]
+
+    def _estimate_all(self, what: str, candidates: Sequence[tuple]) -> None:
+        """Estimate candidates, given as the arguments of `_estimate`."""
+        on_estimate = self.job.progress(f"candidates: {what}", len(candidates))
+        for candidate in candidates:
+            self._estimate(*candidate)
+            on_estimate()
 
     def _too_expensive(self, plan: str, pruning_db: float | None) -> str | None:
         """Why a plan that runs layers isn't tried; None if it is."""
@@ -129,7 +217,7 @@ class Sweep:
         if expected < MAX_RELATIVE_COST * fastest.cpu:
             return None
         taken = f"{fastest.candidate.plan} takes {fastest.cpu:.0f} ms for the whole frame"
-        return f"not tried: its layers would take about {expected:.0f} ms of processor time, where {taken}"
+        return f"not tried: its layers would take about {expected:.0f} ms of processor time; {taken}"
 
     def _reachable(self, estimate: QuickEstimate | None) -> None:
         if estimate is None:  # its layers can't be run in float32; fitted plans may still work
@@ -141,7 +229,7 @@ class Sweep:
             raise TargetNotReached("min_psnr", expected, self.min_psnr)
 
     def _pairs(self, unvaried: list[QuickEstimate], level: float) -> set[tuple[str, float]]:
-        """The plans worth trying with pruning to `level` dB."""
+        """The plans to try with pruning to `level` dB."""
         pairs = set()
         for headroom in HEADROOM:
             enough = [estimate for estimate in unvaried if estimate.worst_db >= level + headroom]
@@ -207,9 +295,3 @@ class Sweep:
 
     def _images_psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
         return self.images.psnr(pose, options) if self.images else None
-
-    def _tell(self, what: str, calls: list[tuple[Callable[..., object], tuple]]) -> None:
-        on_call = self.job.progress(what, len(calls))
-        for function, arguments in calls:
-            function(*arguments)
-            on_call()

@@ -45,8 +45,8 @@ def write_scene(
 ) -> Exported:
     """Write a scene file beside `output`, compare it with the model of its moving part, and only then move it there.
 
-    `rendered` is what is known of its frames, and goes into its metadata. With it, a plan that computes something
-    else than the model's own layers isn't held to `tolerance`: its frames have been compared.
+    `rendered` is the error of its frames, which is stored in its metadata. With it, a plan other than `network` isn't
+    held to `tolerance`: its frames have been compared.
     """
     exact = rendered is None or properties(contents)["plan"] == BASELINE
     with replacing(output) as temporary:
@@ -56,16 +56,18 @@ def write_scene(
         measured = properties(contents)["measured_error"] | measured  # keeps the error bound of a fitted plan
         if rendered is not None:
             measured |= {"rendered": rendered}
-        helper.set_model_props(contents, _as_texts(properties(contents) | {"measured_error": measured}))
+        set_properties(contents, measured_error=measured)
         temporary.write_bytes(contents.SerializeToString())
         scene = DeformationSession(temporary).scene  # opened again: its metadata has changed
     return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
 
 
 def properties(contents: onnx.ModelProto) -> dict[str, Any]:
-    """The metadata of a scene file, plain values by name."""
+    """The metadata of a scene file as plain values by name."""
     return {entry.key: json.loads(entry.value) for entry in contents.metadata_props}
 
 
-def _as_texts(values: dict[str, Any]) -> dict[str, str]:
-    return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}
+def set_properties(contents: onnx.ModelProto, **changes: Any) -> None:
+    """Change metadata of a scene file."""
+    values = properties(contents) | changes
+    helper.set_model_props(contents, {name: json.dumps(value, allow_nan=False) for name, value in values.items()})

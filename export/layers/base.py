@@ -1,4 +1,4 @@
-"""What an export needs to know of a kind of deformation layer."""
+"""The interface of the export of a kind of deformation layer."""
 
 from typing import NamedTuple, Protocol, cast
 
@@ -24,23 +24,23 @@ class LayerInputs(NamedTuple):
     layer: DeformationLayer
     means: str  # [P, 3] points, Gaussians or control nodes, as moved by the layers before it
     time: str  # [1, 1]
-    gate: str  # [1] how much of the layer the input `steps` applies, in [0, 1]
+    gate: str  # [1] fraction of the layer that the input `steps` applies, in [0, 1]
 
 
 class LayerExport(Protocol):
     """How layers of one kind are exported. Register one in `export.layers.LAYERS` under the kind's name."""
 
     removable_heads: frozenset[str]
-    """Those of `HEADS` that `without_heads` can remove."""
+    """The heads that `without_heads` can remove."""
     scale_columns: int
-    """Of a delta of scales: 3, or 6 of a stretch tensor on control nodes."""
+    """Columns of a delta of scales: 3, or 6 of a stretch tensor on control nodes."""
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
         """Add the nodes of one layer. Returns the deltas of the heads `used`, side by side, times weight and gate."""
         ...
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
-        """Those of `HEADS` whose deltas are always 0."""
+        """The heads whose deltas are always 0."""
         ...
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
@@ -61,13 +61,13 @@ class FieldLayerExport:
         return weighted(graph, inputs, self.outputs(graph, inputs, rows), len(rows), has_weight)
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
-        """Add the nodes of the field. Returns [P, len(rows)]: those of its output columns, the logit of the weight,
-        if there is one, last."""
+        """Add the nodes of the field. Returns these output columns, [P, len(rows)]; the logit of the weight is last, if
+        there is one."""
         raise NotImplementedError
 
 
 def output_rows(used: list[str], has_weight: bool) -> np.ndarray:
-    """Indices of the outputs that are computed: those of the heads `used`, then the weight's."""
+    """Indices of the outputs of the heads `used`, then of the weight."""
     columns = np.arange(HEAD_COLUMNS[HEADS[-1]].stop + 1)
     deltas = [columns[HEAD_COLUMNS[head]] for head in used]
     return np.concatenate([*deltas, columns[-1:]] if has_weight else deltas)

@@ -10,11 +10,11 @@ from export.layers.graph import GraphBuilder
 from msdgs_train.layers.deformation import DeformationLayer
 
 STRETCH_COLUMNS = 6
-"""Of a symmetric matrix, which control nodes sum up; three columns are its diagonal."""
+"""Columns of a symmetric matrix, in which control nodes sum stretches; the first three are its diagonal."""
 
 
 def used_heads(layers: Sequence[DeformationLayer]) -> list[str]:
-    """Heads that change anything in any of the layers; one at least."""
+    """Heads that change anything in any of the layers; at least one."""
     inert = [export_of(layer).inert_heads(layer) for layer in layers]
     return [head for head in HEADS if any(head not in heads for heads in inert)] or ["means"]
 
@@ -45,14 +45,14 @@ def summed_deltas(
 
 
 def _padded(graph: GraphBuilder, name: str, step: str, num_nodes: int) -> str:
-    """[P, 10] of all heads as [P, 13]."""
+    """Deltas of all heads, [P, 10], with zeros for the off-diagonal columns of scales, [P, 13]."""
     parts = graph.split(step, [f"{name}.raw.{head}" for head in HEADS], [3, 3, 4])
     zeros = graph.constant(f"{name}.off_diagonal", np.zeros((num_nodes, 3), np.float32))
     return graph.node("Concat", [parts[0], parts[1], zeros, parts[2]], f"{name}.padded", axis=1)
 
 
 def _gate(graph: GraphBuilder, name: str, steps: str, k: int) -> str:
-    """[1] how much of layer k is applied after `steps`: all, nothing, or a part of the last one."""
+    """[1] fraction of layer k that is applied if `steps` layers are, in [0, 1]."""
     before = graph.constant(f"{name}.before", np.array([k - 1], np.float32))
     limits = [graph.constant(f"{name}.gate.{n}", np.array(v, np.float32)) for n, v in (("min", 0), ("max", 1))]
     return graph.node("Clip", [graph.node("Sub", [steps, before], f"{name}.steps"), *limits], f"{name}.gate")

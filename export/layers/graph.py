@@ -9,11 +9,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 OPSET = 18
 IR_VERSION = 9
-"""Of opset 18's own time: read by every onnxruntime since 1.14."""
+"""The version of opset 18, which every onnxruntime since 1.14 reads."""
 
 
 class GraphBuilder:
-    """Collects nodes in the order of their execution."""
+    """Collects nodes in the order of execution."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -30,7 +30,7 @@ class GraphBuilder:
         return output
 
     def split(self, value: str, outputs: list[str], sizes: list[int]) -> list[str]:
-        """Columns of a matrix, `sizes` of them at a time."""
+        """Split a matrix into groups of columns with these sizes."""
         lengths = self.constant(f"{value}.sizes", np.array(sizes, np.int64))
         self.nodes.append(helper.make_node("Split", [value, lengths], outputs, name=f"{value}.split", axis=1))
         return outputs

@@ -13,7 +13,7 @@ from msdgs_train.layers.mlp import MLPLayer
 
 
 class MLPExport(FieldLayerExport):
-    """Of `MLPLayer`."""
+    """Exports `MLPLayer`."""
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Encoded means and time through the hidden layers, then one product for all heads."""
@@ -27,7 +27,7 @@ class MLPExport(FieldLayerExport):
         )
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
-        """Rows of the last Linear set to 0."""
+        """Set these rows of the last Linear to 0."""
         layer = copy.deepcopy(cast(MLPLayer, layer))
         for name in names:
             zero(layer.heads.weight[HEAD_COLUMNS[name]], layer.heads.bias[HEAD_COLUMNS[name]])
@@ -57,7 +57,7 @@ def _outputs(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: 
 
 
 def _time_code(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:
-    """[1, time_features] what the layer knows of the time: one row a call, whatever the number of ids."""
+    """[1, time_features] the encoded time: one row per call, for any number of ids."""
     encoded = _encode(graph, f"{name}.time", time, layer.time_frequency_matrix)
     hidden = graph.node(
         "Relu", [_linear(graph, f"{name}.time_hidden", layer.time_hidden, encoded)], f"{name}.time_relu"
@@ -68,7 +68,7 @@ def _time_code(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> st
 def _read_input(
     graph: GraphBuilder, name: str, layer: MLPLayer, linear: torch.nn.Module, encoded: str, code: str
 ) -> str:
-    """[M, width] the part of a Linear that reads encoded means and, as a bias of one row a call, time."""
+    """[M, width] the part of a Linear that reads encoded means and time; time is a bias of one row per call."""
     weight = to_numpy(linear.weight)
     weight_time = graph.constant(f"{name}.weight_time", weight[:, layer.xyz_features : layer.input_features])
     bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
@@ -78,7 +78,7 @@ def _read_input(
 
 
 def _encode(graph: GraphBuilder, name: str, value: str, frequency_matrix: torch.Tensor) -> str:
-    """`PositionalEncoding`: value, sines, cosines side by side."""
+    """Positional encoding: value, sines and cosines side by side."""
     phases = graph.node(
         "MatMul", [value, graph.constant(f"{name}.octaves", to_numpy(frequency_matrix))], f"{name}.phases"
     )

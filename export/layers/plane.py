@@ -17,7 +17,7 @@ SECOND_AXES = np.array([1, 2, 2], np.int64)
 
 
 class PlaneExport(FieldLayerExport):
-    """Of `PlaneLayer`."""
+    """Exports `PlaneLayer`."""
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Features of the planes, then a hidden layer and a product for each head."""
@@ -25,11 +25,11 @@ class PlaneExport(FieldLayerExport):
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose Linear is all 0."""
-        heads = zip(HEADS, cast(PlaneLayer, layer).heads, strict=False)  # the weight's comes after those of the deltas
+        heads = zip(HEADS, cast(PlaneLayer, layer).heads, strict=False)  # the head of the weight comes last
         return frozenset(name for name, head in heads if not any(p.any() for p in head.parameters()))
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
-        """Linears of heads set to 0."""
+        """Set the Linears of these heads to 0."""
         layer = copy.deepcopy(cast(PlaneLayer, layer))
         for name in names:
             zero(*layer.heads[HEADS.index(name)].parameters())
@@ -68,7 +68,7 @@ def _features(graph: GraphBuilder, name: str, grid: PlaneGrid, means: str, time:
 
 
 def _cells(graph: GraphBuilder, name: str, positions: str, nodes: int) -> tuple[str, str]:
-    """Index of the node below, int64, and the part of the way to the next, both of the shape of `positions`."""
+    """Index of the node below, int64, and the fraction of the way to the next, both of the shape of `positions`."""
     zero = graph.constant(f"{name}.zero", np.array(0, np.float32))
     last, last_cell = (
         graph.constant(f"{name}.{n}", np.array(v, np.float32))
@@ -81,7 +81,7 @@ def _cells(graph: GraphBuilder, name: str, positions: str, nodes: int) -> tuple[
 
 
 def _lines(graph: GraphBuilder, name: str, grid: PlaneGrid, time: str) -> str:
-    """[3 S, C] the planes over time at `time`, [1, 1]: one lookup a call, whatever the number of ids."""
+    """[3 S, C] the planes over time at `time`, [1, 1]: one lookup per call, for any number of ids."""
     nodes, channels = grid.time.shape[1], grid.time.shape[3]
     first = graph.constant(f"{name}.first_time", to_numpy(grid.first_time))
     rate = graph.constant(f"{name}.time_cells", to_numpy(grid.time_cells))
@@ -138,7 +138,7 @@ def _interpolated_planes(graph: GraphBuilder, name: str, table: str, cells: str,
 
 
 def _gathered(graph: GraphBuilder, name: str, table: str, rows: str, steps: tuple[int, ...]) -> list[str]:
-    """[M, 3, C] rows of a table, so many steps further on each."""
+    """[M, 3, C] rows of a table, once for each offset of `steps`."""
     values = []
     for step in steps:
         offset = graph.constant(f"{name}.step{step}", np.array(step, np.int64))

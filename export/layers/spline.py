@@ -11,18 +11,18 @@ from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.spline import SplineLayer
 
 KNOTS = 4
-"""Knots that the value at a time depends on."""
+"""Number of knots that determine the value at a time."""
 
 
 class SplineExport:
-    """Of `SplineLayer`."""
+    """Exports `SplineLayer`."""
 
     removable_heads: frozenset[str] = frozenset()
     scale_columns = 6
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
-        """[nodes, 13] translations, stretches and quaternions less the identity."""
-        assert used == list(HEADS)  # it moves nodes, whose heads are all used
+        """[nodes, 13] translations, stretches, and quaternions minus the identity."""
+        assert used == list(HEADS)  # all heads of nodes are used
         curves = _spline(graph, inputs.name, cast(SplineLayer, inputs.layer), inputs.time)
         rest = np.zeros(13, np.float32)
         rest[9] = 1  # the identity quaternion's w
@@ -30,7 +30,7 @@ class SplineExport:
         return graph.node("Mul", [raw, inputs.gate], f"{inputs.name}.gated")
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
-        """None: a curve translates, stretches and rotates."""
+        """No heads, since a curve translates, stretches and rotates."""
         return frozenset()
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:

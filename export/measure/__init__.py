@@ -1,1 +1,1 @@
-"""How far exported frames and poses are from the model's own, how long a frame takes and how much memory."""
+"""Errors of exported frames and poses against the model's own, and time and memory of a frame."""

@@ -1,6 +1,6 @@
 """Memory of one frame of a scene file, measured in a process that loads only what serving needs.
 
-`frame_memory` runs this file as that process: it reads a request on standard input and prints a list of bytes.
+`frame_memory` runs this module as that process, which reads a request on standard input and prints a list of bytes.
 """
 
 import gc
@@ -11,10 +11,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-if __name__ == "__main__":
-    folder = Path(__file__).resolve().parent
-    sys.path[:] = [str(folder.parents[1]), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained, rasterize
@@ -27,11 +23,16 @@ EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALL
 
 
 def frame_memory(paths: Sequence[Path], view: SceneCamera) -> list[int | None]:
-    """Peak bytes of loading each file and drawing a frame of it, above those of the process before."""
-    request = {"paths": [str(path) for path in paths], "view": view.to_plain()}
-    command = [sys.executable, str(Path(__file__).resolve())]
+    """Peak bytes of loading each file and drawing one of its frames, above the memory of the process before."""
+    request = {"paths": [str(path.resolve()) for path in paths], "view": view.to_plain()}
     done = subprocess.run(
-        command, input=json.dumps(request), env=os.environ | EAGER, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "export.measure.frame_memory"],
+        input=json.dumps(request),
+        cwd=Path(__file__).resolve().parents[2],
+        env=os.environ | EAGER,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     return json.loads(done.stdout) if done.returncode == 0 else [None] * len(paths)
 
@@ -41,7 +42,7 @@ def main() -> None:
     request: dict[str, Any] = json.load(sys.stdin)
     view = SceneCamera.from_plain(request["view"])
     for path in request["paths"][:1]:
-        _draw(path, view)  # libraries and kernels that are loaded once don't count
+        _draw(path, view)  # loads libraries and kernels
     print(json.dumps([_peak(path, view) for path in request["paths"]]))
 
 
@@ -52,7 +53,7 @@ def _peak(path: str, view: SceneCamera) -> int | None:
         before = _status("VmRSS")
         _draw(path, view)
         return max(0, _status("VmHWM") - before)
-    except (OSError, KeyError):  # another system than Linux
+    except (OSError, KeyError):  # not Linux
         return None
 
 
@@ -62,7 +63,7 @@ def _draw(path: str, view: SceneCamera) -> None:
 
 
 def _status(name: str) -> int:
-    """Bytes of a line of the process's status."""
+    """Bytes in a line of the process's status."""
     lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
     return 1024 * int(lines[name].split()[0])
 

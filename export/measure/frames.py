@@ -1,4 +1,4 @@
-"""Frames of Gaussians, how far two of them are apart, and where points lie in them."""
+"""Frames of Gaussians, differences of two frames, and projections of points."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ FALLBACK_SIZE = 256
 
 
 class FrameDifference(NamedTuple):
-    """How far a frame is from its target; values in [0, 1]."""
+    """Difference of a frame from its target; values in [0, 1]."""
 
     psnr: float  # dB, at most 100
     worst_pixel: float  # largest difference of a channel
@@ -35,14 +35,14 @@ def render(gaussians: Gaussians, camera: Camera, background: Sequence[float], op
 
 
 def compare(frame: FloatArray, target: FloatArray) -> FrameDifference:
-    """Of two frames [H, W, 3]; subtracted in their own precision, squared and averaged in float64."""
+    """Compare two frames [H, W, 3]; subtracted in their own precision, squared and averaged in float64."""
     difference = np.abs(frame - target)
     mse = float(np.mean(np.square(difference, dtype=np.float64)))
     return FrameDifference(psnr_from_mse(mse), float(difference.max(initial=0)))
 
 
 def project(points: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Pixels [N, 2] and depths [N] of points [N, 3], in float64; those nearer than the near plane are moved to it."""
+    """Pixels [N, 2] and depths [N] of points [N, 3], in float64. Closer points are projected at the near plane."""
     pose = camera.world_to_camera
     with np.errstate(invalid="ignore", over="ignore"):
         in_camera = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]

@@ -1,4 +1,4 @@
-"""Poses of a model, and how far two computations of the same pose are apart, Gaussian by Gaussian."""
+"""Poses of a model, and errors of poses by Gaussian."""
 
 import math
 
@@ -12,10 +12,10 @@ from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.supports.base import Support
 
 SMALLEST_VISIBLE = 1e-3
-"""Scales below this part of the scene's half diagonal are less than a pixel; their errors are relative to this size."""
+"""Scales below this fraction of the scene's half diagonal are less than a pixel; errors are relative to at least it."""
 
 UNIT_TOLERANCE = 1e-3
-"""Of the norm of a quaternion, as `Gaussians.validate` has it."""
+"""Allowed difference of the norm of a quaternion from 1, as in `Gaussians.validate`."""
 
 
 @torch.no_grad()
@@ -36,13 +36,13 @@ def operations(support: Support, chain: MultiStepDeformation, count: int) -> flo
 
 
 def half_diagonal(bounds: object) -> float:
-    """Of a box given by its two corners, [2, 3]; above 0."""
+    """Half the diagonal of a box given by two corners, [2, 3]; above 0."""
     low, high = np.array(bounds)
     return max(float(np.linalg.norm(high - low)) / 2, 1e-30)
 
 
 def pose_errors(got: Gaussians, expected: Gaussians, scene_size: float) -> dict[str, np.ndarray]:
-    """[M] the largest error of each Gaussian, by output; infinite where `got` is NaN or infinite.
+    """[M] the largest error of each Gaussian, by output; infinite if `got` is NaN or infinite.
 
     Means: relative to the scene's half diagonal or, further out, to the largest coordinate. Quaternions: absolute.
     Scales: relative to the Gaussian's largest scale, or to `SMALLEST_VISIBLE` of the scene.
@@ -61,12 +61,12 @@ def pose_errors(got: Gaussians, expected: Gaussians, scene_size: float) -> dict[
 
 
 def largest_error(errors: dict[str, np.ndarray]) -> np.ndarray:
-    """[M] of each Gaussian, over all outputs."""
+    """[M] the largest error of each Gaussian over all outputs."""
     return np.max([*errors.values()], axis=0)
 
 
 def usable_rows(posed: Gaussians) -> np.ndarray:
-    """[M] whether a Gaussian can be drawn: finite, with a unit quaternion, which one that overflows isn't."""
+    """[M] whether a Gaussian can be drawn: all values are finite and its quaternion hasn't overflowed."""
     finite = np.all([np.isfinite(array.reshape(len(array), -1)).all(axis=1) for array in vars(posed).values()], axis=0)
     norms = np.linalg.norm(np.where(finite[:, None], posed.quats, 1), axis=1)
     return finite & (np.abs(norms - 1) < UNIT_TOLERANCE)

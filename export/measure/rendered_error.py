@@ -17,10 +17,10 @@ from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 
 MEMORY = 768e6
-"""Bytes of exact frames and poses that are stored; with larger images there are fewer views."""
+"""Largest size in bytes of exact frames and poses; with larger images there are fewer views."""
 
 POSE_BYTES = 52
-"""Per Gaussian and time: its mean in float64, the rest in float32."""
+"""Bytes per Gaussian and time: its mean in float64, the rest in float32."""
 
 Pose = Callable[[float], Gaussians]
 
@@ -91,7 +91,7 @@ class ExactFrames:
     ) -> RenderedError:
         """The error of `pose`, whose rows are the model's Gaussians `ids`, over all views or every n-th of them.
 
-        It is drawn with the model's own rasterizer options, or with others."""
+        By default, frames are drawn with the model's own rasterizer options."""
         options = options or self._model.rasterizer
         psnrs: list[float] = []
         worst, worst_frame, worst_pixel, position, position_pixels = np.inf, None, 0.0, 0.0, 0.0
@@ -122,13 +122,13 @@ def by_time(views: Sequence[View]) -> Iterator[tuple[float, list[View]]]:
 
 
 def within_memory(views: Sequence[View], gaussians: int) -> list[View]:
-    """As many of the views, evenly spread, as their exact frames and poses fit into `MEMORY`."""
+    """Evenly spread views, as many as fit into `MEMORY` with their exact frames and poses."""
     sizes = [12 * view.camera.width * view.camera.height + POSE_BYTES * gaussians for view in views]
     count = min(len(views), max(2, int(MEMORY / (sum(sizes) / len(sizes)))))
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
 
 
 def _pixel_distances(camera: Camera, got: FloatArray, exact: FloatArray) -> FloatArray:
-    """[M] how far apart two sets of points are in a frame, of those that lie within it."""
+    """[M] distances in pixels of the points `got` from the points `exact`, of those inside the image."""
     inside = in_frame(exact, camera)
     return np.linalg.norm(project(got[inside], camera)[0] - project(exact[inside], camera)[0], axis=1)

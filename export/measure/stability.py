@@ -1,6 +1,6 @@
 """Whether a model's layers may be computed in float32 when a frame is served.
 
-Measured in frames, and predicted from how much the layers amplify errors.
+It is measured in frames, and predicted from the amplification of errors by the layers.
 """
 
 import math
@@ -16,8 +16,7 @@ from export.measure.frames import NEAR, FrameDifference, PoseRenderer, compare
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed, usable_rows
 from export.measure.verify import times_to_verify
 from export.precision.formats import FLOAT32, Format, in_format
-from export.precision.limits import limits_met
-from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians
+from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians, limits_met
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -30,16 +29,35 @@ TIMES = 20
 SAMPLED = 2_000
 """Gaussians per time whose amplification is computed; others at each next time."""
 
-FRAME_TIMES = 2
-FRAME_CAMERAS = 2
-"""Frames are drawn at the times and from the cameras with the largest errors of float32."""
+FRAME_TIMES, FRAME_CAMERAS = 2, 2
+"""Frames are rendered at the times and from the cameras with the largest errors of float32."""
 
 WORST_FRACTION = 0.001
-"""Of the Gaussians: those with the largest errors, which are reported one by one."""
+"""Fraction of the Gaussians, those with the largest errors, that is reported separately."""
 
 NEAR_WORST = 1 - WORST_FRACTION
 
 _Frames = list[tuple[Camera, np.ndarray]]
+
+
+class _TimeSample(NamedTuple):
+    """Some of the Gaussians at one time."""
+
+    t: float
+    ids: np.ndarray
+    growth: Growth
+    exact: Gaussians  # float64
+    single_means: np.ndarray
+    errors: dict[str, np.ndarray]  # [M] the largest of each Gaussian, by format
+
+
+class _FrameGap(NamedTuple):
+    """The worst frame of a format at one time."""
+
+    difference: FrameDifference
+    without_worst: float  # dB
+    pixels: float
+    overflowed: int
 
 
 def assess(
@@ -57,15 +75,14 @@ def assess(
         on_time()
         broken = _hidden(PoseRenderer(scene), model) if len(model.gaussians) else []
         return StabilityReport(len(model.gaussians), times, min_psnr, limits_met(model, []), broken)
-    with np.errstate(over="ignore", invalid="ignore"):  # reported, not an accident
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is part of the report
         return _Assessment(model, scene, min_psnr, formats).run(times, on_time)
 
 
 class _Assessment:
     def __init__(self, model: DynamicGaussians, scene: SceneInfo, min_psnr: float, formats: Sequence[Format]) -> None:
         self.model, self.scene, self.min_psnr = model, scene, min_psnr
-        self.size = half_diagonal(scene.bounds)
-        self.count = len(model.gaussians)
+        self.size, self.count = half_diagonal(scene.bounds), len(model.gaussians)
         self.formats = (FLOAT32, *(f for f in formats if f is not FLOAT32))
         self.models = {f.name: in_format(model, f) for f in self.formats}
         self.single = self.models[FLOAT32.name]
@@ -82,8 +99,10 @@ class _Assessment:
         samples = _joined(found)
         by_error = sorted(found, key=lambda m: np.quantile(m.errors[FLOAT32.name], NEAR_WORST, method="higher"))
         frames = [self._frames(sample, samples) for sample in by_error[::-1][:FRAME_TIMES]]
-        gaps = [self._format_gap(f, found, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
+        gaps = [_format_gap(f, found, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
         predicted = min(prediction for _, prediction, _ in frames)
+        overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in found)
+        broken = [f"{overflowed:,} poses are NaN or infinite even in float64"] if overflowed else []
         return StabilityReport(
             gaussians=self.count,
             layers=[layer.kind for layer in self.model.config.layers],
@@ -96,12 +115,12 @@ class _Assessment:
             formats=gaps,
             worst=frames[0][2],
             limits=limits_met(self.double, [sample.exact.scales for sample in found]),
-            broken=self._broken(found),
+            broken=broken + _hidden(self.renderer, self.double),
             unstable=self._unstable(gaps[0], predicted),
             samples=samples,
         )
 
-    def _sample(self, t: float, ids: np.ndarray) -> "_TimeSample":
+    def _sample(self, t: float, ids: np.ndarray) -> _TimeSample:
         exact = posed(self.double, t, ids)
         poses = {name: posed(model, t, ids) for name, model in self.models.items()}
         errors = {name: largest_error(pose_errors(pose, exact, self.size)) for name, pose in poses.items()}
@@ -111,7 +130,7 @@ class _Assessment:
 
     @torch.no_grad()
     def _growth(self, ids: np.ndarray, t: float) -> Growth:
-        """Of the Gaussians `ids`. Followers of control nodes get the nodes', plus the measured round-off of skinning in
+        """Growth of the Gaussians `ids`; on control nodes that of the nodes, plus the measured round-off of skinning in
         float32."""
         double, single, rows = self.double, self.single, torch.from_numpy(ids)
         points = double.canonical_points(double.gaussians.rows(rows))
@@ -131,11 +150,6 @@ class _Assessment:
         after = np.stack([spread(values) for values in found.after])
         return Growth(after, spread(found.amplification), spread(found.predicted) + own)
 
-    def _broken(self, samples: list["_TimeSample"]) -> list[str]:
-        overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in samples)
-        problems = [f"{overflowed:,} poses are NaN or infinite even in float64"] if overflowed else []
-        return problems + _hidden(self.renderer, self.double)
-
     def _unstable(self, gap: FormatGap, predicted: float) -> list[str]:
         if gap.overflowed:
             return [f"{gap.overflowed:,} Gaussians overflow in float32"]
@@ -146,22 +160,20 @@ class _Assessment:
             return [f"float32 round-off may be visible: {found}, under {self.min_psnr:g}"]
         return []
 
-    def _frames(self, sample: "_TimeSample", joined: Samples) -> tuple[dict[str, "_FrameGap"], float, WorstGaussians]:
-        """Frames at one time: gaps by format, dB of the predicted displacement, the worst Gaussians of float32."""
-        exact = posed(self.double, sample.t)
+    def _frames(self, sample: _TimeSample, joined: Samples) -> tuple[dict[str, _FrameGap], float, WorstGaussians]:
+        """Frames at one time: gaps by format, PSNR of the predicted displacement, the worst Gaussians of float32."""
+        exact, draw = posed(self.double, sample.t), self.renderer.draw
         poses = {name: posed(model, sample.t) for name, model in self.models.items()}
-        frames = [(c, self.renderer.draw(exact, c)) for c in self._cameras(poses[FLOAT32.name], exact)]
-        gaps = {name: self._frame_gap(pose, exact, frames) for name, pose in poses.items()}
+        single = poses[FLOAT32.name]
+        gaps = [np.square(self.renderer.pixel_gaps(single, exact, c)).sum() for c in self.renderer.cameras]
+        cameras = [self.renderer.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]
+        frames = [(camera, draw(exact, camera)) for camera in cameras]
+        by_format = {name: self._frame_gap(pose, exact, frames) for name, pose in poses.items()}
         displaced = replace(exact, means=_displaced(exact.means, sample, joined))
-        predicted = min(compare(self.renderer.draw(displaced, c), frame).psnr for c, frame in frames)
-        return gaps, predicted, self._worst(sample.t, poses[FLOAT32.name], exact, frames)
+        predicted = min(compare(draw(displaced, camera), frame).psnr for camera, frame in frames)
+        return by_format, predicted, self._worst(sample.t, single, exact, frames)
 
-    def _cameras(self, got: Gaussians, exact: Gaussians) -> list[Camera]:
-        """Those from which the pose is furthest off, in pixels."""
-        gaps = [np.square(self.renderer.pixel_gaps(got, exact, camera)).sum() for camera in self.renderer.cameras]
-        return [self.renderer.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]
-
-    def _frame_gap(self, got: Gaussians, exact: Gaussians, frames: _Frames) -> "_FrameGap":
+    def _frame_gap(self, got: Gaussians, exact: Gaussians, frames: _Frames) -> _FrameGap:
         without_worst = Gaussians(*(array.copy() for array in vars(got).values()))
         worst = _worst_ids(got, exact, self.size)
         for name, array in vars(without_worst).items():
@@ -191,39 +203,22 @@ class _Assessment:
             drawn_psnr=min(compare(self.renderer.draw(exact, c, keep=others), frame).psnr for c, frame in frames),
         )
 
-    def _format_gap(self, number_format: Format, samples: list["_TimeSample"], frames: list["_FrameGap"]) -> FormatGap:
-        errors = np.concatenate([sample.errors[number_format.name] for sample in samples])
-        worst = min(frames, key=lambda frame: frame.difference.psnr)
-        return FormatGap(
-            name=number_format.name,
-            meaning=number_format.meaning,
-            median=_quantile(errors, 0.5),
-            near_worst=_quantile(errors, NEAR_WORST),
-            worst=float(errors.max()),
-            pixels=max(frame.pixels for frame in frames),
-            psnr=worst.difference.psnr,
-            worst_pixel=worst.difference.worst_pixel,
-            psnr_without_worst=worst.without_worst,
-            overflowed=max(frame.overflowed for frame in frames),
-        )
 
-
-class _TimeSample(NamedTuple):
-    """Some of the Gaussians at one time."""
-
-    t: float
-    ids: np.ndarray
-    growth: Growth
-    exact: Gaussians  # float64
-    single_means: np.ndarray
-    errors: dict[str, np.ndarray]  # the largest of each Gaussian, by format
-
-
-class _FrameGap(NamedTuple):
-    difference: FrameDifference
-    without_worst: float
-    pixels: float
-    overflowed: int
+def _format_gap(number_format: Format, samples: list[_TimeSample], frames: list[_FrameGap]) -> FormatGap:
+    errors = np.concatenate([sample.errors[number_format.name] for sample in samples])
+    worst = min(frames, key=lambda frame: frame.difference.psnr)
+    return FormatGap(
+        name=number_format.name,
+        meaning=number_format.meaning,
+        median=_quantile(errors, 0.5),
+        near_worst=_quantile(errors, NEAR_WORST),
+        worst=float(errors.max()),
+        pixels=max(frame.pixels for frame in frames),
+        psnr=worst.difference.psnr,
+        worst_pixel=worst.difference.worst_pixel,
+        psnr_without_worst=worst.without_worst,
+        overflowed=max(frame.overflowed for frame in frames),
+    )
 
 
 @torch.no_grad()
@@ -241,7 +236,7 @@ def _hidden(renderer: PoseRenderer, model: DynamicGaussians) -> list[str]:
 
 
 def _worst_ids(got: Gaussians, exact: Gaussians, size: float) -> np.ndarray:
-    """Those with the largest errors, at least one, the worst first."""
+    """Ids of the Gaussians with the largest errors, at least one, the worst first."""
     errors = largest_error(pose_errors(got, exact, size))
     return np.argsort(errors, kind="stable")[::-1][: math.ceil(WORST_FRACTION * len(errors))]
 

@@ -1,10 +1,11 @@
 """Milliseconds per frame of many candidates, interleaved so that load on the machine affects all alike."""
 
 import gc
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from export.jobs.job import Candidate
 from export.measure.views import View
@@ -12,7 +13,7 @@ from msdgs_serve.rasterizer import rasterize
 
 REPEATS = 15
 SECONDS_PER_CANDIDATE = 6.0
-"""If frames take longer, there are fewer repeats, but at least `MIN_REPEATS`."""
+"""With slower frames there are fewer repeats, but at least `MIN_REPEATS`."""
 
 MIN_REPEATS = 2
 
@@ -47,24 +48,23 @@ def time_frames(
     repeats: int = REPEATS,
     on_repeat: Callable[[], object] = lambda: None,
 ) -> list[FrameTime]:
-    """Time a frame of each candidate at each of the views, `repeats` times over; the first frames don't count."""
+    """Time a frame of each candidate at each of the views, `repeats` times; the first frames don't count."""
     firsts = [time_frame(candidate, views[0], background) for candidate in candidates]
-    rounds = [
-        max(MIN_REPEATS, min(repeats, int(1e3 * SECONDS_PER_CANDIDATE / (first[2] * len(views))))) for first in firsts
-    ]
-    runs: list[list[list[TimingRun]]] = [[[] for _ in views] for _ in candidates]
+    possible = [int(1e3 * SECONDS_PER_CANDIDATE / (first[2] * len(views))) for first in firsts]
+    turns = [max(MIN_REPEATS, min(repeats, count)) for count in possible]
+    runs: list[list[list[TimingRun]]] = [[] for _ in candidates]
     collecting = gc.isenabled()
     gc.disable()
     try:
         for turn in range(repeats):
-            for place, candidate in enumerate(candidates):
-                for v, view in enumerate(views if turn < rounds[place] else ()):
-                    runs[place][v].append(time_frame(candidate, view, background))
+            for candidate, count, found in zip(candidates, turns, runs, strict=True):
+                if turn < count:
+                    found.append([time_frame(candidate, view, background) for view in views])
             on_repeat()
     finally:
         if collecting:
             gc.enable()
-    return [_frame_time(of_views) for of_views in runs]
+    return [_frame_time(np.array(found)) for found in runs]
 
 
 def time_frame(
@@ -82,15 +82,7 @@ def time_frame(
     return 1e3 * (posed - start), 1e3 * (drawn - posed), 1e3 * (drawn - start)
 
 
-def _frame_time(runs: list[list[TimingRun]]) -> FrameTime:
-    """`runs` of each view."""
-    parts = []
-    for part in range(3):
-        of_views = [[run[part] for run in view] for view in runs]
-        parts.append(
-            Milliseconds(
-                statistics.fmean(min(view) for view in of_views),
-                statistics.fmean(statistics.median(view) for view in of_views),
-            )
-        )
-    return FrameTime(*parts)
+def _frame_time(runs: np.ndarray) -> FrameTime:
+    """The summary of [turns, views, 3] times of deformation, rasterization and both."""
+    minima, medians = (each.mean(axis=0).tolist() for each in (runs.min(axis=0), np.median(runs, axis=0)))
+    return FrameTime(*(Milliseconds(*pair) for pair in zip(minima, medians, strict=True)))

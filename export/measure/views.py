@@ -1,4 +1,4 @@
-"""Views at which errors are measured: the training cameras, at many times other than those of the training images."""
+"""Views at which errors are measured: the training cameras at times between those of the training images."""
 
 import math
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ class View(NamedTuple):
 
 
 def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[str, Camera]]:
-    """The cameras of a scene by name: `training`'s if given, else those of the model, and more if too few.
+    """The cameras of a scene by name: those of `training` if given, else those of the model; more are added if too few.
 
     Raises `InvalidInput` for a stored camera that can't be used.
     """
@@ -63,20 +63,16 @@ def _camera(stored: dict) -> Camera:
 
 
 def _around(info: SceneInfo, cameras: Sequence[tuple[str, Camera]]) -> list[tuple[str, Camera]]:
+    """Cameras on a circle around the scene that are like the first of `cameras`, if there is one."""
     low, high = np.array(info.bounds, float)
-    centre, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    center, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    like, distance = Camera.from_fov(np.eye(4), ADDED_SIZE, ADDED_SIZE, ADDED_FOV), 2.5 * reach
     up = np.array([0.0, 0.0, 1.0])
-    distance, like = 2.5 * reach, None
     if cameras:
         like = cameras[0][1]
-        distance = max(float(np.linalg.norm(like.position - centre)), 1e-3 * reach)
+        distance = max(float(np.linalg.norm(like.position - center)), 1e-3 * reach)
         up = -like.camera_to_world[:3, 1]
-    added = []
-    for i in range(ADDED_CAMERAS):
-        pose = orbit(centre, distance, 360 * i / ADDED_CAMERAS, ADDED_ELEVATION if i % 2 else 0.0, up)
-        if like is None:
-            camera = Camera.from_fov(pose, ADDED_SIZE, ADDED_SIZE, ADDED_FOV)
-        else:
-            camera = Camera(like.fx, like.fy, like.cx, like.cy, like.width, like.height, pose)
-        added.append((f"added {i}", camera))
-    return added
+    elevations = (ADDED_ELEVATION if i % 2 else 0.0 for i in range(ADDED_CAMERAS))
+    poses = [orbit(center, distance, 360 * i / ADDED_CAMERAS, e, up) for i, e in enumerate(elevations)]
+    intrinsics = like.fx, like.fy, like.cx, like.cy, like.width, like.height
+    return [(f"added {i}", Camera(*intrinsics, pose)) for i, pose in enumerate(poses)]

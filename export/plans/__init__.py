@@ -1,6 +1,6 @@
 """Plans: ways to compute a scene's deformation in an ONNX graph. All keep the contract `msdgs/1`.
 
-One file a plan. A graph of layers deforms the ids that it is given in one go; the loop over chunks of ids, which keeps
-memory independent of the scene's size, is in the reader (`msdgs_serve.deformation`), where the chunks also run side by
-side. A graph of fitted trajectories blends those of all Gaussians and picks the ids.
+One module per plan. A graph of layers deforms all given ids at once. The reader (`msdgs_serve.deformation`) splits ids
+into chunks, which run in parallel and keep memory independent of the scene's size. A graph of fitted trajectories poses
+all Gaussians and picks the ids.
 """

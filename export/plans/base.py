@@ -1,4 +1,4 @@
-"""What a plan is, and how one of a given size is named."""
+"""The interface of plans, and the names of plans with a size."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from export.trajectories.sampling import Trajectories
 
 BASELINE = "network"
-"""The plan that computes what the model computes, in float32: all others are compared with it."""
+"""The plan that computes the model itself in float32; all others are compared with it."""
 
 DEFAULT_PIXELS = 0.1
-"""Error bound of a fitted plan whose text names no size."""
+"""Error bound of a fitted plan whose name has no size."""
 
 
 @dataclass(frozen=True)
 class PlanSpec:
-    """A plan and its size as a text names them: `prefix:2` is ("prefix", 2), `lowrank:0.05` ("lowrank", None, 0.05)."""
+    """The parsed name of a plan: `prefix:2` is ("prefix", 2), `lowrank:0.05` ("lowrank", None, 0.05)."""
 
     name: str
     count: int | None = None
@@ -34,7 +34,7 @@ class PlanSpec:
 
     @property
     def max_pixels(self) -> float | None:
-        """Error bound of a fitted plan, pixels of the scene's nearest camera; None if `count` says how large it is."""
+        """Error bound of a fitted plan, pixels of the scene's nearest camera; None if `count` is its size."""
         return None if self.count is not None else self.pixels or DEFAULT_PIXELS
 
 
@@ -44,16 +44,16 @@ class Plan:
 
     name: str
     usage: str
-    """Its text and what it means, for messages."""
+    """Its name with a size, and an explanation, for messages."""
     color: str
-    """Of its points in the figure of a report."""
+    """Color of its points in the figure of a report."""
     build: Callable[[Baked, PlanSpec, Callable[[], Trajectories]], onnx.ModelProto]
     """The scene file of a baked scene in which something moves. The last argument samples its trajectories."""
     candidates: Callable[[int], Sequence[str]] = lambda layers: ()
-    """The texts that a sweep tries for a model of so many layers."""
+    """The names that a sweep tries, given the number of the model's layers."""
     counts: range | None = None
-    """The counts that its text may name; None: it has no size."""
+    """Allowed counts; None: it has no size."""
     fitted: bool = False
-    """Whether it is fitted to float64 trajectories and may name an error bound; else it runs layers for each frame."""
+    """Whether it is fitted to float64 trajectories and may have an error bound; others run layers for each frame."""
     speedup: float = 1.0
-    """How many times faster its layers run than in float32."""
+    """Speed of its layers relative to float32."""

@@ -1,7 +1,7 @@
-"""Plan `int8`: the network with its widest matrix products in 8 bits, by onnxruntime's static quantiser.
+"""Plan `int8`: the network with its widest matrix products in 8 bits, by onnxruntime's static quantizer.
 
-Weights have a scale for each output, activations one for each product, found on the scene's own Gaussians and times.
-Encodings, the first product, which reads them, the heads and all that depends on time alone stay float32.
+Weights have a scale per output, activations one per product, calibrated on the scene's own Gaussians and times.
+Encodings, the first product, which reads them, the heads and everything that depends only on time stay float32.
 """
 
 import logging
@@ -24,11 +24,11 @@ from export.plans.network import network
 from msdgs_serve.scene.errors import InvalidInput
 
 TIMES, GAUSSIANS = 16, 2048
-"""To calibrate with."""
+"""Sizes of the calibration data."""
 
 
 def int8(baked: Baked) -> onnx.ModelProto:
-    """The scene with all layers, products of width × width in 8 bits. Raises `InvalidInput` where there are none."""
+    """The scene with all layers, products of width × width in 8 bits. Raises `InvalidInput` if there are none."""
     exact = network(baked, "int8")
     products = [node.name for node in exact.graph.node if node.op_type == "Gemm" and ".trunk" in node.name]
     if not products:
@@ -46,12 +46,12 @@ def int8(baked: Baked) -> onnx.ModelProto:
             weight_type=QuantType.QInt8,
             calibrate_method=CalibrationMethod.MinMax,
         )
-        quantised = onnx.load(path)
-    return _plain(quantised)
+        quantized = onnx.load(path)
+    return _plain(quantized)
 
 
 def _plain(model: onnx.ModelProto) -> onnx.ModelProto:
-    """All constants as raw bytes, as scene files have them; the quantiser writes its own as lists of numbers."""
+    """Store all constants as raw bytes, as scene files require; the quantizer writes its own as lists of numbers."""
     for constant in model.graph.initializer:
         constant.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(constant), constant.name))
     return model
@@ -59,7 +59,7 @@ def _plain(model: onnx.ModelProto) -> onnx.ModelProto:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without recommendations: of a preparation that this graph doesn't need, and against a default of `ids`."""
+    """Suppress recommendations of onnxruntime that don't apply to this graph."""
     logging.disable(logging.WARNING)
     onnxruntime.set_default_logger_severity(3)
     try:
@@ -70,7 +70,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _Calibration(CalibrationDataReader):
-    """Inputs of the network: Gaussians evenly spread over all, others at each time."""
+    """Inputs of the network: evenly spread Gaussians, others at each time."""
 
     def __init__(self, baked: Baked) -> None:
         self._inputs = self._each(len(baked.moving), baked.scene.metadata.time_range)

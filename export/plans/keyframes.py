@@ -1,8 +1,8 @@
-"""Plan `keyframes:n`: n stored poses a Gaussian, the control points of a cubic spline over time.
+"""Plan `keyframes:n`: n stored poses per Gaussian, the control points of a cubic spline over time.
 
-Positions, scales and quaternions of one sign are splines, the quaternions made unit after blending: the shortest way.
-A call reads the four poses next to its time. With a number of poses, Gaussians that these get most wrong keep more;
-with an error, each keeps as few as it needs.
+Means, scales and quaternions of one sign are splines; quaternions are normalized after blending. A call reads the four
+poses next to its time. With a number of poses, the Gaussians with the largest errors store more; with an error bound,
+each stores as few as it needs.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 
 
 def keyframes(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.ModelProto:
-    """The scene with `spec.count` poses for all, or with as few of each Gaussian as are within `spec.max_pixels`."""
+    """The scene with `spec.count` poses per Gaussian, or with as few per Gaussian as `spec.max_pixels` allows."""
     every = np.arange(trajectories.count)
     if spec.count is None:
         poses, errors = adaptive_knots(trajectories, every, spec.max_pixels or 0)
@@ -31,7 +31,8 @@ def keyframes(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.
 
 
 def _mostly_of_one_size(trajectories: Trajectories, every: Ids, count: int) -> tuple[GriddedPoses, np.ndarray]:
-    """So many poses for all but the worst, which keep as few as are no worse than any other; and all errors, [N]."""
+    """`count` poses for all but the Gaussians with the largest errors, which get as many as the largest error of the
+    others requires; and all errors, [N]."""
     control, errors = fitted(trajectories, every, count)
     chosen = worst(trajectories, errors, None)
     rest = np.delete(every, chosen)

@@ -1,10 +1,10 @@
 """Plan `lowrank:r`: a pose is its mean over time plus r coefficients of the Gaussian times r functions of time.
 
-One function of time gives all ten numbers of a pose at once, so a frame is one product [M, r + 10] × [r + 10, 10].
-The functions come from the singular value decomposition of all trajectories, positions, scales and rotations weighted
-to be displacements in scene units: in squared error no other r functions are better. Scales are taken as they are and
-not as logarithms, which fall without end where a Gaussian vanishes: on *toybench* 99 % of the errors are a quarter
-smaller. Quaternions are multiplied by their weight, which making them unit takes out again.
+A function of time has all ten numbers of a pose, so a frame is one product [M, r + 10] × [r + 10, 10]. The functions
+are the singular vectors of all trajectories, with positions, scales and rotations weighted to be displacements in scene
+units: no other r functions have a smaller squared error. Scales are linear, since logarithms fall without bound when a
+Gaussian vanishes: on *toybench* 99 % of the errors are a quarter smaller. Quaternions are multiplied by their weight,
+which normalization removes again.
 """
 
 from collections.abc import Iterator
@@ -24,19 +24,19 @@ from export.trajectories.splines import along_time, design, fitting, samples_for
 from export.trajectories.stored import at_time
 
 KNOTS = 131
-"""Control points of each function of time."""
+"""Number of control points of each function of time."""
 
 RANKS = (1, 2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
 OWN_TERMS = 1_000
-"""A Gaussian with poses of its own takes as long, and as many bytes, as so many more terms for one Gaussian."""
+"""Cost of a Gaussian with poses of its own, in time and bytes, in terms of one Gaussian."""
 
 SAMPLED = 4_096
-"""Gaussians at which r is chosen."""
+"""Number of Gaussians by which r is chosen."""
 
 
 def lowrank(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.ModelProto:
-    """The scene with `spec.count` terms, or with as many as make it cheapest within `spec.max_pixels`."""
+    """The scene with `spec.count` terms, or with the cheapest number within `spec.max_pixels`."""
     fit = _Fit(trajectories)
     first_guess = fit.functions(np.arange(trajectories.count))
     rank = spec.count or RANKS[len(RANKS) // 2]
@@ -69,7 +69,7 @@ def _cheapest(trajectories: Trajectories, fit: "_Fit", functions: np.ndarray, pi
 
 
 def _product(graph: GraphBuilder, table: np.ndarray, basis: np.ndarray, time_range: tuple[float, float]) -> str:
-    """[N, 10] a table of coefficients and mean poses, times the functions at `t` above an identity."""
+    """[N, 10] a table of coefficients and mean poses, times the functions at `t` stacked on an identity."""
     rank = basis.shape[1]
     cells, weights = time_weights(graph, "terms.clock", time_range, [KNOTS])
     near = graph.node("Add", [cells, graph.constant("terms.neighbours", np.arange(4, dtype=np.int64))], "terms.near")
@@ -92,7 +92,7 @@ class _Fit:
         self._design = design(KNOTS, times).astype(np.float32)
 
     def functions(self, ids: Ids) -> np.ndarray:
-        """[131 · 10, R] right singular vectors, the most important first; no more than there are Gaussians."""
+        """[131 · 10, R] right singular vectors, the most important first; at most one per Gaussian."""
         size = KNOTS * POSE
         if len(ids) < size:
             matrix = np.concatenate([np.zeros((1, size), np.float32), *(self._rows(rows)[0] for rows in _chunks(ids))])
@@ -104,7 +104,7 @@ class _Fit:
         return eigh(gram, subset_by_index=(size - RANKS[-1], size - 1))[1][:, ::-1].astype(np.float32)
 
     def errors(self, ids: Ids, functions: np.ndarray) -> np.ndarray:
-        """[M] scene units."""
+        """[M] largest errors of the Gaussians with these functions, scene units."""
         errors = np.empty(len(ids))
         done = 0
         for rows in _chunks(ids):
@@ -135,13 +135,13 @@ class _Fit:
         return (control - means[:, None]).reshape(len(ids), -1), means, samples
 
     def _units(self, ids: Ids) -> np.ndarray:
-        """[M, 1, 10] what poses are multiplied by to be displacements in pixels."""
+        """[M, 1, 10] factors from poses to displacements in pixels."""
         units = np.full((len(ids), 1, POSE), 1 / self._trajectories.pixel, np.float32)
         units[..., QUATS] *= self._trajectories.rotation_weights[ids, None, None]
         return units
 
     def _in_scene(self) -> np.ndarray:
-        """[10] what the graph's values are multiplied by: quaternions stay in pixels."""
+        """[10] factors of the values in the graph: quaternions stay in pixels."""
         return np.array([self._trajectories.pixel] * 6 + [1.0] * 4, np.float32)
 
 

@@ -75,7 +75,7 @@ class _Rows:
 
 
 def _modulated(graph: GraphBuilder, rows: _Rows, part: str, factors: np.ndarray | None, deltas: str) -> str:
-    """Equation 12: the summed deltas times the factors of the rows, if there are any."""
+    """The summed deltas times the factors of the rows, if there are any (equation 12)."""
     if factors is None:
         return deltas
     name = f"{part.removesuffix('s')}_modulation"
@@ -100,7 +100,7 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_spac
 
 
 def prefix(baked: Baked, count: int) -> onnx.ModelProto:
-    """The scene with its first `count` layers as trained. Raises `InvalidInput` where it hasn't as many."""
+    """The scene with its first `count` layers as trained. Raises `InvalidInput` if it has fewer."""
     if count > len(baked.layers):
         raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
     metadata = replace(baked.scene.metadata, layers=baked.scene.metadata.layers[:count])

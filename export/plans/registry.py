@@ -1,4 +1,4 @@
-"""From the text of a plan to the scene file that follows it."""
+"""The plans by name, and the scene file of a plan."""
 
 import re
 
@@ -15,11 +15,11 @@ from export.trajectories.sampling import Trajectories, trajectories_of
 from msdgs_serve.scene.errors import InvalidInput
 
 PLANS: dict[str, Plan] = {plan.name: plan for plan in (NETWORK, PREFIX, INT8, LOWRANK, KEYFRAMES)}
-"""By name. A plan from elsewhere is added with `PLANS[plan.name] = plan`; a sweep then tries its candidates too."""
+"""By name. `PLANS[plan.name] = plan` adds a plan from outside this package; a sweep then tries its candidates too."""
 
 
 def usage() -> str:
-    """All plans in words, for messages."""
+    """An explanation of all plans, for messages."""
     fitted = [plan.name for plan in PLANS.values() if plan.fitted]
     bounded = " or ".join(f"{name}:e" for name in fitted)
     return "; ".join(
@@ -32,7 +32,7 @@ def usage() -> str:
 
 
 def parse(text: str | PlanSpec) -> PlanSpec:
-    """The plan that a text names. Raises `InvalidInput` for any other text, saying which there are."""
+    """Parse the name of a plan. Raises `InvalidInput` for any other text, listing the plans."""
     match = re.fullmatch(r"([a-z0-9]+)(?::(?:([0-9]{1,9})|([0-9]{1,9}\.[0-9]{1,9})))?", str(text), re.ASCII)
     if match:
         spec = PlanSpec(match[1], int(match[2]) if match[2] else None, float(match[3]) if match[3] else None)
@@ -42,7 +42,7 @@ def parse(text: str | PlanSpec) -> PlanSpec:
 
 
 def plan_of(text: str | PlanSpec) -> Plan:
-    """The kind of plan that a text names. Raises `InvalidInput` as `parse`."""
+    """The plan with this name. Raises `InvalidInput` as `parse` does."""
     return PLANS[parse(text).name]
 
 
@@ -56,11 +56,11 @@ def _exists(spec: PlanSpec) -> bool:
 
 
 def build(plan: str | PlanSpec, baked: Baked, trajectories: Trajectories | None = None) -> onnx.ModelProto:
-    """The scene file of a plan. A scene in which nothing moves has no nodes under any.
+    """The scene file of a plan. If nothing moves, its graph has no nodes.
 
-    Fitted plans take the scene's `trajectories`; left out, they are sampled, once for all plans of a scene.
-    The error that a fitted plan guarantees is `measured_error` in the result, until the file itself is measured.
-    Raises `InvalidInput` for a plan that doesn't exist or that this scene can't have.
+    Fitted plans use the scene's `trajectories`; by default they are sampled, once for all plans of a scene. The error
+    bound of a fitted plan is stored as `measured_error` until the file itself is measured. Raises `InvalidInput` for a
+    plan that doesn't exist or isn't possible for this scene.
     """
     spec = parse(plan)
     if not len(baked.moving):

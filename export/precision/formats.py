@@ -1,5 +1,5 @@
-"""Emulation of a model's deformation in other number formats: every rounding of the hardware is made, in float32 or
-float64 arithmetic."""
+"""Emulation of a model's deformation in other number formats: float32 or float64 arithmetic with the roundings of the
+hardware."""
 
 import copy
 from collections.abc import Callable
@@ -16,13 +16,13 @@ from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 
 @dataclass(frozen=True)
 class Format:
-    """A number format, and which numbers are rounded to it."""
+    """A number format, and the numbers that are rounded to it."""
 
     name: str
     base: torch.dtype  # means, encodings, sums
     rounded: torch.dtype
     where: Literal["nowhere", "products", "everywhere"]
-    """Products: operands and results of the layers' matrix products. Everywhere: also before the encoding."""
+    """`products`: operands and results of the layers' matrix products; `everywhere`: also before the encoding."""
     meaning: str
 
 
@@ -37,7 +37,7 @@ FORMATS = (
 
 
 def in_format(model: DynamicGaussians, number_format: Format) -> DynamicGaussians:
-    """A copy of the model whose layers compute in `number_format`, and all that follows them in its base type."""
+    """A copy of the model whose layers compute in `number_format`, and everything after them in its base type."""
     changed = copy.deepcopy(model).to(number_format.base)
     if number_format.where == "nowhere":
         return changed
@@ -72,7 +72,7 @@ means, and blends motions, which is cheap in float32."""
 
 
 class _Rounding(TorchDispatchMode):
-    """Rounds what goes in and out of operations. Parameters are rounded already, so views of them don't change."""
+    """Rounds operands and results of operations. Parameters are rounded already, so views of them don't change."""
 
     def __init__(self, number_format: Format) -> None:
         super().__init__()

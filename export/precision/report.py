@@ -1,15 +1,21 @@
-"""The result of an assessment of stability, and what follows from it for the plans of an export."""
+"""The result of an assessment of stability, and the plans that it allows."""
 
 import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 
 from export.plans.registry import PLANS, plan_of
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.modulation import MAX_LOG_FACTOR
+from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
 
-NO_VALUES = np.ones(0)
+AT_LIMIT = 1 - 1e-6
+"""Fraction of a limit from which a value counts as being at it."""
 
 
 class PlanUnsafe(MsdgsError):
@@ -18,7 +24,7 @@ class PlanUnsafe(MsdgsError):
 
 @dataclass(frozen=True)
 class FormatGap:
-    """What one number format does to poses and frames, against float64."""
+    """Errors of poses and frames in one number format, against float64."""
 
     name: str
     meaning: str
@@ -43,23 +49,22 @@ class WorstGaussians:
     outside_bounds: int
     moved: float  # median distance from their canonical means, as a fraction of the half diagonal
     pixels: float  # largest distance of a projected mean
-    drawn_psnr: float  # dB, the float64 frame with against without them: how much of them is visible at all
+    drawn_psnr: float  # dB between the float64 frames with and without them: how visible they are
 
 
 @dataclass(frozen=True)
 class Samples:
     """One row per sampled Gaussian and time."""
 
-    amplification: np.ndarray = field(default_factory=NO_VALUES.copy)  # [S]
-    distance: np.ndarray = field(default_factory=NO_VALUES.copy)  # [S] float32 mean to float64 mean, scene units
-    predicted: np.ndarray = field(default_factory=NO_VALUES.copy)  # [S] the distance predicted by the amplification
+    amplification: np.ndarray = field(default_factory=lambda: np.ones(0))  # [S]
+    distance: np.ndarray = field(default_factory=lambda: np.ones(0))  # [S] of float32 from float64 means, scene units
+    predicted: np.ndarray = field(default_factory=lambda: np.ones(0))  # [S] distance predicted by the amplification
     after: np.ndarray = field(default_factory=lambda: np.ones((0, 0)))  # [K, S] growth after each layer
 
 
 @dataclass(frozen=True)
 class StabilityReport:
-    """What `assess` found. `stable` says whether plans that run the layers may be used. The defaults are those of a
-    model in which nothing moves."""
+    """The result of `assess`. The defaults are those of a model in which nothing moves."""
 
     gaussians: int
     times: int
@@ -78,11 +83,12 @@ class StabilityReport:
 
     @property
     def stable(self) -> bool:
+        """Whether plans that run the layers may be used."""
         return not (self.broken or self.unstable)
 
     @property
     def verdict(self) -> str:
-        """One sentence, or several, on what to do."""
+        """The result in words, with a remedy."""
         if self.broken:
             return "can't be shown: " + "; ".join(self.broken)
         if self.unstable:
@@ -102,14 +108,31 @@ class StabilityReport:
 
     def require(self, plan: str) -> None:
         """Raise `PlanUnsafe` if `plan` must not be used."""
-        problem = self.refusal(plan)
-        if problem:
+        if problem := self.refusal(plan):
             raise PlanUnsafe(problem)
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON, without the samples; infinities become None."""
         plain = {k: v for k, v in asdict(self).items() if k != "samples"}
         return {"stable": self.stable, "verdict": self.verdict, **_without_infinities(plain)}
+
+
+@torch.no_grad()
+def limits_met(model: DynamicGaussians, scales: list[np.ndarray]) -> dict[str, int]:
+    """Numbers of Gaussians that are clamped by each limit of the model, without zeros. `scales` are posed ones, [M, 3]
+    per time."""
+    g = model.gaussians
+    with np.errstate(divide="ignore", invalid="ignore"):
+        posed = [(np.abs(np.log(s)) >= LOG_SCALE_LIMIT * AT_LIMIT).any(axis=1).sum() for s in scales]
+    found = {
+        f"canonical scales at e^±{LOG_SCALE_LIMIT:g}": (g.log_scales.abs() >= LOG_SCALE_LIMIT).any(dim=1).sum(),
+        f"scales at e^±{LOG_SCALE_LIMIT:g}, most at one time": max(posed, default=0),
+        "quaternions without a direction": (torch.linalg.vector_norm(g.raw_quats, dim=1) < MIN_NORM).sum(),
+    }
+    for name, factors in model.modulation(g.embeddings).present().items() if model.modulation is not None else ():
+        bounded = factors.log().abs() >= MAX_LOG_FACTOR * AT_LIMIT
+        found[f"modulation of {name} at e^±{MAX_LOG_FACTOR:g}"] = bounded.any(dim=1).sum()
+    return {what: int(count) for what, count in found.items() if count}
 
 
 def _remedy() -> str:

@@ -1,4 +1,4 @@
-"""Pruning: removing what a scene does not need, as rendered frames decide."""
+"""Pruning: removal of parts of a scene that rendered frames don't need."""
 
 from export.pruning.decide import prune
 from export.pruning.mask import PrunedModel, PruningMask, full_mask, pruned

@@ -1,4 +1,4 @@
-"""Pruning: rule by rule, each measured in frames of what the rules before it have left."""
+"""Pruning rule by rule, each measured in frames of the result of the rules before it."""
 
 import math
 from collections.abc import Callable, Collection
@@ -13,7 +13,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
 MOVING_BYTES, MODULATION_BYTES = 8, 12
-"""Per Gaussian in a scene file: pose, opacity, an SH coefficient; and if it moves, its id and its modulation."""
+"""Sizes per Gaussian in a scene file: pose, opacity, an SH coefficient; and if it moves, its id and its modulation."""
 
 
 def prune(
@@ -22,10 +22,10 @@ def prune(
     rules: Collection[str] = tuple(RULES),
     on_rule: Callable[[], object] = lambda: None,
 ) -> tuple[PruningMask, list[dict[str, Any]]]:
-    """What `rules` leave of the model while the worst selection frame stays at `min_db` dB or more, and the entries of
+    """Apply `rules` while the worst selection frame stays at `min_db` dB or more. Returns the mask and the entries of
     `left_out` in its scene file.
 
-    Each rule may spend its part of the squared error that this allows, and what the rules before it have not spent.
+    Each rule may spend its fraction of the squared error that this allows, and what the rules before it have saved.
     """
     mask, left_out = full_mask(statistics.model), []
     for name in (name for name in RULES if name in rules):

@@ -1,4 +1,4 @@
-"""What pruning leaves of a model, and the smaller model that this makes."""
+"""The parts of a model that pruning keeps, and the smaller model that they make."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from export.jobs.bake import Baked, bake
 from export.layers import HEADS, export_of
 from export.measure.poses import posed
 from export.spatial_order import morton_order
@@ -14,6 +15,7 @@ from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.layers.deformation import DeformationLayer
@@ -21,16 +23,16 @@ from msdgs_train.layers.deformation import DeformationLayer
 
 @dataclass(frozen=True)
 class NetworkMask:
-    """The parts of a deformation that are left."""
+    """The parts of a deformation that are kept."""
 
-    layers: tuple[int, ...]  # indices of the model's
-    heads: frozenset[str]  # out of `HEADS`, of layers that have heads
+    layers: tuple[int, ...]  # indices of the model's layers
+    heads: frozenset[str]  # some of `HEADS`, in layers that have heads
     modulated: bool
 
 
 @dataclass(frozen=True, eq=False)
 class PruningMask:
-    """What is left of a model."""
+    """The parts of a model that are kept."""
 
     network: NetworkMask
     kept: np.ndarray  # [N] bool
@@ -39,7 +41,7 @@ class PruningMask:
 
     @property
     def ids(self) -> np.ndarray:
-        """The model's ids of what is left: moving Gaussians, then static ones."""
+        """The model's ids of the kept Gaussians: moving ones, then static ones."""
         return np.concatenate([np.flatnonzero(self.moves), np.flatnonzero(self.kept & ~self.moves)])
 
     def without(self, **changes: Any) -> "PruningMask":
@@ -75,14 +77,14 @@ def in_spatial_order(model: DynamicGaussians) -> DynamicGaussians:
 
 
 def with_network(model: DynamicGaussians, network: NetworkMask) -> DynamicGaussians:
-    """All Gaussians with what is left of the deformation; parameters are shared with `model`."""
+    """All Gaussians with the kept parts of the deformation; parameters are shared with `model`."""
     return _model(model, network, slice(None), model.config.sh_degree)
 
 
 def pruned(
     model: DynamicGaussians, mask: PruningMask, mean_poses: Gaussians, left_out: list[dict[str, Any]]
 ) -> PrunedModel:
-    """The model that a mask leaves; `mean_poses` are the poses of all N Gaussians if they are static."""
+    """The model that a mask keeps; `mean_poses` are the poses that each of the N Gaussians has if it is static."""
     network = mask.network if mask.moves.any() else replace(mask.network, layers=())
     static = np.flatnonzero(mask.kept & ~mask.moves)
     moving = _model(model, network, torch.from_numpy(mask.moves), mask.sh_degree)
@@ -90,14 +92,30 @@ def pruned(
 
 
 def unpruned(model: DynamicGaussians) -> PrunedModel:
-    """A model as it is."""
+    """A model of which nothing is pruned."""
     every = np.arange(len(model.gaussians))
     canonical = posed(model, 0.0, deform=False)
     return PrunedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
 
 
+def bake_pruned(pruned: PrunedModel, info: SceneInfo, checkpoint_sha256: str) -> Baked:
+    """Bake the moving part of a pruned model, and add its static Gaussians."""
+    baked = bake(pruned.moving, info, checkpoint_sha256)
+    scene, static = baked.scene, pruned.static
+    scene = replace(
+        scene,
+        metadata=replace(scene.metadata, left_out=pruned.left_out),
+        static_means=np.concatenate([scene.static_means, static.means]),
+        static_quats=np.concatenate([scene.static_quats, static.quats]),
+        static_scales=np.concatenate([scene.static_scales, static.scales]),
+        opacities=np.concatenate([scene.opacities, static.opacities]),
+        sh=np.concatenate([scene.sh, static.sh]),
+    )
+    return replace(baked, scene=scene.validate("the pruned scene"))
+
+
 def with_sh_degree(pruned: PrunedModel, sh_degree: int) -> PrunedModel:
-    """The same Gaussians with the SH bands up to `sh_degree` alone."""
+    """The same Gaussians with only the SH bands up to `sh_degree`."""
     before = pruned.moving.config.sh_degree
     network = full_mask(pruned.moving).network
     static = rows(pruned.static, np.arange(len(pruned.static)), sh_degree)

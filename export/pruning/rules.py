@@ -1,4 +1,4 @@
-"""The rules of pruning: each proposes what to remove, and rendered frames decide how much of it."""
+"""The rules of pruning: each proposes parts to remove, and rendered frames decide how many."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,45 +10,45 @@ from export.pruning.mask import PruningMask
 from export.pruning.statistics import PruningStatistics
 
 BISECTIONS = 7
-"""Steps of the search for the number of Gaussians that can be removed: to 1 in 128."""
+"""Steps of the search for the number of Gaussians that can be removed: precise to 1 in 128."""
 
 MAX_MEAN_MOTION = 1.0
 """Pixels. Parts of the network that move the visible Gaussians by more than this on average aren't tried."""
 
 VISIBLE_MOTION = 2.0
-"""Pixels. Gaussians that move further stay in motion even if they are faint: from other views they may not be."""
+"""Pixels. Gaussians that move further keep their motion even if they are faint: in other views they may not be."""
 
 MAX_OPERATIONS = 2e13
-"""Operations for trials without some of the layers, minutes of two cores; layers not tried by then are kept. A scene of
-the paper's size would be posed for half an hour."""
+"""Operations for trials without some of the layers, some minutes of two cores; layers not tried by then are kept. All
+trials of a scene of the paper's size would take half an hour."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """One rule as users see it."""
+    """One rule."""
 
-    what: str  # what it removes, in words
-    error_budget: float  # fraction of the squared error allowed that may be spent when this rule is done
+    what: str  # the removed parts, in words
+    error_budget: float  # fraction of the allowed squared error that may be spent by this rule and those before it
     apply: Callable[[PruningStatistics, PruningMask, float], PruningMask]
-    """Removes what it can while the worst selection frame stays at so many dB or more."""
+    """Removes as much as possible while the worst selection frame stays at this many dB or more."""
     count: Callable[[PruningMask], int]
-    """How many there still are of what it removes."""
+    """The number of these parts that are still there."""
 
 
 def modulation(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
-    """Modulation whose factors are 1, or nearly."""
+    """Remove the modulation if its factors are close to 1."""
     return _if_allowed(statistics, mask, min_db, modulated=False) if mask.network.modulated else mask
 
 
 def heads(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
-    """Heads of all layers that change nothing: positions, scales or rotations."""
+    """Remove heads of all layers, for positions, scales or rotations, that change nothing."""
     for name in sorted(mask.network.heads, key=HEADS.index, reverse=True):
         mask = _if_allowed(statistics, mask, min_db, heads=mask.network.heads - {name})
     return mask
 
 
 def layers(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
-    """Whole layers whose weighted step is invisible: as many of the last ones as possible, then single ones."""
+    """Remove layers whose weighted step is invisible: as many of the last ones as possible, then single ones."""
     work = MAX_OPERATIONS
 
     def tried(left: tuple[int, ...]) -> PruningMask:
@@ -68,19 +68,19 @@ def layers(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> P
 
 
 def invisible(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
-    """Gaussians that contribute to no frame, those that contribute least first."""
+    """Remove Gaussians that contribute to no frame, those that contribute least first."""
     return _as_many_as_allowed(statistics, mask, "kept", statistics.peaks * statistics.amounts, mask.kept, min_db)
 
 
 def static(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
-    """Motion of Gaussians that don't move visibly, those that move least first."""
+    """Remove the motion of Gaussians that don't move visibly, those that move least first."""
     motion = statistics.motion(mask.network)
     among = mask.moves & (motion < VISIBLE_MOTION)
     return _as_many_as_allowed(statistics, mask, "moves", motion * statistics.peaks, among, min_db)
 
 
 def sh(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
-    """Upper bands of the spherical harmonics that change no color visibly."""
+    """Remove upper SH bands that change no color visibly."""
     for degree in range(mask.sh_degree):
         lower = mask.without(sh_degree=degree)
         if statistics.worst_db(lower, min_db) >= min_db:
@@ -100,7 +100,7 @@ RULES = {
 
 
 def _if_allowed(statistics: PruningStatistics, mask: PruningMask, min_db: float, **changes: object) -> PruningMask:
-    """The mask with a smaller network if frames allow it; a few poses are compared before any frame is rendered."""
+    """The mask with a smaller network if the frames allow it; a few poses are compared before frames are rendered."""
     network = replace(mask.network, **changes)
     if not mask.moves.any() or statistics.change(mask.network, network) > MAX_MEAN_MOTION:
         return mask
@@ -111,8 +111,8 @@ def _if_allowed(statistics: PruningStatistics, mask: PruningMask, min_db: float,
 def _as_many_as_allowed(
     statistics: PruningStatistics, mask: PruningMask, flags: str, amounts: np.ndarray, among: np.ndarray, min_db: float
 ) -> PruningMask:
-    """Clear the flags, "kept" or "moves", of as many Gaussians of `among`, [N] bool, as frames allow, in the
-    order of `amounts`, [N]: all, or what bisection finds."""
+    """Clear the flags, "kept" or "moves", of as many Gaussians of `among`, [N] bool, as the frames allow, in the order
+    of `amounts`, [N]. The number is all of them, or found by bisection."""
     ids = np.flatnonzero(among)
     order = ids[np.argsort(amounts[ids], kind="stable")]
 

@@ -1,4 +1,4 @@
-"""What pruning decides by: the visibility of each Gaussian, its motion in pixels, and frames to compare."""
+"""The basis of pruning: the visibility of each Gaussian, its motion in pixels, and frames to compare."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -19,10 +19,10 @@ from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.rendering.rasterize import rasterize
 
 MEMORY, POSE_BYTES = 2e9, 40
-"""Bytes of poses of smaller networks that are cached, and bytes of a Gaussian at one time."""
+"""Bytes of cached poses of smaller networks, and bytes of a Gaussian at one time."""
 
 SAMPLED_GAUSSIANS, SAMPLED_TIMES = 1000, 5
-"""For the quick estimate of what a part of the network contributes."""
+"""Samples of the quick estimate of a network part's contribution."""
 
 
 class Poses:
@@ -47,7 +47,7 @@ class Poses:
 
 
 class PruningStatistics:
-    """Frames of the whole model at the selection views, and what a mask changes in them. All in float32."""
+    """Frames of the whole model at the selection views, and the changes that a mask makes in them. All in float32."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class PruningStatistics:
         self.peaks, self.amounts = self._visibility()
 
     def poses(self, network: NetworkMask) -> Poses:
-        """All Gaussians as this part of the network moves them."""
+        """The poses of all Gaussians with this part of the network."""
         if network == self._whole[0]:
             return self._whole[1]
         if network not in self._kept:
@@ -104,14 +104,13 @@ class PruningStatistics:
             frame = render(drawn, view.camera, self.background, self.model.rasterizer)
             worst = min(worst, compare(frame, self._frames[i]).psnr)
             if worst < min_db:
-                self._order.remove(i)  # likely the worst one next time too
+                self._order.remove(i)  # probably the worst one next time too
                 self._order.insert(0, i)
                 break
         return worst
 
     def motion(self, network: NetworkMask) -> FloatArray:
-        """[N] largest displacement in pixels, in the nearest camera, of the ends of a Gaussian's axes from its mean
-        pose: by position, rotation and scales."""
+        """[N] largest displacement of the ends of a Gaussian's axes from its mean pose, pixels."""
         poses = self.poses(network)
         mean_axes = half_axes(poses.static)
         furthest = np.zeros(len(poses.static), np.float32)
@@ -138,7 +137,7 @@ class PruningStatistics:
         return change
 
     def pixels_per_unit(self, means: FloatArray) -> FloatArray:
-        """[N] pixels per scene unit at each point, in the camera in which that is largest."""
+        """[N] pixels per scene unit at each point, in the nearest camera."""
         most = np.zeros(len(means), np.float32)
         for camera in {id(view.camera): view.camera for view in self._views}.values():
             distances = np.linalg.norm(means - camera.position, axis=1)
@@ -149,8 +148,8 @@ class PruningStatistics:
         return Poses(with_network(self.model, network), sorted({view.t for view in self._views}))
 
     def _visibility(self) -> tuple[FloatArray, FloatArray]:
-        """[N] the largest fraction that a Gaussian contributes to a pixel at its center, and to how many pixels, over
-        the views."""
+        """[N] the largest contribution of a Gaussian to a pixel at its center, in [0, 1], and the largest sum of its
+        contributions to a view."""
         poses = self.poses(self._whole[0])
         peaks, amounts = np.zeros((2, len(poses.static)), np.float32)
         for view in self._views if len(peaks) else ():
@@ -168,9 +167,9 @@ def blending_weights(gaussians: Gaussians, view: View, options: RasterizerOption
     means, quats, scales, opacities = (
         torch.from_numpy(array) for array in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     )
-    grey = torch.zeros(len(means), 1, 3, requires_grad=True)
-    rgb, _, _ = rasterize(means, quats, scales, opacities, grey, view.camera, torch.zeros(3), options)
-    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), grey)
+    gray = torch.zeros(len(means), 1, 3, requires_grad=True)
+    rgb, _, _ = rasterize(means, quats, scales, opacities, gray, view.camera, torch.zeros(3), options)
+    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), gray)
     return (gradient[:, 0, 0] / SH_C0).numpy()
 
 

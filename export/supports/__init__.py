@@ -1,4 +1,4 @@
-"""Supports as parts of an ONNX graph: how a chain of layers on points becomes deltas of Gaussians, one module a kind.
+"""Supports as parts of an ONNX graph, from a chain of layers on points to deltas of Gaussians; one module per kind.
 
 A kind from outside this package registers itself with `SUPPORTS[kind] = export`, a `SupportExport`.
 """
@@ -12,11 +12,11 @@ from msdgs_train.supports.base import Support
 __all__ = ["SUPPORTS", "Layout", "SupportExport", "SupportInputs", "support_export_of"]
 
 SUPPORTS: dict[str, SupportExport] = {"gaussians": GaussiansExport(), "nodes": NodesExport()}
-"""By the kind of the support, its attribute `kind`."""
+"""By the attribute `kind` of a support."""
 
 
 def support_export_of(support: Support) -> SupportExport:
-    """How this support is exported. Raises `ModelNotExportable` for a kind that isn't registered."""
+    """The export of this support. Raises `ModelNotExportable` for a kind that isn't registered."""
     if support.kind not in SUPPORTS:
         known = ", ".join(SUPPORTS)
         raise ModelNotExportable(f"support {support.kind!r} can't be exported; those that can: {known}")

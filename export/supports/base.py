@@ -1,4 +1,4 @@
-"""What an export needs to know of a kind of support."""
+"""The interface of the export of a kind of support."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class SupportExport:
     """How supports of one kind are exported. Register one in `export.supports.SUPPORTS` under the kind's name."""
 
     heads_are_removable = True
-    """Whether a head of the layers that is always 0 is one of the Gaussians that is."""
+    """Whether a head that is 0 in all layers is 0 for the Gaussians too."""
 
     def bytes_per_gaussian(self, support: Support) -> int:
         """What the support stores per Gaussian in a scene file."""
@@ -45,6 +45,6 @@ class SupportExport:
         return None
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
-        """Add the nodes of the chain and of what follows it. Returns summed deltas of the rows by head, those that
-        aren't always 0 (equations 7 to 9, before modulation)."""
+        """Add the nodes of the chain and of the support. Returns the summed deltas of the rows by head, without heads
+        that are always 0 (equations 7 to 9, before modulation)."""
         raise NotImplementedError

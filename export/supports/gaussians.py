@@ -6,9 +6,9 @@ from export.supports.base import SupportExport, SupportInputs
 
 
 class GaussiansExport(SupportExport):
-    """Of `GaussiansSupport`."""
+    """Exports `GaussiansSupport`."""
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
-        """Of the chain itself."""
+        """The deltas of the chain itself."""
         used = used_heads(inputs.layers)
         return summed_deltas(graph, inputs.layers, inputs.means, inputs.time, inputs.steps, used)

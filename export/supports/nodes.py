@@ -25,7 +25,7 @@ IDENTITY = np.array([1, 0, 0, 0], np.float32)
 
 
 class NodesExport(SupportExport):
-    """Of `NodesSupport`."""
+    """Exports `NodesSupport`."""
 
     heads_are_removable = False
 
@@ -156,7 +156,7 @@ def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
 
 
 def _row_sums(graph: GraphBuilder, name: str, products: str) -> str:
-    """[·, 9] → [·, 3]: of three at a time."""
+    """[·, 9] → [·, 3]: sums of three columns at a time."""
     threes = graph.constant(f"{name}.threes", np.kron(np.eye(3), np.ones((3, 1))).astype(np.float32))
     return graph.node("MatMul", [products, threes], name)
 
@@ -236,7 +236,7 @@ def _rotated(graph: GraphBuilder, rots: str, quats: str) -> str:
 
 
 def _unit(graph: GraphBuilder, name: str, quats: str) -> str:
-    """Quaternions [·, 4] of unit length, as training makes them."""
+    """Normalize quaternions, [·, 4], as training does."""
     ones = graph.constant(f"{name}.four", np.ones((4, 4), np.float32))
     least = graph.constant(f"{name}.least", np.array(MIN_NORM, np.float32))
     sums = graph.node("MatMul", [graph.node("Mul", [quats, quats], f"{name}.squares"), ones], f"{name}.sums")

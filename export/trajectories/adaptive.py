@@ -1,4 +1,4 @@
-"""Splines with as many control points per Gaussian as an error bound needs."""
+"""Splines whose number of control points per Gaussian follows from an error bound."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ from export.trajectories.splines import along_time, design, fitting, samples_for
 from export.trajectories.stored import GriddedPoses, StoredPoses
 
 COUNTS = (7, 11, 19, 35, 67, 131, 259, 515, FINEST // 2 + 3)
-"""Control points that a Gaussian's spline may have."""
+"""Possible numbers of control points of a Gaussian's spline."""
 
 MAX_CORRECTED = 0.05
-"""Fraction of the Gaussians, those with the largest errors, that a plan of a given size corrects."""
+"""Fraction of the Gaussians, those with the largest errors, that a plan of a fixed size corrects."""
 
 VISIBLE = 0.02
 """Smallest error that is corrected, pixels."""
@@ -20,11 +20,11 @@ BLOCK = 4096
 """Gaussians whose control points are held in float32 at a time."""
 
 CHUNK = 2048
-"""Gaussians that are fitted at a time; fewer of those that are sampled more densely."""
+"""Gaussians that are fitted at a time, fewer if they are sampled more densely."""
 
 
 def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) -> Ids:
-    """Gaussians with larger errors than `most` pixels, or, without it, the worst 5 %."""
+    """Gaussians with larger errors than `most` pixels, or the worst 5 % if it is None."""
     if most is not None:
         return np.flatnonzero(errors > most * trajectories.pixel)
     over = np.flatnonzero(errors > VISIBLE * trajectories.pixel)
@@ -32,7 +32,7 @@ def worst(trajectories: Trajectories, errors: np.ndarray, most: float | None) ->
 
 
 def adaptive_knots(trajectories: Trajectories, ids: Ids, most: float) -> tuple[GriddedPoses, np.ndarray]:
-    """Poses of the Gaussians `ids`, each on the coarsest grid that is within `most` pixels, and their errors [H]."""
+    """Poses of the Gaussians `ids`, each on the coarsest grid with an error up to `most` pixels, and the errors [H]."""
     errors, fewest = np.full(len(ids), np.inf), trajectories.fewest_poses(most, ids)
     grids, left = [], np.arange(len(ids))
     for count in COUNTS:
@@ -54,7 +54,8 @@ def adaptive_knots(trajectories: Trajectories, ids: Ids, most: float) -> tuple[G
 
 
 def fitted(trajectories: Trajectories, ids: Ids, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """[M, n, 10] control points as stored, and the largest error of each Gaussian at all its samples, scene units."""
+    """[M, n, 10] control points, and the largest error of each Gaussian at its samples, in scene units and including
+    the rounding of stored control points."""
     control = np.empty((len(ids), count, POSE), np.float32)
     errors, checks = np.empty(len(ids)), np.maximum(trajectories.checks(ids), samples_for(count))
     for times in np.unique(checks):
@@ -65,7 +66,7 @@ def fitted(trajectories: Trajectories, ids: Ids, count: int) -> tuple[np.ndarray
 
 
 def _fitted(trajectories: Trajectories, ids: Ids, count: int, checks: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same for Gaussians that are compared at `checks` times."""
+    """`fitted` for Gaussians that are compared at `checks` times."""
     samples, times = trajectories.on_grid(checks, ids), samples_for(count)
     matrix, shown = fitting(count, times).astype(np.float32), design(count, checks).astype(np.float32)
     control = along_time(matrix, samples[:, :: (checks - 1) // (times - 1)])

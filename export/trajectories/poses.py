@@ -25,7 +25,7 @@ Poses = npt.NDArray[np.float64]
 
 
 class ExactPoses:
-    """`at(t)`: the scene's layers run on the baked values in float64, without any graph."""
+    """Poses in float64, by running the scene's layers on the baked values."""
 
     def __init__(self, baked: Baked) -> None:
         m = baked.moving
@@ -65,10 +65,8 @@ def _double(array: np.ndarray) -> torch.Tensor:
 
 
 def pixel(baked: Baked) -> float:
-    """Size in scene units of one pixel of the nearest camera, at the middle of the moving Gaussians.
-
-    The unit of error bounds. Without cameras: of an image of 400 pixels across the scene's bounds.
-    """
+    """The unit of error bounds: size in scene units of a pixel of the nearest camera, at the middle of the moving
+    Gaussians. Without cameras, an image of 400 pixels spans the scene's bounds."""
     low, high = np.array(baked.scene.metadata.bounds)
     middle = np.median(baked.moving.means, axis=0) if len(baked.moving) else (low + high) / 2
     spans = [
@@ -80,7 +78,7 @@ def pixel(baked: Baked) -> float:
 
 
 class SinglePoses:
-    """As `ExactPoses`, in float32: 0.4 of the processor time of torch, at ten layers of 256 units on two cores.
+    """Poses in float32, in 0.4 of the processor time of torch for ten layers of 256 units on two cores.
 
     Raises `SceneFileInvalid` if float32 can't hold the scene or its motion.
     """

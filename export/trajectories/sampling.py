@@ -1,16 +1,16 @@
 """Poses of the moving Gaussians, sampled over time as densely as each of them needs.
 
-All Gaussians are sampled at 65 times. Where a cubic misses a pose between them by more than a tenth of a pixel, that
-Gaussian is sampled again twice as densely, and so on up to 2,049 times: a fast motion that a coarse sampling misses is
-found at the times between, and only what moves fast pays for it. The times between are every second sample and a few
-at irregular times, which detect motion with the period of the samples.
+All Gaussians are sampled at 65 times. If a cubic through the samples of a Gaussian is off by more than a tenth of a
+pixel between them, this Gaussian is sampled again twice as densely, and so on up to 2,049 times, so that only fast
+motion costs more. Cubics are compared at every second sample and at a few irregular times (probes), which detect motion
+with the period of the samples.
 
-The times on no grid are sampled in float64 and in float32. Where float32 is as good as exact there, all other samples
-are taken in it: a network of the paper's size takes ten seconds a time in float64, one to two in float32.
+The probes are taken in float64 and in float32. If float32 is close enough there, all other samples are taken in it: a
+network of the paper's size needs ten seconds per time in float64, one to two in float32.
 """
 
+import copy
 import hashlib
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -18,20 +18,20 @@ import numpy as np
 import numpy.typing as npt
 
 from export.jobs.bake import Baked
+from export.progress import Track, no_progress
 from export.trajectories.poses import MEANS, POSE, QUATS, SCALES, ExactPoses, Poses, SinglePoses, pixel
 from msdgs_serve.scene.errors import SceneFileInvalid
 
 COARSE, USUAL, FINEST = 64, 512, 2048
-"""Intervals between samples: of all Gaussians, for comparing fits, and of the fastest Gaussians."""
+"""Numbers of intervals between samples: of all Gaussians, of comparisons with fits, and of the fastest Gaussians."""
 
 RESOLVED = 0.1
 """Largest error of a cubic between samples, pixels."""
 
 FLOAT32_ENOUGH = 0.005
-"""Largest error of float32 at the irregular times, pixels, for other samples to be taken in it."""
+"""Largest error of float32 at the probes, pixels, with which all other samples are taken in it."""
 
 PROBES = 9
-"""Number of irregular times."""
 
 WORK = 1e14
 """Largest number of operations for samples beyond the coarse ones: about ten minutes of two cores."""
@@ -41,44 +41,49 @@ MEMORY = 2 * 2**30
 
 Samples = npt.NDArray[np.floating]  # [M, T, 10] means, linear scales, unit quaternions of one sign along time
 Ids = npt.NDArray[np.int64]
-OnTime = Callable[[int, int], object]
 
 
 class Trajectories:
     """Samples of one baked scene, used by all plans that are fitted to them."""
 
-    def __init__(self, baked: Baked, on_time: OnTime = lambda done, total: None) -> None:
-        """`on_time(done, total)` is called after each time sampled; the total grows if motion is fast."""
+    def __init__(self, baked: Baked, track: Track = no_progress) -> None:
         self.exact = ExactPoses(baked)
         self.count = self.exact.count
         self.time_range = baked.scene.metadata.time_range
         self.pixel = pixel(baked)
-        self._done, self._total, self._on_time = 0, COARSE + 1 + PROBES, on_time
+        self._ids = np.arange(self.count)  # in the arrays below
+        self._track = track
+        self._on_time = track(f"{self.count:,} trajectories", COARSE + 1 + PROBES)
         self._probe_parts = np.arange(1, PROBES + 1) * (np.sqrt(5) - 1) / 2 % 1
         self._sampler, self._probes = self._probed(baked)
-        samples = self._sampled(np.arange(self.count), np.linspace(*self.time_range, COARSE + 1))
+        samples = self._sampled(self._ids, np.linspace(*self.time_range, COARSE + 1))
         give_one_sign(samples)
-        self._levels = {COARSE: (np.arange(self.count), samples)}
+        self._levels = {COARSE: (self._ids, samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
         self._fewest: dict[float, npt.NDArray[np.int64]] = {}  # by pixels
-        self._misses = np.zeros(self.count)  # scene units, at the finest times between samples that were looked at
+        self._misses = np.zeros(self.count)  # scene units, error of cubics at the finest level
         self.rotation_weights = _rotation_weights(samples, self.pixel)
         self._refine()
+
+    def some(self, rows: Ids) -> "Trajectories":
+        """Trajectories of some of the Gaussians; the samples are shared."""
+        made = copy.copy(self)
+        made.count, made._ids = len(rows), self._ids[rows]
+        made.rotation_weights = self.rotation_weights[rows]
+        return made
 
     @property
     def unresolved(self) -> Ids:
         """Gaussians that move faster than their finest sampling resolves."""
-        return np.flatnonzero(self._misses > RESOLVED * self.pixel)
+        return np.flatnonzero(self._misses[self._ids] > RESOLVED * self.pixel)
 
     def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
-        """[M] at how many evenly spread times fits are compared with each of these Gaussians."""
-        return np.maximum(self._depth[ids], USUAL) + 1
+        """[M] the number of evenly spread times at which fits are compared with each of these Gaussians."""
+        return np.maximum(self._depth[self._ids[ids]], USUAL) + 1
 
     def on_grid(self, times: int, ids: Ids) -> Samples:
-        """[M, T, 10] poses at evenly spread times, a power of two of them and one more.
-
-        Between the samples of a slow Gaussian a cubic through them.
-        """
+        """[M, T, 10] poses at T = 2ⁿ + 1 evenly spread times, interpolated by cubics between samples."""
+        ids = self._ids[ids]
         got = np.empty((len(ids), times, POSE), np.float32)
         for level in np.unique(self._depth[ids]):
             rows = np.flatnonzero(self._depth[ids] == level)
@@ -104,17 +109,18 @@ class Trajectories:
         }
 
     def fewest_poses(self, most: float, ids: Ids) -> npt.NDArray[np.int64]:
-        """[M] how many control points each needs to be within `most` pixels, where that was found before, or 0."""
-        return self._fewest.get(most, np.zeros(self.count, np.int64))[ids]
+        """[M] the number of control points that each needs to be within `most` pixels, if another plan has found it, or
+        0."""
+        return self._fewest[most][self._ids[ids]] if most in self._fewest else np.zeros(len(ids), np.int64)
 
     def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
-        """Store counts for other plans with the same error bound."""
-        self._fewest.setdefault(most, np.zeros(self.count, np.int64))[ids] = counts
+        """Store numbers of control points for other plans with the same error bound."""
+        self._fewest.setdefault(most, np.zeros_like(self._depth))[self._ids[ids]] = counts
 
     def distances(self, ids: Ids, differences: np.ndarray) -> npt.NDArray[np.float64]:
         """[M] the largest of differences from poses, [M, T, 10], in scene units.
 
-        Of means, of scales, and of how far a wrong rotation displaces the end of the longest axis.
+        They are those of means, of scales, and of the end of the longest axis by a wrong rotation.
         """
         return distances(differences, self.rotation_weights[ids])
 
@@ -131,7 +137,7 @@ class Trajectories:
                 break
             work -= len(fast) * (level // 2) * self.exact.operations
             coarse = samples[np.searchsorted(ids, fast)]
-            self._total += level // 2
+            self._on_time = self._track("fast trajectories, sampled more densely", level // 2)
             between = self._sampled(fast, np.linspace(*self.time_range, level + 1)[1::2])
             fine = _with_between(coarse, between)
             give_one_sign(fine)
@@ -141,7 +147,7 @@ class Trajectories:
             ids, samples = fast, fine
 
     def _missed(self, ids: Ids, samples: Samples) -> npt.NDArray[np.float64]:
-        """[M] how far cubics through samples are off: every second one from the others, and all from the probes."""
+        """[M] errors of cubics through every second sample at the others, and through all samples at the probes."""
         between = self.distances(ids, _cubic_between(samples[:, ::2]) - samples[:, 1::2])
         got = _cubic_at(samples, self._probe_parts)
         probes = self._probes[ids]
@@ -150,22 +156,22 @@ class Trajectories:
         return np.maximum(between, self.distances(ids, got - probes))
 
     def _probed(self, baked: Baked) -> tuple[ExactPoses | SinglePoses, Samples]:
-        """What all other samples are taken with, and the samples at the times on no grid."""
+        """The sampler of all other times, and the samples at the probes."""
         t0, t1 = self.time_range
-        every, probes = np.arange(self.count), np.empty((self.count, PROBES, POSE), np.float32)
+        probes = np.empty((self.count, PROBES, POSE), np.float32)
         single: SinglePoses | None = None
         with suppress(SceneFileInvalid):
             single = SinglePoses(baked)
         for i, t in enumerate(t0 + (t1 - t0) * self._probe_parts):
-            probes[:, i] = exact = self.exact.at(float(t), every)
+            probes[:, i] = exact = self.exact.at(float(t), self._ids)
             if single and not self._close(single, float(t), exact):
                 single = None
-            self._tell()
+            self._on_time()
         return single or self.exact, probes
 
     def _close(self, sampler: SinglePoses, t: float, exact: Poses) -> bool:
         try:
-            single = sampler.at(t, np.arange(self.count))
+            single = sampler.at(t, self._ids)
         except SceneFileInvalid:
             return False
         turned = np.where(np.einsum("mc,mc->m", single[:, QUATS], exact[:, QUATS]) < 0, -1, 1)
@@ -174,41 +180,12 @@ class Trajectories:
         off = distances(single[:, None] - exact[:, None], weights)
         return bool((off <= FLOAT32_ENOUGH * self.pixel).all())
 
-    def _tell(self) -> None:
-        self._done += 1
-        self._on_time(self._done, self._total)
-
     def _sampled(self, ids: Ids, times: np.ndarray) -> Samples:
         samples = np.empty((len(ids), len(times), POSE), np.float32)
         for i, t in enumerate(times):
             samples[:, i] = self._sampler.at(float(t), ids)
-            self._tell()
+            self._on_time()
         return samples
-
-
-class SomeTrajectories(Trajectories):
-    """Trajectories of some of the Gaussians of another set, those in `rows`."""
-
-    def __init__(self, sampled: Trajectories, rows: Ids) -> None:
-        self._source, self._rows = sampled, rows
-        self.count, self.time_range, self.pixel = len(rows), sampled.time_range, sampled.pixel
-        self.rotation_weights, self._misses = sampled.rotation_weights[rows], sampled._misses[rows]
-
-    def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
-        """Of the other set."""
-        return self._source.checks(self._rows[ids])
-
-    def fewest_poses(self, most: float, ids: Ids) -> npt.NDArray[np.int64]:
-        """Of the other set."""
-        return self._source.fewest_poses(most, self._rows[ids])
-
-    def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
-        """In the other set."""
-        self._source.remember_poses(most, self._rows[ids], counts)
-
-    def on_grid(self, times: int, ids: Ids) -> Samples:
-        """Of the other set."""
-        return self._source.on_grid(times, self._rows[ids])
 
 
 def distances(differences: np.ndarray, rotation_weights: np.ndarray) -> npt.NDArray[np.float64]:
@@ -224,7 +201,7 @@ _recent: dict[bytes, Trajectories] = {}
 
 
 def trajectories_of(baked: Baked) -> Trajectories:
-    """Of the scene's moving Gaussians, sampled once for all plans; those of the last two scenes are cached."""
+    """The trajectories of a scene's moving Gaussians, sampled once for all plans; the last two scenes are cached."""
     digest = hashlib.sha256(repr((baked.scene.metadata.time_range, pixel(baked))).encode() + layers_digest(baked))
     m = baked.moving
     for values in (m.means, m.log_scales, m.quats, *m.modulation.values(), *m.attributes.values()):
@@ -247,23 +224,23 @@ def layers_digest(baked: Baked) -> bytes:
 
 
 def give_one_sign(samples: Samples) -> None:
-    """Flip signs along time so that each quaternion is nearer to the one before it: q and −q are one rotation."""
+    """Choose signs of quaternions along time so that each is closer to the one before: q and −q are one rotation."""
     quats = samples[..., QUATS]
     turned = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
     quats[:, 1:] *= np.cumprod(turned, axis=1)[..., None].astype(samples.dtype)
 
 
 def _rotation_weights(samples: Samples, pixel: float) -> npt.NDArray[np.float64]:
-    """[M] scene units: how far one unit of quaternion displaces the end of the longest axis against a sphere.
+    """[M] scene units by which one unit of quaternion displaces the end of the longest axis.
 
-    Turning a sphere changes nothing; at least a thousandth of a pixel, since plans divide by it.
+    At least a thousandth of a pixel, since plans divide by it.
     """
     scales = samples[..., SCALES].astype(np.float64)
     return np.maximum(2 * (scales.max(-1) - scales.min(-1)).max(1, initial=0), 1e-3 * pixel)
 
 
 def _cubic_between(samples: Samples) -> Samples:
-    """[M, T − 1, 10] halfway between samples: cubics through the nearest four."""
+    """[M, T − 1, 10] poses halfway between samples, by cubics through the nearest four."""
     inner = (9 * (samples[:, 1:-2] + samples[:, 2:-1]) - samples[:, :-3] - samples[:, 3:]) / 16
     first, last = (
         (5 * s[:, :1] + 15 * s[:, 1:2] - 5 * s[:, 2:3] + s[:, 3:4]) / 16 for s in (samples, samples[:, ::-1])
@@ -272,7 +249,7 @@ def _cubic_between(samples: Samples) -> Samples:
 
 
 def _cubic_at(samples: Samples, parts: np.ndarray) -> Samples:
-    """[M, P, 10] at parts of the whole time: cubics through the nearest four samples."""
+    """[M, P, 10] poses at fractions of the time range, by cubics through the nearest four samples."""
     intervals = samples.shape[1] - 1
     first = np.clip(np.floor(parts * intervals).astype(int) - 1, 0, intervals - 3)
     x = parts * intervals - first

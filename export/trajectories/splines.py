@@ -1,8 +1,8 @@
 """Clamped uniform cubic B-splines over a scene's time range: fitted with NumPy, evaluated in a graph.
 
-A spline of n control points has n − 3 equal intervals; at any time four neighbouring control points count. It passes
-through its first and its last control point, which a fit sets to the first and the last sample exactly.
-Against Catmull–Rom through as many poses, a fit's largest error is 5 to 40 % lower on trained scenes.
+A spline of n control points has n − 3 equal intervals; its value depends on four neighboring control points. It passes
+through its first and its last control point, which a fit sets to the first and the last sample. The largest error of a
+fit is 5 to 40 % lower on trained scenes than that of Catmull–Rom splines through the same number of poses.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from scipy.linalg import solve
 from export.layers.graph import GraphBuilder
 
 MIN_CONTROL_POINTS = 4
-"""Of a spline with one interval."""
+"""Control points of a spline with one interval."""
 
 
 @cache
@@ -27,7 +27,7 @@ def design(count: int, samples: int) -> np.ndarray:
 
 @cache
 def fitting(count: int, samples: int) -> np.ndarray:
-    """[n, T] from evenly spread samples to control points: least squares, the first and the last sample exact."""
+    """[n, T] from evenly spread samples to control points: least squares, with exact first and last samples."""
     matrix = design(count, samples)
     middle = matrix[:, 1:-1]
     inner = solve(middle.T @ middle, middle.T, assume_a="pos")  # of 1,027 points 30 times faster than a pseudo-inverse
@@ -41,20 +41,20 @@ def fitting(count: int, samples: int) -> np.ndarray:
 def along_time(matrix: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """[M, S, 10] the product of a matrix, [S, T], with poses over time, [M, T, 10].
 
-    One large product, not one of ten columns a Gaussian, which reads the matrix again each time.
+    One large product: a product of ten columns per Gaussian would read the matrix again each time.
     """
     return np.ascontiguousarray(np.tensordot(matrix, poses, axes=(1, 1)).transpose(1, 0, 2))
 
 
 def samples_for(count: int) -> int:
-    """A power of two and one more, two intervals of samples or more for one of the spline: fewer leave it to chance."""
+    """The number of samples for a fit: 2ⁿ + 1, with at least two intervals of samples per interval of the spline."""
     return 2 ** int(np.ceil(np.log2(max(2 * (count - 3), 8)))) + 1
 
 
 def time_weights(
     graph: GraphBuilder, name: str, time_range: tuple[float, float], counts: Sequence[int]
 ) -> tuple[str, str]:
-    """At the time `t`, for splines of so many control points: their intervals, int64 [L], and weights [L, 4]."""
+    """Intervals of the time `t`, int64 [L], and weights [L, 4], for splines with these numbers of control points."""
     t0, t1 = time_range
     first = graph.constant(f"{name}.t0", np.array([t0], np.float32))
     rate = graph.constant(f"{name}.rate", np.array([1 / (t1 - t0) if t1 > t0 else 0], np.float32))
@@ -81,7 +81,7 @@ def time_weights(
 
 
 def _polynomials(count: int) -> np.ndarray:
-    """[n − 3, 4, 4] by interval, power of the part of the way through it, and control point: the weights."""
+    """[n − 3, 4, 4] weights by interval, power of the position in the interval, and control point."""
     intervals = count - 3
     table = np.zeros((intervals, 4, 4))
     for point in range(count):

@@ -16,9 +16,9 @@ LEVELS = 2**15 - 1
 
 @dataclass(frozen=True)
 class StoredPoses:
-    """Control points [M, n, 10] as integers: each column of each Gaussian has a range of its own.
+    """Control points [M, n, 10] as integers; each column of each Gaussian has its own range.
 
-    A range about a Gaussian's motion keeps 1/65,534 of it, where float16 keeps 1/2,048 of the largest value.
+    The resolution is 1/65,534 of the range of a Gaussian's motion; that of float16 is 1/2,048 of the largest value.
     """
 
     points: npt.NDArray[np.int16]  # [M, n, 10]
@@ -36,11 +36,11 @@ class StoredPoses:
 
     @classmethod
     def joined(cls, parts: Sequence["StoredPoses"]) -> "StoredPoses":
-        """Those of all parts, one after the other; of as many control points each."""
+        """Concatenate parts that have the same number of control points."""
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("points", "steps", "middles")))
 
     def control(self) -> np.ndarray:
-        """[M, n, 10] what a graph reads from them."""
+        """[M, n, 10] the control points as a graph reads them."""
         return self.points * self.steps[:, None] + self.middles[:, None]
 
 
@@ -48,36 +48,31 @@ class StoredPoses:
 class GriddedPoses:
     """Poses of H Gaussians, each on one of several grids of times."""
 
-    grids: tuple[tuple[npt.NDArray[np.int64], StoredPoses], ...]  # which of the H, and their poses
-
-    @classmethod
-    def on_one(cls, stored: StoredPoses) -> "GriddedPoses":
-        """All on the same."""
-        return cls(((np.arange(len(stored.points)), stored),))
+    grids: tuple[tuple[npt.NDArray[np.int64], StoredPoses], ...]  # indices among the H, and their poses
 
     def __len__(self) -> int:
         return sum(len(rows) for rows, _ in self.grids)
 
     @property
     def order(self) -> npt.NDArray[np.int64]:
-        """[H] which of the H come first, second, … where grid follows on grid."""
+        """[H] indices of the Gaussians in the order of the grids."""
         return np.concatenate([rows for rows, _ in self.grids])
 
 
 def at_time(graph: GraphBuilder, poses: GriddedPoses, time_range: tuple[float, float]) -> str:
-    """[H, 10] poses of all at `t`, in their `order`.
+    """[H, 10] poses of all Gaussians at `t`, in their `order`.
 
-    Of each grid the next four control points are read in one piece and blended in one product. To do so for all, once
-    a frame, takes a quarter of the time of looking up rows for each of the ids that a call asks for.
+    The next four control points of each grid are read in one piece and blended in one product. Doing this for all
+    Gaussians once per frame takes a quarter of the time of looking up the rows of the given ids.
     """
     counts = [stored.points.shape[1] for _, stored in poses.grids]
     cells, weights = time_weights(graph, "poses.clock", time_range, counts)
-    neighbours = graph.constant("poses.neighbours", np.arange(4, dtype=np.int64))
+    neighbors = graph.constant("poses.neighbours", np.arange(4, dtype=np.int64))
     shape = graph.constant("poses.shape", np.array([-1, POSE], np.int64))
     parts = []
     for g, (_, stored) in enumerate(poses.grids):
         name, which = f"poses.grid{g}", graph.constant(f"poses.grid{g}.which", np.array([g], np.int64))
-        times = graph.node("Add", [graph.node("Gather", [cells, which], f"{name}.cell"), neighbours], f"{name}.times")
+        times = graph.node("Add", [graph.node("Gather", [cells, which], f"{name}.cell"), neighbors], f"{name}.times")
         points = stored.points.transpose(1, 0, 2).reshape(counts[g], -1)
         near = graph.node("Gather", [graph.constant(f"{name}.points", points), times], f"{name}.near")
         near = graph.node("Cast", [near], f"{name}.float", to=TensorProto.FLOAT)  # [4, M · 10]

@@ -1,13 +1,20 @@
 """`msdgs-train compare`."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, rich_table
+from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, progress_bar, rich_table
+from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
+
+if TYPE_CHECKING:
+    from msdgs_train.comparison.pools import RunEnd
 
 
 @dataclass(frozen=True)
@@ -32,19 +39,7 @@ class Compare:
     """The folder of all runs and results: new, or one of the same comparison."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run per seed; the table shows mean and standard deviation."""
-    steps: int = 3000
-    """Optimizer steps of each run, instead of the preset's. Schedules in fractions of a run scale with it; those in
-    steps (sh_degree_interval, refine_start, reset_every, ema_steps) don't."""
-    minutes: float | None = None
-    """Time limit of each run. Learning rates decay over --steps, which the limit should just allow."""
-    size: int | None = None
-    """Width of all images in pixels."""
-    init_num_pts: int | None = None
-    """Initial Gaussians of all systems; their own settings if not given."""
-    max_gaussians: int | None = None
-    """Maximum Gaussians of all systems; their own settings if not given."""
-    threads: int = 1
-    """CPU threads of each run."""
+    budget: Annotated[Budget, tyro.conf.arg(name="")] = field(default_factory=Budget)
     jobs: int | None = None
     """Parallel runs; as many as the cores allow if not given. Parallel runs slow each other down somewhat; frame times
     are measured at the end, one after the other."""
@@ -54,23 +49,20 @@ class Compare:
 
     def execute(self) -> int:
         from msdgs_serve.threads import thread_count
-        from msdgs_train.cli.compare_progress import ComparisonProgress
-        from msdgs_train.comparison.matrix import Budget, make_runs, read_systems
         from msdgs_train.comparison.pools import processes, ray_tasks
         from msdgs_train.comparison.report import HEADINGS, table, write_comparison
         from msdgs_train.comparison.results import collect
         from msdgs_train.comparison.runner import train_all
 
-        budget = Budget(self.steps, self.minutes, self.size, self.threads, self.init_num_pts, self.max_gaussians)
-        runs = make_runs(read_systems(self.systems, budget), self.data, self.seeds, self.out)
+        runs = make_runs(read_systems(self.systems, self.budget), self.data, self.seeds, self.out)
         if self.jobs is not None and self.jobs < 1:
             raise InvalidInput("jobs", "1 or more", self.jobs)
         if self.ray is None:
-            pool = processes(self.jobs or max(1, thread_count() // self.threads))
+            pool = processes(self.jobs or max(1, thread_count() // self.budget.threads))
         else:
-            pool = ray_tasks(self.ray, self.threads, self.jobs)
-        with ComparisonProgress(console, len(runs)) as progress:
-            complete = train_all(runs, pool, progress.ended)
+            pool = ray_tasks(self.ray, self.budget.threads, self.jobs)
+        with _progress(len(runs)) as on_end:
+            complete = train_all(runs, pool, on_end)
         results = collect(runs)
         if results:
             paths = write_comparison(self.out, results, len(runs) - len(results))
@@ -83,3 +75,18 @@ class Compare:
             console.print("interrupted; the same command continues", soft_wrap=True)
             return EXIT_INTERRUPTED
         return 0 if len(results) == len(runs) else EXIT_INVALID
+
+
+@contextmanager
+def _progress(total: int) -> "Iterator[Callable[[Run, RunEnd], None]]":
+    """A bar over the runs; yields a function that advances it and prints a line about an ended run."""
+    columns = BarColumn(None), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with progress_bar(*columns) as bar:
+        task = bar.add_task("runs", total=total)
+
+        def on_end(run: Run, end: "RunEnd") -> None:
+            bar.advance(task)
+            line = f"{run.name}: {end.status}" + (f", {end.message}" if end.message else "")
+            console.print(line, soft_wrap=True, markup=False, style="red" if end.status == "failed" else None)
+
+        yield on_end

@@ -2,30 +2,21 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, ProgressColumn
 from rich.table import Table
 
 EXIT_INVALID = 2
-EXIT_INTERRUPTED = 130  # as a shell reports a program that Ctrl-C has stopped
+EXIT_INTERRUPTED = 130  # the exit code of a shell for a program that Ctrl-C has stopped
 
 console = Console()
-
-
-class Command(Protocol):
-    """The options of one command."""
-
-    def execute(self) -> int:
-        """Run the command; returns the exit code."""
-        ...
 
 
 def rich_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], *, names: int, title: str | None = None
 ) -> Table:
-    """The first `names` columns are left-aligned, the others right-aligned."""
+    """Return a table whose first `names` columns are left-aligned, and the others right-aligned."""
     shown = Table(title=title)
     for i, heading in enumerate(headings):
         shown.add_column(heading, justify="left" if i < names else "right")
@@ -34,9 +25,14 @@ def rich_table(
     return shown
 
 
+def progress_bar(*columns: ProgressColumn) -> Progress:
+    """Return a progress bar, with rich's own columns if none are given; hidden if the output is not a terminal."""
+    return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
 @contextlib.contextmanager
 def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
     """A bar over frames; yields a function of (done, total)."""
-    with Progress(console=console, disable=not console.is_terminal) as bar:
+    with progress_bar() as bar:
         task = bar.add_task("frames", total=total)
         yield lambda done, of: bar.update(task, completed=done, total=of)

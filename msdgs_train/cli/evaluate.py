@@ -2,21 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.console import console, frame_progress, rich_table
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from msdgs_train.evaluation.evaluate import Evaluation
-
 
 @dataclass(frozen=True)
-class Evaluate:
+class Eval:
     """Evaluate the last and the best model of runs on held-out images: PSNR, SSIM, LPIPS, ꟻLIP, and PSNR of the
     moving region, since a static background hides errors of the motion.
 
@@ -40,7 +35,7 @@ class Evaluate:
 
     def execute(self) -> int:
         from msdgs_train.evaluation.evaluate import evaluate_run
-        from msdgs_train.evaluation.report import draw_runs, notes, write_evaluation
+        from msdgs_train.evaluation.report import HEADINGS, cells, draw_runs, notes, write_evaluation
 
         if not self.runs:
             raise InvalidInput("RUN", "the folder of one run or more", "none")
@@ -49,7 +44,9 @@ class Evaluate:
             with frame_progress(0) as progress:
                 evaluation = evaluations[str(run)] = evaluate_run(run, self.data, self.split, progress)
             paths = write_evaluation(run, evaluation)
-            console.print(_table(str(run), evaluation))
+            title = f"{run}: {evaluation.split}, mean of {len(evaluation.frames)} images"
+            rows = [[m.name, f"{m.loaded.step:,}", *cells(evaluation, m.mean)] for m in evaluation.models]
+            console.print(rich_table(["model", "step", *HEADINGS.values()], rows, names=1, title=title))
             for note in notes(evaluation):
                 console.print(note, soft_wrap=True, highlight=False)
             console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
@@ -57,11 +54,3 @@ class Evaluate:
             draw_runs(self.sheet, evaluations)
             console.print(f"wrote {self.sheet}", soft_wrap=True)
         return 0
-
-
-def _table(run: str, evaluation: "Evaluation") -> "Table":
-    from msdgs_train.evaluation.report import HEADINGS, cells
-
-    rows = [[model.name, f"{model.loaded.step:,}", *cells(evaluation, model.mean)] for model in evaluation.models]
-    title = f"{run}: {evaluation.split}, mean of {len(evaluation.frames)} images"
-    return rich_table(["model", "step", *HEADINGS.values()], rows, names=1, title=title)

@@ -5,10 +5,10 @@ import contextlib
 import inspect
 import io
 import sys
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
@@ -18,9 +18,6 @@ from msdgs_train.cli.parts import PARTS
 from msdgs_train.cli.view import open_viewer
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import DEFAULT, preset, systems
-
-if TYPE_CHECKING:
-    from msdgs_train.viewer.training_view import TrainingView
 
 HELP_ALL = "--help-all"
 COMMON = {
@@ -71,22 +68,28 @@ class Fit:
     def execute(self) -> int:
         """Train with a progress bar; returns the exit code."""
         from msdgs_train.cli.fit_progress import FitProgress, print_result
-        from msdgs_train.engine.observer import Observer, Observers
+        from msdgs_train.engine.observer import Observers
         from msdgs_train.engine.run import fit
 
+        progress = FitProgress(self.config.run.steps)
         with contextlib.ExitStack() as stack:
-            view = stack.enter_context(_training_view(self)) if self.viewer else None
-            with FitProgress(console, self.config.run.steps) as progress:
-                observers: list[Observer] = [progress, view] if view else [progress]
+            view, observer = None, progress
+            if self.viewer:
+                from msdgs_train.viewer.training_view import TrainingView
+
+                viewer = stack.enter_context(open_viewer(self.viewer_host, self.viewer_port))
+                view = TrainingView(viewer, self.config.run.steps)
+                observer = Observers(progress, view)
+            with progress:
                 result = fit(
                     self.config,
                     self.data,
                     self.run,
                     resume=self.resume,
-                    observer=Observers(*observers),
+                    observer=observer,
                     tensorboard=self.tensorboard,
                 )
-            print_result(console, result, self.data, self.run)
+            print_result(result, self.data, self.run)
             if view is not None and result.status != "interrupted":
                 with contextlib.suppress(KeyboardInterrupt):
                     console.print("the viewer shows the last model; Ctrl-C closes it")
@@ -95,7 +98,7 @@ class Fit:
 
 
 def parse_fit(arguments: Sequence[str]) -> Fit:
-    """Options change the settings of the preset, or of the run that is resumed; --help shows those settings."""
+    """Parse the arguments of `fit`. Options change the settings of the preset, or of the run that is resumed."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset")
     name = early.parse_known_args(arguments)[0].preset
@@ -137,7 +140,7 @@ def _cli(arguments: Sequence[str], default: Fit) -> Fit:
 
 
 def _invalid_setting(end: SystemExit) -> InvalidInput | None:
-    """The error of a setting for which tyro exits; None if it exits for another reason."""
+    """Return the error of a setting for which tyro exits; None if it exits for another reason."""
     cause: BaseException | None = end
     while cause is not None and not isinstance(cause, InvalidInput):
         cause = cause.__context__
@@ -145,7 +148,7 @@ def _invalid_setting(end: SystemExit) -> InvalidInput | None:
 
 
 def _short_help(command: Fit) -> Any:
-    """The same command, of a type that hides rarely used options in its help."""
+    """Return the same command, of a type that hides rarely used options in its help."""
     config = command.config
     groups = {item.name: _hiding(getattr(config, item.name), COMMON.get(item.name, ())) for item in fields(config)}
     kinds = [(name, type(group)) for name, group in groups.items()]
@@ -155,8 +158,8 @@ def _short_help(command: Fit) -> Any:
 
 
 def _hiding(options: Any, shown: Container[str], **replaced: Any) -> Any:
-    """A copy of a dataclass, of a type whose other fields aren't in the help; fields in `replaced` change their type
-    and value."""
+    """Return a copy of a dataclass, of a type that hides all fields but `shown` in the help; fields in `replaced` get
+    another type and value."""
     kind = type(options)
     values = {item.name: getattr(options, item.name) for item in fields(kind)} | replaced
     changed = [(name, Annotated[type(value), tyro.conf.arg(name="")], tyro.MISSING) for name, value in replaced.items()]
@@ -167,11 +170,3 @@ def _hiding(options: Any, shown: Container[str], **replaced: Any) -> Any:
     ]
     short = make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True, namespace={"__doc__": kind.__doc__})
     return short(**values)
-
-
-@contextlib.contextmanager
-def _training_view(command: Fit) -> Iterator["TrainingView"]:
-    from msdgs_train.viewer.training_view import TrainingView
-
-    with open_viewer(command.viewer_host, command.viewer_port) as viewer:
-        yield TrainingView(viewer, command.config.run.steps)

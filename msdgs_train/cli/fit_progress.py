@@ -4,12 +4,12 @@ import signal
 import threading
 import time
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from msdgs_train.cli.console import console, progress_bar
 from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.run import RunResult
 from msdgs_train.engine.run_record import BEST, MODEL
@@ -21,25 +21,19 @@ PLAIN_LINE_SECONDS = 10.0  # between lines if the output is not a terminal
 
 
 class FitProgress(Observer):
-    """A bar with loss, PSNR, Gaussians and speed; lines if the output is not a terminal. The first Ctrl-C stops the run
-    after the current step, the second one at once."""
+    """Shows a bar with loss, PSNR, Gaussians and speed, or prints lines if the output is not a terminal.
 
-    def __init__(self, console: Console, steps: int) -> None:
-        self._console = console
+    The first Ctrl-C stops the run after the current step, the second one at once.
+    """
+
+    def __init__(self, steps: int) -> None:
         self._steps = steps
         self._stop = threading.Event()
         self._first: tuple[int, float] | None = None  # step and time that the speed is measured from
         self._next_update = 0.0
         self._old_handler: Any = None
-        self._bar = Progress(
-            BarColumn(None),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[state]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(elapsed_when_finished=True),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        state, left = TextColumn("{task.fields[state]}"), TimeRemainingColumn(elapsed_when_finished=True)
+        self._bar = progress_bar(BarColumn(None), MofNCompleteColumn(), state, TimeElapsedColumn(), left)
         self._task = self._bar.add_task("fit", total=steps, state="reading images, compiling kernels")
 
     def __enter__(self) -> Self:
@@ -48,9 +42,7 @@ class FitProgress(Observer):
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
         if self._old_handler is not None:
             signal.signal(signal.SIGINT, self._old_handler)
@@ -69,13 +61,13 @@ class FitProgress(Observer):
             self._first = (result.step, now)
         if now < self._next_update and result.step < self._steps:
             return
-        self._next_update = now + (UPDATE_SECONDS if self._console.is_terminal else PLAIN_LINE_SECONDS)
+        self._next_update = now + (UPDATE_SECONDS if console.is_terminal else PLAIN_LINE_SECONDS)
         speed = (result.step - self._first[0]) / max(now - self._first[1], 1e-9)
         state = f"loss {result.loss:.4f}  PSNR {result.psnr:.2f} dB  {result.gaussians:,} Gaussians"
         state += f"  {speed:.1f} steps/s" if speed else ""
         state += f"  {result.skipped} skipped" if result.skipped else ""
         self._bar.update(self._task, completed=result.step, state=state)
-        if not self._console.is_terminal:
+        if not console.is_terminal:
             steps_left = self._steps - result.step
             left = f"  {steps_left / speed:.0f} s left" if speed and steps_left else ""
             self._print(f"step {result.step:,}/{self._steps:,}  {state}{left}")
@@ -91,7 +83,7 @@ class FitProgress(Observer):
         return self._stop.is_set()
 
     def _print(self, line: str, style: str | None = None) -> None:
-        self._console.print(line, style=style, soft_wrap=True)
+        console.print(line, style=style, soft_wrap=True)
 
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         if self._stop.is_set():
@@ -99,17 +91,15 @@ class FitProgress(Observer):
         self._stop.set()
 
 
-def print_result(console: Console, result: RunResult, data: Path, run: Path) -> None:
+def print_result(result: RunResult, data: Path, run: Path) -> None:
     """Print how a run has ended, its metrics and models, and the command that continues it."""
     console.print(f"{result.status} at step {result.step:,}, {result.gaussians:,} Gaussians, {result.seconds:.0f} s")
     for split, metrics in result.metrics.items():
         console.print(f"{split:>5}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
     console.print(f"model: {run / MODEL}", soft_wrap=True)
     if result.best is not None:
-        best = result.best
-        console.print(
-            f"best:  {run / BEST}, {best.split} PSNR {best.psnr:.2f} dB at step {best.step:,}", soft_wrap=True
-        )
+        best = f"{result.best.split} PSNR {result.best.psnr:.2f} dB at step {result.best.step:,}"
+        console.print(f"best:  {run / BEST}, {best}", soft_wrap=True)
     if result.status != "finished":
         more = " --max-minutes None" if result.status == "out of time" else ""
         console.print(f"continue with: msdgs-train fit {data} {run} --resume{more}", soft_wrap=True)

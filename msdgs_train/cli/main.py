@@ -3,29 +3,22 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
 import tyro
 from rich.console import Console
 
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.cli.compare import Compare
-from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, Command
-from msdgs_train.cli.evaluate import Evaluate
+from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID
+from msdgs_train.cli.evaluate import Eval
 from msdgs_train.cli.fit import Fit, parse_fit
 from msdgs_train.cli.steps import Steps
 from msdgs_train.cli.synthetic import Synthetic
 from msdgs_train.cli.view import View
 from msdgs_train.layers.plugins import add_plugin
 
-Commands = (
-    Annotated[Fit, tyro.conf.subcommand("fit")]
-    | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
-    | Annotated[Evaluate, tyro.conf.subcommand("eval")]
-    | Annotated[Steps, tyro.conf.subcommand("steps")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Compare, tyro.conf.subcommand("compare")]
-)
+Commands = Fit | Synthetic | Eval | Steps | View | Compare
+"""Each command has the name of its class in lower case."""
 
 EPILOG = "--plugin MODULE, before the command: a module or Python file that registers layers or systems (repeatable)."
 
@@ -53,7 +46,7 @@ def _without_plugins(arguments: Sequence[str]) -> list[str]:
     return rest
 
 
-def _parse(arguments: Sequence[str]) -> Command:
+def _parse(arguments: Sequence[str]) -> Commands:
     if arguments[:1] == ["fit"]:
         return parse_fit(arguments[1:])
     description = f"{__doc__}\n\n{EPILOG}"

@@ -18,36 +18,33 @@ class PartInvalid(MsdgsError):
     """An invalid layer or support in an option. Not a `ValueError`, which tyro would replace by its own message."""
 
 
+OPTIONS: dict[type, tuple[str, Mapping[str, type]]] = {
+    LayerConfig: ("layers", LAYERS),
+    SupportConfig: ("support", SUPPORTS),
+}
+"""By base class, the option and the kinds that it accepts."""
+
 PARTS = ConstructorRegistry()
-"""How tyro parses and prints them."""
+"""The rules by which tyro parses and prints layers and supports."""
 
 
 @PARTS.primitive_rule
-def _layer(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    return _spec("layers", LAYERS, LayerConfig) if _is_a(info.type, LayerConfig) else None
-
-
-@PARTS.primitive_rule
-def _support(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    return _spec("support", SUPPORTS, SupportConfig) if _is_a(info.type, SupportConfig) else None
-
-
-def _is_a(given: Any, base: type) -> bool:
-    return inspect.isclass(given) and issubclass(given, base)
-
-
-def _spec(field: str, kinds: Mapping[str, type], base: type) -> PrimitiveConstructorSpec[Any]:
+def _part(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    base = next((base for base in OPTIONS if inspect.isclass(info.type) and issubclass(info.type, base)), None)
+    if base is None:
+        return None
+    option, kinds = OPTIONS[base]
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar="KIND[:NAME=VALUE,…]",
-        instance_from_str=lambda words: _read(field, words[0], kinds),
+        instance_from_str=lambda words: _read(option, words[0], kinds),
         is_instance=lambda value: isinstance(value, base),
         str_from_instance=lambda part: [to_text(part)],
     )
 
 
-def _read(field: str, word: str, kinds: Mapping[str, type]) -> Any:
+def _read(option: str, word: str, kinds: Mapping[str, type]) -> Any:
     try:
-        return from_plain(field, word, kinds)
+        return from_plain(option, word, kinds)
     except InvalidInput as error:
         raise PartInvalid(str(error)) from error

@@ -1,6 +1,6 @@
 """`msdgs-train synthetic`."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -31,13 +31,6 @@ class Synthetic:
         from msdgs_train.datasets.synthetic.generate import generate
 
         with frame_progress(self.train_frames + self.test_frames) as progress:
-            generate(
-                self.out,
-                size=self.size,
-                train_frames=self.train_frames,
-                test_frames=self.test_frames,
-                seed=self.seed,
-                progress=progress,
-            )
+            generate(**asdict(self), progress=progress)
         console.print(f"made {self.out}; next: msdgs-train fit {self.out} runs/first", soft_wrap=True)
         return 0

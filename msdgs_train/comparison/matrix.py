@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,23 +12,29 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
-EVALUATIONS = 10  # of held-out images during training
+EVALUATIONS = 10  # number of evaluations of held-out images during training
 LOG_LINES = 100
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Settings that all systems share. None: the system's own."""
+    """Settings that all systems share; None keeps the system's own."""
 
-    steps: int
+    steps: int = 3000
+    """Optimizer steps of each run, instead of the preset's. All schedules are fractions of a run and scale with it."""
     minutes: float | None = None
+    """Time limit of each run. Learning rates decay over --steps: choose as many as fit in the limit."""
     size: int | None = None
-    threads: int = 1
+    """Width of all images in pixels."""
     init_num_pts: int | None = None
+    """Initial Gaussians of all systems; their own settings if not given."""
     max_gaussians: int | None = None
+    """Maximum Gaussians of all systems; their own settings if not given."""
+    threads: int = 1
+    """CPU threads of each run."""
 
     def settings(self) -> dict[str, Any]:
-        """As settings of `TrainConfig`."""
+        """Return the settings of `TrainConfig`."""
         every = max(self.steps // EVALUATIONS, 1)
         given = {
             "steps": self.steps,
@@ -39,14 +46,6 @@ class Budget:
         }
         optional = {name: getattr(self, name) for name in ("size", "init_num_pts", "max_gaussians")}
         return given | {name: value for name, value in optional.items() if value is not None}
-
-
-@dataclass(frozen=True)
-class ComparedSystem:
-    """A system with a name and its settings."""
-
-    name: str
-    config: TrainConfig
 
 
 @dataclass(frozen=True)
@@ -65,33 +64,28 @@ class Run:
         return f"{self.system}, {self.scene}, seed {self.seed}"
 
 
-def read_systems(sources: Sequence[str], budget: Budget) -> list[ComparedSystem]:
-    """Systems from names of presets and from TOML files, where each table is one: a `preset` and changed settings.
+def read_systems(sources: Sequence[str], budget: Budget) -> dict[str, TrainConfig]:
+    """Read the settings of systems from names of presets and from TOML files, each table of which is a system: a
+    `preset` and changed settings.
 
     Raises `InvalidInput` naming the file, the system and the invalid setting.
     """
     tables = [pair for source in sources for pair in _tables(source)]
-    systems = [ComparedSystem(name, _config(name, table, budget)) for name, table in tables]
-    _require_unique("system", (system.name for system in systems))
-    return systems
+    configs = [(name, _config(name, table, budget)) for name, table in tables]
+    _require_unique("system", (name for name, _ in configs))
+    return dict(configs)
 
 
-def make_runs(systems: Sequence[ComparedSystem], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
-    """Seed by seed, so that a comparison that is stopped early has results of every system."""
+def make_runs(systems: Mapping[str, TrainConfig], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
+    """Return one run per system, scene and seed, ordered by seed: if the comparison is stopped early, it has results of
+    every system."""
     _require_unique("scene", (scene.resolve().name for scene in scenes))
     _require_unique("seed", map(str, seeds))
     return [
-        Run(
-            system.name,
-            scene.resolve().name,
-            seed,
-            scene.resolve(),
-            out / system.name / f"{scene.resolve().name}_{seed}",
-            system.config.updated(seed=seed),
-        )
+        Run(name, data.name, seed, data, out / name / f"{data.name}_{seed}", config.updated(seed=seed))
         for seed in seeds
-        for scene in scenes
-        for system in systems
+        for data in map(Path.resolve, scenes)
+        for name, config in systems.items()
     ]
 
 
@@ -125,8 +119,6 @@ def _require_unique(kind: str, given: Iterable[str]) -> None:
     names = list(given)
     if not names:
         raise InvalidInput(kind, "given, one or more", "none")
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise InvalidInput(kind, "named once", f"`{name}` twice")
-        seen.add(name)
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise InvalidInput(kind, "named once", f"`{name}` twice")

@@ -5,8 +5,10 @@ import itertools
 import json
 import os
 import platform
-from collections.abc import Callable, Sequence
+import statistics
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +18,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from msdgs_train.comparison.results import Result, Spread
+from msdgs_train.comparison.results import Result
 from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_train.evaluation.report import markdown_table
 from msdgs_train.layers.parts import to_text
 
 TABLE, NUMBERS, TIME_PLOT, LAYERS_PLOT = "comparison.md", "comparison.json", "time.png", "layers.png"
@@ -27,6 +30,8 @@ HEADINGS = (
 )  # fmt: skip
 BESIDE = 0.04  # horizontal offset between bars of the same K, in layers
 COLORS, DASHES = [f"C{i}" for i in range(10)], ["-", "--", ":", "-."]
+
+_system = attrgetter("run.system")
 
 
 def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list[Path]:
@@ -42,37 +47,37 @@ def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list
 
 
 def table(results: Sequence[Result]) -> list[list[str]]:
-    """One row per system and scene, in the order of `HEADINGS`: mean ± sample standard deviation over seeds."""
-    return [_row(group) for group in _groups(results, lambda r: (r.run.system, r.run.scene))]
+    """Return one row per system and scene, in the order of `HEADINGS`: mean ± sample standard deviation over seeds."""
+    return [_row(group) for group in _groups(results, attrgetter("run.system", "run.scene")).values()]
 
 
 def _row(group: list[Result]) -> list[str]:
     first = group[0]
-
-    def shown(values: list[float], digits: int) -> str:
-        return Spread.of(values).shown(digits)
-
     return [
         first.run.system,
         first.run.scene,
         str(len(group)),
-        shown([r.psnr for r in group], 2),
-        shown([r.ssim for r in group], 4),
+        mean_and_deviation([r.psnr for r in group], 2),
+        mean_and_deviation([r.ssim for r in group], 4),
         f"{first.deformation_parameters:,}",
-        shown([r.deformation_parameters + r.modulation_parameters for r in group], 0),
-        shown([r.gaussians for r in group], 0),
-        shown([r.seconds for r in group], 0),
-        shown([r.frame_ms for r in group], 1),
+        mean_and_deviation([r.deformation_parameters + r.modulation_parameters for r in group], 0),
+        mean_and_deviation([r.gaussians for r in group], 0),
+        mean_and_deviation([r.seconds for r in group], 0),
+        mean_and_deviation([r.frame_ms for r in group], 1),
     ]
 
 
+def mean_and_deviation(values: Sequence[float], digits: int) -> str:
+    """Format mean ± sample standard deviation; of a single value only the value."""
+    deviation = f" ± {statistics.stdev(values):,.{digits}f}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):,.{digits}f}{deviation}"
+
+
 def as_markdown(results: Sequence[Result], missing: int) -> str:
-    """The table and the conditions of the measurement."""
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
-    lines += ["| " + " | ".join(row) + " |" for row in table(results)]
-    budget = results[0].run.config
-    limit = f", at most {budget.run.max_minutes:g} minutes a run" if budget.run.max_minutes is not None else ""
-    conditions = f"{budget.run.steps:,} steps{limit}; {budget.run.threads} thread(s) a run; held-out images of "
+    """Return the table and the conditions of the measurement as Markdown."""
+    run = results[0].run.config.run
+    limit = f", at most {run.max_minutes:g} minutes per run" if run.max_minutes is not None else ""
+    conditions = f"{run.steps:,} steps{limit}; {run.threads} thread(s) per run; held-out images of "
     conditions += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
     machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     notes = [conditions, f"Measured on {date.today().isoformat()}: {machine}."]
@@ -81,11 +86,11 @@ def as_markdown(results: Sequence[Result], missing: int) -> str:
         notes.append(f"{skipped} steps were skipped because their loss was not finite.")
     if missing:
         notes.append(f"{missing} runs are not finished and are not in the table.")
-    return "\n".join([*lines, "", *notes]) + "\n"
+    return "\n".join([markdown_table(HEADINGS, table(results)), "", *notes]) + "\n"
 
 
 def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
-    """All numbers of all runs."""
+    """Return all numbers of all runs as plain values for JSON."""
 
     def plain(result: Result) -> dict[str, Any]:
         values = {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
@@ -96,47 +101,43 @@ def as_json(results: Sequence[Result], missing: int) -> dict[str, Any]:
 
 
 def draw_time(results: Sequence[Result]) -> Figure:
-    """Error on held-out images against training time: one panel per scene, one line per system (mean over seeds)."""
+    """Plot error on held-out images against training time: a panel per scene, a line per system (mean over seeds)."""
     figure, panels = _panels(results, "seconds of training")
-    styles = _styles(_names(results, lambda r: r.run.system))
+    styles = _styles(_groups(results, _system))
     for axes, of_scene in panels:
-        for group in _groups(of_scene, lambda r: r.run.system):
+        for name, group in _groups(of_scene, _system).items():
             shortest = min(len(result.curve) for result in group)
-            seconds, psnr = (
-                np.array([[getattr(point, name) for point in result.curve[:shortest]] for result in group])
-                for name in ("seconds", "psnr")
-            )
-            at, errors, name = seconds.mean(axis=0), rms_error(psnr), group[0].run.system
-            axes.plot(at, errors.mean(axis=0), marker="o", ms=3, label=name, **styles[name])
+            curves = np.array([[(p.seconds, p.psnr) for p in result.curve[:shortest]] for result in group])
+            seconds, errors = curves[..., 0].mean(axis=0), rms_error(curves[..., 1])
+            axes.plot(seconds, errors.mean(axis=0), marker="o", ms=3, label=name, **styles[name])
             if len(group) > 1:
                 low, high = errors.min(axis=0), errors.max(axis=0)
-                axes.fill_between(at, low, high, color=styles[name]["color"], alpha=0.15, lw=0)
-    return _finished(figure)
+                axes.fill_between(seconds, low, high, color=styles[name]["color"], alpha=0.15, lw=0)
+    return _with_legend(figure)
 
 
 def draw_layers(results: Sequence[Result]) -> Figure:
-    """Error against K, one panel per scene. Systems that differ only in their number of equal layers are joined by a
-    line; bars reach from the best seed to the worst."""
+    """Plot error against K, one panel per scene. Systems that differ only in their number of equal layers are joined by
+    a line; bars reach from the best seed to the worst."""
     figure, panels = _panels(results, "K, layers of the deformation")
-    families = _names(results, _family)
+    families = list(_groups(results, _family))
     styles = _styles(families)
     for axes, of_scene in panels:
-        for family in _groups(of_scene, _family):
-            key, points = _family(family[0]), []
-            aside = BESIDE * (families.index(key) - (len(families) - 1) / 2)
-            for group in _groups(family, lambda r: len(r.run.config.model.layers)):
+        for key, family in _groups(of_scene, _family).items():
+            offset, points = BESIDE * (families.index(key) - (len(families) - 1) / 2), []
+            for num_layers, group in _groups(family, lambda r: len(r.run.config.model.layers)).items():
                 errors = rms_error(np.array([result.psnr for result in group]))
-                points.append((len(group[0].run.config.model.layers), errors.mean(), errors.min(), errors.max()))
+                points.append((num_layers, errors.mean(), errors.min(), errors.max()))
             count, mean, low, high = np.array(sorted(points)).T
-            name = "\n".join(_names(family, lambda r: r.run.system))
+            name = "\n".join(_groups(family, _system))
             bars = [mean - low, high - mean]
-            axes.errorbar(count + aside, mean, bars, marker="o", ms=4, capsize=3, label=name, **styles[key])
+            axes.errorbar(count + offset, mean, bars, marker="o", ms=4, capsize=3, label=name, **styles[key])
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return _finished(figure)
+    return _with_legend(figure)
 
 
 def rms_error(psnr: np.ndarray) -> np.ndarray:
-    """Root mean square error of pixels in [0, 1] of a PSNR in dB."""
+    """Convert a PSNR in dB to the root mean square error of pixels in [0, 1]."""
     return 10 ** (-psnr / 20)
 
 
@@ -148,39 +149,35 @@ def _family(result: Result) -> str:
 
 
 def _panels(results: Sequence[Result], label: str) -> tuple[Figure, list[tuple[Axes, list[Result]]]]:
-    """A figure with one panel per scene, and the results of each."""
-    scenes = _groups(results, lambda r: r.run.scene)
+    """Return a figure with one panel per scene, and the results of each."""
+    scenes = _groups(results, attrgetter("run.scene"))
     figure = Figure(figsize=(2.5 + 5.5 * len(scenes), 5.5), layout="constrained")
     panels: list[Axes] = list(np.ravel(figure.subplots(1, len(scenes), squeeze=False)))
-    for axes, of_scene in zip(panels, scenes, strict=True):
-        axes.set(title=of_scene[0].run.scene, xlabel=label, yscale="log")
+    for axes, scene in zip(panels, scenes, strict=True):
+        axes.set(title=scene, xlabel=label, yscale="log")
         axes.grid(alpha=0.3, which="both")
     panels[0].set_ylabel("root mean square error of held-out pixels in [0, 1]")
-    return figure, list(zip(panels, scenes, strict=True))
+    return figure, list(zip(panels, scenes.values(), strict=True))
 
 
-def _finished(figure: Figure) -> Figure:
+def _with_legend(figure: Figure) -> Figure:
     entries = [axes.get_legend_handles_labels() for axes in figure.axes]
     labelled = {label: handle for handles, labels in entries for handle, label in zip(handles, labels, strict=True)}
     figure.legend(list(labelled.values()), list(labelled), loc="outside right upper", fontsize="small")
     return figure
 
 
-def _styles(names: list[str]) -> dict[str, dict[str, Any]]:
+def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     styles = itertools.cycle({"color": color, "linestyle": dashes} for dashes in DASHES for color in COLORS)
     return dict(zip(names, styles, strict=False))
 
 
-def _names(results: Sequence[Result], key: Callable[[Result], str]) -> list[str]:
-    return list(dict.fromkeys(map(key, results)))
-
-
-def _groups(results: Sequence[Result], key: Any) -> list[list[Result]]:
-    """Groups in the order of their first result."""
+def _groups(results: Sequence[Result], key: Callable[[Result], Any]) -> dict[Any, list[Result]]:
+    """Group results by key, in the order of the first result of each."""
     groups: dict[Any, list[Result]] = {}
     for result in results:
         groups.setdefault(key(result), []).append(result)
-    return list(groups.values())
+    return groups
 
 
 def _save(figure: Figure, path: Path) -> None:

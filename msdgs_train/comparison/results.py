@@ -42,29 +42,14 @@ class Result:
     deformation_parameters: int
     modulation_parameters: int  # embeddings included
     gaussians: int
-    seconds: float  # of training, evaluations included
+    seconds: float  # training time, evaluations included
     skipped: int
     frame_ms: float  # deforming and rendering one held-out view, median
     curve: list[CurvePoint]
 
 
-class Spread(NamedTuple):
-    """Mean and sample standard deviation; None for a single value."""
-
-    mean: float
-    deviation: float | None
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Spread":
-        return cls(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
-
-    def shown(self, digits: int) -> str:
-        """As text: mean ± deviation."""
-        return f"{self.mean:,.{digits}f}" + ("" if self.deviation is None else f" ± {self.deviation:,.{digits}f}")
-
-
 def collect(runs: Sequence[Run]) -> list[Result]:
-    """Results of the finished runs; frames are timed one after the other."""
+    """Collect the results of the finished runs; frames are timed one after the other."""
     return [_result(run) for run in runs if is_finished(run)]
 
 
@@ -98,7 +83,7 @@ def _modulation_parameters(loaded: LoadedModel) -> int:
 
 
 def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
-    """Median frame time over some of the model's cameras, after one untimed frame, with `threads` of torch."""
+    """Return the median frame time over some of its cameras, after an untimed frame, with `threads` of torch."""
     torch.set_num_threads(threads)
     times = []
     for i, entry in enumerate([loaded.scene.cameras[0], *loaded.scene.cameras[:TIMED_FRAMES]]):

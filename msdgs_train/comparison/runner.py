@@ -9,7 +9,7 @@ from typing import Any
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
-from msdgs_train.comparison.pools import Pool, RunEnd
+from msdgs_train.comparison.pools import POLL_SECONDS, Pool, RunEnd
 from msdgs_train.engine.config import differences
 from msdgs_train.engine.run_record import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
 
@@ -31,7 +31,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
         return True
     interrupted = threading.Event()
     with pool as trainers:
-        # after Ray, which installs a handler of its own
+        # set here, after Ray has installed its own handler
         old = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
         try:
             while waiting or len(trainers):
@@ -40,7 +40,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
                     waiting.clear()
                 while waiting and len(trainers) < trainers.jobs:
                     trainers.submit(waiting.pop(0))
-                for run, end in trainers.ended():
+                for run, end in trainers.finished(POLL_SECONDS):
                     on_end(run, end)
         finally:
             signal.signal(signal.SIGINT, old)
@@ -57,7 +57,7 @@ def is_finished(run: Run) -> bool:
 
 
 def final_metrics(run: Run) -> dict[str, Any] | None:
-    """The metrics that `fit` writes at its end; None if it hasn't ended."""
+    """Return the metrics that `fit` writes at its end; None if it hasn't ended."""
     try:
         return json.loads((run.folder / FINAL_METRICS).read_text(encoding="utf-8"))
     except FileNotFoundError:

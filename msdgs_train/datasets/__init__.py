@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from msdgs_train.datasets.colmap.loader import SPARSE, TRAILING_NUMBER, load_colmap
+from msdgs_train.datasets.colmap.loader import SPARSE, load_colmap
 from msdgs_train.datasets.common.images import composite
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData
+from msdgs_train.datasets.common.readers import DatasetInvalid
+from msdgs_train.datasets.common.scene_data import Frame, SceneData
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
 from msdgs_train.datasets.hypernerf import DATASET_FILE, load_hypernerf
 from msdgs_train.datasets.nerfstudio import TRANSFORMS_FILE, load_nerfstudio
@@ -17,16 +18,16 @@ LAYOUTS = (
     ("nerfstudio", TRANSFORMS_FILE, load_nerfstudio),
     ("HyperNeRF", DATASET_FILE, load_hypernerf),
     ("Neu3D", CAMERAS, load_neu3d),
+    ("COLMAP", SPARSE, load_colmap),
 )
-"""Name, marker file and reader of each; COLMAP is tried last, since other layouts contain its files too."""
+"""Name, marker file and reader of each layout; COLMAP is tried last, since other layouts contain its files too."""
 
 
-def load_scene(path: Path | str, size: int | None = None, time_pattern: str | None = TRAILING_NUMBER) -> SceneData:
+def load_scene(path: Path | str, size: int | None = None) -> SceneData:
     """Read the dataset in folder `path`, detecting its layout.
 
     `size` is the width in pixels that images are reduced to, height in proportion. Pixels are read later, by
-    `Frame.load_rgba`. `time_pattern` is for COLMAP's layout, which has no times: see `load_colmap`. Raises
-    `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size` or `time_pattern`.
+    `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -34,7 +35,5 @@ def load_scene(path: Path | str, size: int | None = None, time_pattern: str | No
     for _, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
             return load(folder, size)
-    if (folder / SPARSE).is_dir():
-        return load_colmap(folder, size, time_pattern)
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
-    raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}, COLMAP's has {SPARSE}")
+    raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

@@ -12,13 +12,13 @@ MAX_BYTES = 2 << 30
 
 
 class ImageCache:
-    """Keeps pixels as uint8 RGBA from their first use on, up to `MAX_BYTES`."""
+    """Keeps decoded images as uint8 RGBA, up to `MAX_BYTES`."""
 
     def __init__(self) -> None:
         self._pixels: dict[Path, np.ndarray] = {}
 
     def image(self, frame: Frame, background: Tensor) -> Tensor:
-        """[H, W, 3] over a background color [3]."""
+        """Return the image of a frame, [H, W, 3] in [0, 1], over a background color, [3]."""
         rgba = self._pixels.get(frame.image_path)
         if rgba is None:
             rgba = frame.load_rgba()

@@ -8,8 +8,9 @@ these are used instead of the angle. The time range of the scene runs from the f
 
 from pathlib import Path
 
+from msdgs_train.datasets.common.readers import JsonObject, read_json
 from msdgs_train.datasets.common.scene_data import SPLITS, Frame, SceneData
-from msdgs_train.datasets.common.transforms import Entry, check_times, read_entries, read_frame
+from msdgs_train.datasets.common.transforms import check_times, entries_of, read_frame
 
 TRAIN_FILE = "transforms_train.json"
 SCENE_HALF_SIZE = 1.3
@@ -19,26 +20,21 @@ in it."""
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
-def load_dnerf(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras, times and image sizes of a D-NeRF scene; val and test may be missing.
-
-    `size` is the width of the images in pixels. Raises `DatasetInvalid` naming file and field.
-    """
-    entries = {split: _read_split(Path(folder), split) for split in SPLITS}
+def load_dnerf(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras, times and image sizes of a D-NeRF scene, as `load_scene` does; val and test may be missing."""
+    entries = {split: _read_split(folder, split) for split in SPLITS}
     check_times([entry for split in SPLITS for entry in entries[split]])
-    splits = {split: [_frame(entry, size) for entry in entries[split]] for split in SPLITS}
-    times = [frame.t for frames in splits.values() for frame in frames]
-    return SceneData(splits, (min(times), max(times)), SCENE_HALF_SIZE)
+    return SceneData({split: [_frame(entry, size) for entry in entries[split]] for split in SPLITS}, SCENE_HALF_SIZE)
 
 
-def _read_split(folder: Path, split: str) -> list[Entry]:
+def _read_split(folder: Path, split: str) -> list[JsonObject]:
     file = folder / f"transforms_{split}.json"
     if split != "train" and not file.exists():
         return []
-    return read_entries(file, may_be_empty=split != "train")
+    return entries_of(read_json(file), may_be_empty=split != "train")
 
 
-def _frame(entry: Entry, size: int | None) -> Frame:
+def _frame(entry: JsonObject, size: int | None) -> Frame:
     for key in DISTORTION:
         if entry.get(key):
             raise entry.invalid(key, "must be 0: undistort the images first")

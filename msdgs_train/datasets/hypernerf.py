@@ -19,176 +19,114 @@ model, where k3 follows p2. `Frame.load_rgba` removes the distortion; the camera
 """
 
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_train.datasets.common.distortion import Distortion
+from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
 from msdgs_train.datasets.common.extent import scene_half_size
-from msdgs_train.datasets.common.images import ImageSize
-from msdgs_train.datasets.common.readers import read_json, read_table
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, image_size, reduced
+from msdgs_train.datasets.common.images import ImageSize, read_size
+from msdgs_train.datasets.common.readers import DatasetInvalid, JsonObject, read_json, read_table
+from msdgs_train.datasets.common.scene_data import Frame, SceneData, reduced
 
 DATASET_FILE = "dataset.json"
-METADATA_FILE = "metadata.json"
-SCENE_FILE = "scene.json"
-POINTS_FILE = "points.npy"
+FIELDS = {"camera.fx": "focal_length", "camera.fy": "pixel_aspect_ratio", "camera.width": "image_size"}
+"""The value of a file that makes a field of its camera invalid; all other fields come from `orientation`."""
 
 
-def load_hypernerf(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras, times, splits and sparse points of a HyperNeRF scene.
+Transform = Callable[[np.ndarray], np.ndarray]
+"""Maps positions in the files' world, [..., 3], to the scene's."""
 
-    `size` is the width of the images in pixels: the smallest copy that is wide enough is downscaled, or with None the
-    largest copy is used. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
+
+def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras, times, splits and sparse points of a HyperNeRF scene, as `load_scene` does.
+
+    The smallest copy of the images at least `size` pixels wide is downscaled; without `size` the largest copy is used.
     """
-    folder = Path(folder)
-    ids = _read_ids(folder / DATASET_FILE)
-    times = _read_times(folder / METADATA_FILE, [id_ for split in ids.values() for id_ in split])
-    world = _read_world(folder / SCENE_FILE)
+    dataset = read_json(folder / DATASET_FILE)
+    ids = {"train": dataset.names("train_ids"), "val": [], "test": dataset.names("val_ids")}
+    if not ids["train"]:
+        raise dataset.invalid("train_ids", "must name one frame or more")
+    times = _read_times(folder / "metadata.json", [id_ for split in ids.values() for id_ in split])
+    to_scene = _read_transform(folder / "scene.json")
     copies = _find_copy(folder / "rgb", ids["train"][0], size)
     splits = {
-        split: [
-            _frame(folder / "camera" / f"{id_}.json", copies / f"{id_}.png", times[id_], world, size) for id_ in members
-        ]
+        split: [_frame(folder, copies / f"{id_}.png", times[id_], to_scene, size) for id_ in members]
         for split, members in ids.items()
     }
-    points = _read_points(folder / POINTS_FILE, world)
-    frames = [frame for members in splits.values() for frame in members]
-    extent = scene_half_size(points, [frame.camera for frame in frames])
-    return SceneData(splits, (min(times.values()), max(times.values())), extent, points)
-
-
-class _World(NamedTuple):
-    """The transform from the file's world to the scene's."""
-
-    center: np.ndarray  # [3]
-    scale: float
-
-    def apply(self, positions: np.ndarray) -> np.ndarray:
-        return (positions - self.center) * self.scale
-
-
-def _read_ids(file: Path) -> dict[str, list[str]]:
-    content = read_json(file)
-    ids = {split: _id_list(file, content, key) for split, key in (("train", "train_ids"), ("test", "val_ids"))}
-    if not ids["train"]:
-        raise DatasetInvalid(file, "train_ids", "must name one frame or more")
-    return {"train": ids["train"], "val": [], "test": ids["test"]}
-
-
-def _id_list(file: Path, content: dict[str, Any], key: str) -> list[str]:
-    value = _get(file, content, key)
-    if not isinstance(value, list) or not all(isinstance(id_, str | int) for id_ in value):
-        raise DatasetInvalid(file, key, "must be a list of names")
-    return [str(id_) for id_ in value]
+    points = _read_points(folder / "points.npy", to_scene)
+    cameras = [frame.camera for frames in splits.values() for frame in frames]
+    return SceneData(splits, scene_half_size(points, cameras), points)
 
 
 def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
-    """In [0, 1]; all are 0 if the largest time_id is 0."""
-    content = read_json(file)
-    numbers = {}
+    """Read times in [0, 1]; all are 0 if the largest time_id is 0."""
+    metadata, numbers = read_json(file), {}
     for id_ in ids:
-        entry = _get(file, content, id_)
-        if not isinstance(entry, dict):
-            raise DatasetInvalid(file, id_, "must be a JSON object")
-        key = "time_id" if "time_id" in entry else "warp_id"
-        if key not in entry:
-            raise DatasetInvalid(file, f"{id_}.time_id", "is missing, and so is warp_id")
-        number = _numbers(file, entry, key, (), f"{id_}.{key}")
-        if number < 0:
-            raise DatasetInvalid(file, f"{id_}.{key}", f"must be 0 or more, got {number:g}")
-        numbers[id_] = float(number)
+        entry = metadata.child(id_)
+        key = "time_id" if "time_id" in entry.values else "warp_id"
+        if key not in entry.values:
+            raise entry.invalid("time_id", "is missing, and so is warp_id")
+        numbers[id_] = entry.number(key)
+        if numbers[id_] < 0:
+            raise entry.invalid(key, f"must be 0 or more, got {numbers[id_]:g}")
     last = max(numbers.values()) or 1.0
     return {id_: number / last for id_, number in numbers.items()}
 
 
-def _read_world(file: Path) -> _World:
-    content = read_json(file)
-    scale = float(_numbers(file, content, "scale", ()))
+def _read_transform(file: Path) -> Transform:
+    scene = read_json(file)
+    scale = scene.number("scale")
     if scale <= 0:
-        raise DatasetInvalid(file, "scale", f"must be above 0, got {scale:g}")
-    return _World(_numbers(file, content, "center", (3,)), scale)
+        raise scene.invalid("scale", f"must be above 0, got {scale:g}")
+    center = scene.numbers("center", 3)
+    return lambda positions: (positions - center) * scale
 
 
 def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
-    """The folder of the smallest copies at least `size` pixels wide, or of the largest copies."""
+    """Find the folder of the smallest copies at least `size` pixels wide, or of the largest copies."""
     copies = [path for path in folder.glob("*x") if re.fullmatch(r"\d+x", path.name) and path.is_dir()]
     if not copies:
         raise DatasetInvalid(folder, "folder", "must have the images in 1x, 2x or the like, found none")
     copies.sort(key=lambda path: int(path.name[:-1]))
     if size is None:
         return copies[0]
-    wide_enough = [path for path in copies if image_size(path / f"{id_}.png").width >= size]
+    wide_enough = [path for path in copies if read_size(path / f"{id_}.png").width >= size]
     return wide_enough[-1] if wide_enough else copies[0]
 
 
-def _frame(file: Path, image_path: Path, t: float, world: _World, size: int | None) -> Frame:
-    content = read_json(file)
-    camera = _camera(file, content, world, image_size(image_path))
-    distortion = _distortion(file, content)
-    if distortion is not None and distortion.folds(camera):
-        raise DatasetInvalid(
-            file, "radial_distortion", f"{distortion} maps two points to one: undistort the images first"
-        )
+def _frame(folder: Path, image_path: Path, t: float, to_scene: Transform, size: int | None) -> Frame:
+    file = folder / "camera" / f"{image_path.stem}.json"
+    values = read_json(file)
+    camera = _camera(values, to_scene, read_size(image_path))
+    k1, k2, k3 = values.numbers("radial_distortion", 3).tolist()
+    p1, p2 = values.numbers("tangential" if "tangential" in values.values else "tangential_distortion", 2).tolist()
+    distortion = checked_distortion(Distortion(k1, k2, p1, p2, k3), camera, file, "radial_distortion")
     return Frame(image_path.stem, reduced(camera, size, image_path), t, image_path, distortion)
 
 
-def _camera(file: Path, content: dict[str, Any], world: _World, image: ImageSize) -> Camera:
-    """In pixels of the stored image."""
-    if _numbers(file, content, "skew", ()) != 0:
-        raise DatasetInvalid(file, "skew", f"must be 0, got {content['skew']}")
-    width, height = _numbers(file, content, "image_size", (2,))
-    stated = ImageSize(round(width), round(height))
+def _camera(values: JsonObject, to_scene: Transform, image: ImageSize) -> Camera:
+    """Return the camera, in pixels of the stored image."""
+    if values.number("skew") != 0:
+        raise values.invalid("skew", f"must be 0, got {values.get('skew')}")
+    stated = ImageSize(*map(round, values.numbers("image_size", 2)))
     if not stated.has_shape_of(image):
-        raise DatasetInvalid(file, "image_size", f"is {stated}, but the image is {image}")
-    focal = float(_numbers(file, content, "focal_length", ()))
-    aspect = float(_numbers(file, content, "pixel_aspect_ratio", ()))
-    cx, cy = _numbers(file, content, "principal_point", (2,))
+        raise values.invalid("image_size", f"is {stated}, but the image is {image}")
+    focal, aspect = values.number("focal_length"), values.number("pixel_aspect_ratio")
+    cx, cy = values.numbers("principal_point", 2)
     pose = np.eye(4)
-    pose[:3, :3] = _numbers(file, content, "orientation", (3, 3)).T
-    pose[:3, 3] = world.apply(_numbers(file, content, "position", (3,)))
+    pose[:3, :3] = values.numbers("orientation", 3, 3).T
+    pose[:3, 3] = to_scene(values.numbers("position", 3))
     try:
         return Camera(focal, focal * aspect, cx, cy, *stated, pose).resized(*image)
     except InvalidInput as error:
-        raise DatasetInvalid(file, _KEYS.get(error.field, "orientation"), f"is not a valid camera's: {error}") from None
+        raise values.invalid(FIELDS.get(error.field, "orientation"), f"is not a valid camera: {error}") from None
 
 
-_KEYS = {"camera.fx": "focal_length", "camera.fy": "pixel_aspect_ratio", "camera.width": "image_size"}
-
-
-def _distortion(file: Path, content: dict[str, Any]) -> Distortion | None:
-    k1, k2, k3 = _numbers(file, content, "radial_distortion", (3,)).tolist()
-    key = "tangential" if "tangential" in content else "tangential_distortion"
-    p1, p2 = _numbers(file, content, key, (2,)).tolist()
-    distortion = Distortion(k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
-    return distortion if any(distortion) else None
-
-
-def _read_points(file: Path, world: _World) -> np.ndarray | None:
+def _read_points(file: Path, to_scene: Transform) -> np.ndarray | None:
     if not file.exists():
         return None
     points = read_table(file, 3)
-    return world.apply(points) if len(points) else None
-
-
-def _get(file: Path, content: dict[str, Any], key: str) -> Any:
-    if content.get(key) is None:
-        raise DatasetInvalid(file, key, "is missing")
-    return content[key]
-
-
-def _numbers(
-    file: Path, content: dict[str, Any], key: str, shape: tuple[int, ...], name: str | None = None
-) -> np.ndarray:
-    """Finite float64 of that shape; errors call the field `name`, if given."""
-    value = _get(file, content, key)
-    wanted = f"{'×'.join(map(str, shape))} finite numbers" if shape else "a finite number"
-    try:
-        array = np.array(value)
-    except ValueError:  # rows of different lengths
-        array = np.array(None)
-    if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
-        raise DatasetInvalid(file, name or key, f"must be {wanted}, got {repr(value)[:100]}")
-    return array.astype(np.float64)
+    return to_scene(points) if len(points) else None

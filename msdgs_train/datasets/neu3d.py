@@ -11,16 +11,15 @@ are synchronized: all have F frames, and frame i is at t = i / (F - 1). The firs
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.extent import scene_half_size
-from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize
+from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
 from msdgs_train.datasets.common.ply_points import read_ply_points
-from msdgs_train.datasets.common.readers import read_table
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame, SceneData, image_size, reduced
+from msdgs_train.datasets.common.readers import DatasetInvalid, read_table
+from msdgs_train.datasets.common.scene_data import Frame, SceneData, reduced
 from msdgs_train.datasets.common.video import VideoFrame, read_info
 
 POSES_FILE = "poses_bounds.npy"
@@ -30,146 +29,95 @@ CAMERAS = "cam0*"
 POINTS_FILES = ("points3D_downsample*.ply", "points3d.ply", "points3D.ply")
 """The first that exists is read; of several downsampled ones the last by name, which is the smallest."""
 
+VIDEO = ".mp4"
 CAMERA_NAME = re.compile(r"cam\d+")
 
 
-def load_neu3d(folder: Path | str, size: int | None = None) -> SceneData:
-    """Read the cameras of a Neu3D scene and, from a `.ply` file if there is one, its sparse points.
-
-    `size` is the width of the images in pixels. Videos are decoded later, by `Frame.load_rgba`. Raises `DatasetInvalid`
-    naming file and field, and `InvalidInput` for an unusable `size`.
-    """
-    folder = Path(folder)
-    sources = _find_sources(folder)
-    poses = _read_poses(folder / POSES_FILE, sources)
-    views = [_view(folder / POSES_FILE, row, *pair, size) for row, pair in enumerate(zip(sources, poses, strict=True))]
+def load_neu3d(folder: Path, size: int | None = None) -> SceneData:
+    """Read the cameras and, if there is a `.ply` file, the sparse points of a Neu3D scene, as `load_scene` does."""
+    cameras, file = _find_cameras(folder), folder / POSES_FILE
+    poses = read_table(file, 17)
+    if len(poses) != len(cameras):
+        problem = f"are {len(poses)}, but there are {len(cameras)} cameras: {' '.join(cameras)}. There must be one row "
+        raise DatasetInvalid(file, "rows", problem + "per camera, in the order of their names")
+    views = [_view(file, row, name, cameras[name], poses[row], size) for row, name in enumerate(cameras)]
+    first = views[0]
     for view in views:
-        if len(view) != len(views[0]):
-            raise DatasetInvalid(
-                view[0].image_path.parent,
-                "frames",
-                f"are {len(view)}, but {views[0][0].image_path.parent} has {len(views[0])}: "
-                f"cut all cameras to the same frames",
-            )
+        if len(view) != len(first):
+            problem = f"are {len(view)}, but {first[0].image_path.parent} has {len(first)}: cut all to the same frames"
+            raise DatasetInvalid(view[0].image_path.parent, "frames", problem)
     points, colors = _read_points(folder)
-    extent = scene_half_size(points, [view[0].camera for view in views])
-    splits = {"train": [frame for view in views[1:] for frame in view], "val": [], "test": views[0]}
-    return SceneData(splits, (0.0, views[0][-1].t), extent, points, colors)
+    splits = {"train": [frame for view in views[1:] for frame in view], "val": [], "test": first}
+    return SceneData(splits, scene_half_size(points, [view[0].camera for view in views]), points, colors)
 
 
-class _Source(NamedTuple):
-    """The images of a camera: a video, or files in the order of time."""
-
-    name: str
-    video: Path | None
-    images: list[Path]
-
-
-def _find_sources(folder: Path) -> list[_Source]:
-    try:
-        names = {path.stem for path in folder.iterdir() if CAMERA_NAME.fullmatch(path.stem)}
-    except OSError as error:
-        raise DatasetInvalid(folder, "folder", f"can't be read: {error.strerror}") from None
-    sources = [_source(folder, name) for name in sorted(names, key=_natural)]
-    if len(sources) < 2:
-        raise DatasetInvalid(
-            folder, "cameras", f"must be two or more, got {len(sources)}: cam00 for testing, cam01 and on for training"
-        )
-    return sources
+def _find_cameras(folder: Path) -> dict[str, list[Path]]:
+    """Find the images of each camera in the order of time, or its video; by the camera's name."""
+    names = {path.stem for path in folder.iterdir() if CAMERA_NAME.fullmatch(path.stem)}
+    if len(names) < 2:
+        problem = f"must be two or more, got {len(names)}: cam00 for testing, cam01 and on for training"
+        raise DatasetInvalid(folder, "cameras", problem)
+    return {name: _find_files(folder, name) for name in sorted(names, key=_natural)}
 
 
-def _source(folder: Path, name: str) -> _Source:
+def _find_files(folder: Path, name: str) -> list[Path]:
     for place in (folder / name / "images", folder / name):
-        if place.is_dir():
-            files = [path for path in place.iterdir() if path.suffix.lower() in EXTENSIONS and path.is_file()]
-            if files:
-                return _Source(name, None, sorted(files, key=lambda path: _natural(path.name)))
-    video = folder / f"{name}.mp4"
-    if video.is_file():
-        return _Source(name, video, [])
-    raise DatasetInvalid(
-        folder / name, "frames", f"are missing: there is no {video.name} and no {'|'.join(EXTENSIONS)}"
-    )
+        files = [path for path in place.glob("*") if path.suffix.lower() in EXTENSIONS and path.is_file()]
+        if files:
+            return sorted(files, key=lambda path: _natural(path.name))
+    video = folder / f"{name}{VIDEO}"
+    if not video.is_file():
+        problem = f"are missing: there is no {video.name} and no {'|'.join(EXTENSIONS)}"
+        raise DatasetInvalid(folder / name, "frames", problem)
+    return [video]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A sorting key that orders numbers by value, with or without leading zeros."""
+    """Return a sorting key that orders numbers by value, with or without leading zeros."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def _read_poses(file: Path, sources: list[_Source]) -> np.ndarray:
-    """[M, 17] float64, finite, one row per camera."""
-    poses = read_table(file, 17)
-    if len(poses) != len(sources):
-        raise DatasetInvalid(
-            file,
-            "rows",
-            f"are {len(poses)}, but there are {len(sources)} cameras: {' '.join(source.name for source in sources)}. "
-            f"There must be one row per camera, in the order of their names",
-        )
-    return poses
+def _view(file: Path, row: int, name: str, files: list[Path], pose: np.ndarray, size: int | None) -> list[Frame]:
+    """Read all frames of one camera, in the order of time."""
+    first = files[0]
+    if first.suffix == VIDEO:
+        count, *image = read_info(first)
+        camera = reduced(_camera(file, row, pose, ImageSize(*image)), size, first)
+        return [
+            VideoFrame(f"{name}_{i:06d}", camera, t, first / f"{i:06d}", video=first, index=i, count=count)
+            for i, t in enumerate(_times(count))
+        ]
+    image = read_size(first)
+    for path in files:
+        if read_size(path) != image:
+            raise DatasetInvalid(path, "image", f"is {read_size(path)}, but {first} is {image}")
+    camera = reduced(_camera(file, row, pose, image), size, first)
+    return [Frame(f"{name}_{path.stem}", camera, t, path) for path, t in zip(files, _times(len(files)), strict=True)]
 
 
-def _view(file: Path, row: int, source: _Source, pose: np.ndarray, size: int | None) -> list[Frame]:
-    """All frames of one camera, in the order of time."""
-    if source.video is None:
-        return _image_frames(file, row, source, pose, size)
-    info = read_info(source.video)
-    camera = reduced(_camera(file, row, pose, ImageSize(info.width, info.height)), size, source.video)
-    return [
-        VideoFrame(
-            f"{source.name}_{index:06d}",
-            camera,
-            _time(index, info.count),
-            source.video / f"{index:06d}",
-            video=source.video,
-            index=index,
-            count=info.count,
-        )
-        for index in range(info.count)
-    ]
-
-
-def _image_frames(file: Path, row: int, source: _Source, pose: np.ndarray, size: int | None) -> list[Frame]:
-    image = image_size(source.images[0])
-    for path in source.images:
-        if image_size(path) != image:
-            raise DatasetInvalid(path, "image", f"is {image_size(path)}, but {source.images[0]} is {image}")
-    camera = reduced(_camera(file, row, pose, image), size, source.images[0])
-    return [
-        Frame(f"{source.name}_{path.stem}", camera, _time(index, len(source.images)), path)
-        for index, path in enumerate(source.images)
-    ]
-
-
-def _time(index: int, count: int) -> float:
-    return index / (count - 1) if count > 1 else 0.0
+def _times(count: int) -> list[float]:
+    return [index / max(count - 1, 1) for index in range(count)]
 
 
 def _camera(file: Path, row: int, values: np.ndarray, image: ImageSize) -> Camera:
     down, right, back, position, (height, width, focal) = values[:15].reshape(3, 5).T
     near, far = values[15:]
     if not 0 < near < far:
-        raise _invalid_row(file, row, f"must end in 0 < near < far, got {near:g} and {far:g}")
+        raise DatasetInvalid(file, f"row {row}", f"must end in 0 < near < far, got {near:g} and {far:g}")
     stated = ImageSize(round(width), round(height))
     if not stated.has_shape_of(image):
-        raise _invalid_row(file, row, f"states a size of {stated}, but the image is {image}")
+        raise DatasetInvalid(file, f"row {row}", f"states a size of {stated}, but the image is {image}")
     pose = np.eye(4)
     pose[:3] = np.stack([right, down, -back, position], axis=1)
     try:
         return Camera(focal, focal, width / 2, height / 2, *stated, pose).resized(*image)
     except InvalidInput as error:
-        raise _invalid_row(file, row, f"is not a valid camera: {error}") from None
-
-
-def _invalid_row(file: Path, row: int, problem: str) -> DatasetInvalid:
-    return DatasetInvalid(file, f"row {row}", problem)
+        raise DatasetInvalid(file, f"row {row}", f"is not a valid camera: {error}") from None
 
 
 def _read_points(folder: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
     for pattern in POINTS_FILES:
         files = sorted(folder.glob(pattern), key=lambda path: _natural(path.stem))
         if files:
-            points, colors = read_ply_points(files[-1])
-            return (points, colors) if len(points) else (None, None)
+            return read_ply_points(files[-1])
     return None, None

@@ -17,10 +17,10 @@ class DensityConfig(Checked):
     density_strategy: Literal["gradient", "mcmc"] = "gradient"
     """gradient clones and splits by gradients of the projected means, and prunes; mcmc relocates low-opacity Gaussians
     and grows by 5 % a round up to max_gaussians."""
-    refine_start: int = 500
-    """First step of density control."""
-    refine_every: int = 100
-    """Steps between rounds of density control; 0 switches it off."""
+    refine_start_fraction: float = 500 / 16_000
+    """Density control begins after this fraction of the run."""
+    refine_every_fraction: float = 100 / 16_000
+    """Fraction of the run between rounds of density control; 0 switches it off."""
     refine_stop_fraction: float = 0.7
     """Density control ends after this fraction of the run."""
     grow_grad2d: float = 4e-4
@@ -31,8 +31,9 @@ class DensityConfig(Checked):
     """Gaussians of a lower opacity are removed, or relocated."""
     prune_scale3d: float = 0.1
     """gradient: Gaussians larger than this fraction of the scene's scale are removed after a reset of opacities."""
-    reset_every: int = 0
-    """gradient: opacities are reset to at most 0.01 each so many steps, while density control lasts; 0: never."""
+    reset_every_fraction: float = 0.0
+    """gradient: opacities are reset to at most 0.01 after each such fraction of the run, while density control lasts;
+    0: never."""
     noise_lr: float = 5e5
     """mcmc: factor of the noise that is injected into means, in their learning rates times their covariance."""
     opacity_reg: float = 1e-2
@@ -45,8 +46,8 @@ class DensityConfig(Checked):
 
     def __post_init__(self) -> None:
         self.require_counts("init_num_pts", "max_gaussians")
-        self.require_counts("refine_start", "refine_every", "reset_every", least=0)
-        self.require_fractions("refine_stop_fraction", "prune_opa")
+        self.require_fractions("refine_start_fraction", "refine_every_fraction", "refine_stop_fraction")
+        self.require_fractions("reset_every_fraction", "prune_opa")
         self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
         self.require_weights("noise_lr", "opacity_reg", "scale_reg")
         self.require(("reseed_fraction",), "in [0, 0.5]", lambda v: 0 <= v <= 0.5)

@@ -105,7 +105,7 @@ class GradientStrategy:
 
     def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
         pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
-        if 0 < self.config.reset_every < step:
+        if 0 < self.schedule.reset_every < step:
             pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.scene_scale
         if bool(pruned.all()):  # a scene that is wholly transparent keeps its Gaussians and may recover
             return torch.zeros_like(pruned)

@@ -61,18 +61,18 @@ class OptimizerConfig(Checked):
     """Of logarithms of scales."""
     quats_lr: float = 1e-3
     """Of quaternions."""
-    sh_degree_interval: int = 2_000
-    """Steps after which the degree of the spherical harmonics in use rises by one."""
+    sh_degree_fraction: float = 0.125
+    """Fraction of the run after which the degree of the spherical harmonics in use rises by one; 0: all from the
+    start."""
     eps2d_init: float | None = None
     """Dilation of projected covariances, px², until all times take part; the model's own eps2d if not given."""
-    ema_steps: int = 0
-    """The model that is evaluated and saved is an exponential average over about so many last steps, once all times
-    take part and density control has ended, which reduces mini-batch noise; 0: the last step's."""
+    ema_fraction: float = 0.0
+    """The model that is evaluated and saved is an exponential average over about this last fraction of the run, once
+    all times take part and density control has ended, which reduces mini-batch noise; 0: the last step's."""
 
     def __post_init__(self) -> None:
         self.require_positive(*(name for name in self.names() if "_lr" in name))
-        self.require_counts("sh_degree_interval")
-        self.require_counts("ema_steps", least=0)
+        self.require_fractions("sh_degree_fraction", "ema_fraction")
         self.require(("eps2d_init",), "finite and 0 or above, or not given", lambda v: v is None or 0 <= v < 1e9)
 
 

@@ -1,10 +1,10 @@
-"""Packages that a single switch needs."""
+"""The error for an optional package that isn't installed."""
 
 from msdgs_serve.scene.errors import MsdgsError
 
 
 class ExtraMissing(MsdgsError):
-    """A switch was given whose package isn't installed."""
+    """An option was given whose package isn't installed."""
 
-    def __init__(self, switch: str, package: str, extra: str) -> None:
-        super().__init__(f"{switch} needs {package}: pip install 'msdgs[{extra}]'")
+    def __init__(self, option: str, package: str, extra: str) -> None:
+        super().__init__(f"{option} needs {package}: pip install 'msdgs[{extra}]'")

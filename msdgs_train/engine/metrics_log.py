@@ -2,15 +2,18 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from msdgs_train.datasets.common.images import write_png
-from msdgs_train.engine.tensorboard_events import FOLDER, TensorBoardEvents
+from msdgs_train.engine.tensorboard_events import FOLDER, add_scalars, open_events
 from msdgs_train.engine.trainer import EvaluatedFrame, StepResult
 from msdgs_train.evaluation.metrics import ImageMetrics
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 METRICS = "metrics.jsonl"
 CURVE = "curve.png"
@@ -24,9 +27,9 @@ class MetricsLog:
     """
 
     def __init__(self, run: Path, *, keep_until: int = 0, tensorboard: bool = False) -> None:
-        """Appends to the lines up to step `keep_until`; later ones are dropped."""
+        """Keep the lines up to step `keep_until` and drop later ones."""
         self._run, self._tensorboard = run, tensorboard
-        self._events: TensorBoardEvents | None = None
+        self._events: SummaryWriter | None = None
         self.rewind(keep_until)
 
     def rewind(self, step: int) -> None:
@@ -35,7 +38,7 @@ class MetricsLog:
         (self._run / METRICS).write_text("".join(json.dumps(line) + "\n" for line in kept))
         self.close()
         if self._tensorboard:
-            self._events = TensorBoardEvents(self._run / FOLDER, kept, step)
+            self._events = open_events(self._run / FOLDER, kept, step)
 
     def train(self, result: StepResult, seconds: float) -> None:
         """Add a line of training metrics."""
@@ -48,7 +51,8 @@ class MetricsLog:
     def image(self, step: int, split: str, evaluated: EvaluatedFrame) -> None:
         """Add a held-out image and its rendering, side by side; to TensorBoard only."""
         if self._events is not None:
-            self._events.image(step, f"{split}/{_stem(evaluated)}", side_by_side(evaluated))
+            name = f"{split}/{_stem(evaluated)}"
+            self._events.add_image(name, side_by_side(evaluated), step, dataformats="HWC")
 
     def flush(self) -> None:
         """Write buffered events to disk."""
@@ -64,11 +68,11 @@ class MetricsLog:
         with (self._run / METRICS).open("a") as file:
             file.write(json.dumps(line) + "\n")
         if self._events is not None:
-            self._events.add(line)
+            add_scalars(self._events, line)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`, without an incomplete last one; none if there is no such file."""
+    """Read the lines of a run's `metrics.jsonl`, without an incomplete last one; none if there is no such file."""
     path = run / METRICS
     lines = []
     for text in path.read_text().splitlines() if path.exists() else ():
@@ -120,5 +124,5 @@ def _stem(evaluated: EvaluatedFrame) -> str:
 
 
 def to_bytes(rgb: np.ndarray) -> np.ndarray:
-    """uint8 of sRGB values in [0, 1], rounded."""
+    """Round sRGB values in [0, 1] to uint8."""
     return np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)

@@ -1,4 +1,6 @@
-"""The callbacks of a run: what happens is reported to them, and they may pause or stop it."""
+"""The callbacks of a run, which may also pause or stop it."""
+
+from collections.abc import Callable
 
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.evaluation.metrics import ImageMetrics
@@ -8,23 +10,23 @@ class Observer:
     """Callbacks that do nothing; subclasses override those that they need. Called between steps, from one thread."""
 
     def on_train_start(self, trainer: Trainer) -> None:
-        """Before the first step, of a resumed run too."""
+        """Called before the first step, also of a resumed run."""
 
     def step(self, result: StepResult, seconds: float) -> None:
-        """After every step; `seconds` of training so far."""
+        """Called after every step; `seconds` is the training time so far."""
 
     def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
-        """After a split has been evaluated."""
+        """Called after a split has been evaluated."""
 
     def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
-        """Training has diverged and returned to `step`; learning rates are those of the settings times `lr_factor`."""
+        """Called when training has diverged and returned to `step`; learning rates are multiplied by `lr_factor`."""
 
     def should_stop(self) -> bool:
-        """Asked after every step; if true, the run saves a checkpoint and returns."""
+        """Called after every step; if true, the run saves a checkpoint and returns."""
         return False
 
     def is_paused(self) -> bool:
-        """Asked after every step; while true, the run waits and asks again."""
+        """Called after every step; while true, the run waits and calls it again."""
         return False
 
 
@@ -32,26 +34,10 @@ class Observers(Observer):
     """Several observers, called in order; each may pause or stop the run."""
 
     def __init__(self, *observers: Observer) -> None:
-        self.observers = observers
+        for name in ("on_train_start", "step", "evaluation", "rolled_back", "should_stop", "is_paused"):
+            setattr(self, name, _call_all([getattr(observer, name) for observer in observers]))
 
-    def on_train_start(self, trainer: Trainer) -> None:
-        for observer in self.observers:
-            observer.on_train_start(trainer)
 
-    def step(self, result: StepResult, seconds: float) -> None:
-        for observer in self.observers:
-            observer.step(result, seconds)
-
-    def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:
-        for observer in self.observers:
-            observer.evaluation(step, split, metrics)
-
-    def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
-        for observer in self.observers:
-            observer.rolled_back(reason, step, lr_factor)
-
-    def should_stop(self) -> bool:
-        return any(observer.should_stop() for observer in self.observers)
-
-    def is_paused(self) -> bool:
-        return any(observer.is_paused() for observer in self.observers)
+def _call_all(callbacks: list[Callable[..., bool | None]]) -> Callable[..., bool]:
+    """Combine callbacks into one, which returns true if any of them does; those that return nothing are all called."""
+    return lambda *arguments: any(callback(*arguments) for callback in callbacks)

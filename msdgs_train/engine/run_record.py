@@ -41,7 +41,7 @@ class RunRecord:
 
 
 def read_record(run: Path) -> RunRecord | None:
-    """The contents of `run.json`, None if there is no such file. Raises `RunInvalid`."""
+    """Read the contents of `run.json`, None if there is no such file. Raises `RunInvalid`."""
     path = run / RECORD
     if not path.exists():
         return None
@@ -58,18 +58,23 @@ def write_record(run: Path, record: RunRecord) -> None:
     write_text(run / RECORD, json.dumps(values, indent=2) + "\n")
 
 
-def stored_config(run: Path) -> TrainConfig:
-    """The settings that a run was started with.
-
-    Raises `InvalidInput` if the folder holds no run, `RunInvalid` if its settings are those of another version.
-    """
+def read_config(run: Path) -> TrainConfig:
+    """Read the settings of a run. Raises `RunInvalid` if there are none, or those of another version."""
     path = run / CONFIG
-    if not path.exists() or not (run / CHECKPOINT).exists():
-        raise InvalidInput("run", "the folder of a run with a checkpoint, to resume it", run)
     try:
         return TrainConfig.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        problem = f"{error.strerror}; RUN must be the folder of a run of `msdgs-train fit DATA RUN`"
+        raise RunInvalid(path, problem) from None
     except (InvalidInput, ValueError, AttributeError, TypeError) as error:
-        raise RunInvalid(path, f"can't be resumed, train again in a new folder: {error}") from error
+        raise RunInvalid(path, f"isn't usable in this version, train again in a new folder: {error}") from error
+
+
+def stored_config(run: Path) -> TrainConfig:
+    """Return the settings of a run that can be resumed. Raises `InvalidInput` if there is none, and `RunInvalid`."""
+    if not (run / CONFIG).exists() or not (run / CHECKPOINT).exists():
+        raise InvalidInput("run", "the folder of a run with a checkpoint, to resume it", run)
+    return read_config(run)
 
 
 def write_config(run: Path, config: TrainConfig) -> None:

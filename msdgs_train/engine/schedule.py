@@ -21,7 +21,12 @@ class Schedule(NamedTuple):
     static_steps: int  # all images, no deformation
     deform_start_step: int
     full_window_step: int  # all times take part
+    refine_start: int  # the first step of density control, counted from 1
+    refine_every: int  # 0: no density control
     refine_stop: int  # the last step of density control, counted from 1
+    reset_every: int  # 0: opacities are never reset
+    sh_degree_interval: int
+    ema_steps: int  # 0: no average
     num_reseeded: int  # random Gaussians that are added after the static phase
 
     @classmethod
@@ -37,7 +42,12 @@ class Schedule(NamedTuple):
             static_steps,
             deform_start_step=round((c.static_fraction + static_window) * steps),
             full_window_step=round(c.window_full_fraction * steps),
+            refine_start=round(config.density.refine_start_fraction * steps),
+            refine_every=_interval(config.density.refine_every_fraction, steps),
             refine_stop=round(config.density.refine_stop_fraction * steps),
+            reset_every=_interval(config.density.reset_every_fraction, steps),
+            sh_degree_interval=_interval(config.optimizer.sh_degree_fraction, steps),
+            ema_steps=_interval(config.optimizer.ema_fraction, steps),
             num_reseeded=int(config.density.reseed_fraction * config.density.max_gaussians) if reseeds else 0,
         )
 
@@ -85,7 +95,8 @@ class Schedule(NamedTuple):
 
     def sh_degree(self, step: int) -> int:
         """Degree of the spherical harmonics in use."""
-        return min(step // self.config.optimizer.sh_degree_interval, self.config.model.sh_degree)
+        degree = self.config.model.sh_degree
+        return min(step // self.sh_degree_interval, degree) if self.sh_degree_interval else degree
 
     def eps2d(self, step: int) -> float:
         """Dilation of projected covariances in this step, counted from 1, px²."""
@@ -99,15 +110,20 @@ class Schedule(NamedTuple):
 
     def refines_at(self, step: int) -> bool:
         """Whether a round of density control is due after this step, counted from 1."""
-        d = self.config.density
-        return d.refine_every > 0 and d.refine_start <= step <= self.refine_stop and step % d.refine_every == 0
+        every = self.refine_every
+        return every > 0 and self.refine_start <= step <= self.refine_stop and step % every == 0
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are reset after this step, counted from 1."""
-        every = self.config.density.reset_every
+        every = self.reset_every
         return every > 0 and step < self.refine_stop and step % every == 0
 
     def averages_at(self, step: int) -> bool:
         """Whether the model after this step, counted from 1, is part of the average."""
         last = max(self.deform_start_step, self.full_window_step, self.refine_stop)
-        return self.config.optimizer.ema_steps > 0 and step > last
+        return self.ema_steps > 0 and step > last
+
+
+def _interval(fraction: float, steps: int) -> int:
+    """Steps of a fraction of the run, one at least; 0 for 0."""
+    return max(round(fraction * steps), 1) if fraction else 0

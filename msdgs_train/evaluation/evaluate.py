@@ -1,6 +1,5 @@
 """Evaluation of the last and the best model of a run on held-out images."""
 
-import json
 import statistics
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, composite, load_scene
-from msdgs_train.engine.run_record import BEST, CONFIG, MODEL, RECORD, Best, RunInvalid, read_record
+from msdgs_train.engine.run_record import BEST, MODEL, RECORD, Best, RunInvalid, read_config, read_record
 from msdgs_train.evaluation.metrics import image_metrics, masked_psnr
 from msdgs_train.evaluation.moving_region import moving_region
 from msdgs_train.evaluation.perceptual import PerceptualMetrics, perceptual_metrics
@@ -44,11 +43,11 @@ class EvaluatedModel(NamedTuple):
         return Scores(*(statistics.fmean(column) if column else None for column in columns))  # type: ignore[arg-type]
 
     def render(self, frame: Frame) -> Tensor:
-        """[H, W, 3] in [0, 1], rendered with the camera and time of the frame."""
+        """Render [H, W, 3] in [0, 1] with the camera and time of the frame."""
         return self.loaded.render(frame.camera, frame.t).clamp(0, 1)
 
     def image(self, frame: Frame) -> Tensor:
-        """[H, W, 3] in [0, 1], over the background that the model was trained with."""
+        """Read the image of the frame, [H, W, 3] in [0, 1], over the background that the model was trained with."""
         return torch.from_numpy(composite(frame.load_rgba(), self.loaded.scene.background))
 
 
@@ -70,15 +69,11 @@ def evaluate_run(
 ) -> Evaluation:
     """Evaluate `model.pt` and, if there is one, `best.pt` of the run in folder `run` on a split.
 
-    Args:
-        run: the folder of a run of `msdgs-train fit`.
-        data: the dataset; by default the one that the run was trained on.
-        split: "test", "val" or "train".
-        progress: called with (done, total) images.
+    The arguments are the options of `msdgs-train eval`; `progress` is called with (done, total) images.
 
     Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
     """
-    size = _image_width(run)
+    size = read_config(run).data.size
     loaded = {name: load_model(run / file) for name, file in FILES.items() if name == "last" or (run / file).exists()}
     data = _data_folder(run, data)
     scene = load_scene(data, size)
@@ -99,22 +94,10 @@ def evaluate_run(
 
 
 def scores(rgb: Tensor, target: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
-    """The scores of one rendering and its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
+    """Score a rendering against its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
     psnr, ssim = image_metrics(rgb, target)
     others = {name: metric(rgb, target) for name, metric in perceptual.metrics.items()}
     return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, mask))
-
-
-def _image_width(run: Path) -> int | None:
-    """The width that the run was trained at, None for that of the images."""
-    path = run / CONFIG
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))["data"]["size"]
-    except OSError as error:
-        problem = f"{error.strerror}; RUN must be the folder of a run of `msdgs-train fit DATA RUN`"
-        raise RunInvalid(path, problem) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise RunInvalid(path, f"isn't the configuration of a run: {error!r}") from None
 
 
 def _data_folder(run: Path, data: Path | None) -> Path:
@@ -122,17 +105,16 @@ def _data_folder(run: Path, data: Path | None) -> Path:
         return data.absolute()
     record = read_record(run)
     if record is None:
-        raise RunInvalid(
-            run / RECORD, f"no such file, so the dataset has to be given: msdgs-train eval {run} --data DATA"
-        )
+        problem = f"no such file, so the dataset has to be given: msdgs-train eval {run} --data DATA"
+        raise RunInvalid(run / RECORD, problem)
     if not record.data.is_dir():
-        where = f"if it is elsewhere now: msdgs-train eval {run} --data DATA"
-        raise DatasetInvalid(record.data, "folder", f"does not exist; {where}")
+        problem = f"does not exist; if it is elsewhere now: msdgs-train eval {run} --data DATA"
+        raise DatasetInvalid(record.data, "folder", problem)
     return record.data
 
 
 def _frames(scene: SceneData, data: Path, split: str) -> list[Frame]:
     if not scene.splits.get(split):
-        there = [f"`{name}` with {len(frames)}" for name, frames in scene.splits.items() if frames]
-        raise DatasetInvalid(data, split, f"has no images; there are {', '.join(there)}")
+        others = [f"`{name}` with {len(frames)}" for name, frames in scene.splits.items() if frames]
+        raise DatasetInvalid(data, split, f"has no images; there are {', '.join(others)}")
     return scene.splits[split]

@@ -19,14 +19,9 @@ def write_steps(
 ) -> list[np.ndarray]:
     """Draw the model in `path` at time `t` after each of its layers into the PNG `out`; returns the K + 1 images.
 
-    Args:
-        path: `model.pt` or `best.pt` of a run.
-        out: where to write; its folder is created if missing. Atomic.
-        t: in the scene's time range.
-        size: width of each image in pixels, the height in proportion.
-        camera: name of a camera in the model; by default the one whose image is nearest in time.
+    The arguments are the options of `msdgs-train steps`. Atomic; the folder of `out` is created if missing.
 
-    Raises `CheckpointInvalid` if the model can't be read, `InvalidInput` naming what is out of range.
+    Raises `CheckpointInvalid` if the model can't be read, `InvalidInput` naming an argument that is out of range.
     """
     if out.suffix.lower() != ".png":
         raise InvalidInput("out", "a .png file", out)
@@ -45,7 +40,7 @@ def write_steps(
 
 
 def render_steps(loaded: LoadedModel, t: float, camera: Camera) -> list[np.ndarray]:
-    """K + 1 images, [H, W, 3] uint8: after no layer, after the first, …, after all."""
+    """Render K + 1 images, [H, W, 3] uint8: after no layer, after the first, …, after all."""
     return [to_bytes(loaded.render(camera, t, k).numpy()) for k in range(len(loaded.model.deformation) + 1)]
 
 
@@ -61,7 +56,7 @@ def _stored_camera(loaded: LoadedModel, t: float, name: str | None) -> dict[str,
 
 
 def camera_of(entry: dict[str, Any], width: int) -> Camera:
-    """A camera from a model file, with images `width` pixels wide."""
+    """Return a camera from a model file, for images `width` pixels wide."""
     if width < 1:
         raise InvalidInput("size", "a width of 1 pixel or more", width)
     values = {name: entry[name] for name in ("fx", "fy", "cx", "cy", "width", "height")}

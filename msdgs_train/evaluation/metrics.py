@@ -21,28 +21,28 @@ class ImageMetrics(NamedTuple):
 
 
 def psnr(rgb: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of [H, W, 3] images with values in [0, 1], over all pixels and channels."""
+    """Return PSNR in dB of [H, W, 3] images with values in [0, 1], over all pixels and channels."""
     return psnr_from_mse(float((rgb - target).double().square().mean()))
 
 
 def masked_psnr(rgb: Tensor, target: Tensor, mask: np.ndarray) -> float | None:
-    """PSNR in dB over the pixels of `mask`, [H, W] bool, and all channels of [H, W, 3]; None if there are none."""
+    """Return PSNR in dB of [H, W, 3] images over the pixels of `mask`, [H, W] bool; None if there are none."""
     inside = torch.from_numpy(mask)
     return psnr_from_mse(float((rgb - target)[inside].double().square().mean())) if mask.any() else None
 
 
 def psnr_from_mse(mse: float) -> float:
-    """−10 log10(mse), at most `MAX_PSNR`; NaN stays NaN."""
+    """Return −10 log10(mse), at most `MAX_PSNR`; NaN stays NaN."""
     return MAX_PSNR if mse <= 10 ** (-MAX_PSNR / 10) else -10 * math.log10(mse)
 
 
 def image_metrics(rgb: Tensor, target: Tensor) -> ImageMetrics:
-    """PSNR and SSIM of one rendering, clamped to [0, 1] first; both [H, W, 3]."""
+    """Return PSNR and SSIM of one rendering, clamped to [0, 1] first; both [H, W, 3]."""
     shown = rgb.detach().clamp(0, 1)
     return ImageMetrics(psnr(shown, target), float(ssim(shown, target)))
 
 
 def mean_metrics(metrics: list[ImageMetrics]) -> ImageMetrics:
-    """The mean over images: of their PSNRs (not the PSNR of their mean error) and of their SSIMs."""
+    """Return the mean over images: of PSNR (not the PSNR of the mean error) and of SSIM."""
     count = len(metrics)
     return ImageMetrics(sum(q.psnr for q in metrics) / count, sum(q.ssim for q in metrics) / count)

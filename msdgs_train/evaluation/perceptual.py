@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 Metric = Callable[[Tensor, Tensor], float]
-"""Of a rendering and its image, both [H, W, 3] in [0, 1]; 0 for equal images, lower is better."""
+"""Error of a rendering against its image, both [H, W, 3] in [0, 1]; 0 for equal images."""
 
 
 class Unavailable(Exception):
@@ -25,7 +25,7 @@ class PerceptualMetrics(NamedTuple):
 
 
 def perceptual_metrics() -> PerceptualMetrics:
-    """`lpips` and `flip`, each as a metric or with the reason why it is unavailable."""
+    """Load `lpips` and `flip`, each as a metric or with the reason why it is unavailable."""
     found = PerceptualMetrics({}, {})
     for name, load in (("lpips", _load_lpips), ("flip", _load_flip)):
         try:
@@ -37,25 +37,23 @@ def perceptual_metrics() -> PerceptualMetrics:
 
 def _load_flip() -> Metric:
     """NVIDIA's LDR-ꟻLIP, mean over the pixels, at its default of 67 pixels per degree."""
-    try:
-        evaluator: Any = importlib.import_module("flip_evaluator")
-    except ImportError:
-        raise Unavailable("flip-evaluator isn't installed: pip install flip-evaluator") from None
-
-    def metric(rgb: Tensor, target: Tensor) -> float:
-        return float(evaluator.evaluate(target.numpy(), rgb.numpy(), "LDR", applyMagma=False)[1])
-
-    return metric
+    evaluator = _module("flip_evaluator", "flip-evaluator")
+    return lambda rgb, target: float(evaluator.evaluate(target.numpy(), rgb.numpy(), "LDR", applyMagma=False)[1])
 
 
 def _load_lpips() -> Metric:
-    """LPIPS with VGG-16, through the lpips package or else torchmetrics, on images scaled to [−1, 1].
+    """LPIPS with VGG-16, on images scaled to [−1, 1].
 
     This is the definition of LPIPS. The scripts of 3D Gaussian Splatting pass [0, 1], which gives lower values.
     """
-    weights = _vgg_weights()
+    models = _module("torchvision.models", "torchvision")
+    name = models.VGG16_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[-1]
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / name
+    if not weights.is_file():
+        raise Unavailable(f"its weights aren't on this machine: no {name} in torch's hub folder (TORCH_HOME)")
+    lpips = _module("torchmetrics.image.lpip", "torchmetrics")
     try:
-        network: Any = _lpips_network()
+        network = lpips.LearnedPerceptualImagePatchSimilarity(net_type="vgg")
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise Unavailable(f"{weights} can't be used: {error}") from None
 
@@ -66,24 +64,8 @@ def _load_lpips() -> Metric:
     return metric
 
 
-def _vgg_weights() -> Path:
+def _module(name: str, package: str) -> Any:
     try:
-        models: Any = importlib.import_module("torchvision.models")
+        return importlib.import_module(name)
     except ImportError:
-        raise Unavailable("torchvision isn't installed, whose VGG-16 LPIPS uses") from None
-    name = models.VGG16_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[-1]
-    path = Path(torch.hub.get_dir()) / "checkpoints" / name
-    if not path.is_file():
-        raise Unavailable(f"its weights aren't on this machine: no {name} in torch's hub folder (TORCH_HOME)")
-    return path
-
-
-def _lpips_network() -> Any:
-    try:
-        return importlib.import_module("lpips").LPIPS(net="vgg", verbose=False).eval()
-    except ImportError:
-        pass
-    try:
-        return importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity(net_type="vgg")
-    except ImportError:
-        raise Unavailable("neither lpips nor torchmetrics is installed") from None
+        raise Unavailable(f"{package} isn't installed: pip install {package}") from None

@@ -1,24 +1,25 @@
 """The files of an evaluation in RUN/eval: numbers as JSON, a Markdown table and a contact sheet."""
 
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets.common.files import write_text
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.evaluate import FILES, EvaluatedModel, Evaluation, Scores
-from msdgs_train.evaluation.sheets import ColorScale, Panel, color, draw_sheet
+from msdgs_train.evaluation.sheets import Panel, draw_sheet
 
 FOLDER = "eval"
 SHEET_ROWS = 8
 MAX_PANEL = 320  # pixels of width; smaller images are enlarged to MIN_PANEL or more
 MIN_PANEL = 200
-COLOR_MAP = "magma"
-FULL_ERROR = 0.25  # mean over the channels; fixed, so that sheets can be compared
+FULL_ERROR = 0.25  # mean over the channels that gets the last color; fixed, so that sheets can be compared
 OUTLINE = (0, 220, 255)
 
 HEADINGS = {
@@ -42,7 +43,7 @@ def write_evaluation(run: Path, evaluation: Evaluation) -> list[Path]:
 
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain values; an unavailable score is null."""
+    """Return the evaluation as plain values for JSON; an unavailable score is null."""
     return {
         "data": str(evaluation.data),
         "split": evaluation.split,
@@ -57,21 +58,29 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def as_markdown(evaluation: Evaluation) -> str:
-    """Tables of the means of each model and of its images, with notes."""
-    rows = [[*_names(evaluated), *cells(evaluation, evaluated.mean)] for evaluated in evaluation.models]
+    """Return Markdown tables of the means of each model and of its images, with notes."""
+    rows = [
+        [m.name, FILES[m.name], f"{m.loaded.step:,}", f"{len(m.loaded.model.gaussians):,}", *cells(evaluation, m.mean)]
+        for m in evaluation.models
+    ]
     parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} images of {evaluation.data}"]
-    parts += [_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
+    parts += [markdown_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
     for evaluated in evaluation.models:
         images = [
             [frame.name, f"{frame.t:.4g}", *cells(evaluation, scores), f"{100 * mask.mean():.1f} %"]
             for frame, scores, mask in zip(evaluation.frames, evaluated.images, evaluation.masks, strict=True)
         ]
-        parts += [f"## {evaluated.name}", _table(["image", "t", *HEADINGS.values(), "moving region"], images)]
+        parts += [f"## {evaluated.name}", markdown_table(["image", "t", *HEADINGS.values(), "moving region"], images)]
     return "\n\n".join(parts) + "\n"
 
 
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *rows])
+
+
 def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
-    """The scores as text, in the order of `HEADINGS`."""
+    """Format the scores, in the order of `HEADINGS`."""
     digits = {"psnr": 2, "moving_psnr": 2}
     return [
         f"{value:.{digits.get(name, 4)}f}"
@@ -82,7 +91,7 @@ def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
 
 
 def notes(evaluation: Evaluation) -> list[str]:
-    """The notes below the table."""
+    """Return the lines below the table."""
     source = {"images": "the images", "model": "the models"}[evaluation.region_source]
     percent = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
     lines = [f"moving region: {percent:.1f} % of the pixels, determined from {source}; the same for all models."]
@@ -95,17 +104,16 @@ def notes(evaluation: Evaluation) -> list[str]:
 
 
 def draw_contact_sheet(path: Path, evaluation: Evaluation) -> None:
-    """One row per frame, from the worst of the last model to its best, evenly spaced: the image, then the rendering of
+    """Draw one row per frame, evenly spaced from the last model's worst to its best: the image, then the rendering of
     each model and its error, with the moving region outlined. Atomic."""
-    models = distinct_models(evaluation)
-    by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: evaluation.models[0].images[index].psnr)
-    count = min(SHEET_ROWS, len(by_psnr))
-    chosen = [by_psnr[round(place)] for place in np.linspace(0, len(by_psnr) - 1, count)]
-    rows = [_row(evaluation, models, index) for index in chosen]
-    shown = "" if count == len(by_psnr) else f"{count} of "
+    last, *others = evaluation.models
+    models = [last, *(best for best in others if best.loaded.step != last.loaded.step)]
+    by_psnr = sorted(range(len(evaluation.frames)), key=lambda index: last.images[index].psnr)
+    rows = [_row(evaluation, models, by_psnr[place]) for place in _evenly_spaced(len(by_psnr))]
+    shown = "" if len(rows) == len(by_psnr) else f"{len(rows)} of "
     names = " and ".join(f"{evaluated.name} (step {evaluated.loaded.step:,})" for evaluated in models)
     title = f"{evaluation.split}, {shown}{len(by_psnr)} frames, worst first: {names}"
-    draw_sheet(path, title, rows, ColorScale("error", "0", f"≥ {FULL_ERROR}", COLOR_MAP))
+    draw_sheet(path, f"{title}. Error: black 0, yellow ≥ {FULL_ERROR}", rows)
 
 
 def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
@@ -115,52 +123,47 @@ def draw_runs(path: Path, runs: dict[str, Evaluation]) -> None:
     names = [frame.name for frame in first.frames]
     if any([frame.name for frame in other.frames] != names for other in others):
         raise InvalidInput("RUN", "runs on the same images", "others")
-    rows = []
-    for index in dict.fromkeys(round(place) for place in np.linspace(0, len(names) - 1, min(SHEET_ROWS, len(names)))):
-        frame = first.frames[index]
-        row = [Panel(_fitted(to_bytes(first.models[0].image(frame).numpy())), f"{frame.name}, t = {frame.t:.3g}")]
-        for run, evaluation in runs.items():
-            last = evaluation.models[0]
-            rendering = _fitted(to_bytes(last.render(evaluation.frames[index]).numpy()))
-            row.append(Panel(rendering, f"{Path(run).name}: {last.images[index].psnr:.1f} dB"))
-        rows.append(row)
+    models = [evaluation.models[0]._replace(name=Path(run).name) for run, evaluation in runs.items()]
+    rows = [_row(first, models, index, errors=False) for index in _evenly_spaced(len(names))]
     draw_sheet(path, f"{first.split}, {len(rows)} of {len(names)} frames: {', '.join(runs)}", rows)
 
 
-def distinct_models(evaluation: Evaluation) -> list[EvaluatedModel]:
-    """The models without the best one if it is also the last one."""
-    last, *others = evaluation.models
-    return [last, *(evaluated for evaluated in others if evaluated.loaded.step != last.loaded.step)]
+def _evenly_spaced(count: int) -> list[int]:
+    """Return up to `SHEET_ROWS` evenly spaced numbers from 0 to `count` - 1."""
+    return [round(place) for place in np.linspace(0, count - 1, min(SHEET_ROWS, count))]
 
 
-def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int) -> list[Panel]:
+def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int, errors: bool = True) -> list[Panel]:
+    """Return panels of the image of a frame and its rendering by each model, each with its error if `errors`."""
     frame, mask = evaluation.frames[index], evaluation.masks[index]
     target = models[0].image(frame).numpy()
-    row = [Panel(_fitted(to_bytes(target)), f"{frame.name}, t = {frame.t:.3g}")]
+    row = [_panel(to_bytes(target), f"{frame.name}, t = {frame.t:.3g}")]
     for evaluated in models:
         scores, rgb = evaluated.images[index], evaluated.render(frame).numpy()
         moving = "" if scores.moving_psnr is None else f", moving {scores.moving_psnr:.1f}"
-        error = color(np.abs(rgb - target).mean(axis=-1) / FULL_ERROR, COLOR_MAP)
-        error[_outline(mask)] = OUTLINE
-        row.append(Panel(_fitted(to_bytes(rgb)), f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
-        row.append(Panel(_fitted(error), "error" + (", moving region outlined" if mask.any() else "")))
+        row.append(_panel(to_bytes(rgb), f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
+        if errors:
+            relative = np.abs(rgb - target).mean(axis=-1) / FULL_ERROR
+            error = colormaps["magma"](np.clip(relative, 0, 1), bytes=True)[..., :3]
+            error[_outline(mask)] = OUTLINE
+            row.append(_panel(error, "error" + (", moving region outlined" if mask.any() else "")))
     return row
 
 
 def _outline(mask: np.ndarray) -> np.ndarray:
-    """[H, W] bool: pixels outside of the mask that border it, so that the inside isn't covered."""
+    """Return [H, W] bool, the pixels outside of the mask that border it, so that the inside isn't covered."""
     padded = np.pad(mask, 1)
     return ~mask & (padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:])
 
 
-def _fitted(pixels: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3] enlarged or downscaled to the width of a panel."""
+def _panel(pixels: np.ndarray, caption: str) -> Panel:
+    """Return a panel with uint8 [H, W, 3], enlarged or downscaled to its width."""
     height, width, _ = pixels.shape
     if width <= MAX_PANEL:
         times = -(-MIN_PANEL // width)
-        return pixels.repeat(times, axis=0).repeat(times, axis=1)
+        return Panel(pixels.repeat(times, axis=0).repeat(times, axis=1), caption)
     opaque = np.concatenate([pixels, np.full((height, width, 1), 255, np.uint8)], axis=2)
-    return resize_area(opaque, MAX_PANEL, max(1, round(height * MAX_PANEL / width)))[..., :3]
+    return Panel(resize_area(opaque, MAX_PANEL, max(1, round(height * MAX_PANEL / width)))[..., :3], caption)
 
 
 def _model_as_json(evaluation: Evaluation, evaluated: EvaluatedModel) -> dict[str, Any]:
@@ -175,17 +178,3 @@ def _model_as_json(evaluation: Evaluation, evaluated: EvaluatedModel) -> dict[st
         "mean": evaluated.mean._asdict(),
         "images": images,
     }
-
-
-def _names(evaluated: EvaluatedModel) -> list[str]:
-    return [
-        evaluated.name,
-        FILES[evaluated.name],
-        f"{evaluated.loaded.step:,}",
-        f"{len(evaluated.loaded.model.gaussians):,}",
-    ]
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from msdgs_serve.scene.errors import InvalidInput
@@ -15,7 +14,6 @@ MARGIN = 12  # pixels, around the sheet and between panels
 HEADER = 36
 CAPTION = 20
 MIN_CELL = 240  # pixels of width, so that a caption fits
-SCALE_WIDTH = 160
 MAX_SIDE = 2**16 - 1  # matplotlib's own limit
 
 
@@ -26,16 +24,7 @@ class Panel(NamedTuple):
     caption: str
 
 
-class ColorScale(NamedTuple):
-    """The legend of a color map, at the top right."""
-
-    label: str
-    low: str
-    high: str
-    color_map: str  # of matplotlib
-
-
-def draw_sheet(path: Path, title: str, rows: list[list[Panel]], scale: ColorScale | None = None) -> None:
+def draw_sheet(path: Path, title: str, rows: list[list[Panel]]) -> None:
     """Write a PNG of `rows` of panels with a caption above each. Atomic.
 
     Raises `InvalidInput` if the sheet would be too large.
@@ -45,8 +34,6 @@ def draw_sheet(path: Path, title: str, rows: list[list[Panel]], scale: ColorScal
         raise InvalidInput("size", f"smaller: a sheet has at most {MAX_SIDE:,} pixels a side", f"{width}×{height}")
     figure = Figure(figsize=((width + 0.5) / DPI, (height + 0.5) / DPI), dpi=DPI, facecolor="white")
     figure.text(MARGIN / width, 1 - MARGIN / height, title, va="top", fontsize=11, weight="bold")
-    if scale is not None:
-        _draw_scale(figure, scale, width, height)
     for row, corners in zip(rows, panel_corners(rows), strict=True):
         for panel, (x, y) in zip(row, corners, strict=True):
             figure.text(x / width, 1 - (y - 5) / height, panel.caption, fontsize=9)
@@ -56,7 +43,7 @@ def draw_sheet(path: Path, title: str, rows: list[list[Panel]], scale: ColorScal
 
 
 def panel_corners(rows: list[list[Panel]]) -> list[list[tuple[int, int]]]:
-    """(x, y) of each panel's top left pixel."""
+    """Return (x, y) of the top left pixel of each panel."""
     cell = _cell_width(rows)
     corners, y = [], HEADER
     for row in rows:
@@ -67,24 +54,10 @@ def panel_corners(rows: list[list[Panel]]) -> list[list[tuple[int, int]]]:
 
 
 def sheet_size(rows: list[list[Panel]]) -> tuple[int, int]:
-    """Width and height of the sheet, in pixels."""
+    """Return width and height of the sheet in pixels."""
     width = MARGIN + max(len(row) for row in rows) * (_cell_width(rows) + MARGIN)
     return width, panel_corners(rows)[-1][0][1] + max(len(panel.pixels) for panel in rows[-1]) + MARGIN
 
 
-def color(values: np.ndarray, color_map: str) -> np.ndarray:
-    """uint8 [H, W, 3] of values in [0, 1], [H, W]; larger values get the last color."""
-    return colormaps[color_map](np.clip(values, 0, 1), bytes=True)[..., :3]
-
-
 def _cell_width(rows: list[list[Panel]]) -> int:
     return max(MIN_CELL, *(panel.pixels.shape[1] for row in rows for panel in row))
-
-
-def _draw_scale(figure: Figure, scale: ColorScale, width: int, height: int) -> None:
-    bar = np.broadcast_to(np.linspace(0, 1, SCALE_WIDTH), (12, SCALE_WIDTH))
-    right = width - MARGIN - 8 * len(scale.high)
-    x, text_y = right - SCALE_WIDTH, 1 - (MARGIN + 10) / height
-    figure.figimage(color(bar, scale.color_map), x, height - MARGIN - len(bar))
-    figure.text((x - 5) / width, text_y, f"{scale.label}   {scale.low}", fontsize=9, ha="right")
-    figure.text((right + 5) / width, text_y, scale.high, fontsize=9)

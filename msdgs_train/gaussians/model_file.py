@@ -1,9 +1,5 @@
-"""Files of a training: `model.pt`, which export reads, and the trainer's own to resume from.
+"""`model.pt`: a trained model, which `eval`, `view` and the export read."""
 
-Every file is written beside its place and moved over it, so that a reader finds the old one or the new one whole.
-"""
-
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +27,7 @@ class SceneInfo:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sRGB in [0, 1], as trained
     bounds: list[list[float]] = field(default_factory=lambda: [[-1.0] * 3, [1.0] * 3])  # corners, scene units
     cameras: list[dict[str, Any]] = field(default_factory=list)
-    """Each: name, fx, fy, cx, cy (pixels), width, height, camera_to_world (4×4 nested lists, OpenCV), t."""
+    """Each has name, fx, fy, cx, cy (pixels), width, height, camera_to_world (4×4 nested lists, OpenCV) and t."""
 
 
 class LoadedModel(NamedTuple):
@@ -43,7 +39,7 @@ class LoadedModel(NamedTuple):
 
     @torch.no_grad()
     def render(self, camera: Camera, t: float, num_layers: int | None = None) -> Tensor:
-        """[H, W, 3] over the scene's background, after `num_layers` of the deformation; all if not given."""
+        """Return [H, W, 3] over the scene's background, after the first `num_layers` layers; all if not given."""
         background = torch.tensor(self.scene.background)
         return rasterize(*self.model.pose(t, num_layers=num_layers), camera, background, self.model.rasterizer)[0]
 
@@ -51,7 +47,7 @@ class LoadedModel(NamedTuple):
 def save_model(
     path: str | Path, model: DynamicGaussians, scene: SceneInfo, step: int, config: ModelConfig | None = None
 ) -> None:
-    """Write `model.pt`, atomically; `config` as the model is drawn, its own if not given."""
+    """Write `model.pt`, atomically. `config`, if given, replaces the model's own: another eps2d, for example."""
     contents = {
         "format": FORMAT,
         "package_version": __version__,
@@ -84,7 +80,7 @@ def load_model(path: str | Path) -> LoadedModel:
 
 
 def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
-    """A model of this configuration and these tensors; RuntimeError names missing and unexpected ones."""
+    """Build a model from its configuration and tensors. Raises `RuntimeError` naming missing and unexpected ones."""
     prefix = "gaussians."
     gaussians = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
     for layer in config.layers:
@@ -97,7 +93,9 @@ def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
 
 
 def _refuse_not_finite(path: str | Path, state: dict[str, Tensor]) -> None:
-    bad = [f"{name} ({count:,} of {total:,})" for name, count, total in _not_finite(state)]
+    # compared as float32: a finite float64 may be infinite in it
+    counts = {name: int((~torch.isfinite(tensor.to(torch.float32))).sum()) for name, tensor in state.items()}
+    bad = [f"{name} ({count:,} of {state[name].numel():,})" for name, count in counts.items() if count]
     if bad:
         raise CheckpointInvalid(path, f"holds values that are NaN or infinite: {', '.join(bad)}")
 
@@ -111,10 +109,3 @@ def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
         if values.shape != shape or not torch.isfinite(values).all():
             expected = " × ".join(map(str, shape))
             raise CheckpointInvalid(path, f"scene.{name} must be {expected} finite numbers, got {getattr(scene, name)}")
-
-
-def _not_finite(state: dict[str, Tensor]) -> Iterator[tuple[str, int, int]]:
-    for name, tensor in state.items():
-        count = int((~torch.isfinite(tensor.to(torch.float32))).sum())  # also float64 values beyond float32
-        if count:
-            yield name, count, tensor.numel()

@@ -1,4 +1,4 @@
-"""Torch files from anywhere: written atomically, and read as tensors and plain values only."""
+"""Torch files: written atomically, and read without trusting them, as tensors and plain values only."""
 
 import zipfile
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from msdgs_train.datasets.common.files import replacing
 
 PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
 PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
-"""Types of numbers."""
+"""Supported dtypes."""
 
 
 class CheckpointInvalid(MsdgsError):
@@ -24,13 +24,13 @@ class CheckpointInvalid(MsdgsError):
 
 
 def save_atomic(path: str | Path, obj: Any) -> None:
-    """`torch.save`, atomically."""
+    """Write `obj` with `torch.save`, atomically."""
     with replacing(Path(path)) as temporary, temporary.open("wb") as file:
         torch.save(obj, file)
 
 
 def load(path: str | Path) -> Any:
-    """`torch.load` of tensors and plain values onto the CPU; no code in the file is run."""
+    """Load tensors and plain values onto the CPU; no code in the file is run. Raises `CheckpointInvalid`."""
     path = Path(path)
     try:
         size = path.stat().st_size
@@ -40,7 +40,7 @@ def load(path: str | Path) -> Any:
             raise CheckpointInvalid(path, f"isn't a torch checkpoint, or is cut off after {size:,} bytes")
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > size:  # it could unpack to anything
+        if unpacked > size:  # a zip bomb
             raise CheckpointInvalid(path, f"is packed: it holds {unpacked:,} bytes; torch.save packs nothing")
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
@@ -56,7 +56,7 @@ def load(path: str | Path) -> Any:
 def refuse_unlike_stored(path: str | Path, tensors: Mapping[str, Tensor]) -> None:
     """Raise `CheckpointInvalid` for tensors that aren't dense plain numbers, or are larger than their storage.
 
-    Strides of 0 make a few stored bytes a tensor of any size.
+    With strides of 0, a few stored bytes can claim to be a tensor of any size.
     """
     claimed: dict[int, int] = {}
     for name, tensor in tensors.items():

@@ -7,9 +7,9 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from msdgs_train.losses.ssim import check_pair, ssim
 
 CHANGE_THRESHOLD = 0.25
-"""Mean color difference of a pixel from which something has moved away, or come."""
+"""Mean color difference of a pixel from which on an object is assumed to have moved there."""
 MSE_SCALE = 4.0
-"""MSE times this equals L1 if a channel is off by a quarter."""
+"""Factor of MSE, at which it equals L1 for an error of 0.25."""
 BLOCKS = (8, 16, 32)
 """Sizes in pixels of the blocks that `pooled_l1` averages over."""
 
@@ -34,9 +34,9 @@ def photometric_loss(rgb: Tensor, target: Tensor, l1_weight: float, mse_fraction
 
 
 def pooled_l1(rgb: Tensor, target: Tensor) -> Tensor:
-    """L1 of two images, [H, W, 3], averaged over blocks that overlap: a scalar, the sum over `BLOCKS`.
+    """L1 of two images, [H, W, 3], averaged over overlapping blocks: a scalar, the sum over `BLOCKS`.
 
-    Pooling gives a gradient at displacements larger than the object, where L1 of single pixels has none.
+    Pooling gives a gradient at displacements larger than the object, at which L1 of single pixels has none.
     """
     check_pair(rgb, target)
     error = (rgb - target).permute(2, 0, 1)
@@ -45,10 +45,8 @@ def pooled_l1(rgb: Tensor, target: Tensor) -> Tensor:
 
 
 def masked_l1(rgb: Tensor, target: Tensor, l1_weight: float) -> Tensor:
-    """λ L1 over the pixels in which two images, [H, W, 3], agree.
-
-    No pixel at most two away from them differs by `CHANGE_THRESHOLD` or more.
-    """
+    """λ L1 over the pixels in which two images, [H, W, 3], agree: no pixel in the 5×5 around them differs by
+    `CHANGE_THRESHOLD` or more."""
     check_pair(rgb, target)
     error = (rgb - target).abs()
     worst = max_pool2d(error.detach().mean(dim=2)[None], kernel_size=5, stride=1, padding=2)[0]

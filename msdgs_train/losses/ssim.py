@@ -15,23 +15,18 @@ from torch import Tensor
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.scene.errors import InvalidInput
 
-RADIUS = 5  # of the window, 11 pixels wide
+RADIUS = 5  # pixels; the window is 11 pixels wide
 SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
 
 
-def _gaussian_window() -> np.ndarray:
-    x = np.arange(-RADIUS, RADIUS + 1)
-    weights = np.exp(-(x**2) / (2 * SIGMA**2))
-    return weights / weights.sum()
-
-
-_TAPS = _gaussian_window()
+_WEIGHTS = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
+_TAPS = _WEIGHTS / _WEIGHTS.sum()
 
 
 def ssim(rgb: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity, a scalar, differentiable in `rgb`.
+    """Return the mean structural similarity, a scalar, differentiable in `rgb`.
 
     Window 11, σ = 1.5, data range 1, and zeros beyond the border, as the 3D Gaussian projects compute it.
     """
@@ -73,7 +68,7 @@ def _add_scaled(weight: float, source: np.ndarray, target: np.ndarray) -> None:
 
 @kernel
 def _blur_along_row(taps: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
-    """One symmetric 11-tap blur of a row [W * 3] with 5 pixels of zeros on both sides; one load a tap, one store."""
+    """One symmetric 11-tap blur of a row [W * 3] with 5 pixels of zeros on both sides; one load per tap, one store."""
     n = len(out)
     w0, w1, w2, w3, w4, w5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     # slices, not offsets: numba's check for negative indices would keep the loop from being vectorised (7x slower)
@@ -100,7 +95,7 @@ def _blur_row(maps: np.ndarray, taps: np.ndarray, i: int, padded: np.ndarray, ou
 
 @kernel
 def _ssim_sum_and_derivatives(x: np.ndarray, y: np.ndarray, taps: np.ndarray) -> tuple[float, np.ndarray]:
-    """The sum of SSIM over [H, W * 3] images, and its derivatives [3, H, W * 3] in blur(x), blur(x²), blur(xy)."""
+    """Return SSIM summed over [H, W * 3] images, and its derivatives [3, H, W * 3] in blur(x), blur(x²), blur(xy)."""
     height, width = x.shape
     c1, c2 = x.dtype.type(C1), x.dtype.type(C2)
     one, two = x.dtype.type(1), x.dtype.type(2)

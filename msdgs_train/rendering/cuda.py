@@ -1,35 +1,28 @@
 """Rendering by gsplat for CUDA tensors. Its kernels fix the alpha and transmittance limits of `GSPLAT`."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, InvalidInput
-
-if TYPE_CHECKING:
-    from msdgs_train.rendering.rasterize import RasterizationInfo
+from msdgs_train.rendering.rasterize import RasterizationInfo
 
 
 def rasterize_cuda(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh: Tensor,
+    gaussians: tuple[Tensor, ...],
     camera: Camera,
     background: Tensor,
     options: RasterizerOptions,
-    info: "RasterizationInfo",
+    info: RasterizationInfo,
 ) -> tuple[Tensor, Tensor]:
-    """rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
+    """Return rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
     try:
         import gsplat
     except ModuleNotFoundError as error:
         raise RuntimeError("training on CUDA renders with gsplat: pip install gsplat, or train on the CPU") from error
     if options._replace(near_plane=GSPLAT.near_plane, eps2d=GSPLAT.eps2d) != GSPLAT:
         raise InvalidInput("options", "gsplat's alpha and transmittance limits on CUDA", options)
+    means, quats, scales, opacities, sh = gaussians
     intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32)
     rgb, alpha, meta = gsplat.rasterization(
         means,

@@ -19,7 +19,7 @@ class RasterizationInfo:
     """Radii and gradients of one rendering, for density control."""
 
     radii: Tensor
-    """[N] larger half-extent of the footprint in pixels, 0 where not drawn."""
+    """[N] larger half-extent of the footprint in pixels; 0 for Gaussians that are not drawn."""
     means2d_grads: Tensor | None = None
     """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
 
@@ -50,41 +50,38 @@ def rasterize(
         rgb [H, W, 3] with the background, alpha [H, W], and radii and gradients for density control.
     """
     info = RasterizationInfo()
+    gaussians = (means, quats, scales, opacities, sh)
     if means.is_cuda:
         from msdgs_train.rendering.cuda import rasterize_cuda
 
-        rgb, alpha = rasterize_cuda(means, quats, scales, opacities, sh, camera, background, options, info)
+        rgb, alpha = rasterize_cuda(gaussians, camera, background, options, info)
     else:
-        rgb, alpha = _Rasterize.apply(means, quats, scales, opacities, sh, background, camera, options, info)
+        rgb, alpha = _Rasterize.apply(camera, options, info, background, *gaussians)
     return rgb, alpha, info
 
 
-BACKGROUND = 5
-"""Its index among the arguments; its gradient, as slow as half of the rest for a large image, is computed on demand."""
+BACKGROUND = 3
+"""Index of `background` among the arguments. Its gradient is only computed on demand: for a large image it takes half
+as long as all others."""
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        sh: Tensor,
-        background: Tensor,
         camera: Camera,
         options: RasterizerOptions,
         info: RasterizationInfo,
+        background: Tensor,
+        *gaussians: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        gaussians = Gaussians(*map(_array, (means, quats, scales, opacities, sh)))
-        splats = project(gaussians, camera, options)
+        splats = project(Gaussians(*map(_array, gaussians)), camera, options)
         tiles = bin_into_tiles(splats, camera.width, camera.height)
         frame = composite(splats, tiles, camera.width, camera.height, _array(background), options)
         info.radii = torch.from_numpy(splats.extents.max(axis=1, initial=0))
         image = torch.from_numpy(frame.rgb)
         # saved as tensors: autograd then notices if one is written to before the backward pass
-        ctx.save_for_backward(means, quats, scales, opacities, sh, image)
+        ctx.save_for_backward(*gaussians, image)
         ctx.drawn = (splats, tiles, frame.alpha)
         ctx.view = (camera, options)
         ctx.info = info
@@ -93,19 +90,18 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         *arrays, rgb = map(_array, ctx.saved_tensors)
-        gaussians = Gaussians(*arrays)
         splats, tiles, alpha = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
         unused = np.empty((0, 0), rgb.dtype)
         frame = Frame(rgb, alpha, unused, unused)
         sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
-        grads = project_backward(gaussians, splats, sums, *ctx.view)
+        grads = project_backward(Gaussians(*arrays), splats, sums, *ctx.view)
         ctx.info.means2d_grads = torch.from_numpy(grads.means2d)
         arrays = (grads.means, grads.quats, grads.scales, grads.opacities, grads.sh)
         grad_background = None
         if ctx.needs_input_grad[BACKGROUND]:
             grad_background = torch.from_numpy(np.einsum("hw,hwc->c", 1 - alpha, grad_rgb))
-        return *(torch.from_numpy(array) for array in arrays), grad_background, None, None, None
+        return None, None, None, grad_background, *(torch.from_numpy(array) for array in arrays)
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -11,10 +11,12 @@ PUBLISHED = TrainConfig().updated(
     init_num_pts=100_000,
     max_gaussians=150_000,
     static_fraction=3_000 / 40_000,
-    sh_degree_interval=1_000,
+    sh_degree_fraction=1_000 / 40_000,
     grow_grad2d=2e-4,
     refine_stop_fraction=15_000 / 40_000,
-    reset_every=3_000,
+    refine_start_fraction=500 / 40_000,
+    refine_every_fraction=100 / 40_000,
+    reset_every_fraction=3_000 / 40_000,
 )
 """As it trains on D-NeRF, and most that came after it."""
 

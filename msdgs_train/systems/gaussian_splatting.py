@@ -40,7 +40,7 @@ class GaussianSplatting:
         self._model = _new_model(schedule, scene, SceneBounds(self.scene_half_size, scene.time_range))
         scale = scene_scale([frame.camera for frame in scene.splits["train"]]) or self.scene_half_size
         self.density = make_strategy(schedule, scale, self.size)
-        self.average: WeightAverage[DynamicGaussians] = WeightAverage(config.optimizer.ema_steps)
+        self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
 
     @property
     def model(self) -> DynamicGaussians:

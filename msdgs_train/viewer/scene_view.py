@@ -27,14 +27,14 @@ class SceneView(NamedTuple):
 
 
 def view_of_data(scene: SceneData, layers: int) -> SceneView:
-    """The camera of the first training image."""
+    """Return the view of the camera of the first training image."""
     middle = np.zeros(3) if scene.points is None or not len(scene.points) else np.median(scene.points, axis=0)
     cameras = [frame.camera for frame in scene.splits["train"]]
     return _seen_by(cameras, middle, scene.time_range, layers)
 
 
 def view_of_file(loaded: LoadedModel) -> SceneView:
-    """The first camera in the model, or one from the side with z up if it has none."""
+    """Return the view of the first camera in the model, or one from the side with z up if it has none."""
     low, high = np.array(loaded.scene.bounds)
     cameras = [camera_of(entry, entry["width"]) for entry in loaded.scene.cameras]
     if not cameras:
@@ -45,7 +45,7 @@ def view_of_file(loaded: LoadedModel) -> SceneView:
 
 
 def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[float, float], layers: int) -> SceneView:
-    """The first camera; the target is the point of its optical axis nearest to `middle`, [3]."""
+    """Return the view of the first camera; the target is the point of its optical axis nearest to `middle`, [3]."""
     first = cameras[0]
     forward = first.camera_to_world[:3, 2]
     ahead = float((middle - first.position) @ forward)
@@ -53,7 +53,5 @@ def _seen_by(cameras: Sequence[Camera], middle: np.ndarray, time_range: tuple[fl
     up = -np.mean([camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
     if np.linalg.norm(up) < 1e-3 or np.linalg.norm(np.cross(up, forward)) < 1e-3:
         up = -first.camera_to_world[:3, 1]
-    fov_y = 2 * math.atan(first.height / (2 * first.fy))
-    return SceneView(
-        time_range, layers, first.position, first.position + distance * forward, up / np.linalg.norm(up), fov_y
-    )
+    up, fov_y = up / np.linalg.norm(up), 2 * math.atan(first.height / (2 * first.fy))
+    return SceneView(time_range, layers, first.position, first.position + distance * forward, up, fov_y)

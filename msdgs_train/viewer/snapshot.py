@@ -12,7 +12,6 @@ from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import LoadedModel
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 
 Channel = Literal["rgb", "alpha", "depth"]
@@ -27,13 +26,13 @@ class Snapshot:
     model: DynamicGaussians
     background: tuple[float, float, float]  # sRGB in [0, 1]
     deform: bool = True  # False in the static phase, before layers are trained
-    sh_degree: int | None = None  # of the bands in use; None: all
+    sh_degree: int | None = None  # highest degree in use; None: all
     _posed: tuple[tuple[float, int], Gaussians] | None = field(default=None, init=False)
 
     def draw(self, camera: Camera, t: float, layers: int, channel: Channel = "rgb") -> np.ndarray:
-        """[H, W, 3] uint8 at time `t`, after `layers` of the deformation.
+        """Draw [H, W, 3] uint8 at time `t`, after `layers` of the deformation; alpha 1 and the nearest depth are white.
 
-        White is an alpha of 1 and the nearest depth. Raises `InvalidInput` if Gaussians aren't finite.
+        Raises `InvalidInput` if Gaussians aren't finite.
         """
         posed, options = self._pose(t, layers), self.model.rasterizer
         drawn = rasterize(posed, camera, background=self.background, depth=channel == "depth", options=options)
@@ -41,7 +40,7 @@ class Snapshot:
 
     @torch.no_grad()
     def _pose(self, t: float, layers: int) -> Gaussians:
-        """Cached for one time and number of layers: a moving camera needs the same Gaussians for each frame."""
+        """Deform the Gaussians. The last result is kept: a moving camera needs the same Gaussians for each frame."""
         if self._posed is None or self._posed[0] != (t, layers):
             posed = self.model.pose(t, num_layers=layers, deform=self.deform, sh_degree=self.sh_degree)
             self._posed = (t, layers), Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
@@ -49,7 +48,7 @@ class Snapshot:
 
 
 def snapshot_of_training(trainer: Trainer) -> Snapshot:
-    """A copy of the model as it would be evaluated and saved now. Must not be called during a step."""
+    """Copy the model as it would be evaluated and saved now. Must not be called during a step."""
     system, step = trainer.system, trainer.step_count
     if not isinstance(system, GaussianSplatting):
         raise InvalidInput("viewer", "off for this system, which isn't made of Gaussians", trainer.config.run.system)
@@ -57,11 +56,6 @@ def snapshot_of_training(trainer: Trainer) -> Snapshot:
     model.config = replace(model.config, eps2d=schedule.eps2d(step))
     background = trainer.config.data.evaluation_background
     return Snapshot(model, background, schedule.deforms(step), schedule.sh_degree(step))
-
-
-def snapshot_of_file(loaded: LoadedModel) -> Snapshot:
-    """The model of a `model.pt` or `best.pt`."""
-    return Snapshot(loaded.model, loaded.scene.background)
 
 
 def _image_of(rendering: Rendering, channel: Channel) -> np.ndarray:
@@ -76,7 +70,7 @@ def _image_of(rendering: Rendering, channel: Channel) -> np.ndarray:
 
 
 def _nearness(depth: np.ndarray) -> np.ndarray:
-    """[H, W] in [0, 1] of depths, infinite for empty pixels; 1 is nearest."""
+    """Map depths, [H, W] and infinite for empty pixels, to [0, 1]; 1 is nearest."""
     seen = np.isfinite(depth)
     if not seen.any():
         return np.zeros_like(depth)

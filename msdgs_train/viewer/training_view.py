@@ -7,8 +7,8 @@ from msdgs_train.viewer.scene_view import view_of_data
 from msdgs_train.viewer.snapshot import snapshot_of_training
 from msdgs_train.viewer.viewer import Viewer
 
-TIME_FRACTION = 0.25  # of the time, for drawing; initial value of the slider
-STATUS_SECONDS = 0.5  # of training, between updates of the status
+TIME_FRACTION = 0.25  # fraction of the time for drawing; initial value of the slider
+STATUS_SECONDS = 0.5  # training time between updates of the status
 
 
 class TrainingView(Observer):

@@ -10,7 +10,6 @@ import math
 import threading
 import time
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
@@ -19,11 +18,11 @@ from msdgs_serve.scene import Camera, InvalidInput, MsdgsError, quaternion
 from msdgs_train.engine.extras import ExtraMissing
 from msdgs_train.gaussians.model_file import LoadedModel
 from msdgs_train.viewer.scene_view import SceneView, view_of_file
-from msdgs_train.viewer.snapshot import Channel, Snapshot, snapshot_of_file
+from msdgs_train.viewer.snapshot import Channel, Snapshot
 
 POLL_SECONDS = 1 / 30  # between polls of the browsers
 IDLE_SECONDS = 0.2  # without a change before the large image is drawn
-MOVING_PART = 0.5  # of the large image's sides, during changes
+MOVING_PART = 0.5  # scale of the image during changes
 JPEG_QUALITY = 90
 LONGEST_SIDE = 640  # pixels; initial value of the slider
 
@@ -40,18 +39,21 @@ class Wanted(NamedTuple):
     layers: int
     channel: Channel
 
-    def camera(self, part: float) -> Camera:
-        """The camera, with `part` of the large image's sides."""
-        longest = part * min(self.longest, max(self.canvas))
+    def camera(self, scale: float) -> Camera:
+        """Return the camera of the rendering, whose sides are `scale` times those of the large image."""
+        longest = scale * min(self.longest, max(self.canvas))
         width, height = (max(1, round(longest * side / max(self.canvas))) for side in self.canvas)
-        return camera_of_browser(np.array(self.wxyz), np.array(self.position), self.fov_y, width, height)
+        camera_to_world = np.eye(4)
+        camera_to_world[:3, :3] = quaternion.to_matrix(quaternion.normalize(np.array(self.wxyz)))
+        camera_to_world[:3, 3] = self.position
+        return Camera.from_fov(camera_to_world, width, height, math.degrees(self.fov_y))
 
 
 @dataclass
 class _Browser:
     wanted: Wanted | None = None
     changed: float = 0.0  # time of the last change of `wanted`
-    drawn: tuple[Wanted, Snapshot, bool] | None = None  # and whether it was the large image
+    drawn: tuple[Wanted, Snapshot, bool] | None = None  # what was drawn last; True for the large image
 
 
 class Viewer:
@@ -77,11 +79,6 @@ class Viewer:
 
     def __enter__(self) -> Self:
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def open(self, view: SceneView) -> None:
         """Add the controls, move all cameras to the first view, and begin to draw."""
@@ -127,12 +124,12 @@ class Viewer:
         """Block until Ctrl-C, which is raised."""
         self._closing.wait()
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop the server."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join()
-        with _silence():
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints its end
             self.server.stop()
 
     def _run(self) -> None:
@@ -196,23 +193,7 @@ def show_model(viewer: Viewer, loaded: LoadedModel, name: str) -> None:
     """Show the model of a file."""
     viewer.set_status(f"**{name}**  \nstep {loaded.step:,}, {len(loaded.model.gaussians):,} Gaussians")
     viewer.open(view_of_file(loaded))
-    viewer.show(snapshot_of_file(loaded))
-
-
-def camera_of_browser(wxyz: np.ndarray, position: np.ndarray, fov_y: float, width: int, height: int) -> Camera:
-    """The pinhole camera of a browser, from viser's values.
-
-    Args:
-        wxyz: [4] quaternion, rotates OpenCV camera axes (x right, y down, z forward) into world axes.
-        position: [3] world space.
-        fov_y: vertical field of view in radians.
-        width: of the image in pixels.
-        height: of the image in pixels.
-    """
-    camera_to_world = np.eye(4)
-    camera_to_world[:3, :3] = quaternion.to_matrix(quaternion.normalize(wxyz))
-    camera_to_world[:3, 3] = position
-    return Camera.from_fov(camera_to_world, width, height, math.degrees(fov_y))
+    viewer.show(Snapshot(loaded.model, loaded.scene.background))
 
 
 def _serve(host: str, port: int) -> Any:
@@ -222,12 +203,7 @@ def _serve(host: str, port: int) -> Any:
         raise ExtraMissing("the viewer", "viser", "viewer") from None
     if not 0 <= port <= 65535:
         raise InvalidInput("viewer_port", "in [0, 65535]", port)
-    with _silence():
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints its address
         server = viser.ViserServer(host=host, port=port, label="msdgs", verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
-
-
-def _silence() -> contextlib.AbstractContextManager[Any]:
-    """viser prints its address and its end unconditionally."""
-    return contextlib.redirect_stdout(io.StringIO())

@@ -24,7 +24,7 @@ from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
 from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
-from msdgs_train.viewer.snapshot import snapshot_of_file
+from msdgs_train.viewer.snapshot import Snapshot
 from tests.support.models import CAMERA, SCENE, export_scene, random_model, small_config
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import MOTION_BASES, write_scene
@@ -73,7 +73,8 @@ def test_images_of_a_model(loaded: LoadedModel, camera: Camera, expected: np.nda
     evaluated = EvaluatedModel("last", loaded, []).render(frame).numpy()
     np.testing.assert_allclose(evaluated, expected, atol=tolerance("served_frame"))
     np.testing.assert_array_equal(render_steps(loaded, T, camera)[-1], to_bytes(evaluated))
-    np.testing.assert_array_equal(snapshot_of_file(loaded).draw(camera, T, layers=2), to_bytes(evaluated))
+    snapshot = Snapshot(loaded.model, loaded.scene.background)
+    np.testing.assert_array_equal(snapshot.draw(camera, T, layers=2), to_bytes(evaluated))
 
 
 def test_a_served_frame(folder: Path, camera: Camera, expected: np.ndarray):

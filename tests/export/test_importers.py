@@ -206,7 +206,7 @@ def test_a_sog_is_stored_or_deflated(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_LZMA) as archive:
         for file in folder.iterdir():
             archive.write(file, file.name)
-    with pytest.raises(ImportFailed, match=r"its meta.json is packed in a way that no SOG is: 14"):
+    with pytest.raises(ImportFailed, match=r"its meta.json is packed by a method that SOG doesn't use: 14"):
         read_splats(tmp_path / "a.sog")
 
 

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from export.importers import ImportFailed, detect_format
 from export.importers.command import model_or_import
-from export.importers.runs import fourdgs
 from export.importers.runs.model import write_model
 from export.jobs.write import properties
 from export.options import ExportOptions
@@ -215,7 +214,7 @@ def test_sizes_that_do_not_agree_are_named_before_memory_is_taken(
 ):
     changed = {f"deformation_net.{name}": tensor for name, tensor in change.items()}
     run = write_run(tmp_path / "run", their_state((1,)) | changed)
-    built = test_importers_runs.on_which_device(monkeypatch, fourdgs)
+    built = test_importers_runs.on_which_device(monkeypatch)
     with pytest.raises(ImportFailed, match=message):
         write_model(run, "4dgs", tmp_path / "model.pt", QUIET)
     assert set(built) <= {"meta"}

@@ -2,7 +2,6 @@
 
 import zipfile
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from export.importers import ImportFailed, detect_format
-from export.importers.runs import deformgs
+from export.importers.runs import base
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
 from export.measure.poses import posed
@@ -209,13 +208,13 @@ def test_sizes_that_do_not_agree_are_named_before_memory_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blender: bool, change: dict[str, Tensor], message: str
 ):
     run = write_run(tmp_path / "run", their_state(blender) | change)
-    built = on_which_device(monkeypatch, deformgs)
+    built = on_which_device(monkeypatch)
     with pytest.raises(ImportFailed, match=message):
         write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
     assert set(built) <= {"meta"}
 
 
-def on_which_device(monkeypatch: pytest.MonkeyPatch, importer: ModuleType) -> list[str]:
+def on_which_device(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Where the networks of models are from now on made; on `meta` they take no memory."""
     built: list[str] = []
 
@@ -224,7 +223,7 @@ def on_which_device(monkeypatch: pytest.MonkeyPatch, importer: ModuleType) -> li
         built.append(next(made.deformation.parameters()).device.type)
         return made
 
-    monkeypatch.setattr(importer, "DynamicGaussians", model)
+    monkeypatch.setattr(base, "DynamicGaussians", model)
     return built
 
 

@@ -14,7 +14,7 @@ from export.plans.registry import build
 from export.trajectories import sampling as module
 from export.trajectories.adaptive import adaptive_knots, fitted
 from export.trajectories.poses import ExactPoses, SinglePoses, pixel
-from export.trajectories.sampling import SomeTrajectories, Trajectories
+from export.trajectories.sampling import Trajectories
 from export.trajectories.splines import design, fitting, samples_for
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
@@ -143,7 +143,7 @@ def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, mo
         return fitted(trajectories, ids, count)
 
     monkeypatch.setattr("export.trajectories.adaptive.fitted", counted)
-    again, errors_again = adaptive_knots(SomeTrajectories(trajectories, some), np.arange(len(some)), 0.05)
+    again, errors_again = adaptive_knots(trajectories.some(some), np.arange(len(some)), 0.05)
     assert len(tried) == len(some)
     assert_close(errors_again, errors[some], "fitted_beside_others")
     sizes = {int(i): stored.points.shape[1] for rows, stored in poses.grids for i in rows}
@@ -174,10 +174,15 @@ def test_a_rotation_past_half_a_turn_has_one_sign_along_time():
 
 
 def test_progress_is_told_time_by_time():
-    told: list[tuple[int, int]] = []
-    Trajectories(bake(random_model(5), SCENE, "0" * 64), lambda done, total: told.append((done, total)))
-    assert [done for done, _ in told] == list(range(1, len(told) + 1))
-    assert told[-1][0] == told[-1][1]
+    told: list[list[int]] = []
+
+    def track(what: str, steps: int):
+        told.append([steps])
+        return lambda: told[-1].append(len(told[-1]))
+
+    Trajectories(bake(random_model(5), SCENE, "0" * 64), track)
+    assert told
+    assert all(done == list(range(1, steps + 1)) for steps, *done in told)
 
 
 @pytest.mark.parametrize("count", [4, 5, 12, 67])

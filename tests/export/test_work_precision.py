@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from export.jobs.job import ExportJob
-from export.jobs.points import DEFAULT_RASTERIZER, Point, QuickEstimate, choose, front
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.jobs.sweep import Sweep, SweepResult
+from export.jobs.sweep import DEFAULT_RASTERIZER, Point, QuickEstimate, Sweep, SweepResult, choose, front
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
 from export.options import ExportOptions
@@ -124,8 +123,8 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
     whole, fitted = job.candidate("network", None), job.candidate("keyframes:9", None)
     sweep = Sweep(job, 45.0)
     sweep.estimates = [
-        QuickEstimate(whole, DEFAULT_RASTERIZER, 90_000, 89_000, 90),
-        QuickEstimate(fitted, DEFAULT_RASTERIZER, 50, 5, 60),
+        QuickEstimate(whole, 90_000, 89_000, 90),
+        QuickEstimate(fitted, 50, 5, 60),
     ]
     sweep.baseline = sweep.estimates[0]
     assert sweep._estimate("network", 46.0) is None
@@ -137,7 +136,7 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
 
 def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: tuple[ExportJob, SweepResult]):
     def estimate(plan: str, cpu: float, size: int, db: float = 60.0) -> QuickEstimate:
-        return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), DEFAULT_RASTERIZER, cpu + 30, cpu, db)
+        return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), cpu + 30, cpu, db)
 
     sweep = Sweep(swept[0], 45.0)
     fine, coarse = estimate("keyframes:0.03", 10.0, 600), estimate("keyframes:0.1", 11.0, 400)

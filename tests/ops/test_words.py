@@ -18,7 +18,7 @@ RETIRED = {
     "shared motions?": "motion bases",
     "basis_(logits|ids|weights|count|knots|stretches)": "skinning_logits, node_ids, num_nodes, num_knots, affine",
     "warmup_fraction|still_steps|grown_steps": "static_fraction, deform_start_step, full_window_step",
-    "densify_\\w+|opacity_reset_every": "refine_*, grow_*, reset_every",
+    "densify_\\w+|opacity_reset_every": "refine_*, grow_*, reset_every_fraction",
     "\\w+_rate_(start|end)": "*_lr_init, *_lr_final",
     "max_error": "min_psnr",
     "delta_spaces?_raw|detach_means|embedding_size": "scale_space, detach_deform_input, embedding_dim",

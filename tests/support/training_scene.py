@@ -48,9 +48,9 @@ def small_config(**changes: Any) -> TrainConfig:
     """A run of 24 steps that goes through the static phase, densification, opacity reset and every SH degree."""
     values = {
         "steps": 24, "threads": 1, "model": SMALL_MODEL, "init_num_pts": 60, "max_gaussians": 90,
-        "static_fraction": 0.25, "static_window_fraction": 0.0, "sh_degree_interval": 6, "refine_start": 4,
-        "refine_every": 4, "refine_stop_fraction": 0.8,
-        "grow_grad2d": 1e-5, "reset_every": 9, "log_every": 1, "eval_every": 10, "checkpoint_every": 0,
+        "static_fraction": 0.25, "static_window_fraction": 0.0, "sh_degree_fraction": 6 / 24,
+        "refine_start_fraction": 4 / 24, "refine_every_fraction": 4 / 24, "refine_stop_fraction": 0.8,
+        "grow_grad2d": 1e-5, "reset_every_fraction": 9 / 24, "log_every": 1, "eval_every": 10, "checkpoint_every": 0,
     }  # fmt: skip
     return TrainConfig().updated(**{**values, **changes})
 
@@ -79,7 +79,7 @@ def shrunk(config: TrainConfig) -> TrainConfig:
     )
     return config.updated(
         model=model, steps=12, static_fraction=0.25, threads=2, init_num_pts=60, max_gaussians=90,
-        refine_start=4, refine_every=4, sh_degree_interval=4,
+        refine_start_fraction=4 / 12, refine_every_fraction=4 / 12, sh_degree_fraction=4 / 12,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from tests.support.training_scene import assert_same_bits, state_of
 
 PLUGIN = ROOT / "tests" / "support" / "plugin_example.py"
 SMALL = ["--steps=24", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--eval-every=0", "--sh-degree=1"]
-SMALL += ["--static-fraction=0.2", "--refine-start=4", "--refine-every=4"]
+SMALL += ["--static-fraction=0.2", "--refine-start-fraction=0.17", "--refine-every-fraction=0.17"]
 
 pytestmark = pytest.mark.slow
 

@@ -1,44 +1,61 @@
-"""What an importer of another trainer's runs provides."""
+"""The interface of an importer of another trainer's runs."""
 
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
+
+from export.importers.runs.state import RunFolder
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, ModelConfig
 from msdgs_train.gaussians.model_file import SceneInfo
 
 
-class Fidelity(Protocol):
-    """How far frames of an imported model are from those of the program that trained it."""
+@dataclass(frozen=True)
+class Loss:
+    """Something of all Gaussians of a run that a scene file can't hold, and the PSNR that this costs."""
+
+    rule: str
+    what: str
+    count: int  # Gaussians
+    worst_db: float  # of the worst frame
+    note: str  # one sentence for the user
 
     def left_out(self) -> dict[str, Any]:
         """The entry of `left_out` in a scene file."""
-        ...
-
-    def note(self) -> str:
-        """One sentence for the user of the importer."""
-        ...
+        numbers = {"count": self.count, "of": self.count, "worst_frame_db": self.worst_db}
+        return {"rule": self.rule, "what": self.what, **numbers}
 
 
 class RunImporter(Protocol):
     """Reads run folders of one trainer. Register one in `export.importers.runs.model.RUNS` under the format's name."""
 
+    networks: str
+    """Path of the networks in a run folder, with `*` for the number of the iteration. It identifies the format."""
     white_background: bool
-    """The background of runs whose cfg_args don't name one."""
+    """Background of runs whose cfg_args don't name one."""
 
-    def detects(self, run: Path) -> bool:
-        """Whether a folder is a run of this trainer."""
-        ...
+    def read(self, run: RunFolder, gaussians: CanonicalGaussians) -> tuple[DynamicGaussians, list[str]]:
+        """The model of a run, given its canonical Gaussians, and notes for the user.
 
-    def read(
-        self, run: Path, gaussians: CanonicalGaussians, iteration: int, settings: dict[str, Any]
-    ) -> tuple[DynamicGaussians, list[str]]:
-        """The model of an iteration, given its canonical Gaussians and cfg_args, and notes for the user.
-
-        Raises `ImportFailed` for networks that are built otherwise.
+        Raises `ImportFailed` for networks of another structure.
         """
         ...
 
-    def fidelity(self, model: DynamicGaussians, info: SceneInfo) -> Fidelity | None:
-        """The difference that its own renderer makes; None if there is none."""
+    def fidelity(self, model: DynamicGaussians, info: SceneInfo) -> Loss | None:
+        """The difference between frames of the trainer's own renderer and of this one; None if there is none."""
         ...
+
+
+def filled_model(
+    config: ModelConfig, gaussians: CanonicalGaussians, fill: Callable[[DynamicGaussians], object]
+) -> DynamicGaussians:
+    """A model whose parameters `fill` sets. It is called without memory first, so that all shapes are checked before
+    memory for any of them is allocated."""
+    with torch.device("meta"):
+        shapes_only = DynamicGaussians(config, gaussians)
+    fill(shapes_only)
+    model = DynamicGaussians(config, gaussians)
+    fill(model)
+    return model

@@ -1,6 +1,5 @@
-"""Run folders of other trainers to a model.pt, which is then exported as our own."""
+"""Run folders of other trainers to a model.pt, which is then exported as any other."""
 
-import ast
 import json
 import re
 from collections.abc import Iterator
@@ -13,10 +12,11 @@ import torch
 from rich.console import Console
 
 from export.importers.errors import ImportFailed
-from export.importers.runs.base import Fidelity, RunImporter
+from export.importers.runs.base import Loss, RunImporter
 from export.importers.runs.deformgs import DeformGSImporter
 from export.importers.runs.fidelity import static_appearance
 from export.importers.runs.fourdgs import FourDGSImporter
+from export.importers.runs.state import RunFolder
 from export.importers.scene import metadata_of
 from export.importers.splats.base import Splats
 from export.importers.splats.formats import read_splats
@@ -24,7 +24,6 @@ from export.measure.poses import posed
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
 
 RUNS: dict[str, RunImporter] = {"deformgs": DeformGSImporter(), "4dgs": FourDGSImporter()}
@@ -33,6 +32,12 @@ RUNS: dict[str, RunImporter] = {"deformgs": DeformGSImporter(), "4dgs": FourDGSI
 MAX_CAMERAS = 1_000
 CHECKED_TIMES = 3
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+
+
+def run_format(folder: Path) -> str | None:
+    """The format of a run folder, one of `RUNS`; None for other folders."""
+    found = (name for name, importer in RUNS.items() if next(folder.glob(importer.networks), None) is not None)
+    return next(found, None)
 
 
 def write_model(run: Path, file_format: str, output: Path, console: Console) -> list[dict[str, Any]]:
@@ -47,40 +52,33 @@ def write_model(run: Path, file_format: str, output: Path, console: Console) -> 
     }
     if not clouds:
         raise ImportFailed(run, "has no point_cloud/iteration_*/point_cloud.ply")
-    iteration = max(clouds)
+    iteration, importer = max(clouds), RUNS[file_format]
     source = read_splats(clouds[iteration], "ply")
     if source.dropped:
         raise ImportFailed(clouds[iteration], f"{source.dropped:,} Gaussians hold NaN, infinity or no direction")
-    settings, importer = _settings(run / "cfg_args"), RUNS[file_format]
-    model, notes = importer.read(run, canonical(source), iteration, settings)
-    _check_poses(run, model)
-    metadata = metadata_of(source.gaussians.means, source.gaussians.sh_degree, "0" * 64)
-    cameras = _cameras(run / "cameras.json") or [camera.to_plain() for camera in metadata.cameras]
-    info = SceneInfo(
-        background=WHITE if settings.get("white_background", importer.white_background) else BLACK,
-        bounds=[list(b) for b in metadata.bounds],
-        cameras=cameras,
-    )
-    console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
-    losses: list[Fidelity] = []
-    if model.config.opacity_head or model.config.sh_head:
-        with console.status("averaging opacities and colors"), _usable(run):
-            held = static_appearance(model, info)
-        model = held.model
-        losses.append(held)
-    with console.status("comparing frames"), _usable(run):
-        losses += [fidelity] if (fidelity := importer.fidelity(model, info)) else []
-    save_model(output, model, info, iteration)
-    for note in [*notes, *(loss.note() for loss in losses)]:
-        console.print(note, markup=False)
-    return [loss.left_out() for loss in losses]
-
-
-def _check_poses(run: Path, model: DynamicGaussians) -> None:
-    """Raise `ImportFailed` if a network gives poses that aren't finite."""
+    folder = RunFolder(run, iteration, importer.networks)
+    model, notes = importer.read(folder, canonical(source))
     for t in np.linspace(0, 1, CHECKED_TIMES).tolist():
         with _usable(run, f" at t = {t:g}"):
             posed(model, t).validate()
+    metadata = metadata_of(source.gaussians.means, source.gaussians.sh_degree, "0" * 64)
+    info = SceneInfo(
+        background=WHITE if folder.settings.get("white_background", importer.white_background) else BLACK,
+        bounds=[list(b) for b in metadata.bounds],
+        cameras=_cameras(run / "cameras.json") or [camera.to_plain() for camera in metadata.cameras],
+    )
+    console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
+    losses: list[Loss | None] = []
+    with console.status("comparing frames"), _usable(run):
+        if model.config.opacity_head or model.config.sh_head:
+            model, loss = static_appearance(model, info)
+            losses.append(loss)
+        losses.append(importer.fidelity(model, info))
+    save_model(output, model, info, iteration)
+    found = [loss for loss in losses if loss is not None]
+    for note in [*notes, *(loss.note for loss in found)]:
+        console.print(note, markup=False)
+    return [loss.left_out() for loss in found]
 
 
 @contextmanager
@@ -93,7 +91,7 @@ def _usable(run: Path, when: str = "") -> Iterator[None]:
 
 
 def canonical(source: Splats) -> CanonicalGaussians:
-    """Activated Gaussians in storage space, with the original lengths of their quaternions."""
+    """Activated Gaussians in storage space, with the stored norms of their quaternions."""
     g = source.gaussians
     lengths = np.ones(len(g), np.float32) if source.quat_lengths is None else source.quat_lengths
     opacities = g.opacities.astype(np.float64).clip(1e-7, 1 - 1e-7)
@@ -102,23 +100,8 @@ def canonical(source: Splats) -> CanonicalGaussians:
     return CanonicalGaussians(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
 
 
-def _settings(file: Path) -> dict[str, Any]:
-    """The plain values of cfg_args, the text of a Namespace; it isn't executed."""
-    try:
-        call = ast.parse(file.read_text(), mode="eval").body
-    except FileNotFoundError:
-        return {}
-    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        raise ImportFailed(file, f"can't be read: {error}") from error
-    values = {}
-    for keyword in call.keywords if isinstance(call, ast.Call) else ():
-        if isinstance(keyword.value, ast.Constant):
-            values[keyword.arg] = keyword.value.value
-    return values
-
-
 def _cameras(file: Path) -> list[dict[str, Any]]:
-    """Of INRIA's cameras.json, where there is one; position and rotation are camera to world in OpenCV axes."""
+    """The cameras of INRIA's cameras.json, if there is one; its poses are camera to world in OpenCV axes."""
     if not file.is_file():
         return []
     try:

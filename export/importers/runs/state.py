@@ -1,20 +1,19 @@
-"""Networks of other trainers: tensors by name out of a torch file, no code of which is run.
+"""The networks and settings of another trainer's run, read without running any code in its files."""
 
-What is read takes no more memory than a small multiple of the file's size.
-"""
-
+import ast
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from export.importers.errors import ImportFailed
 from msdgs_train.gaussians.model_file import CheckpointInvalid, load, refuse_unlike_stored
 
 
 class State:
-    """The finite tensors of a file."""
+    """The finite tensors of a torch file by name. Reading takes no more memory than a small multiple of its size."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -37,7 +36,7 @@ class State:
         return list(self._values)
 
     def read(self, name: str, *shape: int | None) -> Tensor:
-        """The tensor, float32; of the shape given, of which None is any size. Raises `ImportFailed`."""
+        """A tensor as float32. Raises `ImportFailed` if it is missing or has another shape; None is any size."""
         if name not in self._values:
             raise ImportFailed(self.file, f"lacks `{name}`")
         tensor = self._values[name]
@@ -46,3 +45,33 @@ class State:
             expected = " × ".join("any" if s is None else str(s) for s in shape)
             raise ImportFailed(self.file, f"`{name}` has shape {tuple(tensor.shape)}, not {expected}")
         return tensor.to(torch.float32)
+
+    def fill(self, linear: nn.Module, name: str) -> None:
+        """Set weight and bias of a Linear to those stored under `name`."""
+        for kind in ("weight", "bias"):
+            parameter = linear.get_parameter(kind)
+            parameter.copy_(self.read(f"{name}.{kind}", *parameter.shape))
+
+
+class RunFolder:
+    """One iteration of a run: its networks and the plain values of its cfg_args."""
+
+    def __init__(self, folder: Path, iteration: int, networks: str) -> None:
+        """`networks` is their path in the folder, with `*` for the iteration."""
+        name = networks.replace("*", str(iteration))
+        if not (folder / name).is_file():
+            raise ImportFailed(folder, f"has point_cloud/iteration_{iteration} but no {name}")
+        self.state = State(folder / name)
+        self.settings = _settings(folder / "cfg_args")
+
+
+def _settings(file: Path) -> dict[str, Any]:
+    """The plain values of cfg_args, the text of a Namespace; it isn't executed."""
+    try:
+        call = ast.parse(file.read_text(), mode="eval").body
+    except FileNotFoundError:
+        return {}
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise ImportFailed(file, f"can't be read: {error}") from error
+    keywords = call.keywords if isinstance(call, ast.Call) else ()
+    return {str(k.arg): k.value.value for k in keywords if isinstance(k.value, ast.Constant)}

@@ -1,1 +1,1 @@
-"""Files that hold one set of Gaussians, one module a format."""
+"""Readers of files that hold one set of Gaussians, one module per format."""

@@ -1,11 +1,11 @@
-"""Formats whose axes are right, up, back; all others here, and INRIA's PLY, have right, down, front."""
+"""Conversion from axes right, up, back of some formats to right, down, front of INRIA's PLY and this project."""
 
 import numpy as np
 
 SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
-"""Of each SH function, degree 0 to 3, where y and z change their sign: −1 where it is odd in y and z together."""
+"""Sign of each SH function, degree 0 to 3, if y and z change theirs: −1 if it is odd in y and z together."""
 
 
 def from_right_up_back(means: np.ndarray, quats: np.ndarray, sh: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Means [N, 3], wxyz quaternions [N, 4] and harmonics [N, C, 3] turned by half a turn about x; its own inverse."""
+    """Rotate means [N, 3], wxyz quaternions [N, 4] and SH [N, C, 3] by 180° about x. It is its own inverse."""
     return means * (1, -1, -1), quats * (1, 1, -1, -1), sh * SH_SIGNS[: sh.shape[1], None]

@@ -1,4 +1,4 @@
-"""What every reader of a splat file returns: activated Gaussians without the ones that nothing can draw."""
+"""The result of all readers of splat files: activated Gaussians without those that can't be drawn."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +10,13 @@ from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM
 
 LOG_SCALE_LIMIT = 20.0
-"""Scales stay within e^-20 and e^20, as those of trained models do."""
+"""Scales are clamped to e^-20 and e^20, as in trained models."""
 
-FURTHEST = 1e12
-"""Scene units from the origin; beyond it differences of float32 positions mean nothing."""
+MAX_DISTANCE = 1e12
+"""Largest coordinate, scene units. Differences of float32 positions are meaningless beyond."""
 
-BRIGHTEST = 1e4
-"""Of an SH coefficient; real ones are below 10."""
+MAX_SH = 1e4
+"""Largest SH coefficient; usual ones are below 10."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Splats:
 
     gaussians: Gaussians
     dropped: int = 0  # had NaN, infinity or a quaternion without direction, and are not in `gaussians`
-    antialiasing: str = "dilate"  # or "mip", where the file says that it was trained so
+    antialiasing: str = "dilate"  # or "mip", if the file says so
     quat_lengths: FloatArray | None = None  # [N] of the stored quaternions; None: all 1
 
     def __len__(self) -> int:
@@ -41,21 +41,21 @@ def splats(
     sh: np.ndarray,
     antialiasing: str = "dilate",
 ) -> Splats:
-    """Activated Gaussians from stored ones: means [N, 3], log_scales [N, 3], raw_quats [N, 4] wxyz of any length,
-    opacities [N] in [0, 1] and sh [N, C, 3].
+    """Activate stored Gaussians: means [N, 3], log_scales [N, 3], raw_quats [N, 4] wxyz of any norm, opacities [N] in
+    [0, 1] and sh [N, C, 3].
 
-    Rows that hold NaN, infinity, what is out of all proportion or a quaternion of norm under 1e-8 are dropped and
-    counted; log-scales are cut to ±20. Raises `ImportFailed` where no row is left.
+    Rows with NaN, infinity, values beyond the limits above or a quaternion of norm under 1e-8 are dropped and counted;
+    log-scales are clamped to ±20. Raises `ImportFailed` if no row is left.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norms = np.linalg.norm(raw_quats.astype(np.float64), axis=1)
         good = (
-            (np.abs(means) <= FURTHEST).all(axis=1)
+            (np.abs(means) <= MAX_DISTANCE).all(axis=1)
             & ~np.isnan(log_scales).any(axis=1)
             & (norms >= MIN_NORM)
             & np.isfinite(norms)
             & ~np.isnan(opacities)
-            & (np.abs(sh) <= BRIGHTEST).all(axis=(1, 2))
+            & (np.abs(sh) <= MAX_SH).all(axis=(1, 2))
         )
     count = int(good.sum())
     if not count:
@@ -74,23 +74,23 @@ def splats(
 
 
 def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:
-    """Opacities of logits, in float64; infinite logits, as some converters write them, are 0 and 1."""
+    """Opacities of logits, in float64. Infinite logits, which some converters write, give 0 and 1."""
     x = raw_opacities.astype(np.float64)
     small = np.exp(-np.abs(x))
     return np.where(x >= 0, 1 / (1 + small), small / (1 + small))
 
 
 def smallest_three(values: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """[N, 4] quaternions from all components but the largest, [N, 3] in order, and its place, [N] in 0 to 3.
+    """[N, 4] quaternions from all components but the largest, [N, 3] in order, and its index, [N] in 0 to 3.
 
-    The largest is positive and makes the length 1.
+    The largest is positive and such that the norm is 1.
     """
     quats = np.zeros((len(values), 4))
-    left = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
+    missing = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
     for place in range(4):
         rows = largest == place
         quats[np.ix_(rows, [i for i in range(4) if i != place])] = values[rows]
-        quats[rows, place] = left[rows]
+        quats[rows, place] = missing[rows]
     return quats
 
 

@@ -1,4 +1,4 @@
-"""Formats of one set of Gaussians: which one a file is, and its reader."""
+"""Formats of one set of Gaussians: detection, and the reader of each."""
 
 import zipfile
 from collections.abc import Callable
@@ -21,11 +21,11 @@ READERS: dict[str, Callable[[Path], Splats]] = {
     "splat": read_splat,
     "ksplat": read_ksplat,
 }
-"""By name of the format."""
+"""Readers by name of the format."""
 
 
 def splat_format(path: Path) -> str | None:
-    """The format of a file, or of a folder that is a SOG; None if it is none of `READERS`. Raises `ImportFailed`."""
+    """The format of a file, or of a SOG folder; None if it is none of `READERS`. Raises `ImportFailed`."""
     if path.is_dir():
         return "sog" if (path / META).is_file() else None
     with path.open("rb") as file:
@@ -47,7 +47,7 @@ def splat_format(path: Path) -> str | None:
 
 
 def read_splats(path: Path, file_format: str | None = None) -> Splats:
-    """One set of Gaussians, from a file in any of the formats or in the one named. Raises `ImportFailed`."""
+    """Read one set of Gaussians in `file_format`, by default the detected one. Raises `ImportFailed`."""
     try:
         file_format = file_format or splat_format(path)
         if file_format not in READERS:

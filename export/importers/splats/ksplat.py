@@ -1,4 +1,4 @@
-"""`.ksplat`, the format of mkkellogg's viewer: gaussforge makes a PLY of it, in a process with bounded memory."""
+"""`.ksplat`, the format of mkkellogg's viewer, converted to PLY by gaussforge in a process with bounded memory."""
 
 import importlib.util
 import subprocess
@@ -12,7 +12,7 @@ from export.importers.splats.ply import read_ply
 from msdgs_serve.scene.errors import InvalidInput
 
 MEMORY, MEMORY_PER_BYTE = 1 << 30, 32
-"""Address space of that process: its own, and for each byte of the file. A Gaussian of 24 bytes becomes one of 68."""
+"""Address space of that process: a constant, and per byte of the file. A Gaussian of 24 bytes becomes one of 68."""
 
 SECONDS = 120.0
 
@@ -20,8 +20,8 @@ _PROGRAM = Path(__file__).with_name("ksplat_process.py")
 
 
 def read_ksplat(file: Path) -> Splats:
-    """The Gaussians of a `.ksplat` file of any compression level. Raises `ImportFailed` for one that is damaged, and
-    `InvalidInput` where gaussforge isn't installed."""
+    """Read a `.ksplat` file of any compression level. Raises `ImportFailed` for a damaged file, and `InvalidInput` if
+    gaussforge isn't installed."""
     if importlib.util.find_spec("gaussforge") is None:
         raise InvalidInput("input", "another format, or pip install '.[ksplat]' to read .ksplat", str(file))
     with tempfile.TemporaryDirectory(prefix="msdgs-ksplat-") as folder:

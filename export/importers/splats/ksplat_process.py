@@ -1,4 +1,4 @@
-"""Make a PLY of a .ksplat file with gaussforge. A program, since gaussforge's native code crashes on damaged files."""
+"""A program that converts .ksplat to PLY with gaussforge, whose native code crashes on damaged files."""
 
 import resource
 import sys
@@ -8,7 +8,7 @@ import gaussforge
 
 
 def main(file: Path, ply: Path, memory: int) -> None:
-    """Write `ply`, or end with what is wrong with `file`; in at most `memory` bytes of address space."""
+    """Write `ply`, or exit with the error of `file`, within `memory` bytes of address space."""
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (memory, most))
     made = gaussforge.GaussForge().convert(file.read_bytes(), "ksplat", "ply")

@@ -1,4 +1,4 @@
-"""PLY files: those of INRIA's trainer in any order of properties, and SuperSplat's compressed ones."""
+"""PLY files of INRIA's trainer, with properties in any order, and SuperSplat's compressed PLY files."""
 
 import re
 from pathlib import Path
@@ -12,19 +12,19 @@ from export.importers.splats.base import Splats, sigmoid, smallest_three, splats
 from msdgs_serve.scene.spherical_harmonics import SH_C0, SH_DEGREES
 
 MAGIC = b"ply"
-LONGEST_HEADER = 1 << 16
+MAX_HEADER_BYTES = 1 << 16
 CHUNK = 256
 """Gaussians that share the ranges of one row of `chunk`."""
 
-SMALLEST_TEXT = 2
-"""Bytes of a number in a text file: a digit and what separates it."""
+MIN_TEXT_BYTES = 2
+"""Bytes of the shortest number in a text file: a digit and a separator."""
 
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 
 
 def read_ply(file: Path) -> Splats:
-    """The Gaussians of a PLY file. Raises `ImportFailed` saying what is wrong with it."""
+    """Read a PLY file. Raises `ImportFailed` naming its error."""
     _check_sizes(file)
     try:
         contents = PlyData.read(str(file), mmap="r")
@@ -46,9 +46,9 @@ class _Element(NamedTuple):
 
 
 def _check_sizes(file: Path) -> None:
-    """Whether the file is as long as its header promises, before anything of that size is taken."""
+    """Raise `ImportFailed` if the file is shorter than its header states, before memory of that size is allocated."""
     with file.open("rb") as stream:
-        start = stream.read(LONGEST_HEADER)
+        start = stream.read(MAX_HEADER_BYTES)
     end = re.search(rb"(?m)^end_header\r?\n", start)
     if not start.startswith(MAGIC) or end is None:
         raise ImportFailed(file, "isn't a whole PLY file: its header has no end")
@@ -56,7 +56,7 @@ def _check_sizes(file: Path) -> None:
     binary = any(re.match(r"format\s+binary", line) for line in lines)
     body = file.stat().st_size - end.end()
     for element in _elements(file, lines):
-        needed = element.count * (element.bytes_a_row if binary else SMALLEST_TEXT * element.columns) - (not binary)
+        needed = element.count * (element.bytes_a_row if binary else MIN_TEXT_BYTES * element.columns) - (not binary)
         if needed > body:
             raise cut_off(file, f"{element.count:,} rows of `{element.name}`", needed, body)
         body -= needed
@@ -131,7 +131,7 @@ def _compressed(file: Path, elements: dict[str, PlyElement]) -> Splats:
 
 
 def _bits(packed: np.ndarray, *fields: tuple[int, int]) -> np.ndarray:
-    """[N, F] in [0, 1] from fields of (first bit, number of bits)."""
+    """[N, F] values in [0, 1] of fields given as (first bit, number of bits)."""
     return np.stack([((packed >> first) & (2**size - 1)) / (2**size - 1) for first, size in fields], axis=1)
 
 
@@ -141,7 +141,7 @@ def _byte_sh(stored: np.ndarray) -> np.ndarray:
 
 
 def _rest(file: Path, columns: "_Columns", prefix: str, read) -> np.ndarray:  # noqa: ANN001
-    """[N, C − 1, 3] from columns of which a channel's come together."""
+    """[N, C − 1, 3] SH above degree 0, from columns that are sorted by channel."""
     count = sum(re.fullmatch(prefix + r"[0-9]+", name) is not None for name in columns.names)
     if count % 3 or count // 3 + 1 not in SH_DEGREES:
         raise ImportFailed(file, f"has {count} of `{prefix}…`; 0, 9, 24 or 45 make whole degrees")
@@ -152,7 +152,7 @@ def _rest(file: Path, columns: "_Columns", prefix: str, read) -> np.ndarray:  # 
 
 
 class _Columns:
-    """Properties of one element by name."""
+    """The properties of one element by name."""
 
     def __init__(self, file: Path, element: PlyElement) -> None:
         if any(isinstance(each, PlyListProperty) for each in element.properties):
@@ -165,8 +165,8 @@ class _Columns:
         return name in self.names
 
     def read(self, name: str) -> np.ndarray:
-        """One column as float64. Raises `ImportFailed` where it is missing."""
-        with np.errstate(invalid="ignore"):  # NaN that signals, as damaged files hold
+        """One column as float64. Raises `ImportFailed` if it is missing."""
+        with np.errstate(invalid="ignore"):  # signaling NaN in damaged files
             return self._column(name).astype(np.float64)
 
     def packed(self, name: str) -> np.ndarray:

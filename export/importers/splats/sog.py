@@ -1,7 +1,6 @@
-"""SOG version 2: a folder, or a zip of it, with meta.json and lossless WebP textures of one pixel a Gaussian."""
+"""SOG version 2: a folder, or a zip of it, with meta.json and lossless WebP textures of one pixel per Gaussian."""
 
 import json
-import math
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -17,16 +16,16 @@ from export.importers.splats.webp import read_texture
 META = "meta.json"
 MAX_META_BYTES = 1 << 24
 MAX_GAUSSIANS = 1 << 26
-"""Gaussians in one file: a texture has 16,383 pixels a side at most."""
+"""Gaussians in one file: a texture has at most 16,383 pixels per side."""
 
 SLACK = 1 << 13
-"""Pixels that a texture may have too many: it is made nearly square, and multiples of four."""
+"""Extra pixels of a texture, whose sides are nearly equal multiples of four."""
 
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}
-"""Of each channel beyond degree 0, by number of bands."""
+"""SH coefficients per channel above degree 0, by number of bands."""
 
-A_ROW = 64
-"""Entries of the palette of harmonics side by side."""
+ENTRIES_PER_ROW = 64
+"""Entries of the palette of SH in a row of its texture."""
 
 ZIP_PROBLEMS = (
     zipfile.BadZipFile,
@@ -34,13 +33,13 @@ ZIP_PROBLEMS = (
     EOFError,
     RuntimeError,
     UnicodeDecodeError,  # names of files
-    OverflowError,  # places beyond 2⁶³
+    OverflowError,  # offsets beyond 2⁶³
 )
-"""What zipfile raises for damaged files."""
+"""Errors of zipfile for damaged files."""
 
 
 def read_sog(path: Path) -> Splats:
-    """The Gaussians of a SOG folder, its meta.json or a zip. Raises `ImportFailed`."""
+    """Read a SOG folder, its meta.json or a zip. Raises `ImportFailed`."""
     if path.is_dir() or path.name == META:
         folder = path if path.is_dir() else path.parent
         return _decoded(path, lambda name, most: _from_folder(path, folder / name, most))
@@ -55,7 +54,7 @@ def _from_folder(path: Path, file: Path, most: int) -> bytes:
     try:
         size = file.stat().st_size
         if size > most:
-            raise ImportFailed(path, f"its {file.name} has {size:,} bytes where {most:,} would do")
+            raise ImportFailed(path, f"its {file.name} has {size:,} bytes, at most {most:,} are allowed")
         return file.read_bytes()
     except OSError as error:
         raise ImportFailed(path, f"lacks {file.name}: {error.strerror}") from error
@@ -66,18 +65,18 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, name: str, most: int) -> byt
     if len(found) != 1:
         raise ImportFailed(path, f"holds {len(found)} files named {name}, not one")
     if found[0].compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ImportFailed(path, f"its {name} is packed in a way that no SOG is: {found[0].compress_type}")
+        raise ImportFailed(path, f"its {name} is packed by a method that SOG doesn't use: {found[0].compress_type}")
     if found[0].file_size > most:
-        raise ImportFailed(path, f"its {name} has {found[0].file_size:,} bytes where {most:,} would do")
+        raise ImportFailed(path, f"its {name} has {found[0].file_size:,} bytes, at most {most:,} are allowed")
     with archive.open(found[0]) as member:
         contents = member.read(most + 1)
     if len(contents) > most:
-        raise ImportFailed(path, f"its {name} unpacks to more than it says")
+        raise ImportFailed(path, f"its {name} unpacks to more bytes than its size")
     return contents
 
 
 class _Meta:
-    """meta.json, whose every value may be missing or something else."""
+    """The values of meta.json, checked when they are read."""
 
     def __init__(self, path: Path, contents: bytes) -> None:
         self._path = path
@@ -92,7 +91,7 @@ class _Meta:
         return ImportFailed(self._path, f"its {META}: `{name}` must be {expected}")
 
     def get(self, name: str) -> Any:
-        """The value at a dotted name, None where there is none."""
+        """The value at a dotted name; None if there is none."""
         value = self._values
         for part in name.split("."):
             value = value.get(part) if isinstance(value, dict) else None
@@ -106,13 +105,10 @@ class _Meta:
 
     def numbers(self, name: str, count: int) -> np.ndarray:
         value = self.get(name)
-        good = isinstance(value, list) and len(value) == count and all(type(each) in (int, float) for each in value)
-        if not good or not all(math.isfinite(float(each)) for each in value if abs(each) < 1e300):
+        good = isinstance(value, list) and len(value) == count
+        if not good or not all(type(each) in (int, float) and abs(each) < 1e300 for each in value):
             raise self.wrong(name, f"a list of {count} numbers")
-        array = np.array([float(each) if abs(each) < 1e300 else np.nan for each in value])
-        if not np.isfinite(array).all():
-            raise self.wrong(name, f"a list of {count} numbers")
-        return array
+        return np.array(value, np.float64)
 
     def files(self, name: str, count: int) -> list[str]:
         value = self.get(f"{name}.files")
@@ -126,7 +122,7 @@ def _is_plain(name: Any) -> bool:
 
 
 def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
-    """`read` gives a file's bytes by name, or fails where they are more than a number."""
+    """The Gaussians of a SOG. `read` returns a file's bytes, given its name and its maximum size."""
     meta = _Meta(path, read(META, MAX_META_BYTES))
     if meta.get("version") != 2:
         problem = "of version 1" if meta.get("version") is None else f"of version {meta.get('version')}"
@@ -155,22 +151,22 @@ def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
 
 
 def _quats(stored: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz: three components in bytes, and in the fourth 252 and the place of the largest."""
+    """[N, 4] wxyz: three components in bytes, and 252 plus the index of the largest in the fourth."""
     small = (stored[:, :3] / 255 - 0.5) * np.sqrt(2)
     quats = smallest_three(small, stored[:, 3].astype(np.int64) - 252)
-    quats[stored[:, 3] < 252] = (1, 0, 0, 0)  # as other readers have it
+    quats[stored[:, 3] < 252] = (1, 0, 0, 0)  # as in other readers
     return quats
 
 
 def _harmonics(path: Path, meta: _Meta, count: int, texture: Callable[[str, int], np.ndarray]) -> np.ndarray:
-    """[N, C − 1, 3]: each Gaussian names an entry of a palette, whose bytes name numbers of a codebook."""
+    """[N, C − 1, 3]: each Gaussian has the index of a palette entry, whose bytes are indices into a codebook."""
     bands = meta.whole("shN.bands", 3)
     palette = meta.whole("shN.count", 1 << 16)
     centroids, labels = meta.files("shN", 2)
-    wide = A_ROW * COEFFICIENTS[bands]
-    entries = texture(centroids, wide * -(-palette // A_ROW))[:, :3].reshape(-1, COEFFICIENTS[bands], 3)
+    wide = ENTRIES_PER_ROW * COEFFICIENTS[bands]
+    entries = texture(centroids, wide * -(-palette // ENTRIES_PER_ROW))[:, :3].reshape(-1, COEFFICIENTS[bands], 3)
     stored = texture(labels, count).astype(np.int64)
     label = stored[:, 0] | stored[:, 1] << 8
     if label.max() >= palette:
-        raise ImportFailed(path, f"a Gaussian has harmonics {label.max():,} of a palette of {palette:,}")
+        raise ImportFailed(path, f"a Gaussian has SH entry {label.max():,} of a palette of {palette:,}")
     return meta.numbers("shN.codebook", 256)[entries[label]]

@@ -12,10 +12,10 @@ RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4),
 
 
 def read_splat(file: Path) -> Splats:
-    """The Gaussians of a `.splat` file, which has no header. Raises `ImportFailed` where its length isn't whole."""
+    """Read a `.splat` file, which has no header. Raises `ImportFailed` if its size isn't a multiple of a record."""
     size = file.stat().st_size
     if size % RECORD.itemsize or not size:
-        raise ImportFailed(file, f"is cut off: {size:,} bytes are no whole number of 32 a Gaussian")
+        raise ImportFailed(file, f"is cut off: {size:,} bytes are no multiple of 32 per Gaussian")
     records = np.fromfile(file, RECORD)
     rgba = records["rgba"] / 255
     quats = (records["quats"].astype(np.float64) - 128) / 128

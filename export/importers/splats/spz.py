@@ -1,5 +1,6 @@
-"""`.spz`, versions 2 and 3 (one gzip stream) and 4 (a zstd stream for each attribute). Axes are right, up, back."""
+"""`.spz`, versions 2 and 3 (one gzip stream) and 4 (a zstd stream per attribute). Axes are right, up, back."""
 
+import itertools
 import struct
 import zlib
 from pathlib import Path
@@ -19,10 +20,10 @@ MIP = 1
 """Bit of the header's flags: trained with the anti-aliasing of Mip-Splatting."""
 
 COLOR_SCALE = 0.15
-"""Degree-0 coefficients are stored as 0.15 c + 0.5 in a byte."""
+"""SH coefficients c of degree 0 are stored as 0.15 c + 0.5 in a byte."""
 
 DEFLATE_LIMIT = 1_032
-"""Deflate makes nothing smaller than by this."""
+"""Largest compression factor of Deflate."""
 
 
 class Header(NamedTuple):
@@ -37,83 +38,25 @@ class Header(NamedTuple):
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of positions, opacities, colors, scales, rotations and harmonics."""
+        """Bytes of positions, opacities, colors, scales, rotations and SH above degree 0."""
         rotation, rest = (3 if self.version == 2 else 4), 3 * ((self.sh_degree + 1) ** 2 - 1)
         return [self.count * each for each in (9, 1, 3, 3, rotation, rest)]
 
 
 def read_spz(file: Path, *, turned: bool = True) -> Splats:
-    """The Gaussians of an SPZ file, turned from its axes to those of a PLY, or as they are.
+    """Read an SPZ file, with its axes converted to those of a PLY if `turned`.
 
     Raises `ImportFailed` for other versions, SH above degree 3 and cut-off files.
     """
     contents = file.read_bytes()
     if contents.startswith(GZIP):
-        header, parts = _one_stream(file, _Gzip(file, contents))
+        header, body = _unzipped(file, contents)
     elif contents.startswith(MAGIC):
-        header = _header(file, contents[: HEADER.size])
-        if header.version == 4:
-            parts = _streams(file, header, contents)
-        else:
-            header, parts = _one_stream(file, _Plain(file, contents))
+        header, body = _header(file, contents[: HEADER.size]), contents[HEADER.size :]
     else:
         raise ImportFailed(file, "isn't an SPZ file: it begins neither as gzip nor with NGSP")
+    parts = _streams(file, header, contents) if header.version == 4 else _parts(file, header, body)
     return _decoded(file, header, parts, turned)
-
-
-class _Plain:
-    """Bytes from the first on, as many as are asked for."""
-
-    def __init__(self, file: Path, contents: bytes) -> None:
-        self._file, self._contents, self._at = file, contents, 0
-
-    def possible(self) -> int:
-        """The most bytes that there may be in all."""
-        return len(self._contents)
-
-    def take(self, count: int, what: str) -> bytes:
-        found = self._contents[self._at : self._at + count]
-        self._at += len(found)
-        if len(found) < count:
-            raise cut_off(self._file, what, count, len(found))
-        return found
-
-    def finish(self) -> None:
-        """Nothing comes after the data."""
-
-
-class _Gzip:
-    """The same from a gzip stream, of which no more is unpacked than is asked for."""
-
-    def __init__(self, file: Path, contents: bytes) -> None:
-        self._file, self._packed, self._unpacker = file, contents, zlib.decompressobj(wbits=31)
-
-    def possible(self) -> int:
-        return DEFLATE_LIMIT * len(self._packed)
-
-    def take(self, count: int, what: str) -> bytes:
-        found = bytearray()
-        try:
-            while len(found) < count and not self._unpacker.eof:
-                piece = self._unpacker.decompress(self._packed, count - len(found))
-                self._packed = self._unpacker.unconsumed_tail
-                if not piece and not self._packed:
-                    break
-                found += piece
-        except zlib.error as error:
-            raise ImportFailed(self._file, f"has a damaged gzip stream: {error}") from error
-        if len(found) < count:
-            raise cut_off(self._file, what, count, len(found))
-        return bytes(found)
-
-    def finish(self) -> None:
-        """See that the stream's end, which has its checksum, is there; more data than was asked for may come first."""
-        try:
-            more = self._unpacker.decompress(self._packed, 1)
-        except zlib.error as error:
-            raise ImportFailed(self._file, f"has a damaged gzip stream: {error}") from error
-        if not more and not self._unpacker.eof:
-            raise ImportFailed(self._file, "is cut off: its gzip stream has no end")
 
 
 def _header(file: Path, start: bytes) -> Header:
@@ -127,23 +70,39 @@ def _header(file: Path, start: bytes) -> Header:
     if sh_degree > 3:
         raise ImportFailed(file, f"has SH of degree {sh_degree}; up to 3 can be read")
     if fractional_bits > 24:
-        raise ImportFailed(file, f"has positions with {fractional_bits} fractional bits, of 24 in all")
+        raise ImportFailed(file, f"has positions with {fractional_bits} fractional bits out of 24")
     return Header(version, count, sh_degree, fractional_bits, flags, streams)
 
 
-def _one_stream(file: Path, stream: _Plain | _Gzip) -> tuple[Header, list[bytes]]:
-    header = _header(file, stream.take(HEADER.size, "the header"))
-    if header.version == 4:
-        raise ImportFailed(file, "is SPZ version 4 inside gzip, which has streams of its own")
-    if sum(header.sizes) > stream.possible():
-        raise cut_off(file, f"{header.count:,} Gaussians", sum(header.sizes), stream.possible())
-    parts = [stream.take(size, f"{header.count:,} Gaussians") for size in header.sizes]
-    stream.finish()
-    return header, parts
+def _unzipped(file: Path, contents: bytes) -> tuple[Header, bytes]:
+    """Decompress the header, and then as many bytes as it states."""
+    unpacker = zlib.decompressobj(wbits=31)
+    try:
+        header = _header(file, unpacker.decompress(contents, HEADER.size))
+        if header.version == 4:
+            raise ImportFailed(file, "is SPZ version 4 inside gzip, but version 4 has its own streams")
+        needed, possible = sum(header.sizes), DEFLATE_LIMIT * len(contents)
+        if needed > possible:
+            raise cut_off(file, f"{header.count:,} Gaussians", needed, possible)
+        body = unpacker.decompress(unpacker.unconsumed_tail, needed) if needed else b""
+        more = len(body) < needed or unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum at the end
+    except zlib.error as error:
+        raise ImportFailed(file, f"has a damaged gzip stream: {error}") from error
+    if not more and not unpacker.eof:
+        raise ImportFailed(file, "is cut off: its gzip stream has no end")
+    return header, body
+
+
+def _parts(file: Path, header: Header, body: bytes) -> list[bytes]:
+    """The parts of versions 2 and 3, one after the other."""
+    if len(body) < sum(header.sizes):
+        raise cut_off(file, f"{header.count:,} Gaussians", sum(header.sizes), len(body))
+    ends = list(itertools.accumulate(header.sizes))
+    return [body[end - size : end] for end, size in zip(ends, header.sizes, strict=True)]
 
 
 def _streams(file: Path, header: Header, contents: bytes) -> list[bytes]:
-    """Of version 4: 32 bytes of header with the place of the table, which has two sizes a stream, then the streams."""
+    """The parts of version 4: a header of 32 bytes with the offset of a table of sizes, the table, the streams."""
     if len(contents) < 32:
         raise cut_off(file, "the header", 32, len(contents))
     (table,) = struct.unpack_from("<I", contents, 16)
@@ -157,7 +116,7 @@ def _streams(file: Path, header: Header, contents: bytes) -> list[bytes]:
     for i, size in enumerate(sizes):
         packed, unpacked = struct.unpack_from("<QQ", contents, table + 16 * i)
         if unpacked != size:
-            raise ImportFailed(file, f"stream {i} says {unpacked:,} bytes; {header.count:,} Gaussians need {size:,}")
+            raise ImportFailed(file, f"stream {i} has {unpacked:,} bytes; {header.count:,} Gaussians need {size:,}")
         if at + packed > len(contents):
             raise cut_off(file, f"stream {i}", packed, len(contents) - at)
         parts.append(_zstd(file, i, contents[at : at + packed], size))
@@ -205,7 +164,7 @@ def _decoded(file: Path, header: Header, parts: list[bytes], turned: bool) -> Sp
 
 
 def _quats(header: Header, rotations: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz. Version 2 has x, y, z in bytes; later ones 10 bits of the three smallest, a sign and 9 bits."""
+    """[N, 4] wxyz. Version 2 stores x, y, z in bytes, later ones the three smallest in a sign and 9 bits each."""
     if header.version == 2:
         xyz = rotations.reshape(-1, 3) / 127.5 - 1
         w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(axis=1)))

@@ -1,4 +1,4 @@
-"""Lossless WebP textures that hold numbers."""
+"""Lossless WebP textures of numbers."""
 
 import struct
 import tempfile
@@ -11,11 +11,11 @@ from export.importers.errors import ImportFailed
 
 
 def read_texture(file: Path, name: str, contents: bytes, pixels: int) -> np.ndarray:
-    """[H · W, 4] bytes of the texture `name` of `file`, which holds at most `pixels`. Raises `ImportFailed`."""
+    """[H · W, 4] bytes of the texture `name` of `file`, which has at most `pixels`. Raises `ImportFailed`."""
     where = f"its texture {name}"
     width, height = _size(file, where, contents)
     if width * height > pixels:
-        raise ImportFailed(file, f"{where} has {width} × {height} pixels where {pixels:,} would do")
+        raise ImportFailed(file, f"{where} has {width} × {height} pixels, at most {pixels:,} are allowed")
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)
     with tempfile.NamedTemporaryFile(suffix=".webp") as copy:  # OpenImageIO reads files only
@@ -35,7 +35,7 @@ def read_texture(file: Path, name: str, contents: bytes, pixels: int) -> np.ndar
 
 
 def _size(file: Path, where: str, contents: bytes) -> tuple[int, int]:
-    """Of the header, before the decoder takes memory for it."""
+    """The size in the header, checked before the decoder allocates memory."""
     if len(contents) < 30 or contents[:4] != b"RIFF" or contents[8:12] != b"WEBP":
         raise ImportFailed(file, f"{where} isn't a whole WebP image")
     (length,) = struct.unpack_from("<I", contents, 4)
@@ -48,4 +48,4 @@ def _size(file: Path, where: str, contents: bytes) -> tuple[int, int]:
     if kind == b"VP8X":
         width, height = (int.from_bytes(contents[at : at + 3], "little") + 1 for at in (24, 27))
         return width, height
-    raise ImportFailed(file, f"{where} is a lossy WebP image; its numbers are lost")
+    raise ImportFailed(file, f"{where} is a lossy WebP image, which changes its numbers")

@@ -6,69 +6,22 @@ from pathlib import Path
 
 import numpy as np
 
-from msdgs_train.datasets.colmap.model import (
-    MODEL_NAMES,
-    PARAMETERS,
-    ModelCamera,
-    ModelImage,
-    check_model,
-    make_camera,
-)
-from msdgs_train.datasets.common.scene_data import DatasetInvalid
-
-
-class _Bytes:
-    """A little-endian file, read sequentially."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        try:
-            self.content = file.read_bytes()
-        except OSError as error:
-            raise DatasetInvalid(file, "file", f"can't be read: {error.strerror}") from None
-        self.offset = 0
-
-    def take(self, layout: str, field: str) -> tuple:
-        end = self.offset + struct.calcsize("<" + layout)
-        self._require(end, field)
-        values = struct.unpack_from("<" + layout, self.content, self.offset)
-        self.offset = end
-        return values
-
-    def text(self, field: str) -> str:
-        """The string up to the next zero byte."""
-        end = self.content.find(b"\0", self.offset)
-        self._require(end if end >= 0 else len(self.content) + 1, field)
-        text = self.content[self.offset : end].decode("utf-8", errors="replace")
-        self.offset = end + 1
-        return text
-
-    def skip(self, length: int, field: str) -> None:
-        self._require(self.offset + length, field)
-        self.offset += length
-
-    def _require(self, end: int, field: str) -> None:
-        if end > len(self.content):
-            raise DatasetInvalid(self.file, field, f"is cut off: the file ends after {len(self.content)} bytes")
+from msdgs_train.datasets.colmap.model import MODEL_NAMES, ModelCamera, ModelImage, make_camera, parameter_names
+from msdgs_train.datasets.common.readers import DatasetInvalid, read_bytes
 
 
 def read_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
-    stream = _Bytes(file)
-    (count,) = stream.take("Q", "cameras")
-    for index in range(count):
-        field = f"cameras[{index}]"
-        camera_id, model, width, height = stream.take("iiQQ", field)
-        name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else f"model {model}"
-        check_model(file, field, name)
-        parameters = stream.take(f"{len(PARAMETERS[name])}d", field)
-        yield camera_id, make_camera(file, field, name, width, height, parameters)
+    stream = _Stream(file)
+    for field in stream.records("cameras"):
+        camera_id, number, width, height = stream.take("iiQQ", field)
+        model = MODEL_NAMES[number] if 0 <= number < len(MODEL_NAMES) else f"model {number}"
+        parameters = stream.take(f"{len(parameter_names(file, field, model))}d", field)
+        yield camera_id, make_camera(file, field, model, width, height, parameters)
 
 
 def read_images(file: Path) -> Iterator[ModelImage]:
-    stream = _Bytes(file)
-    (count,) = stream.take("Q", "images")
-    for index in range(count):
-        field = f"images[{index}]"
+    stream = _Stream(file)
+    for field in stream.records("images"):
         _, *pose, camera_id = stream.take("i7di", field)
         name = stream.text(field)
         (observations,) = stream.take("Q", field)
@@ -77,10 +30,36 @@ def read_images(file: Path) -> Iterator[ModelImage]:
 
 
 def read_points(file: Path) -> Iterator[tuple[float, ...]]:
-    stream = _Bytes(file)
-    (count,) = stream.take("Q", "points3D")
-    for index in range(count):
-        field = f"points3D[{index}]"
+    stream = _Stream(file)
+    for field in stream.records("points3D"):
         _, *values, _, length = stream.take("Q3d3BdQ", field)
         stream.skip(8 * length, field)
         yield tuple(values)
+
+
+class _Stream:
+    """A little-endian file, read sequentially. `field` is named in errors."""
+
+    def __init__(self, file: Path) -> None:
+        self.file, self.content, self.offset = file, read_bytes(file), 0
+
+    def records(self, kind: str) -> Iterator[str]:
+        """Read the number of records; returns their names for error messages."""
+        (count,) = self.take("Q", kind)
+        return (f"{kind}[{index}]" for index in range(count))
+
+    def take(self, layout: str, field: str) -> tuple:
+        size = struct.calcsize("<" + layout)
+        self.skip(size, field)
+        return struct.unpack_from("<" + layout, self.content, self.offset - size)
+
+    def text(self, field: str) -> str:
+        """Read the string up to the next zero byte."""
+        start, end = self.offset, self.content.find(b"\0", self.offset)
+        self.skip((end if end >= 0 else len(self.content)) + 1 - start, field)
+        return self.content[start:end].decode("utf-8", errors="replace")
+
+    def skip(self, length: int, field: str) -> None:
+        self.offset += length
+        if self.offset > len(self.content):
+            raise DatasetInvalid(self.file, field, f"is cut off: the file ends after {len(self.content)} bytes")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_train.datasets.common.scene_data import DatasetInvalid
+from msdgs_train.datasets.common.readers import DatasetInvalid
 
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -31,7 +31,7 @@ class ModelCamera(NamedTuple):
 
     width: int
     height: int
-    values: dict[str, float]  # of `PARAMETERS`, pixels but for k and p
+    values: dict[str, float]  # by the names in `PARAMETERS`; all but k and p in pixels
 
 
 class ModelImage(NamedTuple):
@@ -43,23 +43,23 @@ class ModelImage(NamedTuple):
     tvec: np.ndarray  # [3] float64
 
 
+def parameter_names(file: Path, field: str, model: str) -> tuple[str, ...]:
+    """Return the parameters of a camera model. Raises `DatasetInvalid` naming file and field if it is unsupported."""
+    if model not in PARAMETERS:
+        problem = f"is {model}, but only {', '.join(PARAMETERS)} are supported: undistort the images with COLMAP"
+        raise DatasetInvalid(file, field, problem)
+    return PARAMETERS[model]
+
+
 def make_camera(
     file: Path, field: str, model: str, width: int, height: int, parameters: tuple[float, ...]
 ) -> ModelCamera:
-    """Raises `DatasetInvalid` naming file and field if the parameters don't fit the camera model."""
-    keys = PARAMETERS[model]
+    """Build a camera. Raises `DatasetInvalid` naming file and field if the parameters don't fit its model."""
+    keys = parameter_names(file, field, model)
     if len(parameters) != len(keys):
         raise DatasetInvalid(file, field, f"must have {len(keys)} parameters for {model}, got {len(parameters)}")
-    for key, value in zip(keys, parameters, strict=True):
+    values = dict(zip(keys, parameters, strict=True))
+    for key, value in values.items():
         if not math.isfinite(value):
             raise DatasetInvalid(file, f"{field}.{key}", f"must be finite, got {value}")
-    return ModelCamera(width, height, dict(zip(keys, parameters, strict=True)))
-
-
-def check_model(file: Path, field: str, model: str) -> None:
-    """Raise `DatasetInvalid` for an unsupported camera model."""
-    if model not in PARAMETERS:
-        known = ", ".join(PARAMETERS)
-        raise DatasetInvalid(
-            file, field, f"is {model}, but only {known} are supported: undistort the images with COLMAP"
-        )
+    return ModelCamera(width, height, values)

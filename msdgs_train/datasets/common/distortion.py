@@ -1,11 +1,13 @@
 """Lens distortion by the Brown–Conrady model, coefficients as in OpenCV, COLMAP and nerfstudio, and its removal."""
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.scene import Camera
+from msdgs_train.datasets.common.readers import DatasetInvalid
 
 FOLD_GRID = 33
 
@@ -19,18 +21,24 @@ class Distortion(NamedTuple):
     p2: float = 0.0
     k3: float = 0.0
 
-    def folds(self, camera: Camera) -> bool:
-        """Whether two points of the pinhole image of `camera` map to the same point of the distorted image.
 
-        No lens does so: the coefficients are wrong, or were fitted to a part of the image.
-        """
-        x = (np.linspace(0, camera.width, FOLD_GRID) - camera.cx) / camera.fx
-        y = (np.linspace(0, camera.height, FOLD_GRID) - camera.cy) / camera.fy
-        with np.errstate(all="ignore"):
-            u, v = distorted(x[None, :], y[:, None], self)
-            u_y, u_x = np.gradient(u, y, x)
-            v_y, v_x = np.gradient(v, y, x)
-            return not bool(np.all(u_x * v_y - u_y * v_x > 0))
+def checked_distortion(distortion: Distortion, camera: Camera, file: Path, field: str) -> Distortion | None:
+    """Return `distortion`, or None if all its coefficients are 0.
+
+    Raises `DatasetInvalid` if two points of the pinhole image of `camera` map to the same point of the distorted image.
+    No lens does so: the coefficients are wrong, or were fitted to a part of the image.
+    """
+    if not any(distortion):
+        return None
+    x = (np.linspace(0, camera.width, FOLD_GRID) - camera.cx) / camera.fx
+    y = (np.linspace(0, camera.height, FOLD_GRID) - camera.cy) / camera.fy
+    with np.errstate(all="ignore"):
+        u, v = distorted(x[None, :], y[:, None], distortion)
+        u_y, u_x = np.gradient(u, y, x)
+        v_y, v_x = np.gradient(v, y, x)
+        if not np.all(u_x * v_y - u_y * v_x > 0):
+            raise DatasetInvalid(file, field, f"{distortion} maps two points to one: undistort the images first")
+    return distortion
 
 
 def undistort(rgba: np.ndarray, camera: Camera, distortion: Distortion) -> np.ndarray:
@@ -45,7 +53,7 @@ def undistort(rgba: np.ndarray, camera: Camera, distortion: Distortion) -> np.nd
 
 
 def distorted(x: Any, y: Any, distortion: Distortion) -> tuple[Any, Any]:
-    """Where the ray to (x, y, 1) meets the plane z = 1 after the lens; scalars or arrays."""
+    """Distort the points (x, y) of the plane z = 1 in camera axes; scalars or arrays."""
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

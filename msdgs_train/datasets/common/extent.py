@@ -10,7 +10,7 @@ PARALLEL = 1e-3
 
 
 def scene_half_size(points: np.ndarray | None, cameras: list[Camera]) -> float:
-    """Half the side of the cube around the origin that holds 99 % of the sparse `points`, [M, 3], in scene units.
+    """Return half the side of the cube around the origin with 99 % of the sparse `points`, [M, 3], in scene units.
 
     Without points, it holds a ball around the point nearest to all optical axes, whose radius is the median distance of
     the cameras; if the axes are parallel, a ball around the mean position that holds all cameras. `cameras` has one or

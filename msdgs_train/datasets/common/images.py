@@ -6,15 +6,13 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 
+from msdgs_train.datasets.common.readers import DatasetInvalid
+
 EXTENSIONS = (".png", ".jpg", ".jpeg")
 
 
-class ImageUnreadable(Exception):
-    """A file can't be used as an image; the message gives the reason."""
-
-
 class ImageSize(NamedTuple):
-    """In pixels."""
+    """Width and height in pixels."""
 
     width: int
     height: int
@@ -29,7 +27,7 @@ class ImageSize(NamedTuple):
 
 
 def read_size(path: Path) -> ImageSize:
-    """The size in an image's header. Raises `ImageUnreadable`."""
+    """Read the size in an image's header. Raises `DatasetInvalid`."""
     reader = _open(path)
     spec = reader.spec()
     reader.close()
@@ -37,13 +35,13 @@ def read_size(path: Path) -> ImageSize:
 
 
 def read_rgba(path: Path) -> np.ndarray:
-    """[H, W, 4] uint8, straight alpha; gray becomes RGB, images without alpha are opaque. Raises `ImageUnreadable`."""
+    """Read [H, W, 4] uint8, straight alpha; gray becomes RGB, without alpha it is opaque. Raises `DatasetInvalid`."""
     reader = _open(path)
     pixels = reader.read_image("uint8")
     problem = reader.geterror()
     reader.close()
     if pixels is None:
-        raise ImageUnreadable(problem.splitlines()[0] if problem else "no pixels")
+        raise _unreadable(path, problem.splitlines()[0] if problem else "no pixels")
     channels = pixels.shape[2]
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     rgba[..., :3] = pixels[..., :3] if channels >= 3 else pixels[..., :1]
@@ -89,7 +87,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
-    """[count, …] means over `count` equal cells of float64 [length, …]; cell borders may split rows.
+    """Average float64 [length, …] over `count` equal cells, [count, …]; cell borders may split rows.
 
     Computed as differences of cumulative sums, at a cost that doesn't depend on the cell size.
     """
@@ -107,9 +105,13 @@ def _open(path: Path) -> oiio.ImageInput:
     straight.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), straight)
     if reader is None:
-        raise ImageUnreadable(oiio.geterror().splitlines()[0])
+        raise _unreadable(path, oiio.geterror().splitlines()[0])
     spec = reader.spec()
     if spec.format.basetype not in (oiio.UINT8, oiio.UINT16) or spec.nchannels > 4:
         reader.close()
-        raise ImageUnreadable(f"{spec.nchannels} channels of {spec.format}; 1 to 4 of 8 or 16 bits are understood")
+        raise _unreadable(path, f"{spec.nchannels} channels of {spec.format}; 1 to 4 of 8 or 16 bits are supported")
     return reader
+
+
+def _unreadable(path: Path, problem: str) -> DatasetInvalid:
+    return DatasetInvalid(path, "image", f"can't be read: {problem}")

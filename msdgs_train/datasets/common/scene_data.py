@@ -1,26 +1,18 @@
 """The common form of all datasets: splits of frames, each with a camera and a time."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from msdgs_serve.scene import Camera, InvalidInput, MsdgsError
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.distortion import Distortion, undistort
-from msdgs_train.datasets.common.images import ImageSize, ImageUnreadable, read_rgba, read_size, resize_area
+from msdgs_train.datasets.common.images import read_rgba, resize_area
 
 SPLITS = ("train", "val", "test")
 HELD_OUT = 8
 """Every 8th frame is a test frame if a dataset names none, as in Mip-NeRF 360 and 3D Gaussian Splatting."""
-
-
-class DatasetInvalid(MsdgsError):
-    """A dataset is incomplete or inconsistent; `file` and `field` name the place."""
-
-    def __init__(self, file: Path | str, field: str, problem: str) -> None:
-        super().__init__(f"{file}: `{field}` {problem}")
-        self.file = str(file)
-        self.field = field
 
 
 @dataclass(frozen=True)
@@ -31,17 +23,14 @@ class Frame:
     camera: Camera  # a pinhole of the size that `load_rgba` returns
     t: float
     image_path: Path
-    distortion: Distortion | None = None  # of the lens, in the file; `load_rgba` removes it
+    distortion: Distortion | None = None  # of the stored image; `load_rgba` removes it
 
     def load_rgba(self) -> np.ndarray:
-        """[height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.
+        """Read [height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.
 
         Raises `DatasetInvalid` if the file can't be read.
         """
-        try:
-            rgba = read_rgba(self.image_path)
-        except ImageUnreadable as error:
-            raise DatasetInvalid(self.image_path, "image", f"can't be read: {error}") from None
+        rgba = read_rgba(self.image_path)
         if self.distortion is not None:
             height, width, _ = rgba.shape
             rgba = undistort(rgba, self.camera.resized(width, height), self.distortion)
@@ -53,36 +42,31 @@ class SceneData:
     """A dataset ready for training. World axes are those of the dataset; cameras are OpenCV."""
 
     splits: dict[str, list[Frame]]  # "train" has one frame or more; "val" and "test" may be empty
-    time_range: tuple[float, float]  # first and last time of any frame of any split; equal in a static scene
     scene_half_size: float  # half the side of the cube around the origin that holds the scene, in scene units
     points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
     point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None if `points` have no colors
 
-
-def image_size(path: Path) -> ImageSize:
-    """The size in an image's header. Raises `DatasetInvalid` if it can't be read."""
-    try:
-        return read_size(path)
-    except ImageUnreadable as error:
-        raise DatasetInvalid(path, "image", f"can't be read: {error}") from None
+    @cached_property
+    def time_range(self) -> tuple[float, float]:
+        """First and last time of the frames of all splits; equal in a static scene."""
+        times = [frame.t for frames in self.splits.values() for frame in frames]
+        return min(times), max(times)
 
 
 def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
-    """`camera` for images `size` pixels wide, height in proportion; unchanged if `size` is None.
+    """Return `camera` for images `size` pixels wide, height in proportion; unchanged if `size` is None.
 
     Raises `InvalidInput` if `size` is not in [1, width of the image].
     """
     if size is None or size == camera.width:
         return camera
-    if size < 1:
-        raise InvalidInput("size", "a width of 1 pixel or more", size)
-    if size > camera.width:
-        raise InvalidInput("size", f"at most {camera.width}, the width of {image_path}", size)
+    if not 1 <= size <= camera.width:
+        raise InvalidInput("size", f"in [1, {camera.width}], up to the width of {image_path}", size)
     return camera.resized(size, max(1, round(camera.height * size / camera.width)))
 
 
 def hold_out(frames: list[Frame]) -> dict[str, list[Frame]]:
-    """Splits with the first and every 8th frame after it as test frames; a single frame is a training frame."""
+    """Split frames: the first and every 8th after it are test frames; a single frame is a training frame."""
     test = frames[::HELD_OUT] if len(frames) > 1 else []
     train = [frame for index, frame in enumerate(frames) if index % HELD_OUT or not test]
     return {"train": train, "val": [], "test": test}

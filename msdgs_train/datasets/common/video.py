@@ -12,6 +12,7 @@ running: 1.2 GB for 300 frames of 1352×1014. Their names depend on the video's 
 import hashlib
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -19,7 +20,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from msdgs_train.datasets.common.files import replacing
-from msdgs_train.datasets.common.scene_data import DatasetInvalid, Frame
+from msdgs_train.datasets.common.readers import DatasetInvalid
+from msdgs_train.datasets.common.scene_data import Frame
 
 
 class VideoInfo(NamedTuple):
@@ -36,10 +38,10 @@ class VideoFrame(Frame):
 
     video: Path
     index: int
-    count: int  # of the whole video
+    count: int  # number of frames in the video
 
     def load_rgba(self) -> np.ndarray:
-        """[height, width, 4] uint8, sRGB, opaque, downscaled to the camera's size. The first call decodes it all."""
+        """Read [height, width, 4] uint8, sRGB, opaque, of the camera's size. The first call decodes the video."""
         width, height = self.camera.width, self.camera.height
         frames = open_frames(self.video, VideoInfo(self.count, width, height))
         rgba = np.full((height, width, 4), 255, np.uint8)
@@ -48,45 +50,33 @@ class VideoFrame(Frame):
 
 
 def read_info(video: Path) -> VideoInfo:
-    """Count and size of the frames, without decoding any. Raises `DatasetInvalid` naming the file."""
-    av = _av(video)
-    try:
-        with av.open(str(video)) as container:
-            if not container.streams.video:
-                raise _invalid(video, "has no video stream")
-            stream = container.streams.video[0]
-            width, height = stream.codec_context.width, stream.codec_context.height
-            count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
-    except av.FFmpegError as error:
-        raise _invalid(video, f"can't be read: {error.strerror}") from None
+    """Read the count and size of the frames, without decoding any. Raises `DatasetInvalid` naming the file."""
+    with _opened(video) as container:
+        if not container.streams.video:
+            raise _invalid(video, "has no video stream")
+        stream = container.streams.video[0]
+        width, height = stream.codec_context.width, stream.codec_context.height
+        count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
     if count < 1:
         raise _invalid(video, "has no frames")
     return VideoInfo(count, width, height)
 
 
 def open_frames(video: Path, wanted: VideoInfo) -> np.ndarray:
-    """[count, height, width, 3] uint8 RGB, read-only and memory-mapped, downscaled to the wanted size.
+    """Return [count, height, width, 3] uint8 RGB, read-only and memory-mapped, downscaled to the wanted size.
 
     Decodes the video unless it is cached. Raises `DatasetInvalid` if it has another number of frames, can't be decoded,
     or its frames can't be stored.
     """
     cached = _cache_file(video, wanted)
-    frames = _mapped(cached, wanted)
-    if frames is None:
-        _decode_to(cached, video, wanted)
-        frames = _mapped(cached, wanted)
-    if frames is None:
-        raise _invalid(video, f"was decoded into {cached}, which can't be read back")
-    return frames
-
-
-def _mapped(file: Path, wanted: VideoInfo) -> np.ndarray | None:
     try:
-        frames = np.load(file, mmap_mode="r", allow_pickle=False)
+        frames = np.load(cached, mmap_mode="r", allow_pickle=False)
+        if frames.shape == (wanted.count, wanted.height, wanted.width, 3) and frames.dtype == np.uint8:
+            return frames
     except (OSError, ValueError, EOFError):  # missing or truncated
-        return None
-    shape = (wanted.count, wanted.height, wanted.width, 3)
-    return frames if frames.shape == shape and frames.dtype == np.uint8 else None
+        pass
+    _decode_to(cached, video, wanted)
+    return np.load(cached, mmap_mode="r", allow_pickle=False)
 
 
 def _cache_file(video: Path, wanted: VideoInfo) -> Path:
@@ -106,15 +96,15 @@ def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
             _write(output, video, wanted)
     except OSError as error:
         gigabytes = 3e-9 * wanted.count * wanted.width * wanted.height
-        raise _invalid(
-            video,
-            f"can't be stored decoded in {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the "
-            f"environment variable XDG_CACHE_HOME to a folder with space, or train at a smaller size",
-        ) from None
+        problem = (
+            f"can't be decoded into {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the environment "
+        )
+        problem += "variable XDG_CACHE_HOME to a folder with space, or train at a smaller size"
+        raise _invalid(video, problem) from None
 
 
 def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
-    """Written, not memory-mapped: a full disk raises an error in a write, and kills a process that writes to a map."""
+    """Write the frames as a stream: on a full disk this raises an error, but a memory map would kill the process."""
     shape = (wanted.count, wanted.height, wanted.width, 3)
     np.lib.format.write_array_header_1_0(output, {"descr": "|u1", "fortran_order": False, "shape": shape})
     count = 0
@@ -127,33 +117,36 @@ def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
 
 
 def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
-    """Contiguous uint8 RGB [height, width, 3], by the color matrix that the video names, or else BT.601 as in FFmpeg.
+    """Yield the frames as contiguous uint8 RGB [height, width, 3].
 
-    Each new pixel is the mean over the area it covers, within 0.5 of 255 of `resize_area` on average. FFmpeg's default
-    at the full size and at half of it skips half of the chroma and differs by 1.4 to 5.
+    Colors are converted with the matrix that the video names, or with BT.601 if it names none, as FFmpeg does. Each new
+    pixel is the mean over the area that it covers, and differs from `resize_area` by less than 0.5 of 255 on average.
+    FFmpeg's default skips half of the chroma at the full size and at half of it, and differs by 1.4 to 5.
     """
-    av = _av(video)
-    kinds = av.video.reformatter.Interpolation
-    area = kinds.AREA | kinds.ACCURATE_RND | kinds.FULL_CHR_H_INT
-    try:
-        with av.open(str(video)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for frame in container.decode(stream):
-                yield np.ascontiguousarray(
-                    frame.to_ndarray(format="rgb24", width=wanted.width, height=wanted.height, interpolation=area)
-                )
-    except av.FFmpegError as error:
-        raise _invalid(video, f"can't be decoded: {error.strerror}") from None
+    with _opened(video) as container:
+        from av.video.reformatter import Interpolation
+
+        area = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        for frame in container.decode(stream):
+            size = {"width": wanted.width, "height": wanted.height}
+            yield np.ascontiguousarray(frame.to_ndarray(format="rgb24", interpolation=area, **size))
 
 
-def _av(video: Path) -> Any:
+@contextmanager
+def _opened(video: Path) -> Iterator[Any]:
+    """The container of the video, in PyAV. Its errors in the block are raised as `DatasetInvalid`."""
     try:
         import av  # an optional dependency
-        import av.video.reformatter
+        from av.error import FFmpegError
     except ModuleNotFoundError as error:
         raise _invalid(video, f"needs {error.name} to be read: pip install 'msdgs[train]'") from None
-    return av
+    try:
+        with av.open(str(video)) as container:
+            yield container
+    except FFmpegError as error:
+        raise _invalid(video, f"can't be read: {error.strerror}") from None
 
 
 def _invalid(video: Path, problem: str) -> DatasetInvalid:

@@ -1,14 +1,13 @@
 """A small synthetic moving scene, ray-marched into D-NeRF layout, with exactly known motion.
 
-A ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly squashes, twists and bends, a
-pendulum on a thin rod swings in a frame of thin bars, all on a static, tiled ground. As in D-NeRF there is one
-image per time, each from another camera. The same arguments give the same bytes.
+On a static, tiled ground a ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly
+squashes, twists and bends, and a pendulum on a thin rod swings in a frame of thin bars. As in D-NeRF there is one image
+per time, each from another camera. The same arguments give the same bytes.
 """
 
 import json
 import math
-import os
-import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +26,7 @@ CAMERA_DISTANCE = 4.0
 LOWEST, HIGHEST = 6.0, 75.0  # elevation of training cameras, degrees
 TEST_ELEVATION = 25.0
 R2_SEQUENCE = (0.7548776662466927, 0.5698402909980532)
-"""Two-dimensional golden ratio (M. Roberts, 2018): steps that cover azimuth and elevation evenly."""
+"""Steps of the R2 sequence (M. Roberts, 2018), which cover azimuth and elevation evenly."""
 
 MAX_SIZE = 4096
 TRAJECTORIES = "trajectories.json"
@@ -59,12 +58,7 @@ def generate(
     The dataset is built beside `out` and moved there when complete; an interrupted call leaves `out` unchanged. An
     earlier dataset of this function is replaced, any other content is refused with `InvalidInput`.
 
-    Args:
-        size: width and height of the images in pixels.
-        train_frames: images at evenly spaced times in [0, 1], cameras spread over the upper hemisphere.
-        test_frames: images at intermediate times, from one smooth turn around the scene.
-        seed: of the camera positions; the motion is always the same.
-        progress: called with (done, total) after every image.
+    The arguments are the options of `msdgs-train synthetic`; `progress` is called with (done, total) after every image.
     """
     for name, value, least in (("train_frames", train_frames, 1), ("test_frames", test_frames, 0)):
         if value < least:
@@ -90,7 +84,7 @@ def generate(
 
 
 def training_views(count: int, size: int, seed: int) -> list[View]:
-    """One camera per time, over the upper hemisphere; successive cameras are far apart, as in D-NeRF."""
+    """Return one camera per time, over the upper hemisphere; successive cameras are far apart, as in D-NeRF."""
     shift = np.random.default_rng(seed).uniform(size=2)
     across, up = ((shift + np.arange(count)[:, None] * R2_SEQUENCE) % 1).T
     low, high = math.sin(math.radians(LOWEST)), math.sin(math.radians(HIGHEST))
@@ -100,7 +94,7 @@ def training_views(count: int, size: int, seed: int) -> list[View]:
 
 
 def held_out_views(count: int, size: int, seed: int) -> list[View]:
-    """One smooth turn around the scene, at the centers of `count` equal intervals of time."""
+    """Return cameras on one smooth turn around the scene, at the centers of `count` equal intervals of time."""
     parts = (np.arange(count) + 0.5) / max(count, 1)
     shift = np.random.default_rng(seed).uniform()
     return _views(size, 360 * (shift + parts), np.full(count, TEST_ELEVATION), parts)
@@ -139,7 +133,7 @@ def _thumbnail(rgba: np.ndarray) -> np.ndarray:
 
 
 def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
-    """Up to 24 evenly spaced images, in rows."""
+    """Arrange up to 24 evenly spaced images in rows."""
     count = min(len(thumbnails), CONTACT_COLUMNS * CONTACT_ROWS)
     chosen = [thumbnails[index * len(thumbnails) // count] for index in range(count)]
     columns = min(count, CONTACT_COLUMNS)
@@ -149,19 +143,15 @@ def _contact_sheet(thumbnails: list[np.ndarray]) -> np.ndarray:
 
 @contextmanager
 def _replaced_when_complete(out: Path) -> Iterator[Path]:
-    """A folder beside `out`, which it replaces on leaving without an exception."""
+    """A folder beside `out`, which it replaces at the end of the block, unless an exception is raised."""
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / TRAJECTORIES).exists())):
         raise InvalidInput("out", "a new or empty folder, or a dataset made by this command", out)
     out = out.absolute()
-    partial, old = (out.with_name(f".{out.name}.{os.getpid()}.{word}") for word in ("partial", "old"))
-    for leftover in (partial, old):
-        shutil.rmtree(leftover, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as temporary:
+        new, old = Path(temporary, "new"), Path(temporary, "old")
+        new.mkdir()
+        yield new
         if out.exists():
             out.rename(old)
-        partial.rename(out)
-    finally:
-        for leftover in (partial, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        new.rename(out)

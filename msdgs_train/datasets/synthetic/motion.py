@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 OBJECTS = ("ground", "frame", "ball", "ring", "jelly", "pendulum")
-"""In the order of the rows of `Motion`. The ground and the frame are static."""
+"""All objects, in the order of the rows of `Motion`. The ground and the frame are static."""
 
 GROUND_Z = -0.5
 GROUND_RADIUS, GROUND_THICKNESS = 1.1, 0.09
@@ -27,23 +27,22 @@ CONTACT = 0.1
 SQUASH = 4 * BOUNCE_HEIGHT * CONTACT / ((1 - CONTACT) * math.pi * BALL_RADIUS)
 """Depth of the squash as a fraction of the radius, so that the velocity is continuous at contact."""
 
+
+def _box(half_x: float, half_y: float, bottom: float, top: float) -> list[list[float]]:
+    return [[-half_x, -half_y, bottom], [half_x, half_y, top]]
+
+
 REST_BOXES = np.array(
     [
-        [[-GROUND_RADIUS, -GROUND_RADIUS, -GROUND_THICKNESS], [GROUND_RADIUS, GROUND_RADIUS, 0]],
-        [
-            [-FRAME_HALF_WIDTH - BAR_RADIUS, -BAR_RADIUS, -BAR_RADIUS],
-            [FRAME_HALF_WIDTH + BAR_RADIUS, BAR_RADIUS, PIVOT_Z - GROUND_Z + BAR_RADIUS],
-        ],
-        [[-BALL_RADIUS] * 3, [BALL_RADIUS] * 3],
-        [
-            [-RING_RADIUS - RING_TUBE, -RING_RADIUS - RING_TUBE, -RING_TUBE],
-            [RING_RADIUS + RING_TUBE, RING_RADIUS + RING_TUBE, RING_TUBE],
-        ],
-        [[-JELLY_HALF_WIDTH, -JELLY_HALF_WIDTH, 0], [JELLY_HALF_WIDTH, JELLY_HALF_WIDTH, JELLY_HEIGHT]],
-        [[-BOB_RADIUS, -BOB_RADIUS, -ROD_LENGTH - BOB_RADIUS], [BOB_RADIUS, BOB_RADIUS, 2 * ROD_RADIUS]],
+        _box(GROUND_RADIUS, GROUND_RADIUS, -GROUND_THICKNESS, 0),
+        _box(FRAME_HALF_WIDTH + BAR_RADIUS, BAR_RADIUS, -BAR_RADIUS, PIVOT_Z - GROUND_Z + BAR_RADIUS),
+        _box(BALL_RADIUS, BALL_RADIUS, -BALL_RADIUS, BALL_RADIUS),
+        _box(RING_RADIUS + RING_TUBE, RING_RADIUS + RING_TUBE, -RING_TUBE, RING_TUBE),
+        _box(JELLY_HALF_WIDTH, JELLY_HALF_WIDTH, 0, JELLY_HEIGHT),
+        _box(BOB_RADIUS, BOB_RADIUS, -ROD_LENGTH - BOB_RADIUS, 2 * ROD_RADIUS),
     ]
 )
-"""[objects, 2, 3] the corners that hold each object at rest."""
+"""[objects, 2, 3] opposite corners of a box around each object at rest."""
 
 _UNIT_GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, 5)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _BOUND_MARGIN = 1.03  # the grid does not hit the farthest point of a bent box exactly
@@ -54,15 +53,15 @@ class Motion(NamedTuple):
 
     offsets: np.ndarray  # [objects, 3]
     matrices: np.ndarray  # [objects, 3, 3]
-    inverses: np.ndarray  # [objects, 3, 3] of `matrices`
+    inverses: np.ndarray  # [objects, 3, 3] inverses of `matrices`
     warps: np.ndarray  # [objects, 3]: twist in radians per unit of z, bend along x and along y in 1 / unit
     shrinks: np.ndarray  # [objects] lower bound of the ratio of world distances to distances at rest
-    centers: np.ndarray  # [objects, 3] of a sphere in the world that holds the object
-    radii: np.ndarray  # [objects] of that sphere
+    centers: np.ndarray  # [objects, 3] center of a sphere in the world around the object
+    radii: np.ndarray  # [objects] radius of that sphere
 
 
 def motion_at(t: float) -> Motion:
-    """The whole scene at time t; the scene spans [0, 1]."""
+    """Return the state of the whole scene at time t in [0, 1]."""
     placements = _placements(t)
     boxes = REST_BOXES[:, :1] + _UNIT_GRID * (REST_BOXES[:, 1:] - REST_BOXES[:, :1])
     outlines = np.stack([_place(placement, box) for placement, box in zip(placements, boxes, strict=True)])
@@ -73,7 +72,7 @@ def motion_at(t: float) -> Motion:
 
 
 def world_positions(name: str, local: np.ndarray, t: float) -> np.ndarray:
-    """World positions at time t of points of object `name`, [..., 3] at rest. The ground truth of the motion."""
+    """Return the true world positions at time t of points of object `name`, which are given at rest, [..., 3]."""
     return _place(_placements(t)[OBJECTS.index(name)], np.asarray(local, float))
 
 
@@ -84,7 +83,7 @@ class _Placement(NamedTuple):
 
 
 def _placements(t: float) -> tuple[_Placement, ...]:
-    """One for each of `OBJECTS`."""
+    """Return the placement of each of `OBJECTS` at time t."""
     no_warp = np.zeros(3)
     ground = _Placement(np.array([0.0, 0.0, GROUND_Z]), np.eye(3), no_warp)
     jelly = _Placement(np.array([0.6, 0.34, GROUND_Z]), *_jelly(t))
@@ -102,7 +101,7 @@ def _place(placement: _Placement, local: np.ndarray) -> np.ndarray:
 
 
 def _ball(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounces along an arc, spinning; squashed, at constant volume, while it touches the ground."""
+    """Return offset and matrix: it bounces along an arc and spins; on the ground it is squashed at constant volume."""
     phase = (t * BOUNCES + 0.5) % 1.0
     height, flat = BALL_RADIUS, 1.0
     if phase < CONTACT:
@@ -118,13 +117,13 @@ def _ball(t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ring(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Floats, and rotates around the vertical and around its own axis: rigid."""
+    """Return offset and matrix: it floats, and rotates around the vertical and around its own axis."""
     offset = np.array([-0.6, 0.34, 0.06 + 0.06 * math.sin(2 * math.pi * t)])
     return offset, _rotation(2, 2 * math.pi * t) @ _rotation(0, 1.15) @ _rotation(2, -2 * math.pi * t)
 
 
 def _jelly(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Stretches and squashes at constant volume, twists and bends; its base stays on the ground."""
+    """Return matrix and warp: it stretches at constant volume, twists and bends; its base stays on the ground."""
     stretch = 1 + 0.32 * math.sin(4 * math.pi * t)
     warp = np.array([2.4 * math.sin(3 * math.pi * t), 0.7 * math.sin(2 * math.pi * t + 1), 0.5 * math.cos(4 * t)])
     return np.diag([stretch**-0.5, stretch**-0.5, stretch]), warp
@@ -138,7 +137,7 @@ def _shrinks(matrices: np.ndarray, warps: np.ndarray) -> np.ndarray:
 
 
 def _rotation(axis: int, angle: float) -> np.ndarray:
-    """Right-handed, around a coordinate axis."""
+    """Return the right-handed rotation around a coordinate axis, [3, 3]."""
     rotation = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     rotation[i, i] = rotation[j, j] = math.cos(angle)

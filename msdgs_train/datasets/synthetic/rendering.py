@@ -39,7 +39,7 @@ _MISS = 1e9
 
 
 def render(camera: Camera, t: float) -> np.ndarray:
-    """The scene at time t: [H, W, 4] uint8, sRGB, straight alpha, color 0 for rays that hit nothing."""
+    """Render the scene at time t: [H, W, 4] uint8, sRGB, straight alpha, color 0 for rays that hit nothing."""
     motion = motion_at(t)
     linear = np.zeros((camera.height, camera.width, 4))
     view = np.ascontiguousarray(camera.camera_to_world)
@@ -51,17 +51,6 @@ def render(camera: Camera, t: float) -> np.ndarray:
     rgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 0.0031308) ** (1 / 2.4) - 0.055)
     rgba = np.concatenate([np.clip(rgb, 0, 1), coverage / SAMPLES**2], axis=-1)
     return np.floor(255 * rgba + 0.5).astype(np.uint8)
-
-
-def first_hits(origins: np.ndarray, directions: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rays [N, 3] + s · [N, 3] (unit): distance s to the first surface, inf without one, and its row in `OBJECTS`."""
-    motion = motion_at(t)
-    hits = [
-        _first_hit(motion, *map(float, (*origin, *direction)))
-        for origin, direction in zip(origins, directions, strict=True)
-    ]
-    distances = np.array([distance if shape != NO_OBJECT else np.inf for distance, shape in hits])
-    return distances, np.array([shape for _, shape in hits])
 
 
 @kernel
@@ -76,7 +65,7 @@ def _render_rows(motion: Motion, view: np.ndarray, intrinsics: tuple, out: np.nd
                 dx = (view[0, 0] * x + view[0, 1] * y + view[0, 2]) / length
                 dy = (view[1, 0] * x + view[1, 1] * y + view[1, 2]) / length
                 dz = (view[2, 0] * x + view[2, 1] * y + view[2, 2]) / length
-                distance, shape = _first_hit(motion, view[0, 3], view[1, 3], view[2, 3], dx, dy, dz)
+                distance, shape = first_hit(motion, view[0, 3], view[1, 3], view[2, 3], dx, dy, dz)
                 if shape != NO_OBJECT:
                     px, py, pz = view[0, 3] + distance * dx, view[1, 3] + distance * dy, view[2, 3] + distance * dz
                     red, green, blue = _shade(motion, shape, px, py, pz, dx, dy, dz)
@@ -87,7 +76,8 @@ def _render_rows(motion: Motion, view: np.ndarray, intrinsics: tuple, out: np.nd
 
 
 @kernel
-def _first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, int]:
+def first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, int]:
+    """Return the distance along a unit ray to the first surface and its row in `OBJECTS`, or `NO_OBJECT`."""
     nearest, shape = _MISS, NO_OBJECT
     top = (GROUND_Z - oz) / dz if dz < 0 else -1.0
     on_top = top > 0 and math.hypot(ox + top * dx, oy + top * dy) < GROUND_RADIUS - GROUND_ROUNDING
@@ -113,7 +103,7 @@ def _first_hit(motion: Motion, ox: float, oy: float, oz: float, dx: float, dy: f
 def _through_sphere(
     motion: Motion, index: int, margin: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float]:
-    """Entry and exit distance of a ray in the bounding sphere of an object plus a margin; start > end if it misses."""
+    """Return the distances at which a ray enters and leaves an object's bounding sphere plus a margin, or 1, 0."""
     x = ox - motion.centers[index, 0]
     y = oy - motion.centers[index, 1]
     z = oz - motion.centers[index, 2]
@@ -128,7 +118,7 @@ def _through_sphere(
 
 @kernel
 def _to_rest(motion: Motion, index: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The inverse of `motion.world_positions`."""
+    """Map a world position to the object at rest, the inverse of `motion.world_positions`."""
     x, y, z = x - motion.offsets[index, 0], y - motion.offsets[index, 1], z - motion.offsets[index, 2]
     m = motion.inverses[index]
     u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
@@ -162,7 +152,7 @@ def _normal(motion: Motion, index: int, x: float, y: float, z: float) -> tuple[f
 def _shade(
     motion: Motion, index: int, x: float, y: float, z: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float, float]:
-    """Linear RGB that a surface point sends back along the ray."""
+    """Return the linear RGB that a surface point sends back along the ray."""
     u, v, w = _to_rest(motion, index, x, y, z)
     albedo = _PALETTE_LINEAR[color_at_rest(index, u, v, w)]
     nx, ny, nz = _normal(motion, index, x, y, z)
@@ -185,7 +175,7 @@ def _shade(
 
 @kernel
 def _light_arriving(motion: Motion, x: float, y: float, z: float) -> float:
-    """1 in full light, 0 in full shadow: from the narrowest gap along the shadow ray relative to its distance."""
+    """Return 1 in light to 0 in shadow, from the narrowest gap along the shadow ray relative to its distance."""
     arriving = 1.0
     for index in range(len(OBJECTS)):
         if index == GROUND:  # it is below the light and all other objects
@@ -203,7 +193,7 @@ def _light_arriving(motion: Motion, x: float, y: float, z: float) -> float:
 
 @kernel
 def _openness(motion: Motion, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> float:
-    """Ambient occlusion: 1 under the open sky, less in corners, from distances to surfaces along the normal."""
+    """Return ambient occlusion: 1 under the open sky, less in corners, from distances to surfaces along the normal."""
     closed, weight = 0.0, 1.0
     for step in OCCLUSION_STEPS:
         px, py, pz = x + step * nx, y + step * ny, z + step * nz

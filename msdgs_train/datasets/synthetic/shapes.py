@@ -5,29 +5,13 @@ import math
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_train.datasets.synthetic.motion import (
-    BALL_RADIUS,
-    BAR_RADIUS,
-    BOB_RADIUS,
-    FRAME_HALF_WIDTH,
-    GROUND_RADIUS,
-    GROUND_THICKNESS,
-    GROUND_Z,
-    JELLY_HALF_WIDTH,
-    JELLY_HEIGHT,
-    OBJECTS,
-    PIVOT_Z,
-    RING_RADIUS,
-    RING_TUBE,
-    ROD_LENGTH,
-    ROD_RADIUS,
-)
+from msdgs_train.datasets.synthetic import motion
 
-GROUND, FRAME, BALL, RING, JELLY, PENDULUM = range(len(OBJECTS))
+GROUND, FRAME, BALL, RING, JELLY, PENDULUM = range(len(motion.OBJECTS))
 GROUND_ROUNDING = 0.02
 JELLY_ROUNDING = 0.07
-DOTS, DOTS_UP = JELLY_HALF_WIDTH / 1.5, JELLY_HEIGHT / 3.5  # spacing that puts dots on the faces
-POST_HEIGHT = PIVOT_Z - GROUND_Z
+DOTS, DOTS_UP = motion.JELLY_HALF_WIDTH / 1.5, motion.JELLY_HEIGHT / 3.5  # spacing that puts dots on the faces
+POST_HEIGHT = motion.PIVOT_Z - motion.GROUND_Z
 
 PALETTE = np.array(
     [
@@ -45,56 +29,56 @@ PALETTE = np.array(
         [0.25, 0.26, 0.28],  # 11 steel
     ]
 )
-"""[colors, 3] sRGB in [0, 1]; surfaces are evenly colored inside each field of their pattern."""
+"""[colors, 3] sRGB in [0, 1]; each field of a surface's pattern has one color."""
 
 
 @kernel
 def distance_at_rest(shape: int, x: float, y: float, z: float) -> float:
-    """Signed distance from a point to object `shape` at rest, in scene units; negative inside."""
+    """Return the signed distance from a point to object `shape` at rest, in scene units; negative inside."""
     if shape == GROUND:
         return _rounded_disc(x, y, z)
     if shape == FRAME:
-        posts = _bar(abs(x) - FRAME_HALF_WIDTH, y, z, POST_HEIGHT, BAR_RADIUS)
-        return min(posts, _bar(y, z - POST_HEIGHT, abs(x), FRAME_HALF_WIDTH, BAR_RADIUS))
+        posts = _bar(abs(x) - motion.FRAME_HALF_WIDTH, y, z, POST_HEIGHT, motion.BAR_RADIUS)
+        return min(posts, _bar(y, z - POST_HEIGHT, abs(x), motion.FRAME_HALF_WIDTH, motion.BAR_RADIUS))
     if shape == BALL:
-        return math.sqrt(x * x + y * y + z * z) - BALL_RADIUS
+        return math.sqrt(x * x + y * y + z * z) - motion.BALL_RADIUS
     if shape == RING:
-        return math.hypot(math.hypot(x, y) - RING_RADIUS, z) - RING_TUBE
+        return math.hypot(math.hypot(x, y) - motion.RING_RADIUS, z) - motion.RING_TUBE
     if shape == JELLY:
         return _rounded_box(x, y, z)
-    bob = math.sqrt(x * x + y * y + (z + ROD_LENGTH) ** 2) - BOB_RADIUS
-    return min(bob, _bar(x, y, -z, ROD_LENGTH, ROD_RADIUS))
+    bob = math.sqrt(x * x + y * y + (z + motion.ROD_LENGTH) ** 2) - motion.BOB_RADIUS
+    return min(bob, _bar(x, y, -z, motion.ROD_LENGTH, motion.ROD_RADIUS))
 
 
 @kernel
 def color_at_rest(shape: int, x: float, y: float, z: float) -> int:
-    """The row of `PALETTE` on the surface of object `shape`: patterns that move, twist and stretch with it."""
+    """Return the row of `PALETTE` at a point on the surface of object `shape`, given at rest."""
     if shape == GROUND:
         return _tile(x, y)
     if shape == FRAME:
         return 11
     if shape == BALL:
-        if abs(z) > 0.93 * BALL_RADIUS:
+        if abs(z) > 0.93 * motion.BALL_RADIUS:
             return 2
         field = int((math.atan2(y, x) / math.pi + 1) * 3)
         return 3 if field == 0 else 4 if field == 2 else 5 if field == 4 else 0
     if shape == RING:
         around = math.atan2(y, x) / math.pi
-        tube = math.atan2(z, math.hypot(x, y) - RING_RADIUS) / math.pi
+        tube = math.atan2(z, math.hypot(x, y) - motion.RING_RADIUS) / math.pi
         if math.floor(4 * around + tube) % 2 == 0:
             return 0
         return 7 if around > 0 else 6
     if shape == JELLY:
         dot = math.sqrt(_to_lattice(x, DOTS) ** 2 + _to_lattice(y, DOTS) ** 2 + _to_lattice(z, DOTS_UP) ** 2)
         return 9 if dot < 0.05 else 8
-    if z > BOB_RADIUS - ROD_LENGTH:
+    if z > motion.BOB_RADIUS - motion.ROD_LENGTH:
         return 11
-    return 3 if abs(z + ROD_LENGTH) < 0.25 * BOB_RADIUS else 10
+    return 3 if abs(z + motion.ROD_LENGTH) < 0.25 * motion.BOB_RADIUS else 10
 
 
 @kernel
 def _tile(x: float, y: float) -> int:
-    """Square tiles with a few colored ones between them, inside a ring."""
+    """Return the color of the ground: square tiles, a few of them colored, inside a ring."""
     radius = math.hypot(x, y)
     if radius > 0.97:
         return 2
@@ -111,28 +95,28 @@ def _tile(x: float, y: float) -> int:
 
 @kernel
 def _rounded_disc(x: float, y: float, z: float) -> float:
-    across = math.hypot(x, y) - (GROUND_RADIUS - GROUND_ROUNDING)
-    along = abs(z + 0.5 * GROUND_THICKNESS) - (0.5 * GROUND_THICKNESS - GROUND_ROUNDING)
+    across = math.hypot(x, y) - (motion.GROUND_RADIUS - GROUND_ROUNDING)
+    along = abs(z + 0.5 * motion.GROUND_THICKNESS) - (0.5 * motion.GROUND_THICKNESS - GROUND_ROUNDING)
     return math.hypot(max(across, 0.0), max(along, 0.0)) + min(max(across, along), 0.0) - GROUND_ROUNDING
 
 
 @kernel
 def _rounded_box(x: float, y: float, z: float) -> float:
-    a = abs(x) - (JELLY_HALF_WIDTH - JELLY_ROUNDING)
-    b = abs(y) - (JELLY_HALF_WIDTH - JELLY_ROUNDING)
-    c = abs(z - 0.5 * JELLY_HEIGHT) - (0.5 * JELLY_HEIGHT - JELLY_ROUNDING)
+    a = abs(x) - (motion.JELLY_HALF_WIDTH - JELLY_ROUNDING)
+    b = abs(y) - (motion.JELLY_HALF_WIDTH - JELLY_ROUNDING)
+    c = abs(z - 0.5 * motion.JELLY_HEIGHT) - (0.5 * motion.JELLY_HEIGHT - JELLY_ROUNDING)
     outside = math.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2 + max(c, 0.0) ** 2)
     return outside + min(max(a, b, c), 0.0) - JELLY_ROUNDING
 
 
 @kernel
 def _bar(x: float, y: float, along: float, length: float, radius: float) -> float:
-    """A round bar with round ends, from 0 to `length`."""
+    """Return the signed distance to a round bar with round ends, from 0 to `length`."""
     beyond = along - min(max(along, 0.0), length)
     return math.sqrt(x * x + y * y + beyond * beyond) - radius
 
 
 @kernel
 def _to_lattice(value: float, spacing: float) -> float:
-    """Distance to the nearest of the points spacing · (k + 1/2)."""
+    """Return the distance to the nearest of the points spacing · (k + 1/2)."""
     return abs(value - spacing * (math.floor(value / spacing) + 0.5))

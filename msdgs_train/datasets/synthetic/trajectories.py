@@ -9,12 +9,12 @@ from msdgs_train.datasets.synthetic.motion import OBJECTS, REST_BOXES, world_pos
 from msdgs_train.datasets.synthetic.shapes import PALETTE, color_at_rest, distance_at_rest
 
 ROUNDS = 30
-STEP = 1e-5  # of the gradient's differences, scene units
+STEP = 1e-5  # step of the finite differences, scene units
 DIGITS = 7
 
 
 def surface_points(name: str, count: int, seed: int = 0) -> np.ndarray:
-    """[count, 3] points on the surface of object `name` at rest, scattered; for `world_positions`."""
+    """Return [count, 3] points scattered over the surface of object `name` at rest."""
     shape = OBJECTS.index(name)
     low, high = REST_BOXES[shape]
     points = np.random.default_rng(seed).uniform(low, high, size=(count, 3))
@@ -23,12 +23,12 @@ def surface_points(name: str, count: int, seed: int = 0) -> np.ndarray:
 
 
 def surface_colors(name: str, local: np.ndarray) -> np.ndarray:
-    """[N, 3] sRGB albedo in [0, 1] at points of object `name` at rest."""
+    """Return [N, 3] sRGB albedo in [0, 1] at points of object `name` at rest."""
     return PALETTE[[color_at_rest(OBJECTS.index(name), *point) for point in local]]
 
 
 def trajectories(points_per_object: int, times: np.ndarray, seed: int = 0) -> dict[str, Any]:
-    """Plain values for JSON: `times` and `points`, each with object, local [3], color [3] and positions [times][3]."""
+    """Return plain values for JSON: `times`, and `points` with object, local [3], color [3], positions [times][3]."""
     points = []
     for name in OBJECTS:
         local = surface_points(name, points_per_object, seed)

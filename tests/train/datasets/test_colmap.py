@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from tests.support.tolerances import assert_close
 from tests.train.datasets.layouts import COLMAP_POINTS, write_colmap
@@ -44,34 +43,16 @@ def test_times_are_linear_in_the_numbers_found(tmp_path: Path):
     }
 
 
-@both
-def test_a_pattern_may_find_the_time_elsewhere(tmp_path: Path, ending: str):
-    folder = write_colmap(tmp_path, names=("t1.5/a_7.png", "t2.5/a_7.png", "t5.5/a_7.png"), ending=ending)
-    times = [frame.t for frames in load_scene(folder, None, r"t([\d.]+)/").splits.values() for frame in frames]
-    assert times == [0.25, 1.0, 0.0]
-
-
-def test_static_scenes(tmp_path: Path):
-    """By choice, or because there is but one number."""
-    for scene in (
-        load_scene(write_colmap(tmp_path / "a", names=("x.png", "y.png")), time_pattern=None),
-        load_scene(write_colmap(tmp_path / "b", names=("c1/0005.png", "c2/0005.png"))),
-    ):
-        assert scene.time_range == (0.0, 0.0)
-        assert len(scene.splits["train"]) == 1
+def test_equal_numbers_make_a_static_scene(tmp_path: Path):
+    scene = load_scene(write_colmap(tmp_path, names=("c1/0005.png", "c2/0005.png")))
+    assert scene.time_range == (0.0, 0.0)
+    assert len(scene.splits["train"]) == 1
 
 
 def test_names_without_a_time_are_named(tmp_path: Path):
     folder = write_colmap(tmp_path, names=("a_1.png", "cam07/front.png"), ending="txt")
-    with pytest.raises(
-        DatasetInvalid, match=r"images\[cam07/front\.png\]\.name` has no time: .* finds no number in it; set another"
-    ):
+    with pytest.raises(DatasetInvalid, match=r"images\[cam07/front\.png\]\.name` has no number"):
         load_scene(folder)
-    with pytest.raises(DatasetInvalid, match=r"images\[a_1\.png\]\.name` has no time"):
-        load_scene(folder, time_pattern="(a)")
-    for pattern in ("(", "a", "(a)(b)"):
-        with pytest.raises(InvalidInput, match="`time_pattern` must be a regular expression"):
-            load_scene(folder, time_pattern=pattern)
 
 
 def test_without_points_the_cameras_say_how_large_the_scene_is(tmp_path: Path):

@@ -110,7 +110,8 @@ def without_color(content: bytes) -> bytes:
 
 
 def without_points(content: bytes) -> bytes:
-    return content.replace(b"element vertex 2", b"element vertex 0")
+    header = content.partition(b"end_header\n")[0].replace(b"vertex 2", b"vertex 0").replace(b"face 1", b"face 0")
+    return header + b"end_header\n"
 
 
 def test_points_may_lack_colors_and_files_points(tmp_path: Path):
@@ -125,18 +126,21 @@ def test_points_may_lack_colors_and_files_points(tmp_path: Path):
 
 
 BAD_PLY = [
-    (lambda content: content[:40], "`file` is not a PLY"),
-    (lambda content: b"", "`file` is not a PLY"),
-    (lambda content: content[:-24], "`vertex` is cut off: the header says 2, the file holds 1"),
-    (lambda content: content.replace(b"ascii", b"latin"), "`format` must be one of ascii, .* got 'latin'"),
-    (lambda content: content.replace(b"vertex 2", b"vertex -2"), "`element` must be vertex and a number"),
-    (lambda content: content.replace(b"element vertex", b"element edge"), "`element` must be vertex"),
-    (lambda content: content.replace(b"float y", b"float x"), "`property` names must differ"),
-    (lambda content: content.replace(b"float y", b"float v"), "`property y` is missing"),
-    (lambda content: content.replace(b"float y", b"list uchar int y"), "`property` of a vertex must be a number"),
+    (lambda content: content[:40], "`file` is not a complete PLY"),
+    (lambda content: b"", "`file` is not a complete PLY"),
+    (lambda content: content[:-24], "`file` is not a complete PLY file: element 'vertex': "),
+    (lambda content: content.replace(b"ascii", b"latin"), "`file` is not a complete PLY file: line 2: "),
+    (lambda content: content.replace(b"vertex 2", b"vertex -2"), "`file` is not a complete PLY file: negative"),
+    (lambda content: content.replace(b"element vertex", b"element edge"), "`element` vertex is missing"),
+    (
+        lambda content: content.replace(b"float y", b"float x"),
+        "`file` is not .* two properties with same name",
+    ),
+    (lambda content: content.replace(b"float y", b"float v"), "`property y` is missing or not a number"),
+    (lambda content: content.replace(b"float y", b"list uchar int y"), "`file` is not a complete PLY file: "),
     (lambda content: content.replace(b"0.25", b"nan"), r"`vertex\[1\]` must be finite"),
-    (lambda content: content.replace(b"0.25", b"0,25"), "`vertex` must be 6 numbers"),
-    (lambda content: content.replace(b" 51", b" -51"), "`property red` green and blue must be"),
+    (lambda content: content.replace(b"0.25", b"0,25"), "`file` is not a complete PLY file: element 'vertex': "),
+    (lambda content: content.replace(b" 51", b" -51"), "`file` is not a complete PLY file: "),
 ]
 
 
@@ -149,5 +153,5 @@ def test_bad_point_files_are_refused(tmp_path: Path, change: Callable[[bytes], b
 
 def test_a_binary_point_file_that_is_cut_off_is_refused(tmp_path: Path):
     (tmp_path / "points.ply").write_bytes(ply("binary_little_endian")[:-80])
-    with pytest.raises(DatasetInvalid, match="`vertex` is cut off"):
+    with pytest.raises(DatasetInvalid, match=r"`file` is not .*element 'vertex'.*early end-of-file"):
         load_scene(write_nerfstudio(tmp_path, content=nerfstudio_json(ply_file_path="points.ply")))

@@ -119,7 +119,7 @@ def test_a_cache_that_cant_be_written_is_named(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "occupied").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "occupied"))
     frame = load_scene(write_neu3d_videos(tmp_path)).splits["test"][0]
-    with pytest.raises(DatasetInvalid, match=r"cam00\.mp4: `video` can't be stored decoded in .*XDG_CACHE_HOME"):
+    with pytest.raises(DatasetInvalid, match=r"cam00\.mp4: `video` can't be decoded into .*XDG_CACHE_HOME"):
         frame.load_rgba()
 
 
@@ -132,7 +132,7 @@ def test_a_video_that_is_cut_off_is_refused_and_leaves_nothing(tmp_path: Path, c
     path = tmp_path / "cam01.mp4"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frame = load_scene(tmp_path).splits["train"][0]
-    with pytest.raises(DatasetInvalid, match=r"cam01\.mp4: `video` (has 7 frames by its header, but|can't be decoded)"):
+    with pytest.raises(DatasetInvalid, match=r"cam01\.mp4: `video` (has 7 frames by its header, but|can't be read)"):
         frame.load_rgba()
     assert not list(cache.iterdir())
 

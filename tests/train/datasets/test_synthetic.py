@@ -14,7 +14,7 @@ from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, load_scene
 from msdgs_train.datasets.synthetic.generate import generate
 from msdgs_train.datasets.synthetic.motion import GROUND_Z, OBJECTS, motion_at, world_positions
-from msdgs_train.datasets.synthetic.rendering import first_hits
+from msdgs_train.datasets.synthetic.rendering import NO_OBJECT, first_hit
 from msdgs_train.datasets.synthetic.shapes import distance_at_rest
 from msdgs_train.datasets.synthetic.trajectories import surface_colors, surface_points
 from tests.support.tolerances import assert_close, tolerance
@@ -52,8 +52,9 @@ def distances_along_rays(frame: Frame, points: np.ndarray) -> tuple[np.ndarray, 
     """From the camera: to each point, and to the first surface on the way there."""
     rays = points - frame.camera.position
     lengths = np.linalg.norm(rays, axis=1)
-    origins = np.broadcast_to(frame.camera.position, points.shape)
-    return lengths, first_hits(origins, rays / lengths[:, None], frame.t)[0]
+    motion, origin = motion_at(frame.t), tuple(map(float, frame.camera.position))
+    hits = [first_hit(motion, *origin, *map(float, ray)) for ray in rays / lengths[:, None]]
+    return lengths, np.array([distance if shape != NO_OBJECT else np.inf for distance, shape in hits])
 
 
 def visible_points(frame: Frame, count: int = 200) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ CONFIG = small_config(
     model=MOTION_BASES,
     window_full_fraction=0.5,
     refine_stop_fraction=BEGINS / STEPS,
-    ema_steps=KEPT,
+    ema_fraction=KEPT / STEPS,
     eval_every=0,
 )
 AS_THE_PRESET = CONFIG.updated(
@@ -43,7 +43,7 @@ def _parameters(model: torch.nn.Module) -> list[np.ndarray]:
 
 
 def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
-    """All of them weigh the same until there are `ema_steps`, then older ones ever less."""
+    """All of them weigh the same until there are that many, then older ones ever less."""
     trainer, seen = Trainer(CONFIG, load_scene(data)), []
     for step in range(1, STEPS + 1):
         trainer.step()
@@ -133,5 +133,5 @@ def test_it_begins_when_gaussians_and_motions_stay_what_they_are(last: str) -> N
     assert [step for step in range(1, STEPS + 1) if Schedule.from_config(config).averages_at(step)] == list(
         range(13, STEPS + 1)
     )
-    off = Schedule.from_config(config.updated(ema_steps=0))
+    off = Schedule.from_config(config.updated(ema_fraction=0.0))
     assert not any(off.averages_at(step) for step in range(1, STEPS + 1))

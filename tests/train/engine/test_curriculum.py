@@ -151,7 +151,7 @@ def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, model: 
         model=model,
         static_fraction=0.1,
         static_window_fraction=0.1,
-        refine_every=0,
+        refine_every_fraction=0.0,
         steps=100,
         window_full_fraction=0.6,
     )
@@ -181,7 +181,7 @@ def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, model: 
 
 def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: SceneData) -> None:
     config = small_config(
-        model=MOTION_BASES, static_fraction=0.1, static_window_fraction=0.1, steps=100, refine_every=0
+        model=MOTION_BASES, static_fraction=0.1, static_window_fraction=0.1, steps=100, refine_every_fraction=0.0
     )
     trainer = Trainer(config, scene)
     while trainer.step_count < 25:

@@ -23,7 +23,7 @@ from msdgs_train.gaussians.model_file import LoadedModel, SceneInfo, save_model
 from msdgs_train.viewer.scene_view import view_of_data, view_of_file
 from msdgs_train.viewer.snapshot import Snapshot, snapshot_of_training
 from msdgs_train.viewer.training_view import TrainingView
-from msdgs_train.viewer.viewer import MOVING_PART, Viewer, camera_of_browser, show_model
+from msdgs_train.viewer.viewer import MOVING_PART, Viewer, Wanted, show_model
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import FOV, small_config
@@ -59,7 +59,8 @@ def test_a_browsers_camera_is_ours() -> None:
     """Axes are OpenCV's in both, viser's field of view is vertical and in radians."""
     pose = look_at(np.array([1.0, 2.0, 0.5]), np.array([-0.3, 0.1, 0.2]), np.array([0.0, 0.0, 1.0]))
     wxyz = quaternion.from_matrix(pose[:3, :3])
-    camera = camera_of_browser(2 * wxyz, pose[:3, 3], np.radians(50.0), 300, 200)
+    wanted = Wanted(tuple(2 * wxyz), tuple(pose[:3, 3]), np.radians(50.0), (300, 200), 300, 0.0, 0, "rgb")
+    camera = wanted.camera(1.0)
     assert_close(camera.camera_to_world, pose, "rotation")
     top = pose[:3, 3] + pose[:3, :3] @ [0.0, -np.tan(np.radians(25.0)), 1.0]
     right = pose[:3, 3] + pose[:3, :3] @ [1.5 * np.tan(np.radians(25.0)), 0.0, 1.0]

@@ -101,7 +101,7 @@ def test_resuming_changes_no_bit(data: Path, tmp_path: Path, case: str, stop: in
 
 def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    outcome = fit(small_config(steps=150, eval_every=50, checkpoint_every=50, reset_every=0), data, run)
+    outcome = fit(small_config(steps=150, eval_every=50, checkpoint_every=50, reset_every_fraction=0.0), data, run)
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
     assert names == {
         "config.json", "run.json", "metrics.jsonl", "metrics.json", "curve.png", "checkpoint.pt", "model.pt", "best.pt",
@@ -163,7 +163,7 @@ def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: P
 
 
 def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = Trainer(small_config(steps=100, refine_every=0), load_scene(data))
+    trainer = Trainer(small_config(steps=100, refine_every_fraction=0.0), load_scene(data))
     trainer.step()
     before = [p.detach().clone() for p in splatting(trainer).model.parameters()]
     monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: rgb.sum() * float("nan"))
@@ -175,7 +175,7 @@ def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.Mo
 
 
 def test_images_of_a_step_share_it_evenly(data: Path) -> None:
-    config = small_config(static_fraction=0.0, window_full_fraction=0.0, refine_every=0)
+    config = small_config(static_fraction=0.0, window_full_fraction=0.0, refine_every_fraction=0.0)
     scene = load_scene(data)
 
     def gradients(batch_size: int, threads: int) -> list[list[Tensor]]:
@@ -377,8 +377,8 @@ def test_learning_rates(data: Path) -> None:
     ("field", "value"),
     [
         ("steps", 0), ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
-        ("mse_fraction", 1.1), ("pooled_l1_weight", -1.0), ("ema_steps", -1),
-        ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("refine_every", -1),
+        ("mse_fraction", 1.1), ("pooled_l1_weight", -1.0), ("ema_fraction", -0.1),
+        ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("refine_every_fraction", -0.1),
         ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),
     ],
 )  # fmt: skip

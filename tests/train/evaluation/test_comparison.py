@@ -17,8 +17,8 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli import main as cli
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 from msdgs_train.comparison.pools import RunEnd, processes
-from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
-from msdgs_train.comparison.results import CurvePoint, Result, Spread
+from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, mean_and_deviation, table
+from msdgs_train.comparison.results import CurvePoint, Result
 from msdgs_train.comparison.runner import train_all
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.systems.registry import preset
@@ -55,7 +55,7 @@ def systems_file(tmp_path: Path) -> Path:
 
 
 def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) -> None:
-    systems = {system.name: system.config for system in read_systems(["deformgs", str(systems_file)], BUDGET)}
+    systems = read_systems(["deformgs", str(systems_file)], BUDGET)
     assert list(systems) == ["deformgs", "static", "k1", "k2 w=1"]
     assert systems["deformgs"] == preset("deformgs").updated(**BUDGET.settings())
     assert systems["static"].model.layers == ()
@@ -70,7 +70,7 @@ def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) 
 def test_tables_of_systems_in_the_repository_can_be_compared(name: str) -> None:
     file = ROOT / "benchmarks" / "training" / name
     systems = read_systems([str(file)], Budget(steps=6, init_num_pts=4000, max_gaussians=5000))
-    assert len({json.dumps(system.config.to_dict()) for system in systems}) == len(systems) > 10
+    assert len({json.dumps(config.to_dict()) for config in systems.values()}) == len(systems) > 10
 
 
 def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
     runs = make_runs(systems, [Path("a/one"), Path("b/two")], [3, 5], tmp_path)
     assert len({run.folder for run in runs}) == len(runs) == 12
     assert {(run.system, run.scene, run.seed) for run in runs[:6]} == {
-        (system.name, scene, 3) for system in systems for scene in ("one", "two")
+        (system, scene, 3) for system in systems for scene in ("one", "two")
     }
     assert all(run.config.run.seed == run.seed for run in runs)
 
@@ -92,7 +92,7 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
         ("[a]\nlayers = ['mlp:width=0']", r"system `a`.*width"),
         ("[a]\nlayers = ['mlp:width=wide']", r"system `a`.*width"),
         ("[a]\nlayers = 'mlp'", r"system `a`.*layers"),
-        ("[a]\nsh_degree_interval = 'long'", r"system `a`.*sh_degree_interval"),
+        ("[a]\nsh_degree_fraction = 'long'", r"system `a`.*sh_degree_fraction"),
         ("a = 3", r"`a`"),
         ("['../up']\nsteps = 3", r"up"),
         ("[a", r"TOML"),
@@ -142,10 +142,8 @@ RESULTS = [
 
 
 def test_spread_is_the_sample_standard_deviation() -> None:
-    assert Spread.of([1.0, 2.0, 3.0]) == (2.0, 1.0)
-    assert Spread.of([1.0, 2.0, 3.0]).shown(2) == "2.00 ± 1.00"
-    assert Spread.of([5.0]) == (5.0, None)
-    assert Spread.of([1234.5]).shown(1) == "1,234.5"
+    assert mean_and_deviation([1.0, 2.0, 3.0], 2) == "2.00 ± 1.00"
+    assert mean_and_deviation([1234.5], 1) == "1,234.5"
 
 
 def test_the_table_has_a_row_for_each_system_and_scene() -> None:

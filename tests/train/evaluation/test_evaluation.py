@@ -259,7 +259,8 @@ def test_lpips_wants_its_weights_on_disk_and_images_in_plus_minus_one(
 ) -> None:
     weights = types.SimpleNamespace(IMAGENET1K_V1=types.SimpleNamespace(url="https://example.org/vgg16-1.pth"))
     monkeypatch.setitem(sys.modules, "torchvision.models", types.SimpleNamespace(VGG16_Weights=weights))
-    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=_StandInForLpips))
+    stand_in = types.SimpleNamespace(LearnedPerceptualImagePatchSimilarity=_StandInForLpips)
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", stand_in)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     assert "vgg16-1.pth" in perceptual_metrics().unavailable["lpips"]
     (tmp_path / "checkpoints").mkdir()
@@ -269,11 +270,8 @@ def test_lpips_wants_its_weights_on_disk_and_images_in_plus_minus_one(
 
 
 class _StandInForLpips:
-    def __init__(self, net: str, verbose: bool) -> None:
-        assert net == "vgg"
-
-    def eval(self) -> "_StandInForLpips":
-        return self
+    def __init__(self, net_type: str) -> None:
+        assert net_type == "vgg"
 
     def __call__(self, rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         assert rgb.shape == (1, 3, 6, 5)

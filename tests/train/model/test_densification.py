@@ -88,7 +88,7 @@ def test_large_ones_are_split_inside_themselves() -> None:
 
 
 def test_low_opacity_ones_go_at_once_and_giants_after_the_first_reset() -> None:
-    gaussians, surgery, control = _setup(reset_every=9)
+    gaussians, surgery, control = _setup(reset_every_fraction=9 / 24)
     with torch.no_grad():
         gaussians.raw_opacities[0] = -10.0
         gaussians.log_scales[1] = math.log(0.2 * EXTENT)
@@ -152,10 +152,16 @@ def test_splits_depend_on_the_seed_alone() -> None:
 
 
 def test_schedule() -> None:
-    on = _schedule(steps=100, refine_start=10, refine_every=10, refine_stop_fraction=0.5, reset_every=20)
+    on = _schedule(
+        steps=100,
+        refine_start_fraction=0.1,
+        refine_every_fraction=0.1,
+        reset_every_fraction=0.2,
+        refine_stop_fraction=0.5,
+    )
     assert [s for s in range(1, 101) if on.refines_at(s)] == [10, 20, 30, 40, 50]
     assert [s for s in range(1, 101) if on.resets_at(s)] == [20, 40]
-    off = _schedule(refine_every=0, reset_every=0)
+    off = _schedule(refine_every_fraction=0.0, reset_every_fraction=0.0)
     assert not any(off.refines_at(s) or off.resets_at(s) for s in range(1, 101))
 
 

@@ -142,7 +142,7 @@ def test_a_scene_that_has_faded_is_left_alone() -> None:
 
 
 def test_noise_is_for_low_opacity_and_along_the_shape() -> None:
-    gaussians, _, control = setup(refine_every=0)
+    gaussians, _, control = setup(refine_every_fraction=0.0)
     half = math.sqrt(0.5)
     with torch.no_grad():
         gaussians.log_scales[:] = torch.tensor([0.3, 1e-4, 1e-4]).log()
@@ -168,7 +168,9 @@ def test_noise_has_the_size_of_the_formula() -> None:
 
 
 def test_training_keeps_to_the_budget_at_every_step(data: Path) -> None:
-    config = small_config(steps=40, density_strategy="mcmc", max_gaussians=67, refine_start=2, refine_every=2)
+    config = small_config(
+        steps=40, density_strategy="mcmc", max_gaussians=67, refine_start_fraction=0.05, refine_every_fraction=0.05
+    )
     trainer = Trainer(config, load_scene(data))
     counts = [trainer.step().gaussians for _ in range(40)]
     assert counts[0] == config.density.init_num_pts

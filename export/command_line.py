@@ -1,0 +1,33 @@
+"""Common parts of the commands: a check for packages that serving doesn't need, and messages for errors."""
+
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+from msdgs_serve.scene.errors import MsdgsError
+
+try:
+    import tyro
+    from rich.console import Console
+
+    if find_spec("torch") is None:  # not imported yet, so that --help is printed at once
+        raise ModuleNotFoundError(name="torch")
+except ModuleNotFoundError as error:
+    needed = f"{Path(sys.argv[0]).name} needs {error.name}, which serving alone doesn't"
+    raise SystemExit(f"{needed}: pip install '.[export]'") from None
+
+__all__ = ["Console", "run", "tyro"]
+
+
+def run(command: Callable[[Console], int | None], on_interrupt: str) -> int:
+    """Run a command with a console for messages; returns its exit status: 1 after an error, 130 after Ctrl-C."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    try:
+        return command(console) or 0
+    except KeyboardInterrupt:
+        console.print(on_interrupt, markup=False)
+        return 130
+    except (MsdgsError, OSError) as error:
+        console.print(f"error: {error}", style="red", markup=False)
+        return 1
