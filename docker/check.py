@@ -15,6 +15,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.error
@@ -35,6 +36,7 @@ REPLICAS = 3
 LOAD = 120
 """Frames asked for while a replica is killed."""
 CLIENTS = 4
+KEYS = {"read": "reader-0123456789", "write": "writer-0123456789"}
 MAX_MEGABYTES = 600
 PATIENCE = 120.0
 """Seconds until a service must be ready, on a machine that is busy with other things."""
@@ -60,37 +62,39 @@ class Answer:
 def main() -> int:
     """All checks in a row; the first that fails ends it."""
     try:
-        compose = available()
+        available()
     except Skipped as reason:
         print(f"skipped: {reason}")
         return SKIPPED
     build()
     check_contents()
     check_cold_start()
-    with composition(compose) as url:
+    with composition(REPLICAS) as url:
         check_cache(url)
         check_affinity(url)
         check_kill(url)
+    with tempfile.NamedTemporaryFile("w") as keys:
+        keys.write("".join(f"{scope} {key}\n" for scope, key in KEYS.items()))
+        keys.flush()
+        os.chmod(keys.name, 0o644)  # for user 10001
+        with composition(1, MSDGS_UPLOADS="true", API_KEYS=keys.name) as url:
+            check_uploads(url)
     print("The image and the composition do what docs/docker.md says.")
     return 0
 
 
-def available() -> list[str]:
-    """The compose command. Raises `Skipped` without a daemon, without compose, or without images to build from."""
+def available() -> None:
+    """Raises `Skipped` without a daemon, without compose, or without images to build from."""
     if shutil.which(DOCKER) is None:
         raise Skipped(f"there is no {DOCKER} command")
     if output(DOCKER, "info", check=False).returncode != 0:
         raise Skipped("no Docker daemon answers")
-    compose = [DOCKER, "compose"]
-    if output(*compose, "version", check=False).returncode != 0:
-        compose = ["docker-compose"]
-        if shutil.which("docker-compose") is None:
-            raise Skipped("there is no docker compose")
+    if output(DOCKER, "compose", "version", check=False).returncode != 0:
+        raise Skipped("there is no docker compose; docker-compose 1 can't read compose.yaml")
     for image in (BASE_IMAGE, PROXY_IMAGE):
         known = output(DOCKER, "image", "inspect", image, check=False).returncode == 0
         if not known and output(DOCKER, "pull", "--quiet", image, check=False).returncode != 0:
             raise Skipped(f"image {image} can't be had")
-    return compose
 
 
 def build() -> None:
@@ -140,14 +144,7 @@ def check_cold_start() -> None:
         expect(
             int(stored) > 0 and stored == copied, f"no kernel is compiled at the start ({stored} stored, {copied} then)"
         )
-        expect(
-            output(DOCKER, "exec", container, "touch", "/opt/x", check=False).returncode != 0, "the root is read-only"
-        )
-        copied = sh(container, "cp /bin/true /tmp/copied && /tmp/copied && echo it ran")
-        expect(copied != "it ran", "nothing can be run from where it may write")
-        expect(sh(container, "id -u") != "0", "its user isn't root")
-        expect(sh(container, "grep ^Seccomp: /proc/1/status").endswith("2"), "Docker's seccomp profile holds")
-        expect(sh(container, "grep CapEff /proc/1/status").endswith("0" * 16), "it has no capabilities")
+        check_rights(container, "/tmp")
         ready = output(DOCKER, "exec", container, "python", "/opt/msdgs/ready.py", check=False)
         expect(ready.returncode == 0, "its health check passes")
         stopping = time.perf_counter()
@@ -158,14 +155,30 @@ def check_cold_start() -> None:
         output(DOCKER, "rm", "--force", container, check=False)
 
 
+def check_rights(container: str, *writable: str) -> None:
+    """Whoever gets into a container is a user without rights, who runs nothing of their own."""
+    facts = json.loads(output(DOCKER, "inspect", container).stdout)[0]["HostConfig"]
+    expect(facts["Memory"] > 0 and facts["PidsLimit"] > 0, "its memory and processes are limited")
+    expect(output(DOCKER, "exec", container, "touch", "/opt/x", check=False).returncode != 0, "the root is read-only")
+    for folder in writable:
+        ended = sh(container, f"cp /bin/true {folder}/copied && {folder}/copied; echo $?; rm {folder}/copied")
+        expect(ended == "126", f"nothing can be run from {folder}, where it may write")
+    expect(sh(container, "id -u") != "0", "its user isn't root")
+    status = dict(line.split(":\t", 1) for line in sh(container, "cat /proc/1/status").splitlines())
+    expect(status["Seccomp"] == "2", "Docker's seccomp profile holds")
+    expect(int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0, "it has no capabilities and can't get any")
+    expect(status["NoNewPrivs"] == "1", "it can't get other rights")
+
+
 @contextmanager
-def composition(compose: list[str]) -> Iterator[str]:
+def composition(replicas: int, **settings: str) -> Iterator[str]:
     """`up` with replicas, then `down`; the address of the proxy."""
     port = free_port()
-    environment = {**os.environ, "MSDGS_IMAGE": IMAGE, "PROXY_IMAGE": PROXY_IMAGE, "PORT": f"127.0.0.1:{port}"}
-    command = [*compose, "-p", PROJECT, "-f", "docker/compose.yaml"]
+    chosen = {"MSDGS_IMAGE": IMAGE, "PROXY_IMAGE": PROXY_IMAGE, "PORT": f"127.0.0.1:{port}", **settings}
+    environment = {**os.environ, **chosen}
+    command = [DOCKER, "compose", "-p", PROJECT, "-f", "docker/compose.yaml"]
     try:
-        up = ["up", "--detach", "--no-build", "--scale", f"render={REPLICAS}"]
+        up = ["up", "--detach", "--no-build", "--scale", f"render={replicas}"]
         subprocess.run([*command, *up], cwd=ROOT, env=environment, check=True)
         url = f"http://127.0.0.1:{port}"
         wait_for(lambda: get(f"{url}/ready"))
@@ -239,9 +252,37 @@ def check_kill(url: str) -> None:
     expect(good == LOAD, f"{good} of {LOAD} frames came while a replica was killed, the slowest after {slowest:.1f} s")
 
 
-def frame(url: str, t: float, *, size: int = 64, azimuth: int = 30, headers: dict[str, str] | None = None) -> Answer:
+def check_uploads(url: str) -> None:
+    """A scene is added, drawn and deleted by who may do so, and a damaged one refused."""
+    (container,) = containers("render")
+    check_rights(container, "/tmp", "/uploads")
+    whole = (ROOT / "examples" / "toybench.onnx").read_bytes()
+    can_read, can_write = ({"X-API-Key": KEYS[scope]} for scope in ("read", "write"))
+
+    def call(method: str, path: str, headers: dict[str, str], contents: bytes | None = None) -> int:
+        return ask(urllib.request.Request(f"{url}{path}", contents, headers, method=method)).status
+
+    expect(frame(url, 0.5).status == 401, "frames need a key")
+    before = frame(url, 0.5, headers=can_read).body
+    expect(call("POST", "/scenes?name=sent", can_read, whole) == 403, "a key to read uploads nothing")
+    expect(call("POST", "/scenes?name=sent", can_write, whole[: len(whole) // 2]) == 422, "half a file is refused")
+    expect(call("POST", "/scenes?name=sent", can_write, whole) == 201, "a whole one is served after a trial")
+    expect(frame(url, 0.5, headers=can_read, scene="sent").body == before, "it looks as the same scene of the image")
+    expect(call("DELETE", "/scenes/sent", can_write) == 204, "it can be deleted")
+    expect(frame(url, 0.5, headers=can_read).body == before, "the other scene has the same bytes as before")
+
+
+def frame(
+    url: str,
+    t: float,
+    *,
+    scene: str = "toybench",
+    size: int = 64,
+    azimuth: int = 30,
+    headers: dict[str, str] | None = None,
+) -> Answer:
     """A frame by link."""
-    link = f"{url}/render?scene=toybench&azimuth={azimuth}&elevation=20&t={t}&width={size}&height={size}"
+    link = f"{url}/render?scene={scene}&azimuth={azimuth}&elevation=20&t={t}&width={size}&height={size}"
     return get(link, headers)
 
 

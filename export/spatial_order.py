@@ -3,7 +3,7 @@
 import numpy as np
 
 GRID_BITS = 20
-"""Of a coordinate."""
+"""Bits per coordinate."""
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:

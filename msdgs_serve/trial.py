@@ -1,27 +1,24 @@
-"""Open and pose a scene file in a subprocess with limits on memory and time, before the service opens it.
+"""Open and pose a scene file in a subprocess, before the service opens it.
 
 `read_scene_file` rejects all graphs at which onnxruntime is known to crash. If it crashes at another, that ends the
 subprocess and not the service.
 """
 
-import contextlib
 import json
-import os
-import resource
-import subprocess
-import sys
+import tempfile
 from pathlib import Path
+from typing import Any, BinaryIO
 
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.guarded import ProcessFailed, ProcessLimits, call_guarded
 from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.onnx import GraphLimits
-from msdgs_serve.threads import THREADS_VARIABLE
 
 MEMORY, MEMORY_PER_BYTE = 1 << 29, 6
 """Memory limit of the subprocess in bytes: its own, and per byte of the file; the graph's limit is added."""
 
-OPEN_FILES = 64
-NICENESS = 10
+MAX_ANSWER = 1 << 16
+"""Bytes that the subprocess returns."""
 
 
 def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
@@ -30,56 +27,23 @@ def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
     Raises `SceneFileInvalid` with the subprocess's reason, or because it crashed or took too long.
     """
     memory = MEMORY + MEMORY_PER_BYTE * file.stat().st_size + limits.memory_bytes
-    given = json.dumps({"file": str(file), "limits": vars(limits), "memory": memory, "seconds": seconds})
-    command = [sys.executable, "-P", "-m", "msdgs_serve.trial", given]
-    environment = {**os.environ, THREADS_VARIABLE: "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    try:
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, check=False, env=environment
-        )
-    except subprocess.TimeoutExpired:
-        raise SceneFileInvalid(file.name, "file", f"isn't opened and posed within {seconds:g} s") from None
-    try:
-        answer = json.loads(done.stdout) if done.returncode == 0 else None
-    except ValueError:
-        answer = None
-    if answer is None:
-        problem = f"crashes the process that tests it ({done.returncode}), within a limit of {memory >> 20:,} MiB"
-        raise SceneFileInvalid(file.name, "file", problem)
-    if answer:
-        raise SceneFileInvalid(file.name, **answer)
+    with tempfile.TemporaryFile() as answer:
+        try:
+            process_limits = ProcessLimits(memory, MAX_ANSWER, seconds)
+            call_guarded(open_and_pose, str(file), vars(limits), limits=process_limits, answer=answer)
+        except ProcessFailed as error:
+            raise SceneFileInvalid(file.name, "file", str(error)) from None
+        problem = json.load(answer)
+    if problem:
+        raise SceneFileInvalid(file.name, **problem)
 
 
-def main(given: str) -> None:
-    """Run in the subprocess: print the problem of the file as a JSON object, which is empty if there is none."""
-    asked = json.loads(given)
-    _limit(asked["memory"], asked["seconds"])
-    answer = {}
+def open_and_pose(answer: BinaryIO, file: str, limits: dict[str, Any]) -> None:
+    """Run in the subprocess: write the problem of the file as a JSON object, which is empty if there is none."""
+    problem = {}
     try:
-        session = DeformationSession(asked["file"], limits=GraphLimits(**asked["limits"]))
+        session = DeformationSession(file, limits=GraphLimits(**limits))
         session.pose(sum(session.scene.metadata.time_range) / 2)
     except SceneFileInvalid as error:
-        answer = {"field": error.field, "problem": error.problem, "details": error.details}
-    print(json.dumps(answer))
-
-
-def _limit(memory: int, seconds: float) -> None:
-    os.nice(NICENESS)
-    with contextlib.suppress(OSError):  # if Linux runs out of memory, it kills this process first
-        Path("/proc/self/oom_score_adj").write_text("1000")
-    limits = {
-        resource.RLIMIT_CPU: int(seconds) + 1,
-        resource.RLIMIT_FSIZE: 0,
-        resource.RLIMIT_CORE: 0,
-        resource.RLIMIT_NOFILE: OPEN_FILES,
-    }
-    if sys.platform == "linux":  # other systems don't enforce it
-        limits[resource.RLIMIT_DATA] = memory
-    for which, limit in limits.items():
-        _, maximum = resource.getrlimit(which)
-        limit = limit if maximum == resource.RLIM_INFINITY else min(limit, maximum)
-        resource.setrlimit(which, (limit, limit))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+        problem = {"field": error.field, "problem": error.problem, "details": error.details}
+    answer.write(json.dumps(problem).encode())

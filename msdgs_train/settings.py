@@ -39,7 +39,7 @@ class Checked:
         self.require(names, "above 0, or not given", lambda v: v is None or (_is_number(v) and 0 < v < math.inf))
 
     def names(self) -> tuple[str, ...]:
-        """Of all fields."""
+        """Names of all fields."""
         return tuple(item.name for item in dataclasses.fields(self))  # type: ignore[arg-type]
 
 

@@ -15,7 +15,8 @@ from benchmarks.measuring import machine
 from benchmarks.rasterizer.scenes import object_scene, write_splat
 from benchmarks.service.process import Running, service
 from export.exporters.ply import write_ply
-from export.importers import ImportFailed, detect_format
+from export.importers.detect import detect_format
+from export.importers.errors import ImportFailed
 from export.options import ExportOptions
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession

@@ -12,7 +12,7 @@ from rich.console import Console
 from benchmarks.measuring import machine
 from export.exporters.command import LOSSY, convert
 from export.exporters.round_trip import RoundTrip, require
-from export.importers import read_splats
+from export.importers.splats.formats import read_splats
 from export.options import ConvertOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from export.importers import read_splats
+from export.importers.splats.formats import read_splats
 from export.importers.splats.splat import RECORD
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0

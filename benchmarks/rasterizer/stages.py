@@ -106,8 +106,8 @@ def row_of(case: Case, times: Times, work: Work, memory: int, machine: Machine) 
 def floor_of(case: Case, work: Work, machine: Machine) -> dict[str, float]:
     """Lower bounds in milliseconds at the highest rates of this run.
 
-    `arithmetic`: of blended pairs; `evaluated`: of all pixels of touched 4 × 4 blocks; `memory`: of reading
-    Gaussians, writing and reading records once and tile lists twice, and writing the frame.
+    `arithmetic`: of blended pairs; `evaluated`: of all pixels of the 4 × 4 blocks that splats touch; `memory`: of
+    reading Gaussians, writing and reading records once and tile lists twice, and writing the frame.
     """
     g = case.gaussians
     bytes_in = sum(array.nbytes for array in (g.means, g.quats, g.scales, g.opacities, g.sh))

@@ -11,6 +11,7 @@ class ImportFailed(MsdgsError):
     def __init__(self, file: str | Path, problem: str) -> None:
         super().__init__(f"{file}: {problem}")
         self.file = Path(file)
+        self.problem = problem
 
 
 def cut_off(file: str | Path, what: str, needed: int, found: int) -> ImportFailed:

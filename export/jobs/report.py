@@ -37,7 +37,7 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
     "px": lambda p: f"{p['error']['position_pixels']:.2g}",
     "held-out": lambda p: "–" if p["images_psnr"] is None else f"{p['images_psnr']:.2f}",
 }
-"""By name: the text of a point."""
+"""Columns by name, each with a function from a point to its text."""
 
 LEGEND = """\
 - **◆ on the front**: no other point is faster and has a smaller error. **★ chosen**: the fastest within the error

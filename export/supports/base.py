@@ -36,7 +36,7 @@ class SupportExport:
     """Whether a head that is 0 in all layers is 0 for the Gaussians too."""
 
     def bytes_per_gaussian(self, support: Support) -> int:
-        """What the support stores per Gaussian in a scene file."""
+        """Bytes per Gaussian that the support stores in a scene file."""
         return 0
 
     def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout | None:

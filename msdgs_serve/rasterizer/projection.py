@@ -60,7 +60,8 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     counters = np.zeros(2, np.int64)
     run_together(_project_parts, (counters, found, view, arrays, (records, rectangles, keys)))
     _, _, nearest, farthest, valid = found.T.tolist()
-    return Splats(records[:count], rectangles, keys, found[:, :2], (min(nearest), max(farthest)), all(valid))
+    drawn = found[:, :2].copy()  # a view of one row would be of another type, for which numba compiles again
+    return Splats(records[:count], rectangles, keys, drawn, (min(nearest), max(farthest)), all(valid))
 
 
 def part_count(count: int) -> int:

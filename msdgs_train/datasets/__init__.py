@@ -23,17 +23,19 @@ LAYOUTS = (
 """Name, marker file and reader of each layout; COLMAP is tried last, since other layouts contain its files too."""
 
 
-def load_scene(path: Path | str, size: int | None = None) -> SceneData:
+def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0) -> SceneData:
     """Read the dataset in folder `path`, detecting its layout.
 
-    `size` is the width in pixels that images are reduced to, height in proportion. Pixels are read later, by
-    `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for an unusable `size`.
+    `size` is the width in pixels that images are reduced to, height in proportion; `llffhold` that of `DataConfig`.
+    Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for
+    an unusable `size` or `llffhold`.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
     for _, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
-            return load(folder, size)
+            scene = load(folder, size)
+            return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
     raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

@@ -14,6 +14,9 @@ class DataConfig(Checked):
 
     size: int | None = None
     """Width of the images in pixels, height in proportion; their own if not given."""
+    llffhold: int = 0
+    """Hold out every so many-th training image, the first included, as test images, and those halfway between as
+    validation images, instead of the dataset's own; 0: the dataset's splits."""
     background: Literal["white", "black", "random"] = "white"
     """Color behind the scene; random: another one each step, white in evaluation."""
     scene_half_size: float | None = None
@@ -21,6 +24,7 @@ class DataConfig(Checked):
 
     def __post_init__(self) -> None:
         self.require_positive_or_none("size", "scene_half_size")
+        self.require(("llffhold",), "0, or an integer of 3 or more", lambda v: type(v) is int and (v == 0 or v > 2))
         self.require(("background",), f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
 
     @property

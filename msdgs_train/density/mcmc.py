@@ -112,7 +112,7 @@ class MCMCStrategy:
 
 
 def compute_relocation(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """What each of `shares` equal Gaussians in one place is, that together look as one; float64.
+    """Return opacity and scale factor of each of `shares` equal Gaussians that together look as one; float64.
 
     Args:
         opacities: [N] of the one, in (0, 1).

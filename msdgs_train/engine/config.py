@@ -48,19 +48,19 @@ class OptimizerConfig(Checked):
     """Learning rates of the canonical Gaussians, and the average that is evaluated; layers have their own rates."""
 
     means_lr_init: float = 8e-4
-    """Of means, in scene units; Adam moves a mean by about this much a step."""
+    """Learning rate of means, in scene units; Adam moves a mean by about this much a step."""
     means_lr_final: float = 8e-6
-    """At the last step, to which it decays exponentially."""
+    """Learning rate of means at the last step, to which it decays exponentially."""
     sh_dc_lr: float = 2.5e-3
-    """Of colors; constant, as those below."""
+    """Learning rate of colors; constant, as those below."""
     sh_rest_lr: float = 1.25e-4
-    """Of the bands of spherical harmonics above 0."""
+    """Learning rate of the bands of spherical harmonics above 0."""
     opacities_lr: float = 5e-2
-    """Of opacities, before the sigmoid."""
+    """Learning rate of opacities, before the sigmoid."""
     scales_lr: float = 5e-3
-    """Of logarithms of scales."""
+    """Learning rate of logarithms of scales."""
     quats_lr: float = 1e-3
-    """Of quaternions."""
+    """Learning rate of quaternions."""
     sh_degree_fraction: float = 0.125
     """Fraction of the run after which the degree of the spherical harmonics in use rises by one; 0: all from the
     start."""
@@ -106,7 +106,7 @@ class TrainConfig:
     model: ModelConfig = SMALL_MODEL
 
     def updated(self, **settings: Any) -> "TrainConfig":
-        """With other values of some settings, of any group; `model` may be whole, too.
+        """Return a copy with other values of some settings, of any group; `model` may be whole, too.
 
         Raises `InvalidInput` naming a setting that is unknown or out of range.
         """

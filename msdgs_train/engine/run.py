@@ -89,7 +89,7 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         check_resumable(stored_config(folder), config)
     elif (folder / CHECKPOINT).exists():
         raise InvalidInput("run", "a new folder, or --resume to continue the run in it", f"{folder}, which holds a run")
-    trainer = Trainer(config, load_scene(data, config.data.size))
+    trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold))
     seconds = trainer.load_checkpoint(folder / CHECKPOINT) if resume else 0.0
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder, config)

@@ -73,10 +73,10 @@ def evaluate_run(
 
     Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
     """
-    size = read_config(run).data.size
+    settings = read_config(run).data
     loaded = {name: load_model(run / file) for name, file in FILES.items() if name == "last" or (run / file).exists()}
     data = _data_folder(run, data)
-    scene = load_scene(data, size)
+    scene = load_scene(data, settings.size, settings.llffhold)
     frames = _frames(scene, data, split)
     region = moving_region(scene, split, list(loaded.values()))
     perceptual = perceptual_metrics()

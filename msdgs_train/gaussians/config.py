@@ -99,7 +99,7 @@ class ModelConfig:
 
     @property
     def modulation_lr(self) -> LearningRate:
-        """Of the modulation network and its embeddings."""
+        """Learning rate of the modulation network and its embeddings."""
         return LearningRate(self.modulation_lr_init, self.modulation_lr_final)
 
     def attributes(self) -> dict[str, Attribute]:

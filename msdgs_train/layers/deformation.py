@@ -21,7 +21,7 @@ class LayerStep(NamedTuple):
 
     @classmethod
     def of_columns(cls, columns: Tensor, heads: Heads) -> "LayerStep":
-        """From the concatenated outputs of all heads, [N, sum of `heads.sizes`]."""
+        """Split the concatenated outputs of all heads, [N, sum of `heads.sizes`]."""
         means, scales, quats, opacity, sh, logit = columns.split(heads.sizes, dim=1)
         weight = logit.sigmoid() if heads.weight else columns.new_ones(len(columns), 1)
         opacities = opacity[:, 0] if heads.opacity else None

@@ -39,11 +39,11 @@ class PlaneConfig(LayerConfig):
     lr_init: float = 2e-3
     """Learning rate of the networks until all times take part."""
     lr_final: float = 2e-5
-    """Of the networks at the last step, to which it decays exponentially."""
+    """Learning rate of the networks at the last step, to which it decays exponentially."""
     grid_lr_init: float = 1e-2
     """Learning rate of the grids until all times take part."""
     grid_lr_final: float = 1e-3
-    """Of the grids at the last step."""
+    """Learning rate of the grids at the last step."""
     time_smoothness_weight: float = 1e-2
     """Weight of the mean squared second difference along time."""
     l1_time_planes_weight: float = 0.0
@@ -169,7 +169,7 @@ class PlaneLayer(DeformationLayer):
                     head.get_parameter("weight").zero_()
 
     def plane_grids(self) -> list[PlaneGrid]:
-        """From the coarsest to the finest, as `multires` has them."""
+        """Grids from the coarsest to the finest, as in `multires`."""
         return [grid for grid in self.grids if isinstance(grid, PlaneGrid)]
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:

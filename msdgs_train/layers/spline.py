@@ -121,7 +121,7 @@ class SplineLayer(DeformationLayer):
                 self.transls[k], self.rots[k], self.stretches[k] = self.transls[last], rot, self.stretches[last]
 
     def new_frame_rows(self, times: Iterable[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Of translations and rotations. Not of stretches: a misplaced object would shrink until it has no gradient."""
+        """Translations and rotations, but not stretches: a misplaced object would shrink until it has no gradient."""
         rows = torch.zeros(len(self.transls), dtype=torch.bool)
         for t in times:
             rows[self.knots_at(torch.tensor(t))[0]] = True

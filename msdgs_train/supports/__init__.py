@@ -1,1 +1,1 @@
-"""What deformation layers move: the Gaussians themselves, or control nodes that carry them."""
+"""Supports: the points that deformation layers move, Gaussians themselves or control nodes that carry them."""

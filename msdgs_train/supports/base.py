@@ -57,7 +57,7 @@ class Support(nn.Module):
 
     kind: ClassVar[str]
     num_points: int | None = None
-    """Of control nodes; None if the points are the Gaussians themselves."""
+    """Number of control nodes; None if the points are the Gaussians themselves."""
 
     def forward(
         self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None

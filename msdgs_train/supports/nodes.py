@@ -49,7 +49,7 @@ class NodesConfig(SupportConfig):
     skinning_lr_init: float = 2e-2
     """Learning rate of the skinning logits until all times take part."""
     skinning_lr_final: float = 2e-3
-    """Of the skinning logits at the last step, to which it decays exponentially."""
+    """Learning rate of the skinning logits at the last step, to which it decays exponentially."""
     arap_weight: float = 0.1
     """Weight of local rigidity between neighboring nodes (as rigid as possible)."""
 

@@ -28,7 +28,7 @@ def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Te
 
 
 class _Skin(torch.autograd.Function):
-    """With torch's matrix products instead a training step takes 1.14 times as long."""
+    """Linear blend skinning by kernels; with torch's matrix products a training step takes 1.14 times as long."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ MOTION = 16
 OFFSET, ROT = 9, 12
 """First columns of the offset and of the quaternion of a motion; the matrix is before them."""
 MIN_STRETCH = 0.05
-"""Of a Gaussian's own axes."""
+"""Lower bound of the factor by which the axes of a Gaussian are stretched."""
 DELTAS = 10
 """Columns of the deltas per Gaussian: mean 3, logarithms of scales 3, quaternion 4."""
 

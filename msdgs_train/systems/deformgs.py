@@ -18,7 +18,7 @@ PUBLISHED = TrainConfig().updated(
     refine_every_fraction=100 / 40_000,
     reset_every_fraction=3_000 / 40_000,
 )
-"""As it trains on D-NeRF, and most that came after it."""
+"""Its settings for D-NeRF, which most later systems share."""
 
 register_system(
     "deformgs",

@@ -146,7 +146,7 @@ class GaussianSplatting:
         )
 
     def _options(self, step: int) -> RasterizerOptions:
-        """Of a step counted from 1."""
+        """Options of the rasterizer in a step, counted from 1."""
         return GSPLAT._replace(eps2d=self.schedule.eps2d(step))
 
     def _pose(self, model: DynamicGaussians, t: float, step: int) -> PosedGaussians:

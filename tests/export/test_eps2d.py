@@ -1,4 +1,4 @@
-"""A model's own eps2d goes with it: training, evaluation, export and service draw with the same."""
+"""Training, evaluation, export and service all render with the model's own eps2d."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +23,9 @@ from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
-from msdgs_train.gaussians.model_file import LoadedModel, load_model, save_model
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.viewer.snapshot import Snapshot
-from tests.support.models import CAMERA, SCENE, export_scene, random_model, small_config
+from tests.support.models import CAMERA, SCENE, export_scene, random_model, saved, small_config
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import MOTION_BASES, write_scene
 from tests.support.training_scene import small_config as training_config
@@ -39,14 +39,13 @@ NARROW = GSPLAT._replace(eps2d=EPS2D)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With a model and its scene file."""
+    """Return a folder with a model and its scene file."""
     folder = tmp_path_factory.mktemp("narrow")
     model = random_model(count=60, eps2d=EPS2D)
     with torch.no_grad():
         model.gaussians.log_scales.sub_(1.5)  # under a pixel, where it is eps2d that is seen
         model.gaussians.raw_opacities.add_(2.0)
-    save_model(folder / "model.pt", model, SCENE, 1)
-    export_scene(folder / "model.pt", folder / "scene.onnx")
+    export_scene(saved(folder, model), folder / "scene.onnx")
     return folder
 
 
@@ -111,7 +110,7 @@ def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
 
 
 def test_training_may_begin_with_more(tmp_path: Path):
-    """What is saved says what it was trained with, early and late, and going on knows it too."""
+    """Saved models have the eps2d of their training step, also after a checkpoint is loaded."""
     sizes = replace(MOTION_BASES, eps2d=EPS2D)
     config = training_config(model=sizes, window_full_fraction=0.5, eps2d_init=0.4)
     trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))

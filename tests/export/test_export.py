@@ -1,9 +1,8 @@
-"""`export/to_onnx.py`: what the file holds, what it leaves behind, and that an old file outlives every failure."""
+"""`export/to_onnx.py`: the contents of the scene file, and that an old file survives every failure."""
 
 import hashlib
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,21 +20,15 @@ from export.plans.registry import build
 from export.to_onnx import main
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
-from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model
+from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model, saved
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
-
-
-def saved(folder: Path, model: DynamicGaussians) -> Path:
-    save_model(folder / "model.pt", model, SCENE, 1)
-    return folder / "model.pt"
 
 
 @pytest.fixture(scope="module")
@@ -99,20 +92,6 @@ def test_heads_that_the_contract_has_no_place_for_are_refused_by_name(tmp_path: 
     with pytest.raises(ModelNotExportable, match=f"model.{option}"):
         export_scene(saved(tmp_path, random_model(**{option: True})), tmp_path / "scene.onnx")
     assert not (tmp_path / "scene.onnx").exists()
-
-
-def test_a_scene_that_does_not_move_has_no_graph(tmp_path: Path):
-    exported = export_scene(saved(tmp_path, random_model(layers=())), tmp_path / "scene.onnx")
-    assert not onnx.load(exported.path).graph.node
-
-
-def test_plain_onnxruntime_with_t_alone_is_enough(scene_file: Path, model: DynamicGaussians):
-    session = ort.InferenceSession(scene_file)
-    outputs = map(np.asarray, session.run(None, {"t": np.array([0.5], np.float32)}))
-    values = dict(zip([o.name for o in session.get_outputs()], outputs, strict=True))
-    assert np.abs(values["means"] - model.pose(0.5).means.detach().numpy()).max() < tolerance("export.relative")
-    assert values["opacities"].shape == (300,)
-    assert values["sh"].shape == (300, 16, 3)
 
 
 def test_embeddings_and_their_network_are_gone(scene_file: Path, model: DynamicGaussians):
@@ -197,7 +176,7 @@ def test_a_file_that_is_not_its_model_is_found_out(scene_file: Path, name: str):
 
 
 @pytest.mark.parametrize("count", [1, 30])
-def test_unstable_gaussians_are_counted_and_what_is_seen_of_them_is_judged_by_frames_alone(tmp_path: Path, count: int):
+def test_unstable_gaussians_are_counted_and_compared_in_frames(tmp_path: Path, count: int):
     model = random_model(300, layers=("mlp",))
     heads, raw_quats = model.get_submodule("deformation.layers.0.heads"), model.gaussians.raw_quats
     assert isinstance(heads, torch.nn.Linear)
@@ -221,7 +200,7 @@ def interrupt() -> None:
     ("settings", "error"),
     [({"tolerance": 0.0}, VerificationFailed), ({"on_time": interrupt}, KeyboardInterrupt)],
 )
-def test_an_old_file_outlives_what_goes_wrong(tmp_path: Path, settings: dict[str, Any], error: type):
+def test_an_old_file_survives_failures(tmp_path: Path, settings: dict[str, Any], error: type):
     output = tmp_path / "scene.onnx"
     output.write_bytes(b"an older scene")
     checkpoint = saved(tmp_path, random_model())
@@ -231,32 +210,12 @@ def test_an_old_file_outlives_what_goes_wrong(tmp_path: Path, settings: dict[str
     assert sorted(tmp_path.iterdir()) == [checkpoint, output]
 
 
-def fill(name: str, value: float) -> Callable[[DynamicGaussians], None]:
-    def poison(model: DynamicGaussians) -> None:
-        with torch.no_grad():
-            model.get_parameter(name)[-1] = value
-
-    return poison
-
-
-@pytest.mark.parametrize(
-    ("poison", "message"),
-    [
-        (fill("gaussians.means", float("nan")), r"gaussians.means \(3 of 900\)"),
-        (fill("deformation.layers.0.heads.weight", float("inf")), r"layers.0.heads.weight \(32 of 352\)"),
-    ],
-)
-def test_poison_in_a_model_is_named(tmp_path: Path, poison: Callable[[DynamicGaussians], None], message: str):
-    poison(model := random_model())
-    with pytest.raises(MsdgsError, match=message):
-        export_scene(saved(tmp_path, model), tmp_path / "scene.onnx")
-    assert not (tmp_path / "scene.onnx").exists()
-
-
 @pytest.mark.parametrize("layers", [0, 2])
 @pytest.mark.parametrize(("log_scale", "limit"), [(200.0, LOG_SCALE_LIMIT), (-200.0, -LOG_SCALE_LIMIT)])
 def test_a_scale_that_would_overflow_or_vanish_is_cut(tmp_path: Path, layers: int, log_scale: float, limit: float):
-    fill("gaussians.log_scales", log_scale)(model := random_model(layers=("mlp",) * layers))
+    model = random_model(layers=("mlp",) * layers)
+    with torch.no_grad():
+        model.gaussians.log_scales[-1] = log_scale
     path = export_scene(saved(tmp_path, model), tmp_path / "scene.onnx").path
     scales = DeformationSession(path).gaussians(0.5).validate().scales
     np.testing.assert_allclose(scales[-1], np.exp(limit), rtol=tolerance("float32.relative"))
@@ -276,11 +235,6 @@ def test_the_command_says_what_is_wrong(
     assert "error: " in shown
     assert "model.pt" in shown
     assert not (tmp_path / "scene.onnx").exists()
-
-
-def test_the_command_refuses_a_folder_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(ExportOptions(saved(tmp_path, random_model(5)), tmp_path / "nowhere" / "scene.onnx", quick=True)) == 1
-    assert "nowhere" in capsys.readouterr().err
 
 
 def test_the_script_runs_from_any_folder(tmp_path: Path):

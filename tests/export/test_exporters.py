@@ -1,4 +1,4 @@
-"""What is written for other viewers is the scene: read back, and held to the rules of each format."""
+"""Files for other viewers hold the scene when read back, and keep the rules of their format."""
 
 import json
 import struct
@@ -20,8 +20,8 @@ from export.exporters.gltf import EXTENSION, read_gltf
 from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
-from export.importers import read_splats
 from export.importers.sequence import read_sequence, sequence_scene
+from export.importers.splats.formats import read_splats
 from export.jobs.bake import bake
 from export.options import ConvertOptions
 from export.plans.registry import build
@@ -38,7 +38,7 @@ QUIET = Console(quiet=True)
 
 
 def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
-    """A moving scene of 300 Gaussians."""
+    """Write a moving scene of 300 Gaussians."""
     model = random_model(300, noise=0.02, layers=(replace(MLP, time_frequencies=2),) * 2, **config)
     file = folder / "scene.onnx"
     file.write_bytes(build(plan, bake(model, SCENE, "0" * 64)).SerializeToString())
@@ -109,7 +109,7 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
 
 
 @pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it softer"), (0.3, ""), (0.5, "draw it harder")])
-def test_who_converts_is_told_how_others_draw_it(tmp_path: Path, eps2d: float, said: str):
+def test_differences_of_other_renderers_are_printed(tmp_path: Path, eps2d: float, said: str):
     printed = StringIO()
     scene = scene_file(tmp_path, eps2d=eps2d)
     convert(ConvertOptions(scene, tmp_path / "a.ply", 0.0, 30, None), Console(file=printed, soft_wrap=True))
@@ -165,7 +165,7 @@ def test_usd_has_a_sample_a_frame(tmp_path: Path, ending: str):
     assert_same(read_usd(tmp_path / f"still.{ending}")(0), session.gaussians(0.4))
 
 
-def test_what_is_not_close_enough_does_not_replace_a_file(tmp_path: Path):
+def test_a_failed_conversion_keeps_the_old_file(tmp_path: Path):
     scene, out = scene_file(tmp_path), tmp_path / "a.spz"
     out.write_text("old")
     with pytest.raises(ConversionFailed, match=r"99.5 dB were asked for"):
@@ -236,7 +236,7 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
     assert not np.asarray(gaussians)[int(np.asarray(count)[0]) :, 3].any()
 
 
-def test_a_quantised_plan_is_refused_with_what_to_do(tmp_path: Path):
+def test_a_quantised_plan_is_refused_with_an_alternative(tmp_path: Path):
     with pytest.raises(InvalidInput, match=r"--plan lowrank"):
         run(scene_file(tmp_path, "int8"), tmp_path / "a.visionary.onnx")
 
@@ -248,6 +248,6 @@ def test_a_quantised_plan_is_refused_with_what_to_do(tmp_path: Path):
         ("a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd or .visionary.onnx"),
     ],
 )
-def test_other_endings_say_what_there_is(tmp_path: Path, out: str, message: str):
+def test_unknown_endings_name_the_known_ones(tmp_path: Path, out: str, message: str):
     with pytest.raises(InvalidInput, match=message):
         run(scene_file(tmp_path), tmp_path / out)

@@ -1,4 +1,4 @@
-"""Runs of Deformable-3D-Gaussians: their network, said again here in a few lines, and what becomes of it."""
+"""Import of Deformable-3D-Gaussians runs, compared with their network, which is written here in a few lines."""
 
 import zipfile
 from pathlib import Path
@@ -11,7 +11,8 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from export.importers import ImportFailed, detect_format
+from export.importers.detect import detect_format
+from export.importers.errors import ImportFailed
 from export.importers.runs import base
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
@@ -53,7 +54,7 @@ def their_state(blender: bool, depth: int = 8, width: int = 64) -> dict[str, Ten
 
 
 def their_deltas(state: dict[str, Tensor], x: Tensor, t: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Their network in float64: deltas of positions, rotations and scales."""
+    """Return the deltas of positions, rotations and scales by their network in float64."""
     s = {name: tensor.double() for name, tensor in state.items()}
 
     def linear(name: str, value: Tensor) -> Tensor:
@@ -123,99 +124,84 @@ def test_shapes_are_compared_with_those_that_they_draw(tmp_path: Path):
     assert off == pytest.approx(np.abs(np.linalg.norm(quats, axis=1) - 1).max(), rel=tolerance("import.network"))
 
 
-def test_what_differs_is_named(tmp_path: Path):
-    state = their_state(True)
-    run = write_run(tmp_path / "run", state)
-    network = run / "deform" / "iteration_40000" / "deform.pth"
-    broken = {
-        "branch_w.weight": (torch.zeros(3, 64), "is_6dof"),
-        "linear.3.weight": (torch.zeros(64, 7), r"`linear.3.weight` has shape \(64, 7\), not 64 × 64"),
-        "gaussian_warp.bias": (torch.full((3,), np.nan), r"`gaussian_warp.bias` holds NaN"),
-    }
-    for name, (tensor, message) in broken.items():
-        torch.save({**state, name: tensor}, network)
-        with pytest.raises(ImportFailed, match=message):
-            write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
-    network.unlink()
-    with pytest.raises(ImportFailed, match=r"no deform/iteration_40000/deform.pth"):
-        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+def assert_refused(run: Path, kind: str, message: str):
+    with pytest.raises(ImportFailed, match=message):
+        write_model(run, kind, run.parent / "model.pt", QUIET)
+    assert not (run.parent / "model.pt").exists()
+
+
+def network_of(run: Path) -> Path:
+    return run / "deform" / "iteration_40000" / "deform.pth"
+
+
+PLAIN = "isn't a dense tensor of plain numbers"
+UNIMPORTABLE = [
+    ({"branch_w.weight": torch.zeros(3, 64)}, "is_6dof"),
+    ({"linear.3.weight": torch.zeros(64, 7)}, r"`linear.3.weight` has shape \(64, 7\), not 64 × 64"),
+    ({"gaussian_warp.bias": torch.full((3,), np.nan)}, r"`gaussian_warp.bias` holds NaN"),
+    ({"more": torch.zeros(1).expand(10_000_000, 10_000_000)}, r"`more` .*isn't stored in full: it shares 4 bytes"),
+    ({"more": torch.zeros(3, 3).to_sparse()}, rf"`more` .*{PLAIN}"),
+    ({"more": torch.zeros(3, dtype=torch.complex64)}, rf"`more` .*{PLAIN}"),
+    ({"more": torch.zeros(3, device="meta")}, rf"`more` .*{PLAIN}"),
+    ({"more": torch.zeros(3).to(torch.float8_e4m3fn)}, rf"`more` .*{PLAIN}"),
+    ({"linear.0.bias": torch.zeros(4_096)}, r"`linear.0.weight` has shape \(64, 93\), not 4096 × 93"),
+    ({"linear.0.bias": torch.zeros(50_000)}, r"has 50,000 units a layer"),
+    ({"linear.0.bias": torch.zeros(0)}, r"has 0 units a layer"),
+    ({"timenet.0.bias": torch.zeros(1)}, r"`timenet.0.bias` has shape \(1,\), not 256"),
+    ({"timenet.0.bias": torch.zeros(5)}, r"`timenet.0.bias` has shape \(5,\), not 256"),
+    ({"timenet.2.bias": torch.zeros(4_096)}, r"`timenet.2.weight` has shape \(30, 256\), not 4096 × 256"),
+    ({"timenet.0.weight": torch.zeros(256, 2_051)}, r"reads 1,025 frequencies of time"),
+    ({"linear.0.weight": torch.zeros(64, 2_064)}, r"reads 1,000 frequencies of time"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), UNIMPORTABLE)
+def test_a_network_that_differs_is_named_before_memory_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Tensor], message: str
+):
+    of_blender = "linear.0.weight" not in change
+    run, built = write_run(tmp_path / "run", their_state(of_blender) | change), on_which_device(monkeypatch)
+    assert_refused(run, "deformgs", message)
+    assert set(built) <= {"meta"}
+
+
+def test_a_run_without_a_network_is_refused(tmp_path: Path):
+    run = write_run(tmp_path / "run", their_state(True))
+    network_of(run).unlink()
+    assert_refused(run, "deformgs", r"no deform/iteration_40000/deform.pth")
 
 
 def test_rotations_so_long_that_shapes_overflow_are_refused_by_the_runs_name(tmp_path: Path):
     state = their_state(True)
     state["gaussian_rotation.bias"] = torch.full((4,), 1e18)  # poses are sound: rotations are made unit
     state["gaussian_scaling.bias"] = torch.full((3,), 1e5)
-    with pytest.raises(ImportFailed, match=r"run.*its network gives Gaussians that can't be used: `gaussians.scales`"):
-        write_model(write_run(tmp_path / "run", state), "deformgs", tmp_path / "model.pt", QUIET)
-    assert not (tmp_path / "model.pt").exists()
+    message = r"run.*its network gives Gaussians that can't be used: `gaussians.scales`"
+    assert_refused(write_run(tmp_path / "run", state), "deformgs", message)
 
 
 def test_two_layers_whose_heads_read_the_input_again_are_refused(tmp_path: Path):
     run = write_run(tmp_path / "run", their_state(True, depth=2))
-    with pytest.raises(ImportFailed, match=r"has 2 hidden layers; from 3 to 64"):
-        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
-
-
-UNLIKE_STORED = [
-    (torch.zeros(1).expand(10_000_000, 10_000_000), r"isn't stored in full: it shares 4 bytes"),
-    (torch.zeros(3, 3).to_sparse(), r"isn't a dense tensor of plain numbers"),
-    (torch.zeros(3, dtype=torch.complex64), r"isn't a dense tensor of plain numbers"),
-    (torch.zeros(3, device="meta"), r"isn't a dense tensor of plain numbers"),
-    (torch.zeros(3).to(torch.float8_e4m3fn), r"isn't a dense tensor of plain numbers"),
-]
-
-
-@pytest.mark.parametrize(("tensor", "message"), UNLIKE_STORED)
-def test_tensors_that_are_not_rows_of_stored_numbers_are_named(tmp_path: Path, tensor: Tensor, message: str):
-    run = write_run(tmp_path / "run", their_state(True) | {"more": tensor})
-    with pytest.raises(ImportFailed, match=rf"`more` .*{message}"):
-        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+    assert_refused(run, "deformgs", r"has 2 hidden layers; from 3 to 64")
 
 
 def test_a_storage_is_no_two_tensors(tmp_path: Path):
     state = their_state(True)
     run = write_run(tmp_path / "run", state | {"linear.3.weight": state["linear.2.weight"]})
-    with pytest.raises(ImportFailed, match=r"`linear.3.weight` .*isn't stored in full"):
-        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+    assert_refused(run, "deformgs", r"`linear.3.weight` .*isn't stored in full")
 
 
 def test_a_checkpoint_that_unpacks_to_more_than_itself_is_refused(tmp_path: Path):
     run = write_run(tmp_path / "run", {"linear.0.weight": torch.zeros(1_000_000)})
-    network = run / "deform" / "iteration_40000" / "deform.pth"
-    with zipfile.ZipFile(network) as whole:
+    with zipfile.ZipFile(network_of(run)) as whole:
         parts = {name: whole.read(name) for name in whole.namelist()}
-    with zipfile.ZipFile(network, "w", zipfile.ZIP_DEFLATED) as packed:
+    with zipfile.ZipFile(network_of(run), "w", zipfile.ZIP_DEFLATED) as packed:
         for name, contents in parts.items():
             packed.writestr(name, contents)
-    with pytest.raises(ImportFailed, match=r"is packed: it holds 4,\d{3},\d{3} bytes"):
-        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
-
-
-@pytest.mark.parametrize(
-    ("blender", "change", "message"),
-    [
-        (True, {"linear.0.bias": torch.zeros(4_096)}, r"`linear.0.weight` has shape \(64, 93\), not 4096 × 93"),
-        (True, {"linear.0.bias": torch.zeros(50_000)}, r"has 50,000 units a layer"),
-        (True, {"linear.0.bias": torch.zeros(0)}, r"has 0 units a layer"),
-        (True, {"timenet.0.bias": torch.zeros(1)}, r"`timenet.0.bias` has shape \(1,\), not 256"),
-        (True, {"timenet.0.bias": torch.zeros(5)}, r"`timenet.0.bias` has shape \(5,\), not 256"),
-        (True, {"timenet.2.bias": torch.zeros(4_096)}, r"`timenet.2.weight` has shape \(30, 256\), not 4096 × 256"),
-        (True, {"timenet.0.weight": torch.zeros(256, 2_051)}, r"reads 1,025 frequencies of time"),
-        (False, {"linear.0.weight": torch.zeros(64, 2_064)}, r"reads 1,000 frequencies of time"),
-    ],
-)
-def test_sizes_that_do_not_agree_are_named_before_memory_is_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blender: bool, change: dict[str, Tensor], message: str
-):
-    run = write_run(tmp_path / "run", their_state(blender) | change)
-    built = on_which_device(monkeypatch)
-    with pytest.raises(ImportFailed, match=message):
-        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
-    assert set(built) <= {"meta"}
+    assert_refused(run, "deformgs", r"is packed: it holds 4,\d{3},\d{3} bytes")
 
 
 def on_which_device(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Where the networks of models are from now on made; on `meta` they take no memory."""
+    """Return a list of the devices on which networks are made from now on; on `meta` they take no memory."""
     built: list[str] = []
 
     def model(*given: Any) -> DynamicGaussians:
@@ -237,7 +223,6 @@ class Evil:
 def test_no_code_in_a_checkpoint_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     run = write_run(tmp_path / "run", their_state(True))
-    torch.save({"linear.0.weight": Evil()}, run / "deform" / "iteration_40000" / "deform.pth")
-    with pytest.raises(ImportFailed, match=r"isn't a whole torch checkpoint of plain values"):
-        write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+    torch.save({"linear.0.weight": Evil()}, network_of(run))
+    assert_refused(run, "deformgs", r"isn't a whole torch checkpoint of plain values")
     assert not (tmp_path / "ran").exists()

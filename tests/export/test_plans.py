@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 import torch
 
 from export.jobs.bake import Baked, bake
-from export.layers import HEAD_COLUMNS, LAYERS, LayerInputs, ModelNotExportable
+from export.layers import HEAD_COLUMNS, LAYERS, ModelNotExportable
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder
 from export.measure.verify import VerificationFailed, times_to_verify, verify
@@ -24,9 +25,7 @@ from export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.layers.base import Heads, LayerConfig, SceneBounds
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.layers.deformation import DeformationLayer, LayerStep
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
 from msdgs_train.supports.gaussians import GaussiansConfig
 from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, random_model
@@ -225,62 +224,21 @@ def test_more_poses_and_more_terms_are_closer():
         assert errors == sorted(errors, reverse=True)
 
 
-def test_plan_knows_whether_it_is_fitted():
-    assert [name for name, plan in PLANS.items() if plan.fitted] == ["lowrank", "keyframes"]
-
-
-class DriftConfig(LayerConfig):
-    """Of a kind that the package doesn't know."""
-
-    kind = "drift"
-
-    def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "Drift":
-        return Drift()
-
-
-class Drift(DeformationLayer):
-    """All points drift along x."""
-
-    kind = "drift"
-
-    def forward(self, means: torch.Tensor, t: torch.Tensor) -> LayerStep:
-        step = torch.stack([2 * t, 0 * t, 0 * t]).expand(len(means), 3)
-        return LayerStep(step, 0 * step, means.new_zeros(len(means), 4), means.new_ones(len(means), 1))
-
-
-class DriftExport:
-    removable_heads: frozenset[str] = frozenset()
-    scale_columns = 3
-
-    def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
-        columns = sum(HEAD_COLUMNS[head].stop - HEAD_COLUMNS[head].start for head in used)
-        speed = np.eye(1, columns, dtype=np.float32) * 2
-        step = graph.node("Mul", [inputs.time, graph.constant(f"{inputs.name}.speed", speed)], "drift.now")
-        zeros = graph.constant("drift.zeros", np.zeros((3, columns), np.float32))
-        still = graph.node("MatMul", [inputs.means, zeros], "drift.still")
-        return graph.node("Add", [still, graph.node("Mul", [step, inputs.gate], "drift.step")], "drift.deltas")
-
-    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
-        return frozenset({"scales", "quats"})
-
-    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
-        return layer
-
-
 @pytest.mark.parametrize("support", [GaussiansConfig(), NODES], ids=lambda support: support.kind)
 def test_a_kind_of_layer_from_elsewhere_is_exported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, support: SupportConfig
 ):
-    model = random_model(60, layers=(DriftConfig(), SLOW), support=support, noise=0.02)
+    fourier = import_module("tests.support.plugin_example").FourierConfig(frequencies=2)
+    model = random_model(60, layers=(fourier, SLOW), support=support, noise=0.02)
     baked = bake(model, SCENE, "0" * 64)
-    with pytest.raises(ModelNotExportable, match="'drift' can't be exported; those that can: mlp"):
-        build("network", baked)
-    monkeypatch.setitem(LAYERS, "drift", DriftExport())
     check_against_model(opened(tmp_path / "scene.onnx", build("network", baked)), model)
+    monkeypatch.delitem(LAYERS, "fourier")
+    with pytest.raises(ModelNotExportable, match="'fourier' can't be exported; those that can: mlp"):
+        build("network", baked)
 
 
 class RigidConfig(SupportConfig):
-    """Of a kind that the package doesn't know."""
+    """Settings of a kind of support that the package doesn't have."""
 
     kind = "rigid"
 
@@ -289,7 +247,7 @@ class RigidConfig(SupportConfig):
 
 
 class Rigid(Support):
-    """All Gaussians move as the origin does."""
+    """All Gaussians move with the origin."""
 
     kind = "rigid"
     num_points = 1

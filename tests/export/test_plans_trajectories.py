@@ -78,7 +78,7 @@ def test_a_fast_motion_that_a_coarse_sampling_misses_is_caught(sampled, tmp_path
     assert off < tolerance("fast_motion")
 
 
-def test_what_moves_slowly_is_sampled_once(sampled):
+def test_slow_motion_is_sampled_once(sampled):
     times: list[float] = []
 
     def motion(t: float) -> np.ndarray:
@@ -129,7 +129,7 @@ def test_where_float32_is_not_exact_enough_no_sample_is_taken_in_it(monkeypatch:
     assert_close(got[:, 7, :3], want[:, :3].astype(np.float32), "float32.relative")
 
 
-def test_what_is_trimmed_further_is_not_fitted_again(sampled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_further_pruned_trajectories_are_not_fitted_again(sampled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def motion(t: float) -> np.ndarray:
         return np.stack([np.sin((1 + i) * t) * np.array([1, 0.5, 0]) for i in range(COUNT)])
 

@@ -1,7 +1,7 @@
 """Pruning: only what moves stays in the graph, each rule can be switched off, and the error allowed is kept."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,30 +15,31 @@ from export.pruning import RULES
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
-from msdgs_serve.scene.camera import Camera
+from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from msdgs_train.gaussians.model_file import SceneInfo
 from tests.support.images import psnr
-from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model
+from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model, saved
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
 
 GAUSSIAN_BYTES = 40 + 4
-"""Pose and opacity of a static Gaussian; its SH coefficients have 12 each."""
+"""Bytes of a static Gaussian's pose and opacity; an SH coefficient has 12 bytes."""
+
+OBJECT_X = 0.6  # between the ground and the object
 
 
 def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> ExportJob:
-    save_model(folder / "model.pt", model, info, 1)
     (folder / "candidates").mkdir()
-    return ExportJob(folder / "model.pt", folder / "candidates", **settings)
+    return ExportJob(saved(folder, model, info), folder / "candidates", **settings)
 
 
 def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: SceneInfo) -> float:
-    """PSNR of the worst of frames at times that the export has not looked at, the model in float64."""
+    """Return the PSNR of the worst frame, against the model in float64, at times that the export didn't use."""
     double, worst = model.double(), np.inf
     session, (t0, t1) = DeformationSession(candidate.path), info.time_range
-    camera = Camera(**{**cast(dict[str, Any], CAMERA), "camera_to_world": np.array(CAMERA["camera_to_world"])})
+    camera = camera_of(CAMERA, CAMERA["width"])
     for t in t0 + (t1 - t0) * np.random.default_rng(7).uniform(size=12):
         with torch.no_grad():
             posed = double.pose(float(np.float32(t)))
@@ -55,18 +56,19 @@ def test_of_a_scene_with_one_moving_object_only_that_stays_in_the_graph(tmp_path
     scene = candidate.session.scene
     moving = candidate.pruned.ids[: scene.moving_count]
     assert 0 < scene.moving_count <= OBJECT
-    assert (moving >= GROUND).all()
+    assert (job.model.gaussians.means[moving, 0] > OBJECT_X).all()
     assert independent_worst_db(candidate, model, SCENE) >= 50
 
 
 def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_path: Path):
-    candidate = job_of(tmp_path, with_hidden_one(moving_object())).candidate("network", 50.0)
-    scene, ids = candidate.session.scene, candidate.pruned.ids
+    job = job_of(tmp_path, with_hidden_one(moving_object()))
+    candidate = job.candidate("network", 50.0)
+    scene, means = candidate.session.scene, job.model.gaussians.means[candidate.pruned.ids]
     left_out = {entry["rule"]: entry for entry in scene.metadata.left_out}
     assert set(left_out) == set(RULES)
-    assert GROUND not in ids  # the hidden one
-    assert (ids[: scene.moving_count] > GROUND).all()
-    assert (ids[scene.moving_count :] < GROUND).all()
+    assert means[:, 2].min() > -2  # without the hidden one
+    assert (means[: scene.moving_count, 0] > OBJECT_X).all()
+    assert (means[scene.moving_count :, 0] < OBJECT_X).all()
     assert left_out["static"]["count"] == scene.static_count
     assert (left_out["layers"]["count"], left_out["layers"]["of"]) == (1, 2)
     assert (left_out["heads"]["count"], left_out["heads"]["of"]) == (2, 3)
@@ -95,7 +97,7 @@ def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str)
         assert scene.metadata.sh_degree == 1
 
 
-def test_layers_whose_trial_would_be_too_dear_stay_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("export.pruning.rules.MAX_OPERATIONS", 0.0)
     pruned = job_of(tmp_path, moving_object()).pruned(45.0)
     left_out = {entry["rule"] for entry in pruned.left_out}
@@ -134,7 +136,7 @@ def test_the_error_allowed_is_kept_in_frames_of_our_own(tmp_path: Path, pruning_
     assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("pruning.other_times_db")
 
 
-def test_trimming_less_leaves_more_in(tmp_path: Path):
+def test_a_higher_psnr_prunes_less(tmp_path: Path):
     job = job_of(tmp_path, random_model(400, sh_degree=1, noise=0.02))
     sizes = [job.candidate("network", pruning_db).size for pruning_db in (30.0, 55.0, None)]
     assert sizes == sorted(sizes)
@@ -204,7 +206,7 @@ def test_cameras_are_added_where_too_few_are_stored(count: int):
         (40, {}, SceneInfo(time_range=(0.5, 0.5), bounds=SCENE.bounds, cameras=SCENE.cameras[:2])),
     ],
 )
-def test_unusual_scenes_are_trimmed_and_written(tmp_path: Path, count: int, changes: dict[str, Any], info: SceneInfo):
+def test_unusual_scenes_are_pruned_and_written(tmp_path: Path, count: int, changes: dict[str, Any], info: SceneInfo):
     job = job_of(tmp_path, random_model(count, **changes), info)
     candidate = job.candidate("network", 50.0)
     error = job.error(candidate)
@@ -223,7 +225,7 @@ def test_layers_on_nodes_keep_all_heads(tmp_path: Path, kind: str):
 
 
 def with_hidden_one(model: DynamicGaussians) -> DynamicGaussians:
-    """The object's first Gaussian is behind all cameras."""
+    """Move the object's first Gaussian behind all cameras."""
     with torch.no_grad():
         model.gaussians.means[GROUND] = torch.tensor([0.0, 0.0, -50.0])
     return model

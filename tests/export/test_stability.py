@@ -1,4 +1,4 @@
-"""What the stability report says of models whose answer is known, and every row of the suite."""
+"""The stability report of models whose result is known, and every row of the suite."""
 
 import csv
 import json
@@ -17,14 +17,12 @@ from export.measure.stability import assess
 from export.precision.formats import FLOAT32, FORMATS, in_format
 from export.precision.report import PlanUnsafe
 from export.stability import UNSTABLE, main
-from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import save_model
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.layers.deformation import DeformationLayer, LayerStep
 from tests.export import stability_extreme, stability_stiff
 from tests.export.stability_rows import FAILS, Row
 from tests.export.stability_suite import TABLE
-from tests.support.models import SCENE, export_scene, random_model
+from tests.support.models import SCENE, export_scene, random_model, saved
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close, tolerance
 
@@ -168,7 +166,7 @@ def test_the_worst_gaussians_are_named_with_what_they_do_to_the_image():
 
 
 @pytest.mark.parametrize(("count", "layers"), [(0, ("mlp",)), (5, ())])
-def test_what_does_not_move_is_steady(count: int, layers: tuple[str, ...]):
+def test_static_models_are_stable(count: int, layers: tuple[str, ...]):
     report = assess(random_model(count, layers=layers), SCENE)
     assert report.stable
     assert report.refusal("network") is None
@@ -187,11 +185,6 @@ def test_bounds_that_hold_a_gaussian_back_are_counted():
     assert limits["quaternions without a direction"] == 1
     assert limits["modulation of scales at e^±2"] == 9
     assert limits["scales at e^±20, most at one time"] >= 7
-
-
-def saved(folder: Path, model: DynamicGaussians) -> Path:
-    save_model(folder / "model.pt", model, SCENE, 1)
-    return folder / "model.pt"
 
 
 def test_an_unsafe_plan_is_refused_and_an_old_file_stays(tmp_path: Path):

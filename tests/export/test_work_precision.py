@@ -1,4 +1,4 @@
-"""The sweep and its report: dominated points are never chosen, errors repeat, wrong wishes are refused."""
+"""The sweep and its report: dominated points are never chosen, errors repeat, invalid options are refused."""
 
 import json
 from collections.abc import Iterator
@@ -23,8 +23,7 @@ from export.options import ExportOptions
 from export.plans.registry import PLANS
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
-from msdgs_train.gaussians.model_file import save_model
-from tests.support.models import GROUND, OBJECT, SCENE, moving_object, random_model
+from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that it sweeps once
 
@@ -48,7 +47,7 @@ POINT_FIELDS = {
 
 
 def point(milliseconds: float, db: float, rasterizer: str = DEFAULT_RASTERIZER) -> Point:
-    """A point of which only time and error matter."""
+    """Return a point with this time and error."""
     times = FrameTime(*(Milliseconds(milliseconds, milliseconds),) * 3)
     error = RenderedError(db, db, None, 0.0, 0.0, 0.0, 1)
     return Point(cast(Any, SimpleNamespace()), rasterizer, times, error, None, None)
@@ -77,7 +76,7 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_p
         assert points[best].milliseconds == min(p.milliseconds for p in within)
 
 
-def test_what_no_file_can_ask_for_is_not_chosen():
+def test_rasterizers_that_no_file_can_select_are_not_chosen():
     points = [point(10, 60), point(1, 99, "another")]
     assert front(points) == [0]
     assert choose(points, 50) == 0
@@ -91,7 +90,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tup
 
 @pytest.fixture(scope="module", autouse=True)
 def few_candidates() -> Iterator[None]:
-    """As many as the tests estimate at."""
+    """Limit the sweep to few candidates."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.jobs.sweep.PRUNING_STEPS", (5.0, 1.0, -5.0))
         for name, texts in (("lowrank", []), ("keyframes", ["keyframes:2.0"])):
@@ -100,9 +99,8 @@ def few_candidates() -> Iterator[None]:
 
 
 def new_job(folder: Path) -> ExportJob:
-    save_model(folder / "model.pt", moving_object(), SCENE, 1)
     (folder / "candidates").mkdir()
-    return ExportJob(folder / "model.pt", folder / "candidates", min_psnr=45.0)
+    return ExportJob(saved(folder, moving_object()), folder / "candidates", min_psnr=45.0)
 
 
 def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_the_error(
@@ -134,7 +132,7 @@ def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried
     assert sweep._too_expensive("network", None) is None
 
 
-def test_of_plans_that_are_about_as_fast_the_smallest_goes_with_trimming(swept: tuple[ExportJob, SweepResult]):
+def test_of_similarly_fast_plans_the_smallest_is_pruned(swept: tuple[ExportJob, SweepResult]):
     def estimate(plan: str, cpu: float, size: int, db: float = 60.0) -> QuickEstimate:
         return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), cpu + 30, cpu, db)
 
@@ -167,7 +165,7 @@ def test_the_same_model_has_the_same_errors(swept: tuple[ExportJob, SweepResult]
         assert again.error(again.candidate(c.plan, c.pruning_db, lower)) == p.error
 
 
-def test_the_report_holds_what_it_promises(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
+def test_the_report_has_its_fields(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
     contents = report(*swept)
     paths = write_report(contents, tmp_path / "ball.onnx")
     assert [path.name for path in paths] == ["ball.report.json", "ball.report.md", "ball.report.png"]
@@ -193,20 +191,8 @@ def test_the_report_holds_what_it_promises(swept: tuple[ExportJob, SweepResult],
         assert len(np.unique(np.asarray(image).reshape(-1, 4), axis=0)) > 10
 
 
-def saved(folder: Path, **changes: Any) -> Path:
-    save_model(folder / "model.pt", random_model(60, **changes), SCENE, 1)
-    return folder / "model.pt"
-
-
-@pytest.mark.parametrize("min_psnr", [float("nan"), float("inf"), -1.0, 0.0, 101.0])
-def test_an_error_that_cannot_be_meant_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], min_psnr: float):
-    assert main(ExportOptions(saved(tmp_path), tmp_path / "s.onnx", min_psnr=min_psnr)) == 1
-    assert "`min_psnr` must be a PSNR in dB from 10 to 100" in capsys.readouterr().err
-    assert not (tmp_path / "s.onnx").exists()
-
-
 def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = saved(tmp_path)
+    path = saved(tmp_path, random_model(60))
     assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0)) == 1
     shown = capsys.readouterr().err
     assert "at most" in shown
@@ -227,19 +213,23 @@ def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: p
         ({"times": 1}, "times"),
         ({"data": Path("nowhere")}, "nowhere"),
         ({"output": Path("nowhere") / "s.onnx"}, "in a folder that exists"),
+        *(
+            ({"min_psnr": value}, "`min_psnr` must be a PSNR in dB from 10 to 100")
+            for value in (float("nan"), float("inf"), -1.0, 0.0, 101.0)
+        ),
     ],
 )
-def test_wrong_wishes_are_refused_by_name(
+def test_invalid_options_are_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
 ):
     wishes: dict[str, Any] = {"output": tmp_path / "s.onnx"} | settings
-    assert main(ExportOptions(saved(tmp_path), **wishes)) == 1
+    assert main(ExportOptions(saved(tmp_path, random_model(60)), **wishes)) == 1
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "s.onnx").exists()
 
 
 def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
-    assert main(ExportOptions(tmp_path / "model.pt", min_psnr=45.0, keep_sh=True)) == 0
+    assert main(ExportOptions(saved(tmp_path, moving_object()), min_psnr=45.0, keep_sh=True)) == 0
     shown = capsys.readouterr().err
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene
@@ -262,7 +252,7 @@ def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.Monke
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    checkpoint = saved(tmp_path)
+    checkpoint = saved(tmp_path, random_model(60))
     old = {name: f"an older {name}".encode() for name in ("model.onnx", "model.report.json")}
     for name, contents in old.items():
         (tmp_path / name).write_bytes(contents)
@@ -273,9 +263,8 @@ def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_switched_off_on_the_command_line(tmp_path: Path):
-    save_model(tmp_path / "model.pt", moving_object(), SCENE, 1)
     off: dict[str, Any] = {"keep_static": True, "keep_invisible": True, "keep_layers": True}
-    assert main(ExportOptions(tmp_path / "model.pt", quick=True, **off)) == 0
+    assert main(ExportOptions(saved(tmp_path, moving_object()), quick=True, **off)) == 0
     scene = DeformationSession(tmp_path / "model.onnx").scene
     assert (scene.moving_count, scene.static_count) == (GROUND + OBJECT, 0)
     assert scene.metadata.layers == ("mlp", "mlp")

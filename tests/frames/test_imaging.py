@@ -125,7 +125,7 @@ def test_equal_images_give_equal_bytes(image_format: ImageFormat, monkeypatch: p
         ((make_image(width=1, height=16384), "webp"), "height"),
     ],
 )
-def test_what_a_format_cannot_hold_is_refused_by_name(arguments, field):
+def test_images_that_a_format_cannot_hold_are_refused_by_name(arguments, field):
     with pytest.raises(InvalidInput) as error:
         encode(*arguments)
     assert error.value.field == field

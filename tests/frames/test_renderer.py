@@ -1,4 +1,4 @@
-"""Scene, camera and time to an image; posing is done once for those who ask together."""
+"""Rendering of a scene at a time, and the cache of its poses."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -21,17 +21,17 @@ POSE_BYTES = 2 * 10 * 4  # two Gaussians: means, quats, scales
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> DeformationSession:
-    return DeformationSession(write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx"))
+def session(scene: Path) -> DeformationSession:
+    return DeformationSession(scene)
 
 
 def level_camera(width: int = SIZE, height: int = SIZE) -> Camera:
-    """Five units away, at the height of the origin; z is up."""
+    """Return a camera five units away, at the height of the origin; z is up."""
     return Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), width, height, 40.0)
 
 
 class CountingSession(DeformationSession):
-    """Stands for a scene: says how often and with which times it was posed, and can be made slow or to fail."""
+    """A scene that records the times at which it is posed, and that can wait or fail."""
 
     def __init__(self, gaussians: Gaussians, scene: BakedScene) -> None:
         self.scene = scene
@@ -96,15 +96,7 @@ def test_without_background_colors_are_premultiplied(session: DeformationSession
     np.testing.assert_allclose(over, opaque.rgb, atol=1e-6)
 
 
-def test_a_time_outside_the_scene_is_refused_and_not_remembered(session: DeformationSession):
-    renderer = Renderer()
-    for _ in range(2):
-        with pytest.raises(InvalidInput) as error:
-            renderer.render(session, level_camera(), 1.5)
-        assert error.value.field == "t"
-
-
-def test_one_computation_for_all_who_ask_together(counting: CountingSession):
+def test_simultaneous_requests_share_one_computation(counting: CountingSession):
     renderer = Renderer()
     counting.release.clear()
     with ThreadPoolExecutor(8) as pool:
@@ -127,7 +119,7 @@ def test_scenes_do_not_share_poses(session: DeformationSession, counting: Counti
     assert renderer.posed(counting, 0.0) is not renderer.posed(other, 0.0)
 
 
-def test_a_failed_computation_reaches_all_who_wait_and_is_tried_again(counting: CountingSession):
+def test_a_failed_computation_fails_all_requests_and_is_repeated(counting: CountingSession):
     renderer = Renderer()
     counting.failure = RuntimeError("no memory")
     counting.release.clear()
@@ -154,12 +146,6 @@ def test_eight_threads_get_the_bytes_that_one_gets(session: DeformationSession):
     with ThreadPoolExecutor(8) as pool:
         together = list(pool.map(lambda number: draw(shared, number % 8), range(32)))
     assert together == alone * 4
-
-
-def test_a_scene_without_motion(tmp_path: Path):
-    path = write_scene(tmp_path / "static.onnx", moving=False)
-    image = Renderer().render(DeformationSession(path), level_camera(), 0.5)
-    assert image.rgb[SIZE // 2, SIZE // 2].argmax() == 0
 
 
 def test_a_cache_of_less_than_nothing_is_refused():

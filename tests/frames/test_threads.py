@@ -30,7 +30,7 @@ def test_a_part_that_another_thread_has_is_waited_for(two_threads: None):
     assert ended
 
 
-def test_what_another_thread_raises_is_raised(two_threads: None):
+def test_errors_of_other_threads_are_raised(two_threads: None):
     caller, begun = threading.get_ident(), threading.Event()
 
     def work() -> bool:
@@ -44,7 +44,7 @@ def test_what_another_thread_raises_is_raised(two_threads: None):
         run_together(work, ())
 
 
-def test_nobody_is_waited_for_when_all_is_done(two_threads: None):
+def test_threads_without_work_are_not_awaited(two_threads: None):
     caller, begun, go_on = threading.get_ident(), threading.Event(), threading.Event()
 
     def work() -> bool:

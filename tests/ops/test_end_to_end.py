@@ -1,4 +1,4 @@
-"""From a trained model to a frame over HTTP: the service shows what the trainer saw."""
+"""From a trained model to a frame over HTTP: the service renders what the trainer renders."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_serve.scene import Camera, Gaussians
-from msdgs_train.gaussians.model_file import save_model
+from msdgs_serve.scene import Gaussians
+from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.rendering.rasterize import rasterize
 from tests.support.images import decode, linear_to_srgb
-from tests.support.models import CAMERA, SCENE, export_scene, random_model
+from tests.support.models import CAMERA, SCENE, export_scene, random_model, saved
 from tests.support.reference import render
 from tests.support.service import serving
 from tests.support.tolerances import tolerance
@@ -18,18 +18,10 @@ from tests.support.tolerances import tolerance
 TIMES = (0.0, 0.37, 1.0)
 
 
-@pytest.fixture(scope="module")
-def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("model") / "model.pt"
-    save_model(path, random_model(), SCENE, 1)
-    return path
-
-
 @pytest.mark.slow
-def test_the_service_draws_what_the_trainer_draws(model_file: Path) -> None:
-    model = random_model()
-    camera = Camera(**{**CAMERA, "camera_to_world": np.array(CAMERA["camera_to_world"])})
-    scene = export_scene(model_file, model_file.with_suffix(".onnx")).path
+def test_the_service_draws_what_the_trainer_draws(tmp_path: Path) -> None:
+    model, camera = random_model(), camera_of(CAMERA, CAMERA["width"])
+    scene = export_scene(saved(tmp_path, model), tmp_path / "scene.onnx").path
     body = {
         "camera": {"type": "matrix", **{k: CAMERA[k] for k in ("camera_to_world", "fx", "fy", "cx", "cy")}},
         "width": camera.width,

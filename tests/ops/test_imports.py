@@ -1,4 +1,4 @@
-"""Which room may import which: read from the sources by import-linter, and seen in fresh interpreters."""
+"""Which package may import which: checked in the sources by import-linter, and in fresh interpreters."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, run_python
 
 pytestmark = pytest.mark.slow
 
@@ -24,24 +24,14 @@ for name in names:
 
 
 def modules_after(code: str) -> set[str]:
-    """Top-level modules that a fresh interpreter has loaded after running `code`."""
+    """Return the top-level modules that a fresh interpreter has loaded after running `code`."""
     report = "\nimport json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
-    finished = subprocess.run(
-        [sys.executable, "-c", code + report], cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
-    )
-    assert finished.returncode == 0, finished.stderr
-    return set(json.loads(finished.stdout))
+    return set(json.loads(run_python(code + report)))
 
 
 def test_import_contracts_hold() -> None:
-    finished = subprocess.run(
-        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
+    finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert finished.returncode == 0, finished.stdout + finished.stderr
 
 

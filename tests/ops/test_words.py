@@ -27,7 +27,7 @@ RETIRED = {
     "doorman": "early rejection",
     "lanes_memory|lane_types|LanesType|parts?_of_lanes": "vector_memory, vector_types, VectorType, part_count",
     "serve[./]watch|stopped watch|rasterizer[./]ahead": "render_job, precompile",
-    "(?:most|least)_\\w+|at_most": "max_*, min_*",
+    "(?:most|least)_(?!common)\\w+|at_most": "max_*, min_*",
     "[a-z]+_a_(?:byte|pair|part|round|turn)": "*_per_*",
     "anew|nobody|whoever": "again, no one, the one that",
 }

@@ -1,7 +1,6 @@
 """Gradients of the training rasterizer: finite differences, autograd through a plain renderer, laws, edge cases."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,17 +12,16 @@ from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_train.rendering.rasterize import rasterize
 from tests.support import reference, reference_torch
-from tests.support.processes import run_python
 from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene, select
 from tests.support.tolerances import assert_close, tolerance
 
 BACKGROUND = (0.2, 0.6, 0.9)
 STEP = 1e-6
-"""Of the central differences: their error is STEP² f''' / 6, about 1e-10, and 1e-16 / STEP = 1e-10 from rounding."""
+"""Step of central differences: their error is STEP² f''' / 6, about 1e-10, plus 1e-16 / STEP = 1e-10 from rounding."""
 
 
 class Parameters(NamedTuple):
-    """What the rasterizer is differentiated by; quaternions are normalised on their way in."""
+    """Inputs that have gradients; quaternions are normalized before they are rendered."""
 
     means: torch.Tensor
     quats: torch.Tensor
@@ -73,7 +71,7 @@ def weighted(pixels: np.ndarray, seed: int = 0) -> Loss:
 
 
 def assert_gradients_agree(got: dict[str, np.ndarray], want: dict[str, np.ndarray], row: str):
-    """Kind by kind, relative to the largest entry of that kind; where that is nothing, to the largest of all."""
+    """Compare gradients relative to the largest entry of their kind; if that is about 0, to the largest of all."""
     largest = max(np.abs(want[kind]).max(initial=0) for kind in KINDS)
     for kind in KINDS:
         size = np.abs(want[kind]).max(initial=1e-6 * largest)
@@ -82,7 +80,7 @@ def assert_gradients_agree(got: dict[str, np.ndarray], want: dict[str, np.ndarra
 
 
 def central_differences(value: Callable[[], float], parameter: torch.Tensor) -> np.ndarray:
-    """d value / d parameter, entry by entry."""
+    """Return d value / d parameter, entry by entry."""
     flat = parameter.detach().view(-1)
     result = np.empty(flat.shape)
     for i in range(len(flat)):
@@ -96,7 +94,7 @@ def central_differences(value: Callable[[], float], parameter: torch.Tensor) -> 
 
 
 def small_scene(seed: int, options: RasterizerOptions = GSPLAT) -> tuple[Parameters, Camera, np.ndarray]:
-    """A few Gaussians over one another; and the pixels that are not at a threshold."""
+    """Return a few overlapping Gaussians, a camera, and the pixels that are not at a threshold."""
     gaussians, camera = random_scene(seed, 7, 21, 13)
     gaussians = as_dtype(gaussians, np.float64)
     clear = reference.render(gaussians, camera, BACKGROUND, options).slack == 0
@@ -132,7 +130,7 @@ def test_finite_differences(kind: str, seed: int, options: RasterizerOptions):
 
 
 def test_pixels_at_a_threshold_jump_by_no_more_than_stated():
-    """Where a step of the parameters tips a decision, the image departs from its gradient by at most the slack."""
+    """At a threshold the image departs from its gradient by at most the oracle's bound."""
     splat = gaussians_of([[0, 0, 2], [0.1, 0, 3]], scales=0.2, opacities=[0.6, 0.9], dtype=np.float64)
     camera, step = front_camera(21, 13), 2e-4
     want = reference.render(splat, camera, BACKGROUND)
@@ -151,26 +149,28 @@ def test_pixels_at_a_threshold_jump_by_no_more_than_stated():
     assert (departure <= want.slack * want.color_range + tolerance("gradient.second_order")).all()
 
 
-@pytest.mark.parametrize("name", ["random", *sorted(set(ADVERSARIAL) - {"crowd"})])
-@pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
-def test_autograd_through_a_plain_renderer(name: str, options: RasterizerOptions):
-    """All pixels: in float64 both renderers decide alike."""
-    gaussians, camera = random_scene(53, 60) if name == "random" else ADVERSARIAL[name]()
-    gaussians = as_dtype(select(gaussians, slice(60)), np.float64)
-    parameters = parameters_of(gaussians)
-    loss = weighted(np.ones((camera.height, camera.width)))
+def assert_as_autograd(
+    parameters: Parameters, camera: Camera, loss: Loss | None = None, options: RasterizerOptions = GSPLAT
+):
+    """Compare all pixels unless the loss selects some: in float64 both renderers make the same decisions."""
+    loss = loss or weighted(np.ones((camera.height, camera.width)))
     got = gradients(draw(parameters, camera, options), loss, parameters)
     want = gradients(draw_plainly(parameters, camera, options), loss, parameters)
     assert_gradients_agree(got, want, "gradient.autograd")
 
 
+@pytest.mark.parametrize("name", ["random", *sorted(set(ADVERSARIAL) - {"crowd"})])
+@pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
+def test_autograd_through_a_plain_renderer(name: str, options: RasterizerOptions):
+    gaussians, camera = random_scene(53, 60) if name == "random" else ADVERSARIAL[name]()
+    gaussians = as_dtype(select(gaussians, slice(60)), np.float64)
+    assert_as_autograd(parameters_of(gaussians), camera, options=options)
+
+
 @pytest.mark.parametrize("degree", range(4))
 def test_every_degree_of_harmonics(degree: int):
     gaussians, camera = random_scene(54, 30, 21, 13, sh_degree=degree)
-    parameters = parameters_of(as_dtype(gaussians, np.float64))
-    loss = weighted(np.ones((13, 21)))
-    got = gradients(draw(parameters, camera), loss, parameters)
-    assert_gradients_agree(got, gradients(draw_plainly(parameters, camera), loss, parameters), "gradient.autograd")
+    assert_as_autograd(parameters_of(as_dtype(gaussians, np.float64)), camera)
 
 
 @pytest.mark.parametrize(
@@ -178,8 +178,14 @@ def test_every_degree_of_harmonics(degree: int):
 )
 def test_losses_on_one_output_or_one_pixel(loss: Loss):
     parameters, camera, _ = small_scene(55)
-    got = gradients(draw(parameters, camera), loss, parameters)
-    assert_gradients_agree(got, gradients(draw_plainly(parameters, camera), loss, parameters), "gradient.autograd")
+    assert_as_autograd(parameters, camera, loss)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.9995, 1.0])
+def test_no_gradient_is_infinite_at_the_ends_of_opacity(opacity: float):
+    """Three Gaussians behind one another: a naive backward pass divides by 1 - alpha, which is 0."""
+    gaussians = gaussians_of([[0, 0, 2], [0, 0, 2.5], [0, 0, 3]], scales=0.5, opacities=[opacity, 1.0, opacity])
+    assert_as_autograd(parameters_of(gaussians), front_camera(9, 7))
 
 
 def test_gradients_of_projected_means_and_radii():
@@ -239,16 +245,6 @@ def test_none_and_one(count: int, size: tuple[int, int], dtype: torch.dtype):
     assert (count == 1) == bool(grads["opacities"].any())
 
 
-@pytest.mark.parametrize("opacity", [0.0, 0.9995, 1.0])
-def test_no_gradient_is_infinite_at_the_ends_of_opacity(opacity: float):
-    """Three of opacity 1 behind one another: 1 / (1 - alpha) is what a naive backward pass divides by."""
-    gaussians = gaussians_of([[0, 0, 2], [0, 0, 2.5], [0, 0, 3]], scales=0.5, opacities=[opacity, 1.0, opacity])
-    parameters, camera = parameters_of(gaussians), front_camera(9, 7)
-    loss = weighted(np.ones((7, 9)))
-    got = gradients(draw(parameters, camera), loss, parameters)
-    assert_gradients_agree(got, gradients(draw_plainly(parameters, camera), loss, parameters), "gradient.autograd")
-
-
 def test_hidden_and_absent_gaussians_have_no_gradient():
     gaussians = gaussians_of([[0, 0, 2], [0, 0, -2], [90, 0, 2]], scales=0.2, opacities=0.8)
     parameters, camera = parameters_of(gaussians), front_camera()
@@ -270,20 +266,13 @@ def test_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
     assert all(result == results[0] for result in results[1:])
 
 
-def test_changing_the_image_in_place_is_noticed():
-    """The backward pass needs the image as it was drawn."""
-    parameters, camera, _ = small_scene(59)
-    rgb, _ = draw(parameters, camera)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        rgb.mul_(3).sum().backward()
-
-
-def test_changing_a_parameter_before_backward_is_noticed():
-    """As torch's own functions do: the gradient would belong to neither value."""
+@pytest.mark.parametrize("changed", ["image", "means"])
+def test_a_change_in_place_before_the_backward_pass_is_noticed(changed: str):
+    """As for torch's own functions: the gradient would be that of neither value."""
     parameters, camera, _ = small_scene(59)
     rgb, _ = draw(parameters, camera)
     with torch.no_grad():
-        parameters.means.add_(1.0)
+        {"image": rgb, "means": parameters.means}[changed].add_(1.0)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         rgb.sum().backward()
 
@@ -293,20 +282,3 @@ def test_backward_twice_gives_the_same():
     rgb, _ = draw(parameters, camera)
     first, second = (torch.autograd.grad(rgb.sum(), parameters.means, retain_graph=True)[0] for _ in range(2))
     assert torch.equal(first, second)
-
-
-WITHOUT_COMPILER = """
-import numpy, sys, torch
-from tests.rasterizer.test_gradients import draw, gradients, small_scene, weighted
-parameters, camera, clear = small_scene(60)
-numpy.savez(sys.argv[1], **gradients(draw(parameters, camera), weighted(clear), parameters))
-"""
-
-
-@pytest.mark.slow
-def test_without_the_compiler_gradients_are_the_same(tmp_path: Path):
-    run_python(WITHOUT_COMPILER, tmp_path / "gradients.npz", NUMBA_DISABLE_JIT="1")
-    parameters, camera, clear = small_scene(60)
-    want = gradients(draw(parameters, camera), weighted(clear), parameters)
-    with np.load(tmp_path / "gradients.npz") as plain:
-        assert_gradients_agree(dict(plain), want, "gradient.autograd")

@@ -1,4 +1,4 @@
-"""Machine code on disk: void when a source changes, mended where it is damaged, complete before the first request."""
+"""Cached machine code: compiled again if a source changes or a file is damaged, complete before the first request."""
 
 import ast
 import json
@@ -40,14 +40,14 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def compiled(room: Path) -> Path:
-    """A folder of machine code that a process has filled and another one has used."""
+    """Return a cache that one process has filled and another one has used."""
     assert call(room, room / "cache") == (42.0, True)
     assert call(room, room / "cache") == (42.0, False)
     return room / "cache"
 
 
 def call(room: Path, cache: Path | str) -> tuple[float, bool]:
-    """Result of the kernel in a process of its own, and whether that process compiled it."""
+    """Return the kernel's result in a new process, and whether that process compiled it."""
     value, misses = run_python(CALL, room, NUMBA_CACHE_DIR=str(cache)).split()
     return float(value), misses != "0"
 
@@ -67,7 +67,7 @@ def flip(contents: bytes) -> bytes:
     [(".nbi", cut), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", lambda _: b""), (".nbc", flip)],
     ids=["index cut", "index empty", "code cut", "code empty", "code flipped"],
 )
-def test_a_damaged_file_is_compiled_anew_and_mended(
+def test_a_damaged_file_is_compiled_again_and_replaced(
     room: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes]
 ):
     cache = tmp_path / "cache"
@@ -94,7 +94,7 @@ def test_nothing_that_can_be_written_is_no_obstacle(room: Path, tmp_path: Path):
     assert float(value) == 42.0
 
 
-def test_what_was_compiled_beside_the_sources_is_used_from_the_copy(tmp_path: Path):
+def test_a_copy_of_compiled_kernels_is_used(tmp_path: Path):
     """As in a container with a read-only root: compiled at build, copied at start."""
     package = tmp_path / "msdgs_serve"
     shutil.copytree(ROOT / "msdgs_serve", package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -123,7 +123,7 @@ def files_of(folder: Path, stamp: str = "now") -> CheckedFiles:
 
 
 def test_code_that_two_processes_store_at_once_is_not_mixed_up(tmp_path: Path):
-    """Each has seen an index without the other's code; whichever is written last, no type gets the other's."""
+    """Both processes read the index before the other stored its code; no type may get the other's code."""
     files_of(tmp_path).save("float32", "code for float32")
     index = (tmp_path / "room.kernel.nbi").read_bytes()
     (tmp_path / "room.kernel.nbi").unlink()
@@ -145,7 +145,7 @@ def test_code_of_older_sources_goes(tmp_path: Path):
     assert files_of(tmp_path).load("float64") == "new code"
 
 
-def test_code_whose_file_is_gone_is_compiled_anew(tmp_path: Path):
+def test_code_whose_file_is_missing_is_compiled_again(tmp_path: Path):
     files_of(tmp_path).save("float32", "code")
     for file in tmp_path.glob("*.nbc"):
         file.unlink()
@@ -198,7 +198,7 @@ def kernel_files() -> list[Path]:
 
 @pytest.mark.parametrize("file", kernel_files(), ids=lambda file: file.stem)
 def test_kernels_use_only_what_their_stamp_follows(file: Path):
-    """From the package's own modules: the rasterizer, the scene's vocabulary, the kernel's own folder."""
+    """Kernels use modules of the rasterizer, the scene and their own folder only."""
     tree = ast.parse(file.read_text())
     own = ".".join(file.relative_to(ROOT).parent.parts)
     followed = ("msdgs_serve.rasterizer", "msdgs_serve.scene", own)
@@ -217,42 +217,21 @@ def test_kernels_use_only_what_their_stamp_follows(file: Path):
                     assert origin.rpartition(".")[0] in followed, f"{function.name} uses {name} of {origin}"
 
 
-KERNELS_AFTER = """
-import importlib, json, pkgutil, sys
-from numba.core.dispatcher import Dispatcher
-import msdgs_serve.rasterizer as rasterizer
+FRAMES = """
+import dataclasses, json, sys
+from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer.precompile import compile_kernels
+from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
+from msdgs_serve.threads import sharing_cores
+from tests.rasterizer.test_rasterizer_threads import kernels
 
 def compiled():
-    names = [f"{rasterizer.__name__}.{module.name}" for module in pkgutil.iter_modules(rasterizer.__path__)]
-    return {
-        f"{name}.{kernel}": sorted(map(str, value.signatures))
-        for name in names
-        for kernel, value in vars(importlib.import_module(name)).items()
-        if isinstance(value, Dispatcher)
-    }
+    return {f"{kernel.__module__}.{kernel.__name__}": sorted(map(str, kernel.signatures)) for kernel in kernels()}
 
 compile_kernels()
 precompiled = compiled()
-"""
-
-FRAMES = (
-    KERNELS_AFTER
-    + """
-import dataclasses
-from pathlib import Path
-from msdgs_serve.api.cameras import resolve_camera
-from msdgs_serve.api.schemas import RenderRequest
-from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
-from msdgs_serve.store import SceneStore
-
-served = SceneStore([Path(sys.argv[1])]).get("toybench")
-session = served.session
-request = RenderRequest.model_validate(
-    {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 40, "height": 30}
-)
-camera = resolve_camera(request, served)
-renderer = Renderer()
+session, renderer = DeformationSession(sys.argv[1]), Renderer()
+camera = session.scene.metadata.cameras[0].camera.resized(40, 30)
 for model in ("pinhole", "orthographic", "fisheye"):
     view = dataclasses.replace(camera, model=model)
     for options in (
@@ -263,9 +242,10 @@ for model in ("pinhole", "orthographic", "fisheye"):
         RenderOptions(shutter=Shutter(0.0, 0.1, 3)),
     ):
         renderer.render(session, view, 0.5, options)
+with sharing_cores():  # with two callers at once, each computes on one thread
+    renderer.render(session, camera, 0.5)
 print(json.dumps([precompiled, compiled()]))
 """
-)
 
 
 def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
@@ -273,6 +253,11 @@ def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
     assert precompiled["msdgs_serve.rasterizer.projection._project_parts"]
     assert precompiled["msdgs_serve.rasterizer.compositing._composite_tiles"]
     assert after == precompiled
+
+
+def test_kernels_run_without_the_compiler() -> None:
+    """Their tests also pass with the kernels as plain Python, and cover nearly all of their lines."""
+    run_python("import sys; from tests.rasterizer.kernel_coverage import main; sys.exit(main())")
 
 
 def test_compiling_says_where_the_kernels_are() -> None:

@@ -70,17 +70,6 @@ def test_projection(name: str, dtype: type):
     assert_close((conics(got)[drawn] - inverse) / size + 1, np.ones_like(inverse), f"conic.{row}.relative")
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_what_is_not_drawn_adds_nothing(name: str):
-    gaussians, camera = scene(name, np.float64)
-    splats = gsplat_projection(gaussians, camera)
-    hidden = project(gaussians, camera, GSPLAT).extents[:, 0] == 0
-    opacities = torch.from_numpy(gaussians.opacities)
-    hidden_ones = reference_torch.Projection(*(values[hidden] for values in splats))
-    _, alpha = reference_torch.render(hidden_ones, opacities[hidden], camera, torch.zeros(3).double())
-    assert not alpha.any()
-
-
 @pytest.mark.parametrize("name", ["random", "off_axis_89", "principal_point_outside", "inside_splat"])
 def test_images(name: str):
     gaussians, camera = scene(name, np.float64)

@@ -7,7 +7,7 @@ import pytest
 
 from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering
 from tests.support.reference import DEPTH_BAND, Reference, render
-from tests.support.scenes import ADVERSARIAL, as_dtype, draw, front_camera, gaussians_of, random_scene, select
+from tests.support.scenes import ADVERSARIAL, as_dtype, draw, front_camera, gaussians_of, random_scene
 from tests.support.tolerances import tolerance
 
 MANY = "ten_thousand_on_a_pixel"
@@ -18,7 +18,7 @@ EXACT_DEPTHS = {"equal_depths"}
 
 
 def assert_same_image(got: Rendering, want: Reference, row: str, min_clean: float = 0.5):
-    """Tight where every decision is clear; bounded by the decisions' own effect in the band where it is not."""
+    """Compare tightly where no decision is in doubt; elsewhere allow the effect of the decision as well."""
     clean = want.slack == 0
     assert clean.mean() >= min_clean, "the comparison would be empty"
     for name in ("rgb", "alpha"):
@@ -77,7 +77,7 @@ def test_adversarial_scenes(name: str):
 
 @pytest.mark.slow
 def test_largest_image():
-    """8192 × 8192, in which a few splats are found where they belong, small, large and at the far corner."""
+    """A few splats, small, large and at the far corner, are at their places in 8192 × 8192 pixels."""
     side = 8192
     camera = front_camera(side, side, focal=6000.0)
     means = np.array([[0, 0, 3], [-1.2, 1.3, 2], [0.5, -1.0, 2.2], [1.36, 1.36, 2]])
@@ -102,15 +102,3 @@ def test_float64_agrees_to_rounding(name: str, options: RasterizerOptions):
     got = draw(gaussians, camera, background=BACKGROUND, options=options)
     assert got.rgb.dtype == np.float64
     assert_same_image(got, render(gaussians, camera, BACKGROUND, options, depth_band=0.0), "float64")
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_median_depth_lies_behind_half_of_the_light(dtype: type):
-    """Three sheets of opacity 0.4: the light falls to 0.6, then to 0.36; where there is one sheet, never to a half."""
-    sheets = gaussians_of([[0, 0, 2], [0, 0, 3], [0, 0, 4]], scales=1e4, opacities=0.4, dtype=dtype)
-    camera = front_camera(20, 20)
-    image = draw(sheets, camera, median_depth=True)
-    np.testing.assert_array_equal(image.median_depth, np.full((20, 20), 3, dtype))
-    alone = draw(select(sheets, slice(1)), camera, median_depth=True)
-    assert np.isinf(alone.median_depth).all()
-    assert draw(sheets, camera).median_depth.shape == (0, 0)

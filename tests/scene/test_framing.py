@@ -1,4 +1,4 @@
-"""How a scene is seen where a request says nothing of it."""
+"""The default view of a scene, derived from its cameras or its bounds."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The table of operators: what exporters emit, no more, and docs/contract.md says the same."""
+"""The table of allowed operators is exactly what exporters emit and what docs/contract.md lists."""
 
 import re
 from pathlib import Path
@@ -10,8 +10,10 @@ import onnxruntime
 import pytest
 
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.onnx.model import element_name
 from msdgs_serve.scene.onnx.operators import OPERATORS, Operator
+from tests.support.hostile_scenes import beside_the_scene
 from tests.support.sound_scenes import sound_scenes
 
 CONTRACT = Path(__file__).parents[2] / "docs" / "contract.md"
@@ -39,7 +41,7 @@ def test_the_graph_that_is_written_again_computes_the_same_bits(name: str):
 
 
 def emitted() -> dict[str, dict[str, set[Any]]]:
-    """Operators of all sound scenes and their attributes."""
+    """Return the operators of all sound scenes and their attributes."""
     found: dict[str, dict[str, set[Any]]] = {}
     for contents in SCENES.values():
         for node in onnx.load_from_string(contents).graph.node:
@@ -49,7 +51,7 @@ def emitted() -> dict[str, dict[str, set[Any]]]:
     return found
 
 
-def test_the_table_has_what_exporters_emit_and_no_more():
+def test_the_table_has_exactly_the_operators_of_exporters():
     found = emitted()
     assert sorted(found) == sorted(OPERATORS)
     for name, operator in OPERATORS.items():
@@ -57,7 +59,7 @@ def test_the_table_has_what_exporters_emit_and_no_more():
 
 
 def row(name: str, operator: Operator) -> str:
-    """As docs/contract.md has it."""
+    """Return the row of an operator in docs/contract.md."""
     inputs = []
     for operand in operator.operands:
         elements = "/".join(element_name(each) for each in operand.elements)
@@ -78,3 +80,28 @@ def row(name: str, operator: Operator) -> str:
 def test_the_contract_lists_the_table():
     written = re.findall(r"^\| `[A-Z][A-Za-z]+`(?:;[^|]*)? \|.*$", CONTRACT.read_text(), re.MULTILINE)
     assert written == [row(name, operator) for name, operator in OPERATORS.items()]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "message"),
+    [
+        ("largest = Cast (t)", "(Cast) lacks the attribute `to`"),
+        ("largest = Cast <to = 9> (t)", "(Cast) has to = 9, not"),
+        ("largest = Cast <to = 1, saturate = 2, x = 1> (t)", "(Cast) has the unknown attribute `saturate`"),
+        ("largest = Relu <alpha = 1.0> (t)", "has `f`, which a scene file may not have"),
+        ("largest = Clip(t, limits, limits)", "(Clip) clips to limits of shapes [2] and [2]"),
+        ("largest = Squeeze(base, second)", "(Squeeze) squeezes axes [1] of [1, 3]"),
+    ],
+)
+def test_nodes_outside_of_the_table_are_refused(scene: Path, nodes: str, message: str):
+    change = beside_the_scene(nodes, limits=np.zeros(2, np.float32))
+    with pytest.raises(SceneFileInvalid) as caught:
+        DeformationSession("scene.onnx", contents=change(onnx.load(scene), Path("unused")))
+    assert message in str(caught.value)
+
+
+def test_a_node_of_another_domain_is_refused(scene: Path):
+    model = onnx.load(scene)
+    model.graph.node[0].domain = "com.microsoft"
+    with pytest.raises(SceneFileInvalid, match=r"is Gather of another domain, not of ONNX"):
+        DeformationSession("scene.onnx", contents=model.SerializeToString())

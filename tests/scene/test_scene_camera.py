@@ -1,4 +1,4 @@
-"""Cameras by projecting points whose pixels are known, and inputs that are no camera."""
+"""Cameras project points to known pixels, and invalid cameras are refused."""
 
 import math
 
@@ -12,7 +12,7 @@ from tests.support.tolerances import assert_close
 
 
 def pixel_of(camera: Camera, point: object) -> np.ndarray:
-    """[2] x, y of a world point."""
+    """Return the pixel [2] of a world point."""
     x, y, z = (camera.world_to_camera @ [*np.asarray(point, float), 1.0])[:3]
     assert z > 0, "behind the camera"
     return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])

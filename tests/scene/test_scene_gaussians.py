@@ -1,4 +1,4 @@
-"""`Gaussians.validate`: what is refused, and by which name."""
+"""`Gaussians.validate` refuses invalid arrays by name."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,13 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def changed(field: str, value: object) -> Gaussians:
-    """Five valid Gaussians with one array replaced."""
+    """Return five valid Gaussians with one array replaced."""
     gaussians, _ = random_scene(0, 5)
     return Gaussians(**{**{name: getattr(gaussians, name) for name in FIELDS}, field: value})
 
 
 def poisoned(field: str, value: object) -> Gaussians:
-    """Five valid Gaussians, the third with `value` in one array."""
+    """Return five Gaussians, the third with `value` in one array."""
     array = getattr(random_scene(0, 5)[0], field).copy()
     array[2] = value
     return changed(field, array)
@@ -39,16 +39,11 @@ def test_not_finite_is_refused_by_name(field: str, poison: float):
     assert error.value.field == f"gaussians.{field}"
 
 
+OUT_OF_RANGE = {"quats": (0.0, [2.0, 0, 0, 0]), "scales": (0.0, -1.0), "opacities": (-0.01, 1.01)}
+
+
 @pytest.mark.parametrize(
-    ("field", "poison"),
-    [
-        ("quats", 0.0),
-        ("quats", [2.0, 0, 0, 0]),
-        ("scales", 0.0),
-        ("scales", -1.0),
-        ("opacities", -0.01),
-        ("opacities", 1.01),
-    ],
+    ("field", "poison"), [(field, value) for field, values in OUT_OF_RANGE.items() for value in values]
 )
 def test_out_of_range_is_refused_by_name(field: str, poison: object):
     with pytest.raises(InvalidInput) as error:
@@ -56,21 +51,17 @@ def test_out_of_range_is_refused_by_name(field: str, poison: object):
     assert error.value.field == f"gaussians.{field}"
 
 
+WRONG_SHAPES = {
+    "means": ((5, 2), (15,)),
+    "quats": ((4, 4), (5, 3)),
+    "scales": ((5,),),
+    "opacities": ((5, 1), (6,)),
+    "sh": ((5, 3), (5, 5, 3), (5, 16, 4), (4, 16, 3)),
+}
+
+
 @pytest.mark.parametrize(
-    ("field", "shape"),
-    [
-        ("means", (5, 2)),
-        ("means", (15,)),
-        ("quats", (4, 4)),
-        ("quats", (5, 3)),
-        ("scales", (5,)),
-        ("opacities", (5, 1)),
-        ("opacities", (6,)),
-        ("sh", (5, 3)),
-        ("sh", (5, 5, 3)),
-        ("sh", (5, 16, 4)),
-        ("sh", (4, 16, 3)),
-    ],
+    ("field", "shape"), [(field, shape) for field, shapes in WRONG_SHAPES.items() for shape in shapes]
 )
 def test_wrong_shapes_are_refused_by_name(field: str, shape: tuple[int, ...]):
     with pytest.raises(InvalidInput, match="shape") as error:

@@ -1,7 +1,7 @@
 """Scene files of every plan and layer kind, changed at the level of the format: refused with a reason or drawn finite,
 in bounded memory, without opening a file.
 
-`MSDGS_HOSTILE=5000 pytest -n 0 -s tests/scene/test_structured_fuzz.py` takes so many in place of a few for every day.
+`MSDGS_HOSTILE=5000 pytest -n 0 -s tests/scene/test_structured_fuzz.py` tests so many files instead of 300.
 """
 
 import os
@@ -21,10 +21,10 @@ from tests.support.sound_scenes import sound_scenes
 
 FILES = int(os.environ.get("MSDGS_HOSTILE", "300"))
 MEMORY_MEGABYTES = 64.0
-"""Besides what the graph may take: a session of onnxruntime, the file, kernels' working memory."""
+"""Memory beyond that of the graph: a session of onnxruntime, the file, buffers of the kernels."""
 
 OF_THE_SYSTEM = ("/proc/", "/sys/", "/dev/")
-"""What onnxruntime and Python's threads look at to know their processor."""
+"""Folders that onnxruntime and Python read to learn about the processor."""
 
 
 def test_sound_files_are_drawn():

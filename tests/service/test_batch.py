@@ -1,4 +1,4 @@
-"""Many frames in one call: each its own answer, equal ones drawn once."""
+"""Batches: each frame has a response of its own, and equal frames are rendered once."""
 
 import base64
 import email
@@ -13,9 +13,7 @@ import pytest
 from msdgs_serve.api.errors import MAX_BODY_BYTES
 from msdgs_serve.renderer import Renderer
 from tests.support.scene_files import write_scene
-from tests.support.service import serving
-
-FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
+from tests.support.service import FRAME, serving
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +31,14 @@ def client(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Iter
 
 
 def batch(client: httpx.Client, frames: list[Any]) -> list[dict[str, Any]]:
-    """The lines of the answer, in the order of the frames."""
+    """Return the lines of the response in the order of the frames."""
     response = client.post("/render/batch", json={"frames": frames})
     assert response.status_code == 200, response.text
     assert response.headers["Content-Type"] == "application/x-ndjson"
     return sorted((json.loads(line) for line in response.content.splitlines()), key=lambda line: line["index"])
 
 
-def test_every_frame_is_what_a_call_of_its_own_gives(client: httpx.Client):
+def test_every_frame_equals_that_of_a_single_request(client: httpx.Client):
     frames = [{**FRAME, "scene": "red"}, {**FRAME, "scene": "blue", "format": "jpeg"}]
     frames += [{**FRAME, "scene": "red", "t": 0.1 * number} for number in range(5)]
     lines = batch(client, frames)
@@ -105,7 +103,7 @@ def test_the_same_as_parts(client: httpx.Client):
 
 
 @pytest.mark.parametrize("frames", [[], [FRAME] * 21, "x", [1], None], ids=["none", "many", "text", "number", "null"])
-def test_what_is_no_batch(client: httpx.Client, frames: Any):
+def test_invalid_batches(client: httpx.Client, frames: Any):
     response = client.post("/render/batch", json={"frames": frames})
     assert response.status_code == 422
     assert response.json()["errors"][0]["field"].startswith("frames")

@@ -89,7 +89,7 @@ def test_many_frames_and_one_that_fails(client: Client):
         list(client.render_many([]))
 
 
-def test_what_is_wrong_is_told_by_field(client: Client):
+def test_problems_name_the_field(client: Client):
     with pytest.raises(Problem) as error:
         client.render(Orbit(0, 90), 0.5)
     assert error.value.status == 422
@@ -120,7 +120,7 @@ def test_keys_are_sent(scene: Path, tmp_path: Path):
             assert client.scenes() == ["balls"]
 
 
-def test_nobody_there():
+def test_an_unreachable_service():
     with Client("http://127.0.0.1:9", seconds=1) as client:
         assert not client.ready()
         with pytest.raises(Unreachable, match=r"127\.0\.0\.1:9"):

@@ -4,6 +4,7 @@ import logging
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from http.client import HTTPResponse
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from msdgs_serve.api.work import WorkQueue
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 from tests.support.scene_files import write_scene
-from tests.support.service import in_this_process, serving
+from tests.support.service import connect, in_this_process, serving
 
 BODY = b'{"t": 0}'
 HEAD = b"POST /render HTTP/1.1\r\nHost: here\r\nContent-Type: application/json\r\nContent-Length: 8\r\n"
@@ -26,7 +27,7 @@ REFUSED = 'msdgs_problems_total{kind="overloaded"}', 'msdgs_requests_total{metho
 
 @contextmanager
 def full(queue: WorkQueue, places: int) -> Iterator[None]:
-    """All places are taken by calls that do nothing."""
+    """Take places of the queue by calls that do nothing."""
     with ExitStack() as calls:
         for number in range(places):
             calls.enter_context(queue.admitted(str(number)))
@@ -35,7 +36,7 @@ def full(queue: WorkQueue, places: int) -> Iterator[None]:
 
 @pytest.fixture
 def queue() -> Iterator[WorkQueue]:
-    """Of two places."""
+    """Yield a queue of two places."""
     queue = WorkQueue(workers=1, waiting=1, seconds=20)
     yield queue
     queue.shut_down()
@@ -43,7 +44,7 @@ def queue() -> Iterator[WorkQueue]:
 
 @pytest.fixture
 def early_rejection(queue: WorkQueue) -> EarlyRejection:
-    """Of that queue."""
+    """Return the early rejection of that queue."""
     renderer = Renderer()
     return EarlyRejection(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
 
@@ -87,28 +88,22 @@ def test_only_a_full_queue_has_calls_turned_away(early_rejection: EarlyRejection
         HEAD.replace(b"Host", b"Host ") + b"\r\n" + BODY,
     ],
 )
-def test_what_is_not_plain_is_for_the_application(early_rejection: EarlyRejection, queue: WorkQueue, data: bytes):
+def test_unusual_requests_are_left_to_the_application(early_rejection: EarlyRejection, queue: WorkQueue, data: bytes):
     with full(queue, 2):
         assert early_rejection.answer(data, None, ()) is None
 
 
-def sent(connection: socket.socket, data: bytes) -> tuple[bytes, dict[str, str], bytes]:
-    """Status line, headers and body of the answer."""
+def sent(connection: socket.socket, data: bytes) -> tuple[int, dict[str, str], bytes]:
+    """Return status, headers and body of the answer to `data`."""
     connection.sendall(data)
-    received = b""
-    while b"\r\n\r\n" not in received:
-        received += connection.recv(65536)
-    head, _, body = received.partition(b"\r\n\r\n")
-    status, *lines = head.split(b"\r\n")
-    headers = dict(line.decode().lower().split(": ", 1) for line in lines)
-    while len(body) < int(headers["content-length"]):
-        body += connection.recv(65536)
-    return status, headers, body
+    response = HTTPResponse(connection)
+    response.begin()
+    return response.status, {name.lower(): value for name, value in response.getheaders()}, response.read()
 
 
 @in_this_process
 def test_the_answer_is_that_of_the_application(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """The same answer, line in the log and counts as the application's; the connection is as good as before."""
+    """Response, log line and counts are those of the application, and the connection stays usable."""
     write_scene(tmp_path / "ball.onnx")
     slow = HEAD + b"Accept-Charset: utf-8\r\n\r\n" + BODY  # an unknown header
     named = HEAD + b"X-Request-ID: mine\r\n\r\n" + BODY
@@ -116,18 +111,17 @@ def test_the_answer_is_that_of_the_application(tmp_path: Path, caplog: pytest.Lo
     caplog.set_level(logging.INFO, "msdgs_serve.access")
     with serving(tmp_path / "ball.onnx", server=servers, concurrent_renders=1, queued_renders=1) as client:
         service = servers[0].service
-        address = client.base_url.host, client.base_url.port
-        with socket.create_connection(address, timeout=60) as connection:
+        with connect(client) as connection:
             with full(service.queue, 2):
                 answers = [sent(connection, data) for data in (CALL, slow, CALL)]
                 assert sent(connection, named)[1]["x-request-id"] == "mine"
             for status, headers, body in answers:
-                assert status == answers[0][0] == b"HTTP/1.1 503 Service Unavailable"
+                assert status == 503
                 assert body == answers[0][2]
                 assert headers.keys() == answers[0][1].keys()
                 assert all(value == answers[0][1][name] for name, value in headers.items() if name not in CHANGES)
             assert len({headers["x-request-id"] for _, headers, _ in answers}) == 3
-            assert sent(connection, CALL)[0] == b"HTTP/1.1 422 Unprocessable Entity", "there is room, and no camera"
+            assert sent(connection, CALL)[0] == 422, "there is room, and no camera"
         counted = client.get("/metrics").text.splitlines()
         assert [line.split()[-1] for name in REFUSED for line in counted if line.startswith(name)] == ["4.0", "4.0"]
     lines = [vars(record)["facts"] for record in caplog.records if vars(record)["facts"]["status"] == 503]

@@ -1,10 +1,9 @@
-"""Who has how many places in the queue, and whose work is done next."""
+"""How many places in the queue each client has, and whose work is done next."""
 
 import asyncio
 import threading
 import weakref
 from collections.abc import AsyncGenerator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, aclosing
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from msdgs_serve.api.app import create_app
 from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.routes import batch, video
 from msdgs_serve.api.schemas import VideoRequest
-from msdgs_serve.api.server import Server
 from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.turns import PART_INTERVAL, Turns
@@ -25,11 +23,8 @@ from msdgs_serve.imaging import Image
 from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
-from tests.support.scene_files import write_scene
-from tests.support.service import in_this_process, serving
+from tests.support.service import FRAME, ORBIT, serving
 
-ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
-FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 MANY = 40
 
 
@@ -58,7 +53,7 @@ def test_single_frames_come_in_between_parts_which_have_their_turns_too():
     assert done[2 * PART_INTERVAL :] == ["single", "single", "part of 2"]
 
 
-def test_who_leaves_the_line_is_in_nobodys_way():
+def test_removed_work_is_skipped():
     turns: Turns[str] = Turns()
     for item in ("a1", "a2", "b1"):
         turns.add(item, item[0], part=item[0] == "b")
@@ -75,7 +70,7 @@ def queue() -> Iterator[WorkQueue]:
 
 
 def places(queue: WorkQueue, calls: ExitStack, client: str, *, streamed: bool = False) -> int:
-    """How many a client gets, before it is refused."""
+    """Return how many places a client gets before it is rejected."""
     before = queue.waiting
 
     def take_all() -> None:
@@ -128,48 +123,6 @@ def test_parts_keep_their_place_until_the_call_and_its_work_have_ended(queue: Wo
     assert queue.waiting == queue.running == 0
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
-
-
-@in_this_process
-def test_one_client_cant_take_the_places_of_another(scene: Path):
-    """Addresses are those that a proxy on this machine names."""
-    renderer, entered, go_on = Renderer(), threading.Semaphore(0), threading.Event()
-    original = renderer.render
-
-    def render(*arguments: Any) -> Image:
-        if arguments[2] == 0.5:
-            entered.release()
-            assert go_on.wait(20)
-        return original(*arguments)
-
-    renderer.render = render  # pyright: ignore[reportAttributeAccessIssue]
-    servers: list[Server] = []
-    with (
-        serving(scene, renderer=renderer, server=servers, concurrent_renders=1, queued_renders=3) as client,
-        ThreadPoolExecutor(4) as pool,
-    ):
-
-        def ask(address: str, path: str = "/render", body: Any = FRAME) -> httpx.Response:
-            return client.post(path, json=body, headers={"X-Forwarded-For": address})
-
-        frames = [pool.submit(ask, "10.0.0.1") for _ in range(2)]
-        assert entered.acquire(timeout=20)
-        while servers[0].service.queue.waiting != 1:
-            threading.Event().wait(0.005)
-        refused = ask("10.0.0.1")
-        assert (refused.status_code, refused.headers["Retry-After"].isdecimal()) == (503, True)
-        assert "2 places" in refused.json()["detail"]
-        assert ask("10.0.0.1", "/render/batch", {"frames": [FRAME]}).status_code == 503
-        frames.append(pool.submit(ask, "10.0.0.2"))
-        while servers[0].service.queue.waiting != 2:
-            threading.Event().wait(0.005)
-        go_on.set()
-        assert [frame.result(20).status_code for frame in frames] == [200] * 3
-
-
 @pytest.fixture
 def service(scene: Path) -> Iterator[Service]:
     app = create_app(SceneStore([scene]), Renderer(), Settings(scenes=[scene], max_batch=MANY))
@@ -179,7 +132,7 @@ def service(scene: Path) -> Iterator[Service]:
 
 @pytest.fixture
 def images(service: Service, monkeypatch: pytest.MonkeyPatch) -> list[weakref.ref[Image]]:
-    """Every image that was drawn."""
+    """Return a list that references to all rendered images are added to."""
     drawn: list[weakref.ref[Image]] = []
     original = service.renderer.render
 
@@ -208,7 +161,7 @@ def lines(service: Service) -> AsyncGenerator[Any]:
 
 @pytest.mark.parametrize("made", [film, lines])
 def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images: list[weakref.ref[Image]], made: Any):
-    """A film and a batch have one frame at a time in memory, and none is drawn before the last was taken."""
+    """A video or batch has one frame in memory, and renders none before the previous one is sent."""
 
     async def take() -> None:
         taken = 0
@@ -247,7 +200,7 @@ def test_a_film_fails_in_time_to_say_so_or_is_cut_off(scene: Path):
 
 
 def test_a_list_of_times_is_drawn_in_parts(service: Service, scene: Path):
-    """So that it can't keep a thread for all of its frames."""
+    """Otherwise one request would occupy a thread for all of its frames."""
     parts = []
     original = service.queue.run
 

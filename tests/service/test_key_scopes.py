@@ -1,20 +1,22 @@
-"""What a key opens, and which files of keys are taken."""
+"""What a key opens, what is open without one, and which files of keys are read."""
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
 
-from msdgs_serve.api.keys import SCOPES, read_keys, scope_of
+from msdgs_serve.api.body_limit import BodyLimit
+from msdgs_serve.api.keys import SCOPES, KeyCheck, read_keys, scope_of
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.scene import InvalidInput
-from tests.service.test_api_poison import check_problem
 from tests.support.scene_files import write_scene
-from tests.support.service import serving
+from tests.support.service import FRAME, check_problem, serving
 
 KEYS = {scope: f"{scope}-0123456789abcdef" for scope in SCOPES}
-FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
 # one call for each scope that changes nothing where it is let through
 CALLS = [("POST", "/render", "read"), ("DELETE", "/scenes/nothing", "write"), ("GET", "/metrics", "operate")]
 
@@ -38,21 +40,49 @@ def client(tmp_path_factory: pytest.TempPathFactory, keys: Path) -> Iterator[htt
 def test_a_key_opens_its_scope_and_nothing_else(client: httpx.Client, method: str, path: str, scope: str):
     body = FRAME if method == "POST" else None
     for owned, key in KEYS.items():
-        response = client.request(method, path, json=body, headers={"Authorization": f"Bearer {key}"})
+        response = client.request(method, path, json=body, headers={"Authorization": f"bearer {key}"})
         if owned == scope:
             assert response.status_code == (404 if method == "DELETE" else 200)
         else:
-            assert response.status_code == 403
-            check_problem(response)
+            check_problem(response, 403)
             assert f"`{scope}`" in response.json()["detail"]
-    for headers in ({}, {"X-API-Key": "wrong-0123456789abcdef"}):
-        response = client.request(method, path, json=body, headers=headers)
-        assert response.status_code == 401
-        check_problem(response)
 
 
-def test_uploads_need_the_scope_write(client: httpx.Client, tmp_path: Path):
-    file = write_scene(tmp_path / "walk.onnx").read_bytes()
+def test_without_a_key_nothing_but_health_is_answered(client: httpx.Client):
+    read = KEYS["read"]
+    paths = client.get("/openapi.json", headers={"X-API-Key": read}).json()["paths"]
+    calls = [(method.upper(), path.replace("{name}", "balls")) for path, methods in paths.items() for method in methods]
+    calls = [call for call in calls if call[1] not in ("/live", "/ready")]
+    assert len(calls) >= 10
+    calls += [("GET", "/docs"), ("GET", "/redoc"), ("GET", "/static-offline-docs/swagger-ui.css")]
+    calls += [("GET", "/openapi.json"), ("GET", "/nothing"), ("OPTIONS", "/render")]
+    for headers in ({}, {"X-API-Key": "wrong"}, {"Authorization": f"Basic {read}"}, {"X-API-Key": read[:-1]}):
+        for method, path in calls:
+            response = client.request(method, path, headers=headers)
+            check_problem(response, 401)
+            assert response.headers["WWW-Authenticate"] == "Bearer"
+        for path in ("/live", "/ready"):
+            assert client.get(path, headers=headers).status_code == 200
+
+
+def test_under_a_prefix_paths_mean_the_same(keys: Path):
+    async def inside(scope: Scope, receive: Receive, send: Send) -> None:
+        await Response(status_code=204)(scope, receive, send)
+
+    app = BodyLimit(KeyCheck(inside, read_keys(keys)), max_bytes=4, seconds=5, streamed=[("POST", "/live")])
+    transport = httpx.ASGITransport(app, root_path="/scenes")
+
+    async def status(method: str, path: str, body: bytes = b"") -> int:
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return (await client.request(method, path, content=body)).status_code
+
+    assert asyncio.run(status("GET", "/scenes/live")) == asyncio.run(status("GET", "/live")) == 204
+    assert asyncio.run(status("GET", "/scenes/render")) == asyncio.run(status("GET", "/other/live")) == 401
+    assert asyncio.run(status("POST", "/scenes/live", b"12345")) == 204
+    assert asyncio.run(status("POST", "/scenes/ready", b"12345")) == 413
+
+
+def test_uploads_need_the_scope_write(client: httpx.Client, file: bytes):
     for scope, status in (("read", 403), ("operate", 403), ("write", 201)):
         headers = {"X-API-Key": KEYS[scope]}
         assert client.post("/scenes?name=walk", content=file, headers=headers).status_code == status
@@ -95,7 +125,7 @@ def test_a_file_that_says_no_scopes_is_refused_with_the_line_that_it_needs(tmp_p
     assert "0123456789" not in str(error.value)
 
 
-def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
+def test_key_files_must_be_text(tmp_path: Path):
     (tmp_path / "keys").write_bytes(b"\xff\xfe")
     for path in (tmp_path / "keys", tmp_path / "missing", tmp_path):
         with pytest.raises(InvalidInput, match="a readable text file"):
@@ -103,6 +133,6 @@ def test_what_is_no_text_is_no_file_of_keys(tmp_path: Path):
 
 
 def test_a_variable_that_is_empty_is_as_if_it_were_not_there(monkeypatch: pytest.MonkeyPatch):
-    """A composition sets it whether or not there are keys."""
+    """docker/compose.yaml sets it even if there are no keys."""
     monkeypatch.setenv("MSDGS_API_KEYS_FILE", "")
     assert Settings().api_keys_file is None

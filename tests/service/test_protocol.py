@@ -1,4 +1,4 @@
-"""How answers are written to connections."""
+"""How responses are written to connections."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -12,7 +12,7 @@ from msdgs_serve.api.protocol import LimitedProtocol
 
 
 class Recorded(asyncio.Transport):
-    """A connection that is never slow."""
+    """A connection that records what is written and never blocks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class Recorded(asyncio.Transport):
 
 
 def writes_of(app: ASGIApp, request: bytes) -> list[bytes]:
-    """What an application's answer is written as."""
+    """Return the writes by which an application's response is sent."""
 
     async def ask() -> list[bytes]:
         config, state, transport = uvicorn.Config(app, log_config=None, lifespan="off"), ServerState(), Recorded()

@@ -1,4 +1,4 @@
-"""How much clients may store, in all and each key, and that they never fill the disk."""
+"""Quotas of uploads, in all and by key, and the space that they leave on the disk."""
 
 import errno
 import shutil
@@ -11,23 +11,11 @@ import pytest
 
 from msdgs_serve.api import uploads
 from msdgs_serve.api.server import Server
-from tests.service.test_api_poison import check_problem
 from tests.support.scene_files import write_scene
-from tests.support.service import in_this_process, serving
+from tests.support.service import check_problem, in_this_process, serving
 
 ONE, TWO = "one-0123456789abcdef", "two-0123456789abcdef"
 MIB = 1 << 20
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "scenes").mkdir()
-    return tmp_path / "scenes"
-
-
-@pytest.fixture
-def file(tmp_path: Path) -> bytes:
-    return write_scene(tmp_path / "walk.onnx").read_bytes()
 
 
 @pytest.fixture
@@ -92,7 +80,7 @@ def test_so_many_bytes_of_a_key(folder: Path, file: bytes, keys: Path):
     assert left(folder) == {"a.onnx"}
 
 
-def test_what_is_on_its_way_is_counted(folder: Path, file: bytes):
+def test_uploads_in_progress_are_counted(folder: Path, file: bytes):
     with serving(folder, uploads=True, max_scenes=1) as client:
         statuses = []
 

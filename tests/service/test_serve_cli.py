@@ -1,4 +1,4 @@
-"""`msdgs-serve` as a person starts it: what it prints, what it answers, how it ends."""
+"""The command `msdgs-serve`: its output, its first frame, its exit status."""
 
 import re
 import shlex
@@ -29,7 +29,7 @@ def scene(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def process(scene: Path) -> Iterator[subprocess.Popen[str]]:
-    """The service on a free port."""
+    """Yield the service on a free port."""
     command = [*COMMAND, str(scene), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -39,7 +39,7 @@ def process(scene: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def read_until(process: subprocess.Popen[str], pattern: str) -> str:
-    """What it printed until a line matches."""
+    """Return the output up to the first line that matches."""
     assert process.stdout
     printed = ""
     for line in process.stdout:
@@ -65,7 +65,7 @@ def test_it_says_where_it_listens_and_what_to_paste_and_stops_at_ctrl_c(process:
     assert (process.returncode, out.strip(), err) == (0, "Stopped.", "")
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]):
+def test_help_shows_examples_and_options(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         main(["--help"])
     assert ended.value.code == 0

@@ -1,6 +1,5 @@
-"""What answers say beside the frame: versions, times, ids, keys, metrics."""
+"""Channels and motion blur of frames, and the rest of their responses: versions, timings, ids, metrics."""
 
-import asyncio
 import io
 import json
 import logging
@@ -13,24 +12,16 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from starlette.responses import Response
-from starlette.types import Receive, Scope, Send
 
-from msdgs_serve.api.body_limit import BodyLimit
-from msdgs_serve.api.keys import KeyCheck, read_keys
 from msdgs_serve.api.observe import JsonLines, request_id
 from msdgs_serve.imaging.display import FARTHEST_BRIGHTNESS
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
-from tests.service.test_api import eventually
-from tests.service.test_api_poison import check_problem
 from tests.support.images import decode
 from tests.support.scene_files import metadata, write_scene
-from tests.support.service import in_this_process, serving
+from tests.support.service import ORBIT, check_problem, eventually, in_this_process, serving
 
 SIZE = 48
-ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0, "distance": 5, "fov_y": 40}
-FRAME = {"camera": ORBIT, "t": 0.5, "width": SIZE, "height": SIZE}
-KEYS = ["0123456789abcdef", "fedcba9876543210"]
+FRAME = {"camera": {**ORBIT, "distance": 5, "fov_y": 40}, "t": 0.5, "width": SIZE, "height": SIZE}
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +59,7 @@ def test_another_file_is_another_version(tmp_path: Path):
         eventually(lambda: post(client).headers["ETag"] != before)
 
 
-def test_the_answer_says_what_was_used(client: httpx.Client):
+def test_headers_name_plan_channels_and_stages(client: httpx.Client):
     post(client, t=0.123)
     response = post(client, t=0.123, channels=["depth"])
     stages = dict(re.findall(r"(\w+);dur=([\d.]+)", response.headers["Server-Timing"]))
@@ -106,14 +97,11 @@ def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
         link = client.get(f"/render?scene=walk&min_psnr=30&t=0.5&width={SIZE}&height={SIZE}")
         assert (link.headers["Msdgs-Scene"], link.headers["Msdgs-Plan"]) == ("walk.fast", "lowrank:1")
         for scene, min_psnr in (("walk", 65), ("plain", 10), ("walk", -1)):
-            refused = post(client, scene=scene, min_psnr=min_psnr)
-            assert refused.status_code == 422
-            check_problem(refused)
-            assert refused.json()["errors"][0]["field"] == "min_psnr"
+            check_problem(post(client, scene=scene, min_psnr=min_psnr), 422, "min_psnr")
         assert "Msdgs-Error" not in post(client, scene="plain").headers
 
 
-def test_a_link_shows_what_the_body_would(client: httpx.Client):
+def test_get_equals_post(client: httpx.Client):
     link = f"/render?azimuth=0&elevation=0&distance=5&fov_y=40&t=0.5&width={SIZE}&height={SIZE}"
     response = client.get(link)
     assert response.content == post(client).content
@@ -143,10 +131,7 @@ def test_a_link_shows_what_the_body_would(client: httpx.Client):
     ],
 )
 def test_a_link_that_is_wrong_is_told_where(client: httpx.Client, query: str, field: str):
-    response = client.get(f"/render?{query}")
-    assert response.status_code == 422
-    check_problem(response)
-    assert response.json()["errors"][0]["field"].startswith(field), response.text
+    check_problem(client.get(f"/render?{query}"), 422, field)
 
 
 def test_several_times_are_several_files(client: httpx.Client):
@@ -170,7 +155,7 @@ def test_channels_come_in_the_order_asked_for(client: httpx.Client):
 
 
 def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
-    """White where nearest, `FARTHEST_BRIGHTNESS` where farthest, darker where it is thin, black where nothing is."""
+    """The nearest point is white, the farthest `FARTHEST_BRIGHTNESS`; low alpha darkens, empty pixels are black."""
     depth, alpha = (array(client, channels=[name])[..., 0] for name in ("depth", "alpha"))
     seen = np.isfinite(depth)
     assert 0 < seen.mean() < 1
@@ -181,49 +166,32 @@ def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
         assert np.abs(grey - want).max() <= 1
 
 
+def test_gaussians_a_pixel_are_counted(client: httpx.Client):
+    """As numbers and as an image; tests/rasterizer/test_rasterizer_counts.py counts them one by one."""
+    counts = array(client, channels=["gaussians"])[..., 0]
+    assert counts.max() >= 1
+    np.testing.assert_array_equal(counts, counts.round())
+    np.testing.assert_array_equal(counts > 0, array(client, channels=["alpha"])[..., 0] > 0)
+    pixels, spec = decode(post(client, format="exr", channels=["gaussians"]).content, "exr")
+    assert spec.channelnames == ("gaussians",)
+    np.testing.assert_array_equal(pixels[..., 0], counts)
+    grey = decode(post(client, channels=["gaussians"]).content, "png")[0]
+    np.testing.assert_allclose(grey[..., 0], 255 * counts / counts.max(), atol=0.5)
+    blurred = array(client, channels=["gaussians"], shutter={"open": 0, "close": 0.2, "samples": 2})
+    np.testing.assert_allclose(blurred, sum(array(client, channels=["gaussians"], t=t) for t in (0.55, 0.65)) / 2)
+
+
 def test_motion_blur_is_the_mean_of_moments_in_linear_light(client: httpx.Client):
-    blurred = array(client, shutter={"open": -0.2, "close": 0.2, "samples": 4})
-    moments = [array(client, t=t) for t in (0.35, 0.45, 0.55, 0.65)]
-    alpha = np.mean([moment[..., 3] for moment in moments], axis=0)
+    shutter, times = {"open": -0.2, "close": 0.2, "samples": 4}, (0.35, 0.45, 0.55, 0.65)
+    blurred = array(client, shutter=shutter)
+    alpha = np.mean([array(client, t=t)[..., 3] for t in times], axis=0)
     np.testing.assert_allclose(blurred[..., 3], alpha, atol=1e-6)
-    opaque = array(client, shutter={"open": -0.2, "close": 0.2, "samples": 4}, background="scene")
-    light = np.mean(
-        [srgb_to_linear(array(client, t=t, background="scene")[..., :3]) for t in (0.35, 0.45, 0.55, 0.65)], 0
-    )
+    opaque = array(client, shutter=shutter, background="scene")
+    light = np.mean([srgb_to_linear(array(client, t=t, background="scene")[..., :3]) for t in times], axis=0)
     np.testing.assert_allclose(opaque[..., :3], linear_to_srgb(light), atol=1e-5)
     covered = blurred[..., 3] > 1e-3
     over = linear_to_srgb(srgb_to_linear(blurred[covered][:, :3] / blurred[covered][:, 3:4]))
     assert np.isfinite(over).all()
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"shutter": {"open": 0, "close": 0}}, "shutter.close"),
-        ({"shutter": {"open": -0.6, "close": 0}}, "shutter.open"),
-        ({"shutter": {"open": 0, "close": 0.6}}, "shutter.close"),
-        ({"shutter": {"open": 0, "close": 0.1, "samples": 17}}, "shutter.samples"),
-        ({"shutter": {"open": 0, "close": 0.1, "samples": 0}}, "shutter.samples"),
-        ({"t": []}, "t"),
-        ({"t": [0.5] * 9}, "t"),
-        ({"t": [0.5, 2.0]}, "t"),
-        ({"t": [0.5, float("nan")]}, "t.1"),
-        ({"t": [0.0] * 5, "width": 4096, "height": 1000}, "t"),
-        ({"channels": []}, "channels"),
-        ({"channels": ["rgb", "depth"]}, "channels"),
-        ({"channels": ["rgb", "rgb"], "format": "npy"}, "channels"),
-        ({"channels": ["smell"]}, "channels.0"),
-        ({"depth_range": [1, 1]}, "depth_range"),
-        ({"depth_range": [0, float("inf")]}, "depth_range.1"),
-    ],
-    ids=str,
-)
-def test_values_of_the_newer_fields_that_make_no_sense(client: httpx.Client, change: dict[str, Any], field: str):
-    content = json.dumps({**FRAME, **change})
-    response = client.post("/render", content=content, headers={"Content-Type": "application/json"})
-    assert response.status_code == 422
-    check_problem(response)
-    assert response.json()["errors"][0]["field"] == field
 
 
 def test_an_exr_file_knows_its_camera_and_its_time(client: httpx.Client):
@@ -253,7 +221,7 @@ def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixtur
         client.get("/scenes/nothing")
 
         def told() -> list[logging.LogRecord]:
-            """A line follows its answer, so that of a call before may still come."""
+            """A line is logged after its response, so that of an earlier request may come later."""
             return [record for record in caplog.records if "/scenes/nothing" in record.getMessage()]
 
         eventually(lambda: bool(told()))
@@ -262,50 +230,6 @@ def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixtur
     request_id.reset(token)
     assert (line["status"], line["method"], line["request_id"]) == (404, "GET", "the-id")
     assert line["path"] == "/scenes/nothing"
-
-
-def test_without_a_key_nothing_but_health_is_answered(scene: Path, tmp_path: Path):
-    (tmp_path / "keys").write_text("# ours\n" + "".join(f"read {key}\n" for key in KEYS))
-    with serving(scene) as client:
-        paths = client.get("/openapi.json").json()["paths"]
-    calls = [(method.upper(), path.replace("{name}", "balls")) for path, methods in paths.items() for method in methods]
-    calls = [call for call in calls if call[1] not in ("/live", "/ready")]
-    assert len(calls) >= 10
-    calls += [("GET", "/docs"), ("GET", "/redoc"), ("GET", "/static-offline-docs/swagger-ui.css")]
-    calls += [("GET", "/openapi.json"), ("GET", "/nothing"), ("OPTIONS", "/render")]
-    with serving(scene, api_keys_file=tmp_path / "keys") as client:
-        for headers in ({}, {"X-API-Key": "wrong"}, {"Authorization": f"Basic {KEYS[0]}"}, {"X-API-Key": KEYS[0][:-1]}):
-            for method, path in calls:
-                response = client.request(method, path, headers=headers)
-                assert response.status_code == 401, (method, path, headers)
-                check_problem(response)
-                assert response.headers["WWW-Authenticate"] == "Bearer"
-            for path in ("/live", "/ready"):
-                assert client.get(path, headers=headers).status_code == 200
-        for key in KEYS:
-            assert client.post("/render", json=FRAME, headers={"X-API-Key": key}).status_code == 200
-            assert client.post("/render", json=FRAME, headers={"Authorization": f"bearer {key}"}).status_code == 200
-        document = client.get("/openapi.json", headers={"X-API-Key": KEYS[0]}).json()
-        assert "401" in document["paths"]["/render"]["post"]["responses"]
-
-
-def test_under_a_prefix_paths_mean_the_same(tmp_path: Path):
-    async def inside(scope: Scope, receive: Receive, send: Send) -> None:
-        await Response(status_code=204)(scope, receive, send)
-
-    (tmp_path / "keys").write_text(f"read {KEYS[0]}")
-    checked = KeyCheck(inside, read_keys(tmp_path / "keys"))
-    app = BodyLimit(checked, max_bytes=4, seconds=5, streamed=[("POST", "/live")])
-    transport = httpx.ASGITransport(app, root_path="/scenes")
-
-    async def status(method: str, path: str, body: bytes = b"") -> int:
-        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
-            return (await client.request(method, path, content=body)).status_code
-
-    assert asyncio.run(status("GET", "/scenes/live")) == asyncio.run(status("GET", "/live")) == 204
-    assert asyncio.run(status("GET", "/scenes/render")) == asyncio.run(status("GET", "/other/live")) == 401
-    assert asyncio.run(status("POST", "/scenes/live", b"12345")) == 204
-    assert asyncio.run(status("POST", "/scenes/ready", b"12345")) == 413
 
 
 def test_other_web_pages_may_call_only_where_they_are_named(scene: Path, client: httpx.Client):
@@ -319,7 +243,7 @@ def test_other_web_pages_may_call_only_where_they_are_named(scene: Path, client:
 
 
 def numbers(client: httpx.Client, name: str) -> dict[str, float]:
-    """The values of a metric by its labels."""
+    """Return the values of a metric by their labels."""
     lines = client.get("/metrics").text.splitlines()
     pairs = [line.rsplit(" ", 1) for line in lines if line.startswith((f"{name}{{", f"{name} "))]
     return {labels.removeprefix(name): float(value) for labels, value in pairs}
@@ -342,7 +266,7 @@ def test_metrics_are_what_the_client_counted(scene: Path):
 
 
 @in_this_process
-def test_methods_that_nobody_knows_are_counted_as_one(client: httpx.Client):
+def test_unknown_methods_are_counted_as_one(client: httpx.Client):
     assert client.request("BREW", "/render").status_code == 405
     assert 'method="other"' in client.get("/metrics").text
 

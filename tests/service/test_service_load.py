@@ -1,11 +1,12 @@
-"""More than the service can do: refused in time and with advice, while what was accepted is finished."""
+"""Overload: requests beyond the queue are rejected at once with Retry-After, and accepted ones are finished."""
 
+import json
 import math
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,20 +20,15 @@ from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.render_job import RenderCancelled, RenderJob
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Gaussians
-from tests.service.test_api_poison import check_problem
-from tests.support.service import serving
+from tests.support.service import FRAME, MAX_SECONDS, check_problem, connect, eventually, serving
 
 pytestmark = pytest.mark.slow
 
-ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
-MAX_SECONDS = 60.0  # seconds, whatever else the machine does
-FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
-
 
 class SlowPoses(PoseCache):
-    """Poses that wait until they may go on, once `slow` is set, and are never remembered.
+    """A cache that keeps no poses; once `slow` is set, each pose waits for `go_on`.
 
-    From the `last` on that may begin, they wait until they are cancelled.
+    From pose number `last` on, each then waits until its request is cancelled.
     """
 
     def __init__(self) -> None:
@@ -48,7 +44,7 @@ class SlowPoses(PoseCache):
             self.begun += 1
             assert self.go_on.wait(MAX_SECONDS)
             if self.begun >= self.last:
-                until(lambda: is_cancelled(job))
+                eventually(lambda: is_cancelled(job))
         return session.gaussians(t)
 
 
@@ -65,14 +61,6 @@ def renderer_with(poses: SlowPoses) -> Renderer:
     return renderer
 
 
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for it."""
-    deadline = time.monotonic() + MAX_SECONDS
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
 def is_cancelled(job: RenderJob) -> bool:
     try:
         job.check()
@@ -81,29 +69,38 @@ def is_cancelled(job: RenderJob) -> bool:
     return False
 
 
-def test_what_finds_no_place_is_refused_with_a_time_to_come_back(scene: Path, poses: SlowPoses):
+def test_requests_beyond_the_queue_are_rejected_with_retry_after(scene: Path, poses: SlowPoses):
     server: list[Server] = []
     with (
         serving(scene, renderer=renderer_with(poses), server=server, concurrent_renders=2, queued_renders=3) as client,
         ThreadPoolExecutor(5) as pool,
     ):
         poses.slow = True
-        # addresses as a proxy names them: each client has its share
-        addresses = [{"X-Forwarded-For": f"10.0.0.{number}"} for number in range(5)]
-        accepted = [pool.submit(client.post, "/render", json=FRAME, headers=address) for address in addresses]
         queue = server[0].service.queue
-        until(lambda: (queue.running, queue.waiting) == (2, 3))
-        for _ in range(3):
-            response = client.post("/render", json=FRAME)
-            assert response.status_code == 503
-            check_problem(response)
+
+        def ask(number: int) -> httpx.Response:
+            """Send a request as the client of an address, which a proxy names."""
+            return client.post("/render", json=FRAME, headers={"X-Forwarded-For": f"10.0.0.{number}"})
+
+        def check_refused(response: httpx.Response) -> None:
+            check_problem(response, 503)
             assert 1 <= int(response.headers["Retry-After"]) <= 60
+
+        accepted = [pool.submit(ask, 0) for _ in range(3)]
+        eventually(lambda: (queue.running, queue.waiting) == (2, 1))
+        refused = ask(0)
+        check_refused(refused)
+        assert "3 places" in refused.json()["detail"], "the share of one client"
+        accepted += [pool.submit(ask, number) for number in (1, 2)]
+        eventually(lambda: (queue.running, queue.waiting) == (2, 3))
+        for _ in range(3):
+            check_refused(client.post("/render", json=FRAME))
         assert client.post("/render/batch", json={"frames": [FRAME]}).status_code == 503
         assert client.post("/render", json={**FRAME, "width": 0}).status_code == 503, "a body is not even looked at"
         have = client.post("/render", json=FRAME, headers={"If-None-Match": "*"})
         assert have.status_code == 304, "what the client has costs no place"
-        assert client.get("/live").status_code == 200
-        assert client.get("/ready").status_code == 200
+        for path in ("/live", "/ready", "/scenes/balls"):
+            assert client.get(path).status_code == 200
         poses.go_on.set()
         assert [future.result(MAX_SECONDS).status_code for future in accepted] == [200] * 5
         assert client.post("/render", json=FRAME).status_code == 200
@@ -118,26 +115,24 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
         started = time.monotonic()
         response = client.post("/render", json=FRAME)
         assert time.monotonic() - started >= 0.3
-        assert response.status_code == 504
-        check_problem(response)
+        check_problem(response, 504)
         assert server[0].service.queue.running == 1, "the place is taken as long as the thread is"
         waiting = client.post("/render", json=FRAME)
         assert waiting.status_code == 504, "the time in line counts"
         poses.slow = False
         poses.go_on.set()
-        until(lambda: server[0].service.queue.running == 0)
+        eventually(lambda: server[0].service.queue.running == 0)
         assert client.post("/render", json=FRAME).status_code == 200
 
 
 def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
-    """A request on a connection of its own; closing it disconnects the client."""
-    request = client.build_request("POST", path, json=body)
-    request.read()
-    host = client.base_url.host
-    assert client.base_url.port
-    connection = socket.create_connection((host, client.base_url.port))
-    head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\n"
-    connection.sendall(f"{head}Content-Length: {len(request.content)}\r\n\r\n".encode() + request.content)
+    """Send a request on a connection of its own, which its client leaves by closing it."""
+    content = json.dumps(body)
+    head = (
+        f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(content)}\r\n\r\n"
+    )
+    connection = connect(client)
+    connection.sendall((head + content).encode())
     return connection
 
 
@@ -151,10 +146,10 @@ def test_work_for_a_client_that_is_gone_ends(scene: Path, poses: SlowPoses, path
         poses.slow, poses.last = True, part * samples
         poses.go_on.set()
         connection = leave(client, {"frames": [body, {**body, "t": 0.6}]} if path.endswith("batch") else body, path)
-        until(lambda: poses.begun >= poses.last)
+        eventually(lambda: poses.begun >= poses.last)
         connection.close()
         queue = server[0].service.queue
-        until(lambda: queue.running == queue.waiting == 0)
+        eventually(lambda: queue.running == queue.waiting == 0)
         assert poses.begun < samples
 
 
@@ -167,17 +162,17 @@ def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: Sl
         queue = server[0].service.queue
         poses.slow = True
         first = pool.submit(client.post, "/render", json=FRAME)
-        until(lambda: queue.running == 1)
+        eventually(lambda: queue.running == 1)
         connection = leave(client, FRAME)
-        until(lambda: queue.waiting == 1)
+        eventually(lambda: queue.waiting == 1)
         connection.close()
-        until(lambda: queue.waiting == 0)
+        eventually(lambda: queue.waiting == 0)
         poses.go_on.set()
         assert first.result(MAX_SECONDS).status_code == 200
         assert poses.begun == 1
 
 
-def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses):
+def test_a_stopping_service_finishes_accepted_requests(scene: Path, poses: SlowPoses):
     server: list[Server] = []
     with (
         serving(scene, renderer=renderer_with(poses), server=server) as client,
@@ -187,7 +182,7 @@ def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses
         poses.slow = True
         frames = [pool.submit(client.post, "/render", json=FRAME) for _ in range(8)]
         queue = server[0].service.queue
-        until(lambda: queue.running + queue.waiting == 8)
+        eventually(lambda: queue.running + queue.waiting == 8)
         server[0].handle_exit(signal.SIGTERM, None)
         assert other.get("/ready").status_code == 503
         assert other.get("/live").status_code == 200
@@ -196,20 +191,19 @@ def test_a_service_that_stops_finishes_what_it_has(scene: Path, poses: SlowPoses
         assert refused.headers["Retry-After"]
         poses.go_on.set()
         assert [frame.result(MAX_SECONDS).status_code for frame in frames] == [200] * 8
-        until(lambda: not server[0].started or not _listens(client))
+        eventually(lambda: not server[0].started or not _listens(client))
 
 
 def _listens(client: httpx.Client) -> bool:
-    assert client.base_url.port
     try:
-        socket.create_connection((client.base_url.host, client.base_url.port), timeout=1).close()
+        connect(client).close()
     except OSError:
         return False
     return True
 
 
-def test_one_who_gives_up_does_not_spoil_the_pose_for_others(scene: Path):
-    """The pose that a cancelled job was computing is claimed by the next who waits for it."""
+def test_a_cancelled_request_keeps_poses_of_others(scene: Path):
+    """A cancelled request leaves the poses of other requests in the cache."""
     cache, session = PoseCache(1 << 20), DeformationSession(scene)
     cancelled = RenderJob()
     cancelled.cancel()

@@ -1,8 +1,7 @@
-"""Scenes that clients add and delete: whole or not at all, and nothing but scenes."""
+"""Uploads and deletions of scenes: each is complete or has no effect, and only valid scenes are stored."""
 
 import hashlib
 import logging
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,30 +10,23 @@ import httpx
 import numpy as np
 import pytest
 
-from tests.service.test_api import eventually
-from tests.service.test_api_poison import check_problem
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
-from tests.support.service import in_this_process, own_connection, serving
-
-FRAME = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.5, "width": 16, "height": 16}
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "scenes").mkdir()
-    return tmp_path / "scenes"
+from tests.support.service import (
+    FRAME,
+    check_problem,
+    connect,
+    eventually,
+    in_this_process,
+    own_connection,
+    serving,
+)
 
 
 @pytest.fixture
 def client(folder: Path) -> Iterator[httpx.Client]:
     with serving(folder, uploads=True, max_scene_megabytes=1) as client:
         yield client
-
-
-@pytest.fixture
-def file(tmp_path: Path) -> bytes:
-    return write_scene(tmp_path / "walk.onnx").read_bytes()
 
 
 def add(client: httpx.Client, content: Any, name: str = "walk", **query: Any) -> httpx.Response:
@@ -59,31 +51,25 @@ def test_a_scene_is_added_shown_and_deleted(client: httpx.Client, folder: Path, 
 def test_a_scene_is_replaced_only_on_request(client: httpx.Client, tmp_path: Path, file: bytes):
     assert add(client, file).status_code == 201
     blue = write_scene(tmp_path / "blue.onnx", static_color=(0, 0, 1)).read_bytes()
-    conflict = add(client, blue)
-    assert conflict.status_code == 409
-    check_problem(conflict)
+    check_problem(add(client, blue), 409)
+    assert client.get("/scenes/walk").json()["sha256"] == hashlib.sha256(file).hexdigest()
     assert add(client, blue, replace="true").status_code == 201
     pixels, _ = decode(client.post("/render", json={**FRAME, "t": 0, "width": 64, "height": 64}).content, "png")
     assert pixels[32, 32].argmax() == 2
 
 
 @pytest.mark.parametrize(
-    "name", ["../walk", "a/b", "/etc/walk", "a\\b", ".hidden", "..", "a\0b", "a\nb", "x" * 201, ""]
+    "name", [".", "../walk", "a/b", "/etc/walk", "a\\b", ".hidden", "..", "a\0b", "a\nb", "x" * 201, ""]
 )
 def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, folder: Path, file: bytes, name: str):
-    response = add(client, file, name)
-    assert response.status_code == 422
-    check_problem(response)
-    assert response.json()["errors"][0]["field"] == "name"
+    check_problem(add(client, file, name), 422, "name")
     assert files(folder) == []
     assert not (folder.parent / "scenes.onnx").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"no scene", b"\x08\x0a"], ids=["empty", "text", "beginning"])
-def test_what_is_no_scene_is_refused_and_leaves_nothing(client: httpx.Client, folder: Path, content: bytes):
-    response = add(client, content)
-    assert response.status_code == 422
-    check_problem(response)
+def test_invalid_files_are_refused_and_leave_no_file(client: httpx.Client, folder: Path, content: bytes):
+    check_problem(add(client, content), 422)
     assert files(folder) == []
 
 
@@ -102,16 +88,12 @@ def test_a_file_that_was_damaged_on_its_way_is_refused(client: httpx.Client, fol
     damaged = bytearray(file)
     place = file.index(np.float32(0.15).tobytes())
     damaged[place] ^= 1
-    response = add(client, bytes(damaged), sha256=hashlib.sha256(file).hexdigest())
-    assert response.status_code == 422
-    assert response.json()["errors"][0]["field"] == "sha256"
+    check_problem(add(client, bytes(damaged), sha256=hashlib.sha256(file).hexdigest()), 422, "sha256")
     assert files(folder) == []
 
 
 def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path):
-    response = add(client, (b"x" * 65536 for _ in range(40)))
-    assert response.status_code == 413
-    check_problem(response)
+    check_problem(add(client, (b"x" * 65536 for _ in range(40))), 413)
     assert files(folder) == []
 
 
@@ -119,10 +101,9 @@ def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path)
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", [{}, {"body_seconds": 2}], ids=["leaves", "waits"])
 def test_a_file_that_stops_coming_leaves_nothing(folder: Path, limits: dict[str, Any]):
-    """Its client leaves, or is given up."""
+    """The client disconnects, or the service times out."""
     with serving(folder, uploads=True, **limits) as client:
-        assert client.base_url.port
-        with socket.create_connection((client.base_url.host, client.base_url.port), timeout=60) as connection:
+        with connect(client) as connection:
             head = b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
             connection.sendall(head + b"half a scene")
             eventually(lambda: len(files(folder)) == 1)
@@ -135,12 +116,11 @@ def test_where_it_is_not_allowed_nothing_is_added_or_deleted(folder: Path, file:
     write_scene(folder / "walk.onnx")
     with serving(folder) as client:
         for response in (add(client, file, "jump"), client.delete("/scenes/walk")):
-            assert response.status_code == 403
-            check_problem(response)
+            check_problem(response, 403)
     assert files(folder) == ["walk.onnx"]
 
 
-def test_what_a_killed_process_left_is_cleared_at_the_start(folder: Path):
+def test_files_of_a_killed_process_are_removed_at_the_start(folder: Path):
     (folder / ".incoming-token").write_bytes(b"half a scene")
     write_scene(folder / "walk.onnx")
     with serving(folder, uploads=True) as client:

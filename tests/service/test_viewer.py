@@ -63,7 +63,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def page(browser: Browser) -> Iterator[Page]:
-    """An empty page that may not complain in its console, but of requests that found no service."""
+    """Yield an empty page; fail if its console shows an error other than a request that found no service."""
     with browser.new_context(viewport={"width": 820, "height": 420}, reduced_motion="reduce") as context:
         page = context.new_page()
         page.set_default_timeout(MILLISECONDS)
@@ -74,21 +74,25 @@ def page(browser: Browser) -> Iterator[Page]:
         assert [text for text in complaints if not text.startswith("Failed to load resource")] == []
 
 
-@pytest.fixture
-def opened(page: Page, client: httpx.Client) -> Page:
-    page.goto(f"{client.base_url}/#scene=balls")
+def open_page(page: Page, client: httpx.Client, address: str = "#scene=balls") -> Page:
+    page.goto(f"{client.base_url}/{address}")
     wait_until_still(page)
     return page
 
 
+@pytest.fixture
+def opened(page: Page, client: httpx.Client) -> Page:
+    return open_page(page, client)
+
+
 def image(page: Page) -> np.ndarray:
-    """What the canvas holds, [H, W, 3] from 0 to 255."""
+    """Return the pixels of the canvas, [H, W, 3] from 0 to 255."""
     address = page.evaluate("document.getElementById('image').toDataURL('image/png')")
     return decode(base64.b64decode(address.split(",")[1]), "png")[0][..., :3]
 
 
 def bodies(page: Page) -> list[dict[str, Any]]:
-    """Of requests for frames; the list grows while the page asks."""
+    """Return a list that each later request for a frame adds its body to."""
     asked: list[dict[str, Any]] = []
 
     def note(request: Request) -> None:
@@ -176,9 +180,7 @@ def test_wheel_keys_and_shift_drag_move_the_camera(opened: Page):
 
 def test_two_fingers_zoom(browser: Browser, client: httpx.Client):
     with browser.new_context(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True) as context:
-        page = context.new_page()
-        page.goto(f"{client.base_url}/#scene=balls")
-        wait_until_still(page)
+        page = open_page(context.new_page(), client)
         asked = bodies(page)
         touch = context.new_cdp_session(page)
         forget(page)
@@ -297,9 +299,7 @@ def test_the_report_is_drawn(opened: Page):
 def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Client):
     permissions = ["clipboard-read", "clipboard-write"]
     with browser.new_context(viewport={"width": 820, "height": 420}, permissions=permissions) as context:
-        page = context.new_page()
-        page.goto(f"{client.base_url}/#scene=it's&t=0.5")
-        wait_until_still(page)
+        page = open_page(context.new_page(), client, "#scene=it's&t=0.5")
         page.get_by_role("button", name="curl").click()
         page.get_by_text("Copied.").wait_for()
         words = shlex.split(page.evaluate("navigator.clipboard.readText()"))
@@ -318,8 +318,7 @@ def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Cli
 def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Path):
     with serving(scenes) as client:
         port = client.base_url.port
-        page.goto(f"{client.base_url}/#scene=balls")
-        wait_until_still(page)
+        open_page(page, client)
     page.locator("#image").focus()
     page.keyboard.press("ArrowLeft")
     page.get_by_text("The service doesn’t answer").wait_for()
@@ -346,12 +345,12 @@ def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_p
 
 
 def strongest_in_the_middle(image: np.ndarray) -> int:
-    """Which of red, green and blue."""
+    """Return the index of the strongest channel at the center of an image."""
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
 def in_time(page: Page, holds: Callable[[], bool]) -> bool:
-    """Whether it comes to be so within a minute."""
+    """Return whether a condition becomes true within a minute."""
     for _ in range(600):
         if holds():
             return True
@@ -362,8 +361,7 @@ def in_time(page: Page, holds: Callable[[], bool]) -> bool:
 def test_a_changed_file_is_shown(page: Page, tmp_path: Path):
     write_scene(tmp_path / "ball.onnx", static_color=(1.0, 0.0, 0.0), moving=False)
     with serving(tmp_path) as client:
-        page.goto(str(client.base_url))
-        wait_until_still(page)
+        open_page(page, client, "")
         assert in_time(page, lambda: strongest_in_the_middle(image(page)) == 0)
         write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=False).rename(tmp_path / "ball.onnx")
         assert in_time(page, lambda: strongest_in_the_middle(image(page)) == 1)
@@ -372,6 +370,5 @@ def test_a_changed_file_is_shown(page: Page, tmp_path: Path):
 def test_a_service_that_allows_fewer_pixels(page: Page, scenes: Path):
     with serving(scenes, max_pixels=100 * 100) as client:
         asked = bodies(page)
-        page.goto(f"{client.base_url}/#scene=balls")
-        wait_until_still(page)
+        open_page(page, client)
         assert asked[-1]["width"] * asked[-1]["height"] <= 100 * 100

@@ -1,4 +1,4 @@
-"""Mutated scene files by seed, opened, posed and drawn. As a program: opens a marker, then handles so many of them.
+"""Mutated scene files by seed, opened, posed and rendered. As a program: opens the file MARKER, then tests COUNT files.
 
 `python -m tests.support.fuzz_scenes COUNT MARKER`
 """
@@ -24,7 +24,7 @@ DRAWN = "drawn"
 
 
 def hostile_file(seed: int) -> bytes:
-    """The file of a seed."""
+    """Return the mutated file of a seed."""
     rng = np.random.default_rng([33, seed])
     scenes = sound_scenes()
     names = sorted(scenes)
@@ -32,7 +32,7 @@ def hostile_file(seed: int) -> bytes:
 
 
 def outcome(contents: bytes) -> str:
-    """`drawn`, where all that is drawn is finite, or the reason for which the file is refused."""
+    """Return `drawn` if all rendered frames are finite, or the reason for which the file is refused."""
     try:
         session = DeformationSession("mutated.onnx", contents=contents, limits=LIMITS)
         t0, t1 = session.scene.metadata.time_range
@@ -46,7 +46,7 @@ def outcome(contents: bytes) -> str:
 
 
 def reason(error: SceneFileInvalid) -> str:
-    """Why a file is refused; short text that may be shown."""
+    """Return the reason of a refusal; it must be short printable text."""
     shown = f"{error.field} {error.problem}"
     assert error.problem
     assert shown.isprintable()
@@ -55,7 +55,7 @@ def reason(error: SceneFileInvalid) -> str:
 
 
 def outcomes(seeds: range) -> Counter[str]:
-    """How many files have which; a failure says the seed."""
+    """Count the outcomes of the files of some seeds; a failure names its seed."""
     counted: Counter[str] = Counter()
     for seed in seeds:
         try:
@@ -66,7 +66,7 @@ def outcomes(seeds: range) -> Counter[str]:
 
 
 def main(count: str, marker: str) -> None:
-    """What is opened after the marker is opened because of the files."""
+    """Render the sound files, open the marker, then test the mutated files."""
     for contents in sound_scenes().values():
         assert outcome(contents) == DRAWN
     Path(marker).read_bytes()

@@ -1,19 +1,32 @@
-"""Scene files that were made to do harm, each from a sound one: what they do is in their names."""
+"""Hostile scene files, each made from a sound one, and the message of its refusal."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
-
-Attack = Callable[[onnx.ModelProto, Path], bytes]
+from onnx import TensorProto, helper, numpy_helper, parser
 
 SECRET_BYTES = 24
+MANY = 1_500_000_000
+"""Count of float32 numbers that take 6 GB."""
+
+
+class Attack(NamedTuple):
+    """A hostile change of a scene file; `on` makes it from a sound model and the path of a secret file."""
+
+    name: str
+    message: str
+    on: Callable[[onnx.ModelProto, Path], bytes]
+
+    def __str__(self) -> str:
+        return self.name
 
 
 def varint(value: int) -> bytes:
-    """As short as it can be."""
+    """Encode a number in protobuf's wire format."""
     digits = bytearray()
     while value >= 0x80:
         digits.append(value & 0x7F | 0x80)
@@ -22,220 +35,170 @@ def varint(value: int) -> bytes:
 
 
 def field(number: int, content: bytes | int) -> bytes:
-    """A field of protobuf's wire format: a number or what has a length."""
+    """Encode a field in protobuf's wire format: a number, or bytes with their length."""
     if isinstance(content, int):
         return varint(number << 3) + varint(content)
     return varint(number << 3 | 2) + varint(len(content)) + content
 
 
 def with_graph(model: onnx.ModelProto, graph: bytes) -> bytes:
-    """The model with another graph, given as bytes."""
+    """Return the model with another graph, given as bytes."""
     rest = onnx.ModelProto()
     rest.CopyFrom(model)
     rest.ClearField("graph")
     return rest.SerializeToString() + field(7, graph)
 
 
-def elsewhere(name: str, secret: Path, location: int) -> bytes:
-    """A tensor [8, 3] whose values are the first bytes of a file; `location` is what says so."""
+def elsewhere(name: str, secret: Path, location: int = TensorProto.EXTERNAL) -> bytes:
+    """Return a tensor [8, 3] whose values are the first bytes of a file; `location` is its `data_location`."""
     tensor = onnx.TensorProto(name=name, data_type=TensorProto.UINT8, dims=[SECRET_BYTES // 3, 3])
     for key, value in {"location": str(secret), "offset": "0", "length": str(SECRET_BYTES)}.items():
         tensor.external_data.add(key=key, value=value)
     return tensor.SerializeToString() + field(14, location)
 
 
-def without_constant(model: onnx.ModelProto, name: str) -> onnx.GraphProto:
-    """Its graph."""
-    graph = onnx.GraphProto()
-    graph.CopyFrom(model.graph)
-    graph.initializer.remove(next(each for each in graph.initializer if each.name == name))
-    return graph
+def constant_elsewhere(secret: Path) -> onnx.NodeProto:
+    """Return a node whose output `bytes` is read from a file."""
+    value = onnx.TensorProto.FromString(elsewhere("value", secret))
+    return helper.make_node("Constant", [], ["bytes"], value=value)
 
 
-def file_read_by_a_truncated_location(model: onnx.ModelProto, secret: Path) -> bytes:
-    """2³² + 1 in 32 bits is 1: EXTERNAL."""
-    graph = without_constant(model, "base")
-    graph.node.insert(0, helper.make_node("Cast", ["bytes"], ["base"], to=TensorProto.FLOAT))
-    return with_graph(model, graph.SerializeToString() + field(5, elsewhere("bytes", secret, 2**32 + 1)))
+AS_HEIGHTS = helper.make_node("Cast", ["bytes"], ["base"], to=TensorProto.FLOAT)
+"""Returns the bytes of the file as positions."""
 
 
-def location_of_33_bits(model: onnx.ModelProto, secret: Path) -> bytes:
-    """The same number where nothing else is wrong."""
-    graph, sound = without_constant(model, "base"), next(c for c in model.graph.initializer if c.name == "base")
-    return with_graph(model, graph.SerializeToString() + field(5, sound.SerializeToString() + field(14, 2**32 + 1)))
+def without_base(model: onnx.ModelProto) -> onnx.TensorProto:
+    """Remove the positions from the model's constants; return them."""
+    base = next(each for each in model.graph.initializer if each.name == "base")
+    model.graph.initializer.remove(base)
+    return base
 
 
-def file_read_inside_a_function(model: onnx.ModelProto, secret: Path) -> bytes:
+def put_first(model: onnx.ModelProto, *nodes: onnx.NodeProto) -> None:
+    """Put nodes before those of the graph."""
+    nodes = (*nodes, *model.graph.node)
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+
+
+def truncated_location(model: onnx.ModelProto, secret: Path) -> bytes:
+    """Truncated to 32 bits, 2³² + 1 is 1: EXTERNAL."""
+    without_base(model)
+    put_first(model, AS_HEIGHTS)
+    return with_graph(model, model.graph.SerializeToString() + field(5, elsewhere("bytes", secret, 2**32 + 1)))
+
+
+def location_alone(model: onnx.ModelProto, secret: Path) -> bytes:
+    """The same number in an otherwise sound file."""
+    base = without_base(model).SerializeToString() + field(14, 2**32 + 1)
+    return with_graph(model, model.graph.SerializeToString() + field(5, base))
+
+
+def inside_a_function(model: onnx.ModelProto, secret: Path) -> bytes:
     """The constant lies in a function of the model."""
-    value = onnx.TensorProto.FromString(elsewhere("value", secret, 1))
-    nodes = [
-        helper.make_node("Constant", [], ["bytes"], value=value),
-        helper.make_node("Cast", ["bytes"], ["heights"], to=TensorProto.FLOAT),
-    ]
-    opsets = [helper.make_opsetid("", 20)]
-    model.functions.append(helper.make_function("local", "Heights", [], ["heights"], nodes, opsets))
+    without_base(model)
+    nodes, opsets = [constant_elsewhere(secret), AS_HEIGHTS], [helper.make_opsetid("", 20)]
+    model.functions.append(helper.make_function("local", "Heights", [], ["base"], nodes, opsets))
     model.opset_import.append(helper.make_opsetid("local", 1))
-    model.graph.initializer.remove(next(each for each in model.graph.initializer if each.name == "base"))
-    model.graph.node.insert(0, helper.make_node("Heights", [], ["base"], domain="local"))
+    put_first(model, helper.make_node("Heights", [], ["base"], domain="local"))
     return model.SerializeToString()
 
 
-def constant_node_in_another_file(model: onnx.ModelProto, secret: Path) -> bytes:
-    """A `Constant` of the graph itself."""
-    value = onnx.TensorProto.FromString(elsewhere("value", secret, 1))
-    model.graph.initializer.remove(next(each for each in model.graph.initializer if each.name == "base"))
-    model.graph.node.insert(0, helper.make_node("Cast", ["bytes"], ["base"], to=TensorProto.FLOAT))
-    model.graph.node.insert(0, helper.make_node("Constant", [], ["bytes"], value=value))
+def in_a_node(model: onnx.ModelProto, secret: Path) -> bytes:
+    """The constant is a node of the graph."""
+    without_base(model)
+    put_first(model, constant_elsewhere(secret), AS_HEIGHTS)
     return model.SerializeToString()
 
 
-def loop_that_never_ends_in_the_middle(model: onnx.ModelProto, secret: Path) -> bytes:
-    """Around t = 0.5 it runs 10¹⁵ times, at both ends of the scene's time not at all."""
-    add(model, "eight", np.array([8], np.float32))
-    add(model, "huge", np.array([1e15], np.float32))
-    add(model, "none", np.array([], np.int64))
-    add(model, "go", np.array(True))
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["on"], ["on_out"]), helper.make_node("Identity", ["state"], ["state_out"])],
-        "body",
-        [
-            helper.make_tensor_value_info("number", TensorProto.INT64, []),
-            helper.make_tensor_value_info("on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("state", TensorProto.FLOAT, [1]),
-        ],
-        [
-            helper.make_tensor_value_info("on_out", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("state_out", TensorProto.FLOAT, [1]),
-        ],
-    )
-    model.graph.node.insert(0, helper.make_node("Loop", ["trips", "go", "one"], ["applied_once"], body=body))
-    model.graph.node.insert(0, helper.make_node("Reshape", ["many", "none"], ["trips"]))
-    model.graph.node.insert(0, helper.make_node("Cast", ["times"], ["many"], to=TensorProto.INT64))
-    model.graph.node.insert(0, helper.make_node("Mul", ["bump", "huge"], ["times"]))
-    model.graph.node.insert(0, helper.make_node("Floor", ["raised"], ["bump"]))
-    model.graph.node.insert(0, helper.make_node("Mul", ["product", "eight"], ["raised"]))
-    model.graph.node.insert(0, helper.make_node("Mul", ["t", "rest"], ["product"]))
-    model.graph.node.insert(0, helper.make_node("Sub", ["one", "t"], ["rest"]))
-    scaled = next(node for node in model.graph.node if node.output[0] == "applied")
-    scaled.input[:] = ["t", "applied_once"]
+def with_factor(graph: str, model: onnx.ModelProto, secret: Path, **constants: np.ndarray) -> bytes:
+    """Multiply the scene's motion by the output of a graph in ONNX's text format."""
+    added = parser.parse_graph(f"added (float[1] t, float[1] one) => (float[1] factor) {graph}")
+    constants |= {each.name: numpy_helper.to_array(each) for each in added.initializer}
+    model.graph.initializer.extend(numpy_helper.from_array(values, name) for name, values in constants.items())
+    domains = {node.domain for node in added.node} - {""}
+    model.opset_import.extend(helper.make_opsetid(domain, 1) for domain in domains)
+    put_first(model, *added.node)
+    next(node for node in model.graph.node if node.output[0] == "applied").input[:] = ["t", "factor"]
     return model.SerializeToString()
 
 
-def blown_up(operator: str) -> Attack:
-    """An array of 6 GB beside the scene, made by an operator whose output is as large as numbers say."""
-
-    def attack(model: onnx.ModelProto, secret: Path) -> bytes:
-        count = 1_500_000_000
-        add(model, "size", np.array([count], np.int64))
-        add(model, "ends", np.array(count, np.int64))
-        add(model, "zero", np.array(0, np.int64))
-        add(model, "step", np.array(1, np.int64))
-        add(model, "corner", np.array([1], np.int64))
-        inputs = {
-            "Expand": ["one", "size"],
-            "Tile": ["one", "size"],
-            "ConstantOfShape": ["size"],
-            "Range": ["zero", "ends", "step"],
-            "Resize": ["one", "", "", "size"],
-        }[operator]
-        last = "corner" if operator != "Range" else "step"
-        nodes = [helper.make_node(operator, inputs, ["vast"]), helper.make_node("Slice", ["vast", "0", last], ["few"])]
-        add(model, "0", np.array([0], np.int64))
-        nodes += [helper.make_node("Cast", ["few"], ["floats"], to=TensorProto.FLOAT)]
-        nodes += [helper.make_node("ReduceMax", ["floats"], ["largest"], keepdims=0)]
-        return with_sum_of(model, nodes, "largest")
-
-    attack.__name__ = f"six_gigabytes_by_{operator.lower()}"
-    return attack
+def beside_the_scene(nodes: str, **constants: np.ndarray) -> Callable[[onnx.ModelProto, Path], bytes]:
+    """Add nodes that compute `largest`; times 0, it is added to the factor of the scene's motion."""
+    small = f"int64[1] size = {{{MANY}}}, int64 start = {{0}}, int64 stop = {{{MANY}}}, int64 step = {{1}}"
+    small += ", int64[1] first = {0}, int64[1] second = {1}, float[1] nothing = {0}"
+    graph = f"<{small}> {{ {nodes} unseen = Mul(largest, nothing) factor = Add(one, unseen) }}"
+    return partial(with_factor, graph, **constants)
 
 
-def six_gigabytes_by_broadcasting(model: onnx.ModelProto, secret: Path) -> bytes:
-    """All operators are those of sound files."""
-    add(model, "row", np.ones((1, 40_000), np.float32))
-    add(model, "column", np.ones((40_000, 1), np.float32))
-    add(model, "first", np.zeros(1, np.int64))
-    nodes = [
-        helper.make_node("Mul", ["row", "t"], ["row_now"]),
-        helper.make_node("Add", ["row_now", "column"], ["vast"]),
-        helper.make_node("Gather", ["vast", "first"], ["few"]),
-        helper.make_node("Gather", ["few", "first"], ["largest"], axis=1),
-    ]
-    return with_sum_of(model, nodes, "largest")
+def six_gigabytes(call: str) -> Attack:
+    """Make an array of 6 GB by an operator whose inputs set the size of its output."""
+    operator = call.partition("(")[0]
+    nodes = f"vast = {call} few = Slice(vast, first, second) largest = Cast <to = 1> (few)"
+    return Attack(f"six gigabytes by {operator}", f"the operator {operator}", beside_the_scene(nodes))
 
 
-def a_quadrillion_operations(model: onnx.ModelProto, secret: Path) -> bytes:
-    """Products of large matrices in little memory, one after the other."""
-    add(model, "square", np.eye(2000, dtype=np.float32)[:, :2000])
-    add(model, "first", np.zeros(1, np.int64))
-    nodes = [helper.make_node("Mul", ["square", "t"], ["m0"])]
-    nodes += [helper.make_node("MatMul", [f"m{i}", "square"], [f"m{i + 1}"]) for i in range(60)]
-    nodes += [
-        helper.make_node("Gather", ["m60", "first"], ["few"]),
-        helper.make_node("Gather", ["few", "first"], ["largest"], axis=1),
-    ]
-    return with_sum_of(model, nodes, "largest")
-
-
-def whole_numbers_divided_by_zero(model: onnx.ModelProto, secret: Path) -> bytes:
-    """At t0 alone: processors raise a signal."""
-    nodes = [
-        helper.make_node("Cast", ["t"], ["whole"], to=TensorProto.INT64),
-        helper.make_node("Div", ["whole", "whole"], ["quotient"]),
-        helper.make_node("Cast", ["quotient"], ["largest"], to=TensorProto.FLOAT),
-    ]
-    return with_sum_of(model, nodes, "largest")
-
-
-def a_shape_that_depends_on_time(model: onnx.ModelProto, secret: Path) -> bytes:
-    """An operator of the table, whose output is as large as t says."""
-    nodes = [
-        helper.make_node("Cast", ["t"], ["whole"], to=TensorProto.INT64),
-        helper.make_node("Reshape", ["one", "whole"], ["largest"]),
-    ]
-    return with_sum_of(model, nodes, "largest")
-
-
-def another_domain(model: onnx.ModelProto, secret: Path) -> bytes:
-    """onnxruntime's own operators."""
-    model.opset_import.append(helper.make_opsetid("com.microsoft", 1))
-    return with_sum_of(model, [helper.make_node("Gelu", ["t"], ["largest"], domain="com.microsoft")], "largest")
-
-
-def with_sum_of(model: onnx.ModelProto, nodes: list[onnx.NodeProto], value: str) -> bytes:
-    """The scene with nodes that compute a value, which is added to the factor of its motion times 0."""
-    add(model, "nothing", np.zeros(1, np.float32))
-    nodes = [
-        *nodes,
-        helper.make_node("Mul", [value, "nothing"], ["unseen"]),
-        helper.make_node("Add", ["one", "unseen"], ["one_and"]),
-    ]
-    for node in reversed(nodes):
-        model.graph.node.insert(0, node)
-    next(node for node in model.graph.node if node.output[0] == "applied").input[:] = ["t", "one_and"]
-    return model.SerializeToString()
-
-
-def add(model: onnx.ModelProto, name: str, values: np.ndarray) -> None:
-    """A constant."""
-    model.graph.initializer.append(numpy_helper.from_array(values, name))
-
-
-ATTACKS: dict[str, Attack] = {
-    attack.__name__: attack
-    for attack in (
-        file_read_by_a_truncated_location,
-        location_of_33_bits,
-        file_read_inside_a_function,
-        constant_node_in_another_file,
-        loop_that_never_ends_in_the_middle,
-        *(blown_up(operator) for operator in ("Expand", "Tile", "ConstantOfShape", "Range", "Resize")),
-        six_gigabytes_by_broadcasting,
-        a_quadrillion_operations,
-        whole_numbers_divided_by_zero,
-        a_shape_that_depends_on_time,
-        another_domain,
-    )
+# the loop runs 10¹⁵ times around t = 0.5, and not at all at both ends of the time range
+LOOP = """
+<float[1] eight = {8}, float[1] huge = {1e15}, int64[0] none = {}, bool go = {1}> {
+    rest = Sub(one, t)
+    product = Mul(t, rest)
+    raised = Mul(product, eight)
+    bump = Floor(raised)
+    times = Mul(bump, huge)
+    many = Cast <to = 7> (times)
+    trips = Reshape(many, none)
+    factor = Loop <body = body (int64 number, bool on, float[1] state) => (bool on_out, float[1] state_out) {
+        on_out = Identity(on)
+        state_out = Identity(state)
+    }> (trips, go, one)
 }
+"""
+BROADCASTING = """
+row_now = Mul(row, t)
+vast = Add(row_now, column)
+few = Gather(vast, first)
+largest = Gather <axis = 1> (few, first)
+"""
+PRODUCTS = f"""
+m0 = Mul(square, t)
+{" ".join(f"m{i + 1} = MatMul(m{i}, square)" for i in range(60))}
+few = Gather(m60, first)
+largest = Gather <axis = 1> (few, first)
+"""
+ATTACKS = (
+    Attack("file read by a truncated location", "external_data", truncated_location),
+    Attack("location of 33 bits", "data_location", location_alone),
+    Attack("file read inside a function", "functions", inside_a_function),
+    Attack("constant node in another file", "`t`, which a scene file may not have", in_a_node),
+    Attack("loop without end around t = 0.5", "`g`, which a scene file may not have", partial(with_factor, LOOP)),
+    six_gigabytes("Expand(one, size)"),
+    six_gigabytes("Tile(one, size)"),
+    six_gigabytes("ConstantOfShape(size)"),
+    six_gigabytes("Range(start, stop, step)"),
+    six_gigabytes("Resize(one, , , size)"),
+    Attack(
+        "six gigabytes by broadcasting",
+        "`vast` (Add) brings a frame to 6,104 MiB of values; the limit is 2,048 MiB",
+        beside_the_scene(BROADCASTING, row=np.ones((1, 40_000), np.float32), column=np.ones((40_000, 1), np.float32)),
+    ),
+    Attack(
+        "a quadrillion operations",
+        "(MatMul) brings a call to 2.1e+11 operations; the limit is 2e+11",
+        beside_the_scene(PRODUCTS, square=np.eye(2000, dtype=np.float32)),
+    ),
+    Attack(
+        "integers divided by zero, at which processors raise a signal",
+        "`quotient` (Div) reads int64, not float32",
+        beside_the_scene("whole = Cast <to = 7> (t) quotient = Div(whole, whole) largest = Cast <to = 1> (quotient)"),
+    ),
+    Attack(
+        "a shape that depends on time",
+        "`largest` (Reshape) reads `whole`, which must be a constant of the file",
+        beside_the_scene("whole = Cast <to = 7> (t) largest = Reshape(one, whole)"),
+    ),
+    Attack("another domain", "com.microsoft", beside_the_scene("largest = com.microsoft.Gelu(t)")),
+)
 
 POISON: dict[str, tuple[str, str]] = {
     "a time of 400 digits": ("time_range", f"[0, 1{'0' * 400}]"),
@@ -250,11 +213,11 @@ POISON: dict[str, tuple[str, str]] = {
     "texts for numbers": ("time_range", '["0", "1"]'),
     "not a number": ("bounds", "[[0, 0, NaN], [1, 1, 1]]"),
 }
-"""Metadata by what is wrong: the field and its text."""
+"""Metadata by their fault: the field and its text."""
 
 
 def poisoned(model: onnx.ModelProto, what: str) -> bytes:
-    """The scene with one of `POISON`."""
+    """The scene with one entry of `POISON`."""
     name, text = POISON[what]
     properties = {entry.key: entry.value for entry in model.metadata_props} | {name: text}
     del model.metadata_props[:]

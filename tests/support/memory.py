@@ -1,4 +1,4 @@
-"""How much memory some work takes (Linux)."""
+"""Peak memory of a function (Linux)."""
 
 import ctypes
 from collections.abc import Callable
@@ -10,12 +10,17 @@ STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def measured(work: Callable[[], T]) -> tuple[T, float]:
-    """What the work returns, and by how many MB it raised the process's memory at its highest."""
-    ctypes.CDLL(None).malloc_trim(0)  # what earlier work left free would hide this work's
+    """Return the result of a function and by how many MB it raised the peak memory of the process."""
+    before = resident_megabytes()  # freed memory of earlier work would hide that of this work
     FORGET.write_text("5")  # resets the peak
-    before = _memory("VmRSS")
     result = work()
     return result, _memory("VmHWM") - before
+
+
+def resident_megabytes() -> float:
+    """Return the memory in use, after glibc has returned what it keeps for later allocations."""
+    ctypes.CDLL(None).malloc_trim(0)
+    return _memory("VmRSS")
 
 
 def _memory(name: str) -> float:

@@ -17,7 +17,7 @@ from export.plans.registry import build
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import SceneInfo, load_model
+from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.base import LayerConfig
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.layers.plane import PlaneConfig
@@ -125,6 +125,12 @@ def rise(layer: torch.nn.Module) -> None:
     layer.first.bias[1] = -8
     layer.heads.weight[1, 0] = -RISE  # units 0 and 1 differ by 4 t where x > 0.8; the weight is a half
     layer.heads.weight[1, 1] = RISE
+
+
+def saved(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE) -> Path:
+    """Save a model as model.pt in a folder; return its path."""
+    save_model(folder / "model.pt", model, info, 1)
+    return folder / "model.pt"
 
 
 STABILITY_TIMES = 8

@@ -16,17 +16,17 @@ ROOT = Path(__file__).parents[2]
 
 
 def run_python(code: str, *arguments: object, **environment: str) -> str:
-    """What it prints; `environment` is added to the variables of this process."""
+    """Run code in another process and return its output; `environment` is added to the variables of this process."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600, check=False
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr
     return done.stdout
 
 
 def free_port() -> int:
-    """A port of this machine that nothing listens on."""
+    """Return a port of this machine on which nothing listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
@@ -36,17 +36,17 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 def find_chromium() -> str | None:
-    """`MSDGS_CHROMIUM`, or what is on the path."""
+    """Return the path of Chromium: `MSDGS_CHROMIUM`, or one on `PATH`."""
     return os.environ.get("MSDGS_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 
 WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-"""Drawn by the processor: for pages that show nothing without WebGL."""
+"""Options for pages that need WebGL; it is rendered on the CPU."""
 
 
 @contextlib.contextmanager
 def chromium(*arguments: str) -> Iterator[Browser]:
-    """Ended on leaving. Skips the test that asks where there is none."""
+    """Yield a headless Chromium; skip the test if there is none."""
     program = find_chromium()
     if program is None:
         pytest.skip("no Chromium on this machine; `apt-get install chromium`, or name one in MSDGS_CHROMIUM")
@@ -60,10 +60,10 @@ def chromium(*arguments: str) -> Iterator[Browser]:
 
 
 def forget(page: Page) -> None:
-    """That a frame was shown: what `wait_until_still` waits for comes after this."""
+    """Reset the page's mark of a shown frame, for which `wait_until_still` waits."""
     page.evaluate("document.getElementById('image').dataset.shown = ''")
 
 
 def wait_until_still(page: Page) -> None:
-    """Until a frame in full quality is shown."""
+    """Wait until a frame in full quality is shown."""
     page.wait_for_selector("#image[data-shown=full]")

@@ -2,9 +2,10 @@
 
 import contextlib
 import os
+import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,18 @@ import pytest
 
 from msdgs_serve.api.app import create_app
 from msdgs_serve.api.cli import bind
+from msdgs_serve.api.errors import MAX_BODY_BYTES
 from msdgs_serve.api.server import Server
 from msdgs_serve.api.service import Phase
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 from tests.support.service_on_ray import serving_on_ray
+
+ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
+FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
+MAX_SECONDS = 60.0
+"""Seconds that a test waits, whatever else the machine does."""
 
 WATCH_SECONDS = 0.05
 SERVICE_VARIABLE = "MSDGS_TEST_SERVICE"
@@ -46,11 +53,12 @@ def serving(
         server.append(running)
     thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
-    deadline = time.monotonic() + 60
-    while running.service.phase is Phase.STARTING or not running.started:
+
+    def started() -> bool:
         assert thread.is_alive(), running.service.failure
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+        return running.started and running.service.phase is not Phase.STARTING
+
+    eventually(started)
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=60) as client:
             yield client
@@ -59,3 +67,31 @@ def serving(
         thread.join(60)
         listener.close()
     assert not thread.is_alive()
+
+
+def connect(client: httpx.Client) -> socket.socket:
+    """Return a plain connection to a client's service."""
+    assert client.base_url.port
+    return socket.create_connection((client.base_url.host, client.base_url.port), timeout=MAX_SECONDS)
+
+
+def eventually(condition: Callable[[], object]) -> None:
+    """Wait until a condition holds; fail after a minute."""
+    deadline = time.monotonic() + MAX_SECONDS
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def check_problem(response: httpx.Response, status: int | None = None, field: str | None = None) -> None:
+    """Check that an answer has the one shape of all errors; and, if given, its status and the first field it names."""
+    assert status in (None, response.status_code), response.text[:500]
+    assert response.headers["content-type"] == "application/problem+json"
+    assert len(response.content) <= MAX_BODY_BYTES
+    problem = response.json()
+    assert set(problem) == {"type", "title", "status", "detail", "errors"}
+    assert problem["status"] == response.status_code
+    assert problem["title"]
+    assert problem["detail"]
+    if field is not None:
+        assert problem["errors"][0]["field"] == field, response.text[:500]

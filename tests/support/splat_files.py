@@ -1,23 +1,29 @@
-"""Splat files of each format, made small and by hand: what the importers' tests read."""
+"""Splat files of each format, small ones, written by hand for the tests of importers."""
 
+import gzip
 import io
 import json
 import struct
+import tempfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import zstandard
 
+from export.exporters.spz import write_spz
+from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 
 COUNT = 300
-"""More than one chunk of a compressed PLY."""
+"""Gaussians of a file: more than one chunk of a compressed PLY."""
 
 
 def some_gaussians(count: int = COUNT, sh_degree: int = 1, seed: int = 0) -> Gaussians:
-    """In a cube of one unit, every value different."""
+    """Return Gaussians in the cube [-1, 1]³ whose values all differ."""
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(count, 4))
     return Gaussians(
@@ -121,6 +127,13 @@ def ksplat_bytes(g: Gaussians) -> bytes:
     return bytes(header + section) + body
 
 
+def spz3_bytes(g: Gaussians) -> bytes:
+    """Return a `.spz`, version 3, written by our exporter."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_spz(Path(folder) / "a.spz", g, "dilate")
+        return (Path(folder) / "a.spz").read_bytes()
+
+
 def spz2_bytes(version3: bytes, quats: np.ndarray) -> bytes:
     """Version 2 of an unpacked version 3 stream: bytes of x, y and z of rotations, whose axes are right, up, back."""
     _, _, count, *rest = struct.unpack_from("<4sIIBBBB", version3)
@@ -183,10 +196,16 @@ def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
     return folder
 
 
-def zipped(folder: Path) -> bytes:
-    """The files of a folder."""
+def sog_bytes(g: Gaussians, palette: int | None = None) -> bytes:
+    """Return a SOG in a zip."""
+    with tempfile.TemporaryDirectory() as folder:
+        return zipped(write_sog(Path(folder) / "sog", g, palette))
+
+
+def zipped(folder: Path, compression: int = zipfile.ZIP_STORED) -> bytes:
+    """Return a zip of the files of a folder."""
     contents = io.BytesIO()
-    with zipfile.ZipFile(contents, "w") as archive:
+    with zipfile.ZipFile(contents, "w", compression) as archive:
         for file in sorted(folder.iterdir()):
             archive.write(file, file.name)
     return contents.getvalue()
@@ -206,3 +225,31 @@ def _write_webp(file: Path, values: np.ndarray, width: int | None = None) -> Non
     assert writer.open(str(file), spec), writer.geterror()
     assert writer.write_image(pixels.reshape(height, width, 4))
     writer.close()
+
+
+FORMATS: dict[str, tuple[str, Callable[[Gaussians], bytes]]] = {
+    "ply": ("a.ply", lambda g: ply_bytes(inria_columns(g))),
+    "text ply": ("a.ply", lambda g: ply_bytes(inria_columns(g), "ascii")),
+    "compressed ply": ("a.compressed.ply", compressed_ply_bytes),
+    "splat": ("a.splat", splat_bytes),
+    "ksplat": ("a.ksplat", ksplat_bytes),
+    "sog": ("a.sog", sog_bytes),
+    "spz 2": ("a.spz", lambda g: gzip.compress(spz2_bytes(gzip.decompress(spz3_bytes(g)), g.quats))),
+    "spz 3": ("a.spz", spz3_bytes),
+    "spz 3, bare": ("a.spz", lambda g: gzip.decompress(spz3_bytes(g))),
+    "spz 4": ("a.spz", lambda g: spz4_bytes(gzip.decompress(spz3_bytes(g)))),
+}
+"""File name and contents for Gaussians, by format."""
+
+
+def write_splats(folder: Path, file_format: str, g: Gaussians) -> Path:
+    """Write a file of one of `FORMATS`."""
+    name, contents = FORMATS[file_format]
+    (folder / name).write_bytes(contents(g))
+    return folder / name
+
+
+def drawn(g: Gaussians) -> np.ndarray:
+    """[48, 64, 3] image of Gaussians from `some_gaussians`."""
+    camera = Camera.from_fov(orbit(np.zeros(3), 3.0, 30, 20, np.array([0.0, -1.0, 0.0])), 64, 48, 50)
+    return rasterize(g, camera).rgb

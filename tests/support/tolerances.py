@@ -61,7 +61,7 @@ TABLE = (
     Row("gradient.second_order", 1e-5, "what a linear step of 2e-4 leaves out: its square times curvatures up to 100"),
     Row("oracle_db", 70.0, "whole image, threshold pixels included: one step in 1 of 5,000 at every pixel"),
     Row("motion_vector", 2e-3, "pixels; a displacement of 30, stored and blended in float32, over a sum of weights"),
-    Row("hammer.growth", 64e6, "bytes that 16 threads keep; a frame lost each time would be gigabytes"),
+    Row("hammer.growth", 61.0, "MiB that 16 threads keep; a frame lost each time would be gigabytes"),
     Row("kernel_coverage", 95.0, "per cent of the kernels' lines; what is left needs the compiler"),
     # losses
     Row("ssim.float32", 1e-5, "variances are differences of blurred squares; torch blurs in another order"),

@@ -27,7 +27,7 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
 
 RUNS: dict[str, RunImporter] = {"deformgs": DeformGSImporter(), "4dgs": FourDGSImporter()}
-"""By name of the format."""
+"""Importers by name of the format."""
 
 MAX_CAMERAS = 1_000
 CHECKED_TIMES = 3

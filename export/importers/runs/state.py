@@ -5,29 +5,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from export.importers.errors import ImportFailed
+from export.importers.guard import read_guarded
 from msdgs_train.gaussians.model_file import CheckpointInvalid, load, refuse_unlike_stored
 
 
 class State:
-    """The finite tensors of a torch file by name. Reading takes no more memory than a small multiple of its size."""
+    """The finite tensors of a torch file by name, as float32."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        try:
-            values = load(file)
-            if not isinstance(values, Mapping) or not all(isinstance(v, Tensor) for v in values.values()):
-                raise ImportFailed(file, "isn't the state of a network: tensors by name")
-            refuse_unlike_stored(file, values)
-        except CheckpointInvalid as error:
-            raise ImportFailed(file, str(error).removeprefix(f"{file}: ")) from error
-        for name, tensor in values.items():
-            if not torch.isfinite(tensor).all():
-                raise ImportFailed(file, f"`{name}` holds NaN or infinity")
-        self._values = {str(name): tensor for name, tensor in values.items()}
+        self._values = {name: torch.from_numpy(array) for name, array in read_guarded(read_network, file).items()}
 
     def __contains__(self, name: str) -> bool:
         return name in self._values
@@ -36,7 +28,7 @@ class State:
         return list(self._values)
 
     def read(self, name: str, *shape: int | None) -> Tensor:
-        """A tensor as float32. Raises `ImportFailed` if it is missing or has another shape; None is any size."""
+        """A tensor. Raises `ImportFailed` if it is missing or has another shape; None is any size."""
         if name not in self._values:
             raise ImportFailed(self.file, f"lacks `{name}`")
         tensor = self._values[name]
@@ -44,13 +36,31 @@ class State:
         if not fits:
             expected = " × ".join("any" if s is None else str(s) for s in shape)
             raise ImportFailed(self.file, f"`{name}` has shape {tuple(tensor.shape)}, not {expected}")
-        return tensor.to(torch.float32)
+        return tensor
 
     def fill(self, linear: nn.Module, name: str) -> None:
         """Set weight and bias of a Linear to those stored under `name`."""
         for kind in ("weight", "bias"):
             parameter = linear.get_parameter(kind)
             parameter.copy_(self.read(f"{name}.{kind}", *parameter.shape))
+
+
+def read_network(file: Path) -> dict[str, np.ndarray]:
+    """Read the tensors, in a subprocess. Takes no more memory than a small multiple of the file's size.
+
+    Raises `ImportFailed`.
+    """
+    try:
+        values = load(file)
+        if not isinstance(values, Mapping) or not all(isinstance(v, Tensor) for v in values.values()):
+            raise ImportFailed(file, "isn't the state of a network: tensors by name")
+        refuse_unlike_stored(file, values)
+    except CheckpointInvalid as error:
+        raise ImportFailed(file, str(error).removeprefix(f"{file}: ")) from error
+    for name, tensor in values.items():
+        if not torch.isfinite(tensor).all():
+            raise ImportFailed(file, f"`{name}` holds NaN or infinity")
+    return {str(name): tensor.detach().to(torch.float32).numpy() for name, tensor in values.items()}
 
 
 class RunFolder:

@@ -1,6 +1,6 @@
 """The result of all readers of splat files: activated Gaussians without those that can't be drawn."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,18 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.gaussians)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """All that is in it, by name, as `from_arrays` takes it."""
+        own = {name: np.array(value) for name, value in vars(self).items() if name != "gaussians" and value is not None}
+        return {**vars(self.gaussians), **own}
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, np.ndarray]) -> "Splats":
+        """Splats that another process has read. Raises `InvalidInput` for arrays that are none."""
+        names = [field.name for field in fields(Gaussians)]
+        gaussians = Gaussians(*(arrays[name] for name in names)).validate()
+        return Splats(gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), arrays.get("quat_lengths"))
 
 
 def splats(

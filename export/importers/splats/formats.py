@@ -5,7 +5,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from export.importers.errors import ImportFailed
+from export.importers.guard import read_guarded
 from export.importers.splats.base import Splats
 from export.importers.splats.ksplat import read_ksplat
 from export.importers.splats.ply import read_ply
@@ -22,6 +25,9 @@ READERS: dict[str, Callable[[Path], Splats]] = {
     "ksplat": read_ksplat,
 }
 """Readers by name of the format."""
+
+UNPACKED = {"spz", "spz:unturned", "sog", "ksplat"}
+"""Those that native code unpacks, in a process of its own; the others are numbers as they are."""
 
 
 def splat_format(path: Path) -> str | None:
@@ -52,6 +58,13 @@ def read_splats(path: Path, file_format: str | None = None) -> Splats:
         file_format = file_format or splat_format(path)
         if file_format not in READERS:
             raise ImportFailed(path, f"isn't a file of one set of Gaussians: {', '.join(READERS)}")
+        if file_format in UNPACKED:
+            return Splats.from_arrays(read_guarded(read_arrays, path, file_format))
         return READERS[file_format](path)
     except OSError as error:
         raise ImportFailed(path, f"can't be read: {error.strerror or error}") from error
+
+
+def read_arrays(path: Path, file_format: str) -> dict[str, np.ndarray]:
+    """What a reader returns, as arrays. Raises `ImportFailed`."""
+    return READERS[file_format](path).to_arrays()

@@ -1,43 +1,30 @@
-"""`.ksplat`, the format of mkkellogg's viewer, converted to PLY by gaussforge in a process with bounded memory."""
+"""`.ksplat`, the format of mkkellogg's viewer: gaussforge makes a PLY of it."""
 
 import importlib.util
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 from export.importers.errors import ImportFailed
 from export.importers.splats.base import Splats
 from export.importers.splats.ply import read_ply
-from msdgs_serve.scene.errors import InvalidInput
-
-MEMORY, MEMORY_PER_BYTE = 1 << 30, 32
-"""Address space of that process: a constant, and per byte of the file. A Gaussian of 24 bytes becomes one of 68."""
-
-SECONDS = 120.0
-
-_PROGRAM = Path(__file__).with_name("ksplat_process.py")
 
 
 def read_ksplat(file: Path) -> Splats:
-    """Read a `.ksplat` file of any compression level. Raises `ImportFailed` for a damaged file, and `InvalidInput` if
-    gaussforge isn't installed."""
+    """The Gaussians of a `.ksplat` file of any compression level.
+
+    Raises `ImportFailed` for one that is damaged, and where gaussforge isn't installed.
+    """
     if importlib.util.find_spec("gaussforge") is None:
-        raise InvalidInput("input", "another format, or pip install '.[ksplat]' to read .ksplat", str(file))
-    with tempfile.TemporaryDirectory(prefix="msdgs-ksplat-") as folder:
-        ply = Path(folder) / "made.ply"
-        memory = MEMORY + MEMORY_PER_BYTE * file.stat().st_size
-        command = [sys.executable, "-I", str(_PROGRAM), str(file), str(ply), str(memory)]
+        raise ImportFailed(file, "needs gaussforge to be read: pip install '.[ksplat]'")
+    import gaussforge  # native code, which crashes on damaged files
+
+    made = gaussforge.GaussForge().convert(file.read_bytes(), "ksplat", "ply")
+    if "error" in made:
+        raise ImportFailed(file, made["error"].removeprefix("ksplat read failed: "))
+    with tempfile.NamedTemporaryFile(suffix=".ply") as ply:
+        ply.write(made["data"])
+        ply.flush()
         try:
-            done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            raise ImportFailed(file, f"is damaged: its reader didn't end within {SECONDS:.0f} s") from None
-        if done.returncode < 0:
-            raise ImportFailed(file, f"is damaged: its reader died of signal {-done.returncode}")
-        if done.returncode:
-            problem = done.stderr.strip().rpartition("\n")[2]
-            raise ImportFailed(file, problem.removeprefix("ksplat read failed: "))
-        try:
-            return read_ply(ply)
+            return read_ply(Path(ply.name))
         except ImportFailed as error:
-            raise ImportFailed(file, f"is damaged: {str(error).removeprefix(f'{ply}: ')}") from None
+            raise ImportFailed(file, f"is damaged: {error.problem}") from None

@@ -25,7 +25,7 @@ class GraphLimits:
 
 
 UNLIMITED = GraphLimits(*[2**62] * 4)
-"""Limits that no graph reaches, to compare costs."""
+"""No limits, to compare costs."""
 
 
 @dataclass(frozen=True)

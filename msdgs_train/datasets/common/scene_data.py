@@ -1,6 +1,6 @@
 """The common form of all datasets: splits of frames, each with a camera and a time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -51,6 +51,17 @@ class SceneData:
         """First and last time of the frames of all splits; equal in a static scene."""
         times = [frame.t for frames in self.splits.values() for frame in frames]
         return min(times), max(times)
+
+    def split_again(self, every: int) -> "SceneData":
+        """Hold out every so many-th training frame as a test frame and those halfway between as validation frames, in
+        place of the dataset's own. Raises `InvalidInput` if no training frame is left."""
+        places = {0: "test", every // 2: "val"}
+        splits: dict[str, list[Frame]] = {split: [] for split in SPLITS}
+        for index, frame in enumerate(self.splits["train"]):
+            splits[places.get(index % every, "train")].append(frame)
+        if not splits["train"]:
+            raise InvalidInput("llffhold", f"fewer than the {len(self.splits['train'])} training images", every)
+        return replace(self, splits=splits)
 
 
 def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:

@@ -7,7 +7,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from msdgs_serve.scene import Camera
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from msdgs_train.datasets.common.images import write_png
 from tests.train.datasets.layouts import CENTERED, dnerf_json, flat, write_dnerf
@@ -29,6 +29,18 @@ def test_splits_times_and_names(tmp_path: Path):
     assert scene.time_range == (0.2, 1.0)
     assert scene.scene_half_size == 1.3
     assert (scene.splits["train"][1].load_rgba()[..., :3] == 1).all()
+
+
+def test_every_nth_training_image_is_held_out(tmp_path: Path):
+    times = tuple(i / 10 for i in range(10))
+    folder = write_dnerf(tmp_path, splits={split: dnerf_json(split, times) for split in ("train", "test")})
+    splits = load_scene(folder, llffhold=4).splits
+    held_out = {split: [frame.t for frame in splits[split]] for split in ("test", "val", "train")}
+    assert held_out == {"test": [0.0, 0.4, 0.8], "val": [0.2, 0.6], "train": [0.1, 0.3, 0.5, 0.7, 0.9]}
+    assert {frame.image_path.parent.name for frames in splits.values() for frame in frames} == {"train"}
+    single = write_dnerf(folder, splits={"train": dnerf_json("train", (0.5,)), "test": dnerf_json("test", (0.5,))})
+    with pytest.raises(InvalidInput, match="`llffhold` must be fewer than the 1 training images, got 4"):
+        load_scene(single, llffhold=4)
 
 
 def test_a_scene_without_times_is_static(tmp_path: Path):

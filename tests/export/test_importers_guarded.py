@@ -1,0 +1,111 @@
+"""Files that native code unpacks are read in a process of its own: what happens there costs that process alone."""
+
+import ctypes
+import gzip
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from export.exporters.spz import write_spz
+from export.importers import guard
+from export.importers.errors import ImportFailed
+from export.importers.guard import read_guarded
+from export.importers.runs.state import State
+from export.importers.splats.formats import READERS, UNPACKED, read_splats
+from tests.support.splat_files import ksplat_bytes, some_gaussians, spz4_bytes, write_sog
+
+
+def crash(path: Path) -> dict[str, np.ndarray]:
+    ctypes.string_at(0)
+    return {}
+
+
+def hang(path: Path) -> dict[str, np.ndarray]:
+    time.sleep(600)
+    return {}
+
+
+def take_memory(path: Path) -> dict[str, np.ndarray]:
+    return {"vast": np.ones(guard.MEMORY)}
+
+
+def write_much(path: Path) -> dict[str, np.ndarray]:
+    with (path.parent / "vast").open("wb") as file:
+        file.truncate(2 * guard.MEMORY)
+    return {}
+
+
+def refuse(path: Path) -> dict[str, np.ndarray]:
+    raise ImportFailed(path, "has no end")
+
+
+def print_and_return(path: Path) -> dict[str, np.ndarray]:
+    print("what a library has to say")
+    return {"size": np.array(path.stat().st_size), "a/b\0\ud800": np.array("text")}
+
+
+@pytest.mark.parametrize(
+    ("read", "problem"),
+    [
+        (crash, r"a.sog: is damaged: it crashes the process that reads it \(-11\)"),
+        (hang, r"a.sog: is damaged: it isn't read within 1 s"),
+        (refuse, r"a.sog: has no end$"),
+        (write_much, r"a.sog: can't be read: File too large"),
+        pytest.param(
+            take_memory,
+            r"a.sog: is damaged: it crashes the process that reads it \(1\), within a limit of 2,048 MiB",
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="other systems don't keep to a limit of memory"),
+        ),
+    ],
+)
+def test_what_goes_wrong_in_the_process_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], dict[str, np.ndarray]], problem: str
+):
+    if read is hang:
+        monkeypatch.setattr(guard, "SECONDS", 1.0)
+    (tmp_path / "a.sog").touch()
+    with pytest.raises(ImportFailed, match=problem):
+        read_guarded(read, tmp_path / "a.sog")
+
+
+def test_arrays_come_back_by_name(tmp_path: Path):
+    (tmp_path / "a.sog").write_bytes(bytes(7))
+    arrays = read_guarded(print_and_return, tmp_path / "a.sog")
+    assert {name: array.item() for name, array in arrays.items()} == {"size": 7, "a/b\0\ud800": "text"}
+
+
+def written(folder: Path, file_format: str) -> Path:
+    g, file = some_gaussians(20, 0), folder / f"a.{file_format.partition(':')[0]}"
+    if file_format == "ksplat":
+        file.write_bytes(ksplat_bytes(g))
+    elif file_format == "sog":
+        return write_sog(folder / "sog", g)
+    else:
+        write_spz(file, g, "dilate")
+        file.write_bytes(spz4_bytes(gzip.decompress(file.read_bytes())))
+    return file
+
+
+@pytest.mark.parametrize("file_format", sorted(UNPACKED))
+def test_no_splat_file_is_unpacked_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_format: str):
+    file = written(tmp_path, file_format)
+    here = READERS[file_format](file)
+    monkeypatch.setitem(READERS, file_format, lambda _: pytest.fail("in this process"))
+    read = read_splats(file, file_format)
+    assert (read.dropped, read.antialiasing) == (here.dropped, here.antialiasing)
+    for name, array in here.to_arrays().items():
+        assert np.array_equal(read.to_arrays()[name], array), name
+
+
+def test_no_torch_file_of_others_is_unpacked_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    values = {"a.weight": torch.rand(3, 2, dtype=torch.float64), "b": torch.tensor([True])}
+    torch.save(values, tmp_path / "deform.pth")
+    monkeypatch.setattr("export.importers.runs.state.load", lambda _: pytest.fail("in this process"))
+    state = State(tmp_path / "deform.pth")
+    assert torch.equal(state.read("a.weight", None, 2), values["a.weight"].float())
+    assert state.read("b", 1).item() == 1
