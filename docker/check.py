@@ -156,7 +156,7 @@ def check_cold_start() -> None:
 
 
 def check_rights(container: str, *writable: str) -> None:
-    """Whoever gets into a container is a user without rights, who runs nothing of their own."""
+    """The user of a container has no privileges and can't run programs of its own."""
     facts = json.loads(output(DOCKER, "inspect", container).stdout)[0]["HostConfig"]
     expect(facts["Memory"] > 0 and facts["PidsLimit"] > 0, "its memory and processes are limited")
     expect(output(DOCKER, "exec", container, "touch", "/opt/x", check=False).returncode != 0, "the root is read-only")

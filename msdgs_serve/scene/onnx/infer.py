@@ -85,7 +85,7 @@ def _element(node: Node, operator: Operator, operands: list[Value]) -> int:
     if operator.result is None:
         return operands[operator.like].element
     element = node.attributes[operator.result] if isinstance(operator.result, str) else operator.result
-    assert isinstance(element, int)  # `_check_attributes` has looked at the table
+    assert isinstance(element, int)  # `_check_attributes` has checked this
     return element
 
 

@@ -29,7 +29,7 @@ OPSETS = range(18, 21)
 IR_VERSIONS = range(8, 11)
 
 INT_ATTRIBUTE, INTS_ATTRIBUTE = 2, 7
-"""Types of attributes, by their numbers in onnx.proto."""
+"""Attribute types in onnx.proto."""
 
 Attribute = int | tuple[int, ...]
 
