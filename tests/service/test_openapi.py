@@ -322,5 +322,8 @@ def test_no_header_breaks_the_service(tmp_path: Path):
             if name != "content-type":
                 headers.append((b"content-type", b"application/json"))
             where, content = path.replace("{name}", "balls"), json.dumps(BODIES.get(path))
-            response = client.request(method, where, headers=headers, content=content)
+            try:
+                response = client.request(method, where, headers=headers, content=content)
+            except httpx.LocalProtocolError:  # the client doesn't send it
+                continue
             assert response.status_code < 500 or response.status_code in ALLOWED, (method, path, name, value[:60])
