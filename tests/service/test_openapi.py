@@ -78,10 +78,10 @@ HEADERS = [
 """Headers that apply to all calls, which the document doesn't list."""
 
 HEADER_POISON = [
-    b"", b"*", b'"', b'W/"', b'"x", ' * 2000, b"1" * 5000, b"-1", b"nan", b"\xff\xfe", "\U0001f600".encode() * 200,
-    b"x" * 100_000, b"../x", b"a/b;q=nan, */*;q=-1e999", b"application/json; charset=none", b"multipart/form-data",
-    b"Bearer \xff", b"Bearer " + b"x" * 5000, b"bytes=5-1,-,9999999999999999999-", b"gzip", b"100-continue",
-    b"1.2.3.4, x, ::", b"Thu, 99 Xyz 99999 99:99:99 GMT", b"[", b"http://[::", b"@:99999",
+    b"", b"*", b'"', b'W/"', b'"x", ' * 1999 + b'"x"', b"1" * 5000, b"-1", b"nan", b"\xff\xfe",
+    "\U0001f600".encode() * 200, b"x" * 100_000, b"../x", b"a/b;q=nan, */*;q=-1e999", b"application/json; charset=none",
+    b"multipart/form-data", b"Bearer \xff", b"Bearer " + b"x" * 5000, b"bytes=5-1,-,9999999999999999999-", b"gzip",
+    b"100-continue", b"1.2.3.4, x, ::", b"Thu, 99 Xyz 99999 99:99:99 GMT", b"[", b"http://[::", b"@:99999",
 ]  # fmt: skip
 
 
@@ -318,12 +318,10 @@ def test_no_header_breaks_the_service(tmp_path: Path):
                 cases += [(method, path, name, value) for name in [*own, *HEADERS] for value in HEADER_POISON]
         assert len(cases) > 2000
         for number, (method, path, name, value) in enumerate(chosen(cases)):
-            headers = [(name.encode(), value)] * (1 + number % 2)
+            twice = number % 2 == 1 and name != "host"  # of which the client sends one
+            headers = [(name.encode(), value)] * (1 + twice)
             if name != "content-type":
                 headers.append((b"content-type", b"application/json"))
             where, content = path.replace("{name}", "balls"), json.dumps(BODIES.get(path))
-            try:
-                response = client.request(method, where, headers=headers, content=content)
-            except httpx.LocalProtocolError:  # the client doesn't send it
-                continue
+            response = client.request(method, where, headers=headers, content=content)
             assert response.status_code < 500 or response.status_code in ALLOWED, (method, path, name, value[:60])
