@@ -50,7 +50,8 @@ def fit_flags(arguments: argparse.Namespace) -> list[object]:
     """Settings for minutes rather than for quality: few Gaussians, narrow layers, too small to share among threads."""
     layer = "mlp:width=48,depth=2,xyz_frequencies=4,time_width=32,lr_final=2e-4"
     sizes = ["--init-num-pts", 2500, "--max-gaussians", 4000, "--layers", layer, layer]
-    pace = ["--refine-start-fraction", 0.05, "--grow-grad2d", 1e-3, "--sh-degree-fraction", 0.125]
+    density = ["--refine-start-fraction", 0.08, "--refine-every-fraction", 0.04, "--grow-grad2d", 1e-3]
+    pace = [*density, "--sh-degree-fraction", 0.2]
     rest = ["--window-full-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500, "--threads", 1]
     return ["--steps", arguments.steps, "--max-minutes", arguments.minutes, *sizes, *pace, *rest]
 
