@@ -44,9 +44,10 @@ class NodesExport(SupportExport):
         *columns, offsets, rots = graph.split(blended, names, [3, 3, 3, 3, 4])
         blocks, _, rows = inputs.attributes["weights"].shape
         means, quats = _columns(graph, inputs.means, blocks, rows, 3), _columns(graph, inputs.quats, blocks, rows, 4)
+        axes = _matrices(graph, "skinning.axes", inputs.quats)  # constant: computed when the file is opened
         parts = {
             "means": _moved(graph, columns, offsets, means),
-            "scales": _stretched(graph, columns, quats),
+            "scales": _stretched(graph, columns, _columns(graph, axes, blocks, rows, 9)),
             "quats": _rotated(graph, rots, quats),
         }
         return {part: _rows(graph, value, WIDTHS[part]) for part, value in parts.items()}
@@ -131,7 +132,7 @@ def _products(graph: GraphBuilder, name: str, left: str, right: str) -> str:
 
 
 def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
-    """[B, 9] rotation matrices, row by row: products of pairs of w, x, y, z, summed by a constant."""
+    """[·, 9] rotation matrices, row by row: products of pairs of w, x, y, z, summed by a constant."""
     pairs = [(i, j) for i in range(4) for j in range(i, 4)]
     first, second = (
         graph.constant(f"{name}.{n}", np.array(ids, np.int64))
@@ -178,12 +179,14 @@ def _moved(graph: GraphBuilder, columns: list[str], offsets: str, means: str) ->
     return graph.node("Sub", [moved, means], "skinning.means.delta")
 
 
-def _stretched(graph: GraphBuilder, columns: list[str], quats: str) -> str:
-    """[B, 3, S] logarithms of how much longer a Gaussian's axes, columns of its rotation, become by its matrix."""
-    ones, lengths = graph.constant("skinning.axes.ones", np.ones((1, 3), np.float32)), list[str]()
-    for axis, parts in enumerate(_axes(graph, quats)):
+def _stretched(graph: GraphBuilder, columns: list[str], axes: str) -> str:
+    """[B, 3, S] logarithms of how much longer a Gaussian's axes, columns of its rotation [B, 9, S], become by its
+    matrix."""
+    ones, lengths = graph.constant("skinning.three_ones", np.ones((1, 3), np.float32)), list[str]()
+    entries = graph.split(axes, [f"{axes}.{k}" for k in range(9)], [1] * 9)
+    for axis in range(3):
         name = f"skinning.axis{axis}"
-        moved = _linear(graph, name, parts, columns)
+        moved = _linear(graph, name, entries[axis::3], columns)
         lengths.append(
             graph.node("MatMul", [ones, graph.node("Mul", [moved, moved], f"{name}.squares")], f"{name}.square")
         )
@@ -192,24 +195,6 @@ def _stretched(graph: GraphBuilder, columns: list[str], quats: str) -> str:
     half = graph.constant("skinning.half", np.array([0.5], np.float32))
     logs = graph.node("Log", [graph.node("Max", [squares, least], "skinning.kept")], "skinning.logs")
     return graph.node("Mul", [logs, half], "skinning.scales.delta")
-
-
-def _axes(graph: GraphBuilder, quats: str) -> list[list[str]]:
-    """Columns of the rotation matrices of quaternions, [B, 4, S], each as three of [B, 1, S]; constant."""
-    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
-    w, x, y, z = range(4)
-    entries = [
-        {(w, w): 1, (x, x): 1, (y, y): -1, (z, z): -1}, {(x, y): 2, (w, z): 2}, {(x, z): 2, (w, y): -2},
-        {(x, y): 2, (w, z): -2}, {(w, w): 1, (y, y): 1, (x, x): -1, (z, z): -1}, {(y, z): 2, (w, x): 2},
-        {(x, z): 2, (w, y): 2}, {(y, z): 2, (w, x): -2}, {(w, w): 1, (z, z): 1, (x, x): -1, (y, y): -1},
-    ]  # fmt: skip
-    sums = np.array([[entry.get(pair, 0) for pair in pairs] for entry in entries], np.float32)
-    sides = [graph.constant(f"skinning.axes.side{k}", np.array([pair[k] for pair in pairs])) for k in (0, 1)]
-    left, right = (graph.node("Gather", [quats, ids], f"{ids}.columns", axis=1) for ids in sides)
-    products = graph.node("Mul", [left, right], "skinning.axes.products")
-    matrix = graph.node("MatMul", [graph.constant("skinning.axes.sums", sums), products], "skinning.axes")
-    parts = graph.split(matrix, [f"skinning.axes.{k}" for k in range(9)], [1] * 9)
-    return [parts[:3], parts[3:6], parts[6:]]
 
 
 def _rotated(graph: GraphBuilder, rots: str, quats: str) -> str:

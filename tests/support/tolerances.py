@@ -82,7 +82,7 @@ TABLE = (
     Row(
         "export.nodes.relative",
         1e-4,
-        "4 weights of 16 bits, 1.5e-5 each, times motions of size 1; and as export.relative",
+        "weights of 16 bits, off by 1.5e-5 each, times motions of size 1; and as export.relative",
     ),
     Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
     Row("fitted_beside_others", 1e-6, "float32 positions of size 1; how products round depends on how many there are"),
