@@ -55,10 +55,7 @@ class SceneData:
     def split_again(self, every: int) -> "SceneData":
         """Hold out every so many-th training frame as a test frame and those halfway between as validation frames, in
         place of the dataset's own. Raises `InvalidInput` if no training frame is left."""
-        places = {0: "test", every // 2: "val"}
-        splits: dict[str, list[Frame]] = {split: [] for split in SPLITS}
-        for index, frame in enumerate(self.splits["train"]):
-            splits[places.get(index % every, "train")].append(frame)
+        splits = _held_out(self.splits["train"], every, {0: "test", every // 2: "val"})
         if not splits["train"]:
             raise InvalidInput("llffhold", f"fewer than the {len(self.splits['train'])} training images", every)
         return replace(self, splits=splits)
@@ -78,6 +75,12 @@ def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
 
 def hold_out(frames: list[Frame]) -> dict[str, list[Frame]]:
     """Split frames: the first and every 8th after it are test frames; a single frame is a training frame."""
-    test = frames[::HELD_OUT] if len(frames) > 1 else []
-    train = [frame for index, frame in enumerate(frames) if index % HELD_OUT or not test]
-    return {"train": train, "val": [], "test": test}
+    return _held_out(frames, HELD_OUT, {0: "test"} if len(frames) > 1 else {})
+
+
+def _held_out(frames: list[Frame], every: int, places: dict[int, str]) -> dict[str, list[Frame]]:
+    """Split frames by their index modulo `every`: those whose place isn't named are training frames."""
+    splits: dict[str, list[Frame]] = {split: [] for split in SPLITS}
+    for index, frame in enumerate(frames):
+        splits[places.get(index % every, "train")].append(frame)
+    return splits
