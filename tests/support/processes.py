@@ -40,6 +40,9 @@ def find_chromium() -> str | None:
     return os.environ.get("MSDGS_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 
+OPTIONS = ("--disable-gpu", "--no-sandbox", "--disable-dev-shm-usage")
+"""The last two for containers: it runs as root, with 64 MB of shared memory, and shows nothing but our own pages."""
+
 WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Options for pages that need WebGL; it is rendered on the CPU."""
 
@@ -51,10 +54,7 @@ def chromium(*arguments: str) -> Iterator[Browser]:
     if program is None:
         pytest.skip("no Chromium on this machine; `apt-get install chromium`, or name one in MSDGS_CHROMIUM")
     with sync_playwright() as playwright:
-        # it runs as root in containers, and shows nothing but our own page
-        browser = playwright.chromium.launch(
-            executable_path=program, args=["--no-sandbox", "--disable-gpu", *arguments]
-        )
+        browser = playwright.chromium.launch(executable_path=program, args=[*OPTIONS, *arguments])
         yield browser
         browser.close()
 

@@ -10,6 +10,7 @@ ALLOWED_SKIPS = {
     "needs Ray": "350 MB that conflict with nothing and serve few: `make test-cluster`",
     "viser isn't installed": "it wants older versions of what all else is tested with: `make test-viewer`",
     "skipped: no Docker daemon": "a container has none; who builds the image runs docker/check.py",
+    "skipped: there is no docker command": "a container has none, as above",
     "MSDGS_SPLATS names no folder": "files of other programs, which are not ours to pass on",
     "reaches into the process of the service": "on Ray Serve it is another process (MSDGS_TEST_SERVICE=ray)",
     "slow connections end at the proxy": "on Ray Serve (MSDGS_TEST_SERVICE=ray)",
