@@ -1,6 +1,5 @@
 """The page at /, in a browser: it loads, drags, plays, changes view, and says when the service goes away."""
 
-import base64
 import itertools
 import json
 import re
@@ -12,12 +11,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, Request
+from playwright.sync_api import Browser, Page
 
 from msdgs_serve.api.routes.viewer import FILES, FOLDER
 from msdgs_serve.imaging import ImageFormat
 from tests.support.images import decode
-from tests.support.processes import chromium, forget, wait_until_still
+from tests.support.processes import bodies, chromium, forget, image, wait_until_still
 from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
@@ -83,24 +82,6 @@ def open_page(page: Page, client: httpx.Client, address: str = "#scene=balls") -
 @pytest.fixture
 def opened(page: Page, client: httpx.Client) -> Page:
     return open_page(page, client)
-
-
-def image(page: Page) -> np.ndarray:
-    """Return the pixels of the canvas, [H, W, 3] from 0 to 255."""
-    address = page.evaluate("document.getElementById('image').toDataURL('image/png')")
-    return decode(base64.b64decode(address.split(",")[1]), "png")[0][..., :3]
-
-
-def bodies(page: Page) -> list[dict[str, Any]]:
-    """Return a list that each later request for a frame adds its body to."""
-    asked: list[dict[str, Any]] = []
-
-    def note(request: Request) -> None:
-        if request.method == "POST" and request.url.endswith("/render"):
-            asked.append(json.loads(request.post_data or ""))
-
-    page.on("request", note)
-    return asked
 
 
 def test_only_its_own_files_may_be_loaded(client: httpx.Client):

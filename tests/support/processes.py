@@ -1,6 +1,8 @@
 """Other programs: Python code in a process of its own, free ports, and a headless Chromium if this machine has one."""
 
+import base64
 import contextlib
+import json
 import os
 import shutil
 import socket
@@ -8,9 +10,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, Request, sync_playwright
+
+from tests.support.images import decode
 
 ROOT = Path(__file__).parents[2]
 
@@ -67,3 +73,21 @@ def forget(page: Page) -> None:
 def wait_until_still(page: Page) -> None:
     """Wait until a frame in full quality is shown."""
     page.wait_for_selector("#image[data-shown=full]")
+
+
+def image(page: Page) -> np.ndarray:
+    """Return the pixels of the page's canvas, [H, W, 3] from 0 to 255."""
+    address = page.evaluate("document.getElementById('image').toDataURL('image/png')")
+    return decode(base64.b64decode(address.split(",")[1]), "png")[0][..., :3]
+
+
+def bodies(page: Page) -> list[dict[str, Any]]:
+    """Return a list that each later request for a frame adds its body to."""
+    asked: list[dict[str, Any]] = []
+
+    def note(request: Request) -> None:
+        if request.method == "POST" and request.url.endswith("/render"):
+            asked.append(json.loads(request.post_data or ""))
+
+    page.on("request", note)
+    return asked

@@ -17,8 +17,10 @@ from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.layers.base import PAPER_HEADS, SceneBounds
 from msdgs_train.layers.chain import MultiStepDeformation
+from tests.support.images import decode
 from tests.support.plugin_example import FourierConfig
-from tests.support.processes import ROOT, run_python
+from tests.support.processes import ROOT, bodies, chromium, image, run_python, wait_until_still
+from tests.support.service import serving
 from tests.support.tolerances import assert_close, tolerance
 from tests.support.training_scene import assert_same_bits, state_of
 
@@ -108,12 +110,18 @@ def test_a_fourier_layer_has_the_period_of_its_time_range() -> None:
     assert MultiStepDeformation([layer]).operations() == 2 * 3 * 11
 
 
-def test_it_is_exported_and_served(trained: Path, tmp_path: Path) -> None:
-    """The scene file needs neither the plugin nor torch, and holds the poses of the model."""
-    scene = tmp_path / "scene.onnx"
+@pytest.fixture(scope="module")
+def exported(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene file of the run."""
+    scene = tmp_path_factory.mktemp("scene") / "plugin.onnx"
     code = "import sys; from tests.support.models import *; export_scene(*map(Path, sys.argv[1:]), times=5)"
     run_python(code, trained / "model.pt", scene, MSDGS_PLUGINS=str(PLUGIN))
-    loaded, session = load_model(trained / "model.pt"), DeformationSession(scene)
+    return scene
+
+
+def test_it_is_exported_and_served(trained: Path, exported: Path) -> None:
+    """The scene file needs neither the plugin nor torch, and holds the poses of the model."""
+    loaded, session = load_model(trained / "model.pt"), DeformationSession(exported)
     drawn = session.gaussians(0.37)
     with torch.no_grad():
         posed = loaded.model.pose(0.37)
@@ -124,6 +132,22 @@ def test_it_is_exported_and_served(trained: Path, tmp_path: Path) -> None:
     image = Renderer().render(session, camera_of(entry, entry["width"]), 0.37)
     want = loaded.render(camera_of(entry, entry["width"]), 0.37).clamp(0, 1)
     assert_close(image.rgb, want.numpy(), "served_frame")
+
+
+def test_the_page_shows_it(trained: Path, exported: Path) -> None:
+    """In a browser, through a camera of the scene: as the service renders it, and as the model does."""
+    with serving(exported) as client, chromium() as browser, browser.new_page() as page:
+        asked = bodies(page)
+        page.goto(f"{client.base_url}/#scene=plugin&t=0.37&camera=0")
+        wait_until_still(page)
+        shown, frame = image(page), client.post("/render", json=asked[-1])
+    assert (asked[-1]["t"], asked[-1]["camera"]) == (0.37, {"type": "scene", "index": 0})
+    np.testing.assert_array_equal(shown, decode(frame.content, "png")[0])
+    assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 50, "blank"
+    loaded = load_model(trained / "model.pt")
+    want = loaded.render(camera_of(loaded.scene.cameras[0], shown.shape[1]), 0.37).clamp(0, 1)
+    assert want.shape == shown.shape
+    assert_close(shown, 255 * want.numpy(), "served_frame.8bit")
 
 
 def test_the_documented_code_is_the_example() -> None:
