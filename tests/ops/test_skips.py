@@ -13,4 +13,4 @@ def test_one_line_says_what_was_not_tested_and_what_brings_it():
     assert not_tested(list(ALLOWED_SKIPS)) == ""
     line = not_tested([lack.reason for lack in (*LACKS, LACKS[0])])
     assert "the page in a browser (2), " in line
-    assert line.endswith("apt-get install chromium prometheus strace && pip install kubernetes-validate")
+    assert line.endswith("apt-get install chromium libatomic1 prometheus strace && pip install kubernetes-validate")

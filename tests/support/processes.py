@@ -46,9 +46,6 @@ def find_chromium() -> str | None:
     return os.environ.get("MSDGS_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 
-OPTIONS = ("--disable-gpu", "--no-sandbox", "--disable-dev-shm-usage")
-"""The last two for containers: it runs as root, with 64 MB of shared memory, and shows nothing but our own pages."""
-
 WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Options for pages that need WebGL; it is rendered on the CPU."""
 
@@ -58,9 +55,12 @@ def chromium(*arguments: str) -> Iterator[Browser]:
     """Yield a headless Chromium; skip the test if there is none."""
     program = find_chromium()
     if program is None:
-        pytest.skip("no Chromium on this machine; `apt-get install chromium`, or name one in MSDGS_CHROMIUM")
+        pytest.skip("no Chromium on this machine; `apt-get install chromium libatomic1`, or name one in MSDGS_CHROMIUM")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=[*OPTIONS, *arguments])
+        # it runs as root in containers, and shows nothing but our own page
+        browser = playwright.chromium.launch(
+            executable_path=program, args=["--no-sandbox", "--disable-gpu", *arguments]
+        )
         yield browser
         browser.close()
 
