@@ -69,7 +69,8 @@ def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:
     if size is None or size == camera.width:
         return camera
     if not 1 <= size <= camera.width:
-        raise InvalidInput("size", f"in [1, {camera.width}], up to the width of {image_path}", size)
+        expected = f"in [1, {camera.width}], the width of {image_path}, or left out to keep that width"
+        raise InvalidInput("size", expected, size)
     return camera.resized(size, max(1, round(camera.height * size / camera.width)))
 
 
