@@ -26,6 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))  # for files that the tests make
 SKIPPED = 77
 DOCKER = os.environ.get("DOCKER", "docker")
 IMAGE = os.environ.get("MSDGS_IMAGE", "msdgs:check")
@@ -37,7 +38,10 @@ LOAD = 120
 """Frames asked for while a replica is killed."""
 CLIENTS = 4
 KEYS = {"read": "reader-0123456789", "write": "writer-0123456789"}
+CAN_READ, CAN_WRITE = ({"X-API-Key": KEYS[scope]} for scope in ("read", "write"))
 MAX_MEGABYTES = 600
+MAX_MEMORY = 1e9
+"""Bytes that a replica may take, hostile uploads included."""
 PATIENCE = 120.0
 """Seconds until a service must be ready, on a machine that is busy with other things."""
 HARDENED = [
@@ -79,6 +83,7 @@ def main() -> int:
         os.chmod(keys.name, 0o644)  # for user 10001
         with composition(1, MSDGS_UPLOADS="true", API_KEYS=keys.name) as url:
             check_uploads(url)
+            check_hostile_uploads(url)
     print("The image and the composition do what docs/docker.md says.")
     return 0
 
@@ -257,19 +262,45 @@ def check_uploads(url: str) -> None:
     (container,) = containers("render")
     check_rights(container, "/tmp", "/uploads")
     whole = (ROOT / "examples" / "toybench.onnx").read_bytes()
-    can_read, can_write = ({"X-API-Key": KEYS[scope]} for scope in ("read", "write"))
-
-    def call(method: str, path: str, headers: dict[str, str], contents: bytes | None = None) -> int:
-        return ask(urllib.request.Request(f"{url}{path}", contents, headers, method=method)).status
-
     expect(frame(url, 0.5).status == 401, "frames need a key")
-    before = frame(url, 0.5, headers=can_read).body
-    expect(call("POST", "/scenes?name=sent", can_read, whole) == 403, "a key to read uploads nothing")
-    expect(call("POST", "/scenes?name=sent", can_write, whole[: len(whole) // 2]) == 422, "half a file is refused")
-    expect(call("POST", "/scenes?name=sent", can_write, whole) == 201, "a whole one is served after a trial")
-    expect(frame(url, 0.5, headers=can_read, scene="sent").body == before, "it looks as the same scene of the image")
-    expect(call("DELETE", "/scenes/sent", can_write) == 204, "it can be deleted")
-    expect(frame(url, 0.5, headers=can_read).body == before, "the other scene has the same bytes as before")
+    before = frame(url, 0.5, headers=CAN_READ).body
+    expect(upload(url, whole, CAN_READ) == 403, "a key to read uploads nothing")
+    expect(upload(url, whole[: len(whole) // 2]) == 422, "half a file is refused")
+    expect(upload(url, whole) == 201, "a whole one is served after a trial")
+    expect(frame(url, 0.5, headers=CAN_READ, scene="sent").body == before, "it looks as the same scene of the image")
+    deleted = ask(urllib.request.Request(f"{url}/scenes/sent", headers=CAN_WRITE, method="DELETE"))
+    expect(deleted.status == 204, "it can be deleted")
+    expect(frame(url, 0.5, headers=CAN_READ).body == before, "the other scene has the same bytes as before")
+
+
+def check_hostile_uploads(url: str) -> None:
+    """Files that ask for memory, time or another file are refused while a scene is drawn, and nothing of them stays."""
+    try:
+        import onnx
+
+        from tests.support.hostile_scenes import ATTACKS
+        from tests.support.scene_files import write_scene
+    except ImportError as missing:
+        print(f"not checked: hostile files ({missing})")
+        return
+    (container,) = containers("render")
+    with tempfile.TemporaryDirectory() as folder:
+        sound = write_scene(Path(folder) / "sound.onnx").read_bytes()
+    left, before = sh(container, "find /tmp /uploads"), frame(url, 0.5, headers=CAN_READ).body
+    statuses, frames = list[int](), list[bytes]()
+    with ThreadPoolExecutor(1) as pool:
+        for attack in ATTACKS:
+            contents = attack.on(onnx.load_from_string(sound), Path("/opt/msdgs/ready.py"))
+            answer = pool.submit(upload, url, contents)
+            while not answer.done():
+                frames.append(frame(url, 0.5, headers=CAN_READ).body)
+            statuses.append(answer.result())
+    frames.append(frame(url, 0.5, headers=CAN_READ).body)
+    expect(statuses == [422] * len(ATTACKS), f"{statuses.count(422)} of {len(ATTACKS)} hostile files are refused")
+    expect(set(frames) == {before}, f"{len(frames)} frames during and after it have the same bytes as before")
+    expect(sh(container, "find /tmp /uploads") == left, "no file of theirs is left")
+    peak = sh(container, "cat /sys/fs/cgroup/memory.peak || cat /sys/fs/cgroup/memory/memory.max_usage_in_bytes")
+    expect(int(peak) < MAX_MEMORY, f"the container never had more than {int(peak) / 1e6:.0f} MB of memory")
 
 
 def frame(
@@ -284,6 +315,11 @@ def frame(
     """A frame by link."""
     link = f"{url}/render?scene={scene}&azimuth={azimuth}&elevation=20&t={t}&width={size}&height={size}"
     return get(link, headers)
+
+
+def upload(url: str, contents: bytes, headers: dict[str, str] = CAN_WRITE) -> int:
+    """Status of the answer to a scene file named `sent`."""
+    return ask(urllib.request.Request(f"{url}/scenes?name=sent", contents, headers, method="POST")).status
 
 
 def post(url: str, t: float, azimuth: int, request_id: str) -> Answer:
