@@ -128,6 +128,9 @@ Background = Annotated[
     Annotated[Literal["auto", "scene", "transparent"] | None, Tag("name")] | Annotated[Color, Tag("color")],
     Discriminator(_kind_of_background),
 ]
+VideoBackground = Annotated[
+    Annotated[Literal["scene"], Tag("name")] | Annotated[Color, Tag("color")], Discriminator(_kind_of_background)
+]
 
 
 def _kind_of_time(value: Any) -> str:
@@ -296,7 +299,7 @@ class VideoRequest(Strict):
     height: Pixels | None = Field(default=None, description="pixels; required with `width`")
     fps: FramesPerSecond | None = Field(default=None, description="frames per second; default: the path's, else 24")
     format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9. `webp`: animated")
-    background: tuple[Unit, Unit, Unit] | Literal["scene"] = Field(default="scene", description="sRGB-encoded, 0 to 1")
+    background: VideoBackground = Field(default="scene", description="`scene`, or sRGB-encoded, 0 to 1")
 
 
 class SceneEntry(BaseModel):
