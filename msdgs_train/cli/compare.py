@@ -61,7 +61,7 @@ class Compare:
             pool = processes(self.jobs or max(1, thread_count() // self.budget.threads))
         else:
             pool = ray_tasks(self.ray, self.budget.threads, self.jobs)
-        with _progress(len(runs)) as on_end:
+        with comparison_progress(len(runs)) as on_end:
             complete = train_all(runs, pool, on_end)
         results = collect(runs)
         if results:
@@ -78,7 +78,7 @@ class Compare:
 
 
 @contextmanager
-def _progress(total: int) -> "Iterator[Callable[[Run, RunEnd], None]]":
+def comparison_progress(total: int) -> "Iterator[Callable[[Run, RunEnd], None]]":
     """A bar over the runs; yields a function that advances it and prints a line about an ended run."""
     columns = BarColumn(None), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
     with progress_bar(*columns) as bar:

@@ -101,5 +101,4 @@ def print_result(result: RunResult, data: Path, run: Path) -> None:
         best = f"{result.best.split} PSNR {result.best.psnr:.2f} dB at step {result.best.step:,}"
         console.print(f"best:  {run / BEST}, {best}", soft_wrap=True)
     if result.status != "finished":
-        more = " --max-minutes None" if result.status == "out of time" else ""
-        console.print(f"continue with: msdgs-train fit {data} {run} --resume{more}", soft_wrap=True)
+        console.print(f"continue with: msdgs-train fit {data} {run} --resume", soft_wrap=True)

@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_train.cli.bench import Bench
 from msdgs_train.cli.compare import Compare
 from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_train.cli.evaluate import Eval
@@ -17,7 +18,7 @@ from msdgs_train.cli.synthetic import Synthetic
 from msdgs_train.cli.view import View
 from msdgs_train.layers.plugins import add_plugin
 
-Commands = Fit | Synthetic | Eval | Steps | View | Compare
+Commands = Fit | Synthetic | Eval | Steps | View | Compare | Bench
 """Each command has the name of its class in lower case."""
 
 EPILOG = "--plugin MODULE, before the command: a module or Python file that registers layers or systems (repeatable)."

@@ -20,10 +20,10 @@ LOG_LINES = 100
 class Budget:
     """Settings that all systems share; None keeps the system's own."""
 
-    steps: int = 3000
+    steps: int | None = 3000
     """Optimizer steps of each run, instead of the preset's. All schedules are fractions of a run and scale with it."""
     minutes: float | None = None
-    """Time limit of each run. Learning rates decay over --steps: choose as many as fit in the limit."""
+    """Length of each run by the clock, instead of --steps."""
     size: int | None = None
     """Width of all images in pixels."""
     init_num_pts: int | None = None
@@ -35,16 +35,11 @@ class Budget:
 
     def settings(self) -> dict[str, Any]:
         """Return the settings of `TrainConfig`."""
-        every = max(self.steps // EVALUATIONS, 1)
-        given = {
-            "steps": self.steps,
-            "max_minutes": self.minutes,
-            "threads": self.threads,
-            "eval_every": every,
-            "checkpoint_every": every,
-            "log_every": max(self.steps // LOG_LINES, 1),
-        }
-        optional = {name: getattr(self, name) for name in ("size", "init_num_pts", "max_gaussians")}
+        given = {"minutes": self.minutes, "threads": self.threads, "eval_every": 0}
+        if self.steps is not None:
+            every = max(self.steps // EVALUATIONS, 1)
+            given |= {"eval_every": every, "checkpoint_every": every, "log_every": max(self.steps // LOG_LINES, 1)}
+        optional = {name: getattr(self, name) for name in ("steps", "size", "init_num_pts", "max_gaussians")}
         return given | {name: value for name, value in optional.items() if value is not None}
 
 

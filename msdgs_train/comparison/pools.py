@@ -25,7 +25,7 @@ _stop: Event | None = None  # set in a worker process by its parent
 
 
 class RunEnd(NamedTuple):
-    """How a run has ended: "finished", "out of time", "interrupted", "was finished", or "failed" with its message."""
+    """How a run has ended: "finished", "interrupted", "was finished", or "failed" with its message."""
 
     status: str
     message: str = ""

@@ -76,8 +76,8 @@ def mean_and_deviation(values: Sequence[float], digits: int) -> str:
 def as_markdown(results: Sequence[Result], missing: int) -> str:
     """Return the table and the conditions of the measurement as Markdown."""
     run = results[0].run.config.run
-    limit = f", at most {run.max_minutes:g} minutes per run" if run.max_minutes is not None else ""
-    conditions = f"{run.steps:,} steps{limit}; {run.threads} thread(s) per run; held-out images of "
+    length = f"{run.steps:,} steps" if run.minutes is None else f"{run.minutes:g} minutes per run"
+    conditions = f"{length}; {run.threads} thread(s) per run; held-out images of "
     conditions += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
     machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     notes = [conditions, f"Measured on {date.today().isoformat()}: {machine}."]

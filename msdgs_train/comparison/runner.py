@@ -50,10 +50,7 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
 def is_finished(run: Run) -> bool:
     """Whether the budget has been spent and the result written."""
     metrics = final_metrics(run)
-    minutes = run.config.run.max_minutes
-    return metrics is not None and (
-        metrics["step"] >= run.config.run.steps or (minutes is not None and metrics["seconds"] >= 60 * minutes)
-    )
+    return metrics is not None and metrics["step"] >= run.config.run.steps
 
 
 def final_metrics(run: Run) -> dict[str, Any] | None:

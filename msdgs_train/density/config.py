@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from torch import Tensor
+
 from msdgs_train.settings import Checked
 
 
@@ -36,10 +38,11 @@ class DensityConfig(Checked):
     0: never."""
     noise_lr: float = 5e5
     """mcmc: factor of the noise that is injected into means, in their learning rates times their covariance."""
-    opacity_reg: float = 1e-2
-    """mcmc: weight of the mean opacity."""
-    scale_reg: float = 1e-2
-    """mcmc: weight of the mean scale in scene units."""
+    opacity_reg: float | None = None
+    """Weight of the mean opacity, which makes Gaussians that aren't needed transparent; 0.01 with mcmc and 0 with
+    gradient if not given."""
+    scale_reg: float | None = None
+    """Weight of the mean scale in scene units; 0.01 with mcmc and 0 with gradient if not given."""
     reseed_fraction: float = 0.25
     """Random Gaussians that are added after the static phase, as a fraction of max_gaussians: briefly crossed regions
     have lost theirs by then. Until then there are at most max_gaussians less twice as many."""
@@ -49,7 +52,14 @@ class DensityConfig(Checked):
         self.require_fractions("refine_start_fraction", "refine_every_fraction", "refine_stop_fraction")
         self.require_fractions("reset_every_fraction", "prune_opa")
         self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
-        self.require_weights("noise_lr", "opacity_reg", "scale_reg")
+        self.require_weights("noise_lr", *(n for n in ("opacity_reg", "scale_reg") if getattr(self, n) is not None))
         self.require(("reseed_fraction",), "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         self.require(("max_gaussians",), "init_num_pts or more", lambda v: v >= self.init_num_pts)
         self.require(("density_strategy",), "gradient or mcmc", lambda v: v in ("gradient", "mcmc"))
+
+    def regularizers(self, opacities: Tensor, scales: Tensor) -> dict[str, Tensor]:
+        """Weighted terms of the loss, by name, of [N] opacities and [N, 3] scales of posed Gaussians."""
+        default = 1e-2 if self.density_strategy == "mcmc" else 0.0
+        weights = (default if weight is None else weight for weight in (self.opacity_reg, self.scale_reg))
+        means = (("opacity", opacities), ("scale", scales))
+        return {name: w * values.mean() for w, (name, values) in zip(weights, means, strict=True) if w}

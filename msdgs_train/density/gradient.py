@@ -61,14 +61,14 @@ class GradientStrategy:
         return self.schedule.config.density
 
     def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:
-        """None."""
-        return {}
+        """Opacity and scale regularizers: Gaussians that aren't needed become transparent and are removed."""
+        return self.config.regularizers(posed.opacities, posed.scales)
 
-    def after_step(self, surgery: RowSurgery, step: int) -> None:
+    def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """`densify` and `reset_opacities` when they are due."""
-        if self.schedule.refines_at(step):
-            self.densify(surgery, step)
-        if self.schedule.resets_at(step):
+        if any(map(self.schedule.refines_at, steps)):
+            self.densify(surgery, steps[-1])
+        if any(map(self.schedule.resets_at, steps)):
             self.reset_opacities(surgery)
 
     def state(self) -> tuple[Tensor, ...]:

@@ -68,13 +68,12 @@ class MCMCStrategy:
 
     def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:
         """Opacity and scale regularizers: Gaussians that aren't needed become transparent and are relocated."""
-        c = self.config
-        return {"opacity": c.opacity_reg * posed.opacities.mean(), "scale": c.scale_reg * posed.scales.mean()}
+        return self.config.regularizers(posed.opacities, posed.scales)
 
-    def after_step(self, surgery: RowSurgery, step: int) -> None:
+    def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """Relocate if a round is due, then inject noise in proportion to the learning rate of means."""
-        if self.schedule.refines_at(step):
-            self.relocate(surgery, step)
+        if any(map(self.schedule.refines_at, steps)):
+            self.relocate(surgery, steps[-1])
         self.inject_noise(surgery.gaussians, surgery.learning_rate("means"))
 
     @torch.no_grad()

@@ -25,8 +25,8 @@ class DensityStrategy(Protocol):
         """Weighted terms of the loss, by name."""
         ...
 
-    def after_step(self, surgery: RowSurgery, step: int) -> None:
-        """Density control after this optimizer step, counted from 1."""
+    def after_step(self, surgery: RowSurgery, steps: range) -> None:
+        """Density control after an optimizer step, which stands for these steps of the schedule, counted from 1."""
         ...
 
     def reset(self, count: int) -> None:

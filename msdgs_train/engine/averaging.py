@@ -18,15 +18,16 @@ class WeightAverage(Generic[M]):
         self._most, self._count = steps, 0
 
     @torch.no_grad()
-    def add(self, model: M) -> None:
-        """Add one step; the Gaussians must be the same, in the same order."""
-        self._count = min(self._count + 1, self._most)
+    def add(self, model: M, steps: int = 1) -> None:
+        """Add a model that stands for so many steps; the Gaussians must be the same, in the same order."""
+        self._count = min(self._count + steps, self._most)
         if self.model is None:
             self.model = copy.deepcopy(model)
             return
+        fraction = min(steps / self._count, 1.0) if steps else 0.0
         for average, last in zip(self.model.parameters(), model.parameters(), strict=True):
             if last.requires_grad:
-                average.lerp_(last, 1 / self._count)
+                average.lerp_(last, fraction)
 
     def reset(self) -> None:
         """Drop all steps up to now."""

@@ -27,20 +27,21 @@ class RunConfig(Checked):
     system: tyro.conf.Suppress[str] = "msdgs-small"
     """The registered system that builds and trains the model."""
     steps: int = 16_000
-    """Optimizer steps."""
+    """Optimizer steps; with `minutes`, steps of the schedule."""
     batch_size: int = 1
     """Images per step, rendered in parallel; gradients are averaged over them."""
     seed: int = 0
     """Seed of all random numbers of the run."""
     threads: int = 2
     """CPU threads. The same seed and threads give the same bits."""
-    max_minutes: float | None = None
-    """Stop, evaluate and save after this time, resumed parts included."""
+    minutes: float | None = None
+    """Length of the run by the clock, evaluation and saving included: schedules are laid out over this time, and the
+    bits depend on the speed of the machine."""
 
     def __post_init__(self) -> None:
         self.require_counts("steps", "batch_size", "threads")
         self.require_counts("seed", least=0)
-        self.require_positive_or_none("max_minutes")
+        self.require_positive_or_none("minutes")
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def _group_of(name: str) -> str:
     raise InvalidInput("config", "made of known settings", f"`{name}`")
 
 
-RESUMABLE_CHANGES = frozenset({"steps", "threads", "max_minutes", "log_every", "eval_every", "checkpoint_every"})
+RESUMABLE_CHANGES = frozenset({"steps", "threads", "minutes", "log_every", "eval_every", "checkpoint_every"})
 """Settings that may change when a run is resumed. All others have shaped what is trained already."""
 
 

@@ -39,8 +39,8 @@ class TrainingSample(NamedTuple):
 class Curriculum(Protocol):
     """The order of the images of a run."""
 
-    def next(self, number: int, generator: torch.Generator) -> TrainingSample:
-        """The sample of this number, counted from 0; a step takes `batch_size` of them."""
+    def next(self, number: int, step: int, generator: torch.Generator) -> TrainingSample:
+        """The sample of this number, in this step of the schedule, both counted from 0."""
         ...
 
     def state(self) -> Tensor:
@@ -57,7 +57,7 @@ class WindowCurriculum:
 
     def __init__(self, schedule: Schedule, frames: list[Frame], time_range: tuple[float, float]) -> None:
         self._schedule, self._frames, self._time_range = schedule, frames, time_range
-        self._config, self._batch_size = schedule.config.curriculum, schedule.config.run.batch_size
+        self._config = schedule.config.curriculum
         self.distances = distances_from_middle(time_range, frames)
         self._order = torch.empty(0, dtype=torch.int64)
 
@@ -67,8 +67,8 @@ class WindowCurriculum:
     def load_state(self, state: Tensor) -> None:
         self._order = state
 
-    def next(self, number: int, generator: torch.Generator) -> TrainingSample:
-        step, schedule = number // self._batch_size, self._schedule
+    def next(self, number: int, step: int, generator: torch.Generator) -> TrainingSample:
+        schedule = self._schedule
         window = schedule.window(step)
         grows = window < 0.5 and schedule.is_first_pass(step)
         if (

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import SceneData, load_scene
+from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.config import TrainConfig, check_resumable
 from msdgs_train.engine.metrics_log import MetricsLog, draw_curve, write_side_by_side
 from msdgs_train.engine.observer import Observer
@@ -35,14 +36,14 @@ RENDERS_PER_EVAL = 4
 MAX_ROLLBACKS = 3
 PAUSE_SECONDS = 0.05  # between two calls of `Observer.is_paused`
 
-Status = Literal["finished", "interrupted", "out of time"]
+Status = Literal["finished", "interrupted"]
 
 
 class RunResult(NamedTuple):
-    """How a run has ended. Unless it is `finished`, it can be resumed."""
+    """How a run has ended. An interrupted one can be resumed."""
 
     status: Status
-    step: int
+    step: int  # of the schedule
     metrics: dict[str, ImageMetrics]  # by held-out split; empty if interrupted
     gaussians: int
     seconds: float  # of training, resumed parts and evaluations included
@@ -111,9 +112,10 @@ class Run:
         self.splits = [split for split in EVAL_SPLITS if state.trainer.scene.splits.get(split)]
         self.selection_split = _selection_split(state.trainer.scene)
         self.started = time.perf_counter() - state.seconds
+        self.clock, self.advance = self._new_clock(), 1
 
     def execute(self) -> RunResult:
-        """Train until the last step, the time limit or an interruption, then evaluate and save."""
+        """Train until the last step or an interruption, then evaluate and save."""
         self.observer.on_train_start(self.trainer)
         status = self._train()
         metrics = {}
@@ -127,17 +129,22 @@ class Run:
         return RunResult(status, self.trainer.step_count, metrics, size, self._seconds(), self.record.best)
 
     def _train(self) -> Status:
-        steps = self.config.run.steps
+        steps, is_first = self.config.run.steps, True
         while self.trainer.step_count < steps:
+            before = time.perf_counter()
             try:
-                result = self.trainer.step()
+                result = self.trainer.step(self.advance)
             except TrainingDiverged as error:
                 self._roll_back(error)
                 continue
+            taken = time.perf_counter() - before
             self._after_step(result)
-            stop = self._reason_to_stop() if result.step < steps else None
-            if stop is not None:
-                return stop
+            if self.clock and not is_first:  # the first one compiles kernels
+                images = self.config.run.batch_size
+                self.advance = self.clock.advance(result.step, taken, images, self._seconds())
+            is_first = False
+            if result.step < steps and self._is_stopped():
+                return "interrupted"
         return "finished"
 
     def _roll_back(self, error: TrainingDiverged) -> None:
@@ -148,36 +155,36 @@ class Run:
                 "start a new run with lower ones"
             ) from error
         self.trainer.roll_back(self.folder / CHECKPOINT)
+        self.clock, self.advance = self._new_clock(), 1
         self.log.rewind(self.trainer.step_count)
         self._save()
         self.observer.rolled_back(str(error), self.trainer.step_count, self.trainer.lr_factor)
 
-    def _reason_to_stop(self) -> Status | None:
-        self._wait_while_paused()
-        if self.observer.should_stop():
-            return "interrupted"
-        limit = self.config.run.max_minutes
-        return "out of time" if limit is not None and self._seconds() >= 60 * limit else None
+    def _new_clock(self) -> Clock | None:
+        run, splits = self.config.run, self.trainer.scene.splits
+        held_out = sum(len(splits[split]) for split in self.splits)
+        return Clock(run.steps, 60 * run.minutes, held_out, self.trainer.step_count) if run.minutes else None
 
-    def _wait_while_paused(self) -> None:
-        """A pause doesn't count as training time."""
+    def _is_stopped(self) -> bool:
+        """Wait while paused, which doesn't count as training time; whether the run is to stop."""
         since = time.perf_counter()
         while self.observer.is_paused() and not self.observer.should_stop():
             time.sleep(PAUSE_SECONDS)
         self.started += time.perf_counter() - since
+        return self.observer.should_stop()
 
     def _after_step(self, result: StepResult) -> None:
         every, is_last = self.config.logging, result.step == self.config.run.steps
-        if is_last or _is_due(result.step, every.log_every):
+        if is_last or _is_due(self.trainer.reached, every.log_every):
             self.log.train(result, self._seconds())
         self.observer.step(result, self._seconds())
         if is_last:
             return
-        if _is_due(result.step, every.eval_every) and self.splits:
+        if _is_due(self.trainer.reached, every.eval_every) and self.splits:
             for split in self.splits:
                 self._evaluate(split, renders=RENDERS_PER_EVAL)
             draw_curve(self.folder)
-        if _is_due(result.step, every.checkpoint_every) and not self.trainer.is_skipping:
+        if _is_due(self.trainer.reached, every.checkpoint_every) and not self.trainer.is_skipping:
             self._save()
 
     def _evaluate(self, split: str, *, renders: int | None) -> ImageMetrics:
@@ -211,6 +218,7 @@ class Run:
     def _write_final_metrics(self, splits: dict[str, ImageMetrics]) -> None:
         metrics = {
             "step": self.trainer.step_count,
+            "optimizer_steps": self.trainer.optimizer_steps,
             "seconds": round(self._seconds(), 1),
             "gaussians": self.trainer.system.size,
             "splits": {split: metrics._asdict() for split, metrics in splits.items()},
@@ -232,5 +240,6 @@ def _best_so_far(folder: Path, scene: SceneData) -> Best | None:
     return best if best and best.split == _selection_split(scene) and (folder / BEST).exists() else None
 
 
-def _is_due(step: int, every: int) -> bool:
-    return every > 0 and step % every == 0
+def _is_due(steps: range, every: int) -> bool:
+    """Whether one of the steps is a multiple of `every`."""
+    return every > 0 and (steps.stop - 1) // every > (steps.start - 1) // every

@@ -21,7 +21,7 @@ from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates, ste
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.evaluation.metrics import ImageMetrics, image_metrics, psnr_from_mse
 from msdgs_train.gaussians import safe_load
-from msdgs_train.systems.base import System
+from msdgs_train.systems.base import System, Target
 from msdgs_train.systems.registry import system_of
 
 FORMAT = "msdgs-checkpoint/2"
@@ -39,7 +39,7 @@ class TrainingDiverged(MsdgsError):
 class StepResult(NamedTuple):
     """Metrics after one step."""
 
-    step: int  # counted from 1
+    step: int  # of the schedule, counted from 1
     loss: float  # moving average
     psnr: float  # dB, on training images, of the moving average of squared errors
     gaussians: int
@@ -69,22 +69,29 @@ class Trainer:
 
     def _reset(self) -> None:
         """The state before the first step."""
-        self.step_count = self._skipped_in_a_row = 0
+        self.step_count = self.optimizer_steps = self._skipped_in_a_row = 0
+        self.reached = range(1)  # steps of the schedule since the last optimizer step
         self._averages: tuple[float, float] | None = None  # loss, squared error
         self._generator = torch.Generator().manual_seed(self.config.run.seed)
         self._curriculum = WindowCurriculum(self.schedule, self.scene.splits["train"], self.scene.time_range)
         self.system: System = system_of(self.schedule, self.scene)
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
 
-    def step(self) -> StepResult:
-        """Render the next batch, take a step along its mean gradient, and control density."""
-        self.system.before_step(self.optimizer, self.step_count)
+    def step(self, advance: int = 1) -> StepResult:
+        """Render the next batch, take a step along its mean gradient, and control density.
+
+        Args:
+            advance: steps of the schedule that this optimizer step stands for.
+        """
+        self.system.before_step(self.optimizer, self.reached)
         groups = self.system.parameter_groups()
         set_learning_rates(self.optimizer, groups, self.schedule, self.step_count, self.lr_factor)
         views = self._render_and_backward()
         average_gradients(groups, views)
         loss = sum(view.loss for view in views) / len(views)
-        self.step_count += 1
+        self.reached = range(self.step_count + 1, self.step_count + advance + 1)
+        self.step_count += advance
+        self.optimizer_steps += 1
         is_finite = self._is_finite(loss)
         if is_finite:
             # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
@@ -94,7 +101,7 @@ class Trainer:
             step_with_new_frames(self.optimizer, rows)
             self._average([view for view in views if view.sample.update == "all"])
         self.system.after_step(
-            self.optimizer, self.step_count, [(view.sample, view.view) for view in views] if is_finite else []
+            self.optimizer, self.reached, [(view.sample, view.view) for view in views] if is_finite else []
         )
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         clamped = max(view.view.clamped_scales for view in views)
@@ -116,6 +123,8 @@ class Trainer:
         state = {
             "format": FORMAT,
             "step_count": self.step_count,
+            "optimizer_steps": self.optimizer_steps,
+            "reached": (self.reached.start, self.reached.stop),
             "seconds": seconds,
             "skipped": (self.skipped, self._skipped_in_a_row),
             "rollbacks": self.rollbacks,
@@ -136,6 +145,7 @@ class Trainer:
         if not isinstance(state, dict) or state.get("format") != FORMAT:
             raise safe_load.CheckpointInvalid(path, f"isn't of format {FORMAT}: train again in a new folder")
         self.step_count, self._averages = state["step_count"], state["averages"]
+        self.optimizer_steps, self.reached = state["optimizer_steps"], range(*state["reached"])
         self.system.load_state(state["system"], self.step_count)
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
         self.optimizer.load_state_dict(state["optimizer"])
@@ -173,9 +183,9 @@ class Trainer:
     def _render_and_backward(self) -> list[ViewGradients]:
         """Render the next batch and differentiate the loss of each image, in parallel."""
         size = self.config.run.batch_size
-        first = self.step_count * size
+        first = self.optimizer_steps * size
         drawn = [
-            (self._curriculum.next(number, self._generator), self._next_background())
+            (self._curriculum.next(number, self.step_count, self._generator), self._next_background())
             for number in range(first, first + size)
         ]
         if size == 1:
@@ -189,9 +199,10 @@ class Trainer:
 
     @sharing_cores()
     def _differentiate(self, sample: TrainingSample, background: Tensor) -> ViewGradients:
-        target = self._images.image(sample.frame, background)
+        image = self._images.image(sample.frame, background)
+        target = Target(image, self._images.transparency(sample.frame))
         view = self.system.loss(sample, target, background, self.step_count)
-        return differentiate(self.system.parameter_groups(), sample, view, target)
+        return differentiate(self.system.parameter_groups(), sample, view, image)
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":

@@ -17,6 +17,10 @@ class LossConfig(Checked):
     """Weight of L1 of images pooled over 8 to 32 pixels, added for samples that only train motion: pooling gives a
     gradient at displacements larger than the object."""
 
+    empty_weight: float = 0.0
+    """Weight of alpha where the image is transparent: what has the background's color there would be fog in views of
+    other cameras."""
+
     def __post_init__(self) -> None:
         self.require_fractions("ssim_lambda", "mse_fraction")
-        self.require_weights("pooled_l1_weight")
+        self.require_weights("pooled_l1_weight", "empty_weight")

@@ -11,6 +11,13 @@ from msdgs_train.engine.curriculum import TrainingSample
 from msdgs_train.layers.parameters import ParamGroup
 
 
+class Target(NamedTuple):
+    """A training image."""
+
+    rgb: Tensor  # [H, W, 3] in [0, 1], over the background
+    transparency: Tensor  # [H, W], 1 − alpha
+
+
 class ViewLoss(NamedTuple):
     """One rendered training image and its loss."""
 
@@ -37,12 +44,13 @@ class System(Protocol):
         """All current trainable parameters, with learning rates and roles."""
         ...
 
-    def before_step(self, optimizer: torch.optim.Optimizer, step: int) -> None:
-        """Called before this step, counted from 0."""
+    def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
+        """Called before an optimizer step. `steps` of the schedule, counted from 0, have been reached since the last
+        one: one, unless the schedule follows the clock."""
         ...
 
-    def loss(self, sample: TrainingSample, target: Tensor, background: Tensor, step: int) -> ViewLoss:
-        """Render a sample and compare it with its image, [H, W, 3]; called from several threads at once."""
+    def loss(self, sample: TrainingSample, target: Target, background: Tensor, step: int) -> ViewLoss:
+        """Render a sample and compare it with its image; called from several threads at once."""
         ...
 
     def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
@@ -50,9 +58,10 @@ class System(Protocol):
         ...
 
     def after_step(
-        self, optimizer: torch.optim.Optimizer, step: int, views: list[tuple[TrainingSample, ViewLoss]]
+        self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[TrainingSample, ViewLoss]]
     ) -> None:
-        """Density control and averaging after this step, counted from 1; no views if its loss wasn't finite."""
+        """Density control and averaging after these steps of the schedule, counted from 1, of one optimizer step; no
+        views if its loss wasn't finite."""
         ...
 
     def render(self, camera: Camera, t: float, background: Tensor, step: int) -> Tensor:

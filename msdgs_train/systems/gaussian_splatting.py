@@ -24,7 +24,7 @@ from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.parameters import LearningRate, ParamGroup, constant
 from msdgs_train.losses.photometric import masked_l1, photometric_loss, pooled_l1
 from msdgs_train.rendering.rasterize import rasterize
-from msdgs_train.systems.base import ViewLoss
+from msdgs_train.systems.base import Target, ViewLoss
 
 CAMERAS_OF_TRAINING = 20
 """Training cameras that a model file keeps if there is no test split."""
@@ -69,43 +69,45 @@ class GaussianSplatting:
         return own + self.model.motion_groups()
 
     @torch.no_grad()
-    def before_step(self, optimizer: torch.optim.Optimizer, step: int) -> None:
+    def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
         schedule, surgery = self.schedule, RowSurgery(self.model.gaussians, optimizer)
-        if step == schedule.static_steps and schedule.num_reseeded:
+        if schedule.static_steps in steps and schedule.num_reseeded:
             reseed(surgery, schedule, self.scene_half_size)
             self.density.reset(self.size)
-        if step == schedule.deform_start_step:
+        if schedule.deform_start_step in steps:
             self.model.support.on_deform_start(self.model.gaussians, surgery)
-        before, after = schedule.window(step - 1), schedule.window(step)
-        if before < after and schedule.is_first_pass(step):
+        before, after = schedule.window(steps.start - 1), schedule.window(steps.stop - 1)
+        if before < after and schedule.is_first_pass(steps.stop - 1):
             for layer in self.model.deformation:
                 layer.on_window(before, after)
 
-    def loss(self, sample: TrainingSample, target: Tensor, background: Tensor, step: int) -> ViewLoss:
+    def loss(self, sample: TrainingSample, target: Target, background: Tensor, step: int) -> ViewLoss:
         posed, c = self._pose(self.model, sample.t, step), self.config.loss
-        rgb, _, info = rasterize(*posed, sample.frame.camera, background, self._options(step + 1))
+        rgb, alpha, info = rasterize(*posed, sample.frame.camera, background, self._options(step + 1))
         if sample.update == "static":
-            loss = masked_l1(rgb, target, 1 - c.ssim_lambda)
+            loss = masked_l1(rgb, target.rgb, 1 - c.ssim_lambda)
         else:
-            loss = photometric_loss(rgb, target, 1 - c.ssim_lambda, c.mse_fraction)
+            loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
             loss = loss + self._regularizers(posed, sample, step)
         if sample.update == "motion" and c.pooled_l1_weight:
-            loss = loss + c.pooled_l1_weight * pooled_l1(rgb, target)
+            loss = loss + c.pooled_l1_weight * pooled_l1(rgb, target.rgb)
+        if c.empty_weight:
+            loss = loss + c.empty_weight * (target.transparency * alpha).mean()
         return ViewLoss(loss, rgb, count_clamped(self.config.model.scale_space, posed.scales), info)
 
     def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
         return [rows for layer in self.model.deformation for rows in layer.new_frame_rows(times)]
 
     def after_step(
-        self, optimizer: torch.optim.Optimizer, step: int, views: list[tuple[TrainingSample, ViewLoss]]
+        self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[TrainingSample, ViewLoss]]
     ) -> None:
         for sample, view in views:
             if sample.update == "all" and view.screen.means2d_grads is not None:
                 camera = sample.frame.camera
                 self.density.accumulate(view.screen.means2d_grads, view.screen.radii, camera.width, camera.height)
-        self.density.after_step(RowSurgery(self.model.gaussians, optimizer), step)
-        if self.schedule.averages_at(step):
-            self.average.add(self.model)
+        self.density.after_step(RowSurgery(self.model.gaussians, optimizer), steps)
+        if self.schedule.averages_at(steps.stop - 1):
+            self.average.add(self.model, len(steps))
         else:
             self.average.reset()
 

@@ -5,11 +5,11 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.systems.deformgs import PUBLISHED
-from msdgs_train.systems.registry import DEFAULT, register_system
+from msdgs_train.systems.registry import register_system
 
 PAPER_LAYERS = 10
 
-register_system(DEFAULT, "two small MLP layers, for two cores in half an hour", TrainConfig())
+register_system("msdgs-small", "two small MLP layers on the Gaussians themselves", TrainConfig())
 
 register_system(
     "msdgs-mlp",

@@ -17,7 +17,7 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.plugins import load_plugins
 from msdgs_train.systems.base import System
 
-DEFAULT = "msdgs-small"
+DEFAULT = "msdgs-nodes"
 
 
 class SystemEntry(NamedTuple):

@@ -16,7 +16,7 @@ from msdgs_train.layers.base import HEAD_COLUMNS, Heads, LayerConfig, SceneBound
 from msdgs_train.layers.deformation import DeformationLayer, LayerStep
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.registry import register_layer
-from msdgs_train.systems.base import ViewLoss
+from msdgs_train.systems.base import Target, ViewLoss
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from msdgs_train.systems.registry import register_system
 
@@ -84,7 +84,7 @@ MOTION_WEIGHT = 0.01
 class SparseMotion(GaussianSplatting):
     """Gaussian splatting that prefers to leave Gaussians where they are."""
 
-    def loss(self, sample: TrainingSample, target: Tensor, background: Tensor, step: int) -> ViewLoss:
+    def loss(self, sample: TrainingSample, target: Target, background: Tensor, step: int) -> ViewLoss:
         view = super().loss(sample, target, background, step)
         if sample.update == "static" or not self.schedule.deforms(step):
             return view

@@ -28,6 +28,14 @@ PLUGIN = ROOT / "tests" / "support" / "plugin_example.py"
 SMALL = ["--steps=24", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--eval-every=0", "--sh-degree=1"]
 SMALL += ["--static-fraction=0.2", "--refine-start-fraction=0.17", "--refine-every-fraction=0.17"]
 
+STOP_AFTER_A_STEP = """
+import sys
+from unittest.mock import patch
+from msdgs_train.cli import fit_progress, main
+with patch.object(fit_progress.FitProgress, "should_stop", lambda progress: True):
+    assert main.main(sys.argv[1:]) == main.EXIT_INTERRUPTED
+"""
+
 pytestmark = pytest.mark.slow
 
 
@@ -61,9 +69,9 @@ def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_stopped_run_resumes_with_the_same_bits(data: Path, trained: Path, tmp_path: Path) -> None:
     stopped = tmp_path / "stopped"
-    said = train("fit", data, stopped, "--preset", "sparse-fourier", *SMALL, "--max-minutes=1e-9")
-    assert "out of time at step 1," in said
-    train("fit", data, stopped, "--resume", "--max-minutes", "None")
+    arguments = ["fit", data, stopped, "--preset", "sparse-fourier", *SMALL]
+    run_python(STOP_AFTER_A_STEP, *arguments, MSDGS_PLUGINS=str(PLUGIN))
+    assert "resumed after step 1" in train("fit", data, stopped, "--resume")
     assert_same_bits(state_of(stopped), state_of(trained))
     config = json.loads((trained / "config.json").read_text())
     assert [layer["kind"] for layer in config["model"]["layers"]] == ["fourier", "fourier"]

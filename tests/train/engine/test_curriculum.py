@@ -35,7 +35,7 @@ def samples(scene: SceneData, numbers: range, **changes: Any) -> list[TrainingSa
     schedule = Schedule.from_config(small_config(**{**settings, **changes}))
     curriculum = WindowCurriculum(schedule, scene.splits["train"], scene.time_range)
     generator = torch.Generator().manual_seed(0)
-    return [curriculum.next(number, generator) for number in numbers]
+    return [curriculum.next(number, number // schedule.config.run.batch_size, generator) for number in numbers]
 
 
 def distance(scene: SceneData, t: float) -> float:
@@ -166,6 +166,7 @@ def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, model: 
         average_gradients(groups, views)
         trainer.optimizer.step()
         trainer.step_count += 1
+        trainer.optimizer_steps += 1
         changed = {role for role, p, old in before if not torch.equal(p, old)}
         (update,) = [view.sample.update for view in views]
         roles = {group.role for group in groups}
@@ -217,7 +218,7 @@ def test_only_new_frames_are_asked_for_larger_steps(scene: SceneData, monkeypatc
     curriculum = WindowCurriculum(trainer.schedule, scene.splits["train"], scene.time_range)
     generator = torch.Generator().manual_seed(config.run.seed)
     for step in range(40):
-        sample = curriculum.next(step, generator)
+        sample = curriculum.next(step, step, generator)
         expected += [sample.t] if sample.update == "motion" else []
         trainer.step()
     assert asked == expected != []
@@ -232,6 +233,7 @@ def test_pooled_images_are_compared_for_samples_of_motion(scene: SceneData, monk
         (view,) = trainer._render_and_backward()
         updates.append(view.sample.update)
         trainer.step_count += 1
+        trainer.optimizer_steps += 1
     assert len(compared) == updates.count("motion") > 0
 
 
@@ -251,6 +253,7 @@ def test_motion_at_new_frames_need_not_be_smooth(scene: SceneData, monkeypatch: 
         (view,) = trainer._render_and_backward()
         samples_seen += [view.sample] if trainer.schedule.deforms(trainer.step_count) else []
         trainer.step_count += 1
+        trainer.optimizer_steps += 1
     assert {sample.update for sample in samples_seen} == {"all", "motion"}
     assert rigidity == [pytest.approx(sample.t) for sample in samples_seen]
     assert smoothness == [pytest.approx(sample.t) for sample in samples_seen if sample.update != "motion"]

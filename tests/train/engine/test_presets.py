@@ -60,8 +60,8 @@ def test_table_4() -> None:
     assert [in_millions(sizes(two[i], n)[1]) for i, n in ((0, 106_500), (1, 52_800))] == [3.41, 1.69]
 
 
-def test_the_default_is_what_needs_no_preset() -> None:
-    assert preset(DEFAULT) == TrainConfig()
+def test_the_defaults_of_settings_are_a_preset() -> None:
+    assert preset("msdgs-small") == TrainConfig()
 
 
 def test_a_config_names_its_system() -> None:
@@ -70,7 +70,7 @@ def test_a_config_names_its_system() -> None:
 
 
 def test_unknown_names_are_refused_with_those_there_are() -> None:
-    with pytest.raises(InvalidInput, match=r"msdgs-small.*4dgs.*msdgs-mlp.*--plugin.*hexplane"):
+    with pytest.raises(InvalidInput, match=r"msdgs-nodes.*4dgs.*msdgs-mlp.*--plugin.*hexplane"):
         preset("hexplane")
 
 

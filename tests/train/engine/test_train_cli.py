@@ -131,7 +131,7 @@ def test_parts_are_given_as_words(data: Path, tmp_path: Path) -> None:
         (["--layers", "mlp", "hash"], "mlp, plane, spline"),
         (["--layers", "mlp:hight=3"], "`hight`"),
         (["--layers", "mlp:width=0"], "model.layers.0.width"),
-        (["--layers", "spline"], "--model.support nodes"),
+        (["--support", "gaussians", "--layers", "spline"], "--model.support nodes"),
         (["--support", "cage"], "gaussians, nodes"),
     ],
 )

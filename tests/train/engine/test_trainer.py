@@ -29,6 +29,7 @@ from msdgs_train.layers.plane import PlaneConfig, PlaneLayer
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems import gaussian_splatting as system_module
+from msdgs_train.systems.base import Target
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import (
     MIXED_ON_GAUSSIANS,
@@ -142,9 +143,11 @@ def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_curve")
-def test_time_budget_stops_evaluates_and_saves(data: Path, tmp_path: Path) -> None:
-    outcome = fit(small_config(max_minutes=1e-9), data, tmp_path / "run")
-    assert (outcome.status, outcome.step) == ("out of time", 1)
+def test_a_run_that_has_no_time_left_ends_its_schedule(data: Path, tmp_path: Path) -> None:
+    config = small_config(minutes=1e-9)
+    outcome = fit(config, data, tmp_path / "run")
+    assert (outcome.status, outcome.step) == ("finished", config.run.steps)
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["optimizer_steps"] == 3
     assert set(outcome.metrics) == {"test", "val"}
     assert (tmp_path / "run" / "checkpoint.pt").exists()
 
@@ -276,7 +279,7 @@ def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_pat
 
 
 def _next_frame(trainer: Trainer) -> str:
-    return trainer._curriculum.next(trainer.step_count, trainer._generator).frame.name
+    return trainer._curriculum.next(trainer.step_count, trainer.step_count, trainer._generator).frame.name
 
 
 def _plane_differences(planes: np.ndarray, order: int, axis: int) -> float:
@@ -307,7 +310,7 @@ def test_weighted_regularizers_are_added_to_the_loss(data: Path, monkeypatch: py
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(layer.plane_grids()) == 2
         frame = load_scene(data).splits["train"][0]
-        target, black = torch.zeros(SIZE, SIZE, 3), torch.zeros(3)
+        target, black = Target(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE)), torch.zeros(3)
         monkeypatch.setattr(system_module, "photometric_loss", lambda *arguments: torch.zeros(()))
         loss = system.loss(TrainingSample(frame, 0.3, "all"), target, black, 0).loss
         assert float(loss) == pytest.approx(float(expected), rel=tolerance("float32.relative"))
@@ -378,7 +381,7 @@ def test_learning_rates(data: Path) -> None:
     [
         ("steps", 0), ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
         ("mse_fraction", 1.1), ("pooled_l1_weight", -1.0), ("ema_fraction", -0.1),
-        ("max_gaussians", 10), ("background", "green"), ("max_minutes", 0.0), ("refine_every_fraction", -0.1),
+        ("max_gaussians", 10), ("background", "green"), ("minutes", 0.0), ("refine_every_fraction", -0.1),
         ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),
     ],
 )  # fmt: skip

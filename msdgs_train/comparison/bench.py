@@ -1,0 +1,130 @@
+"""The benchmark of many scenes: its runs, and a row of a CSV file for each finished one.
+
+Settings are chosen by the mean over scenes of PSNR on `val` images; `test` images, which no choice has seen, are
+reported. A run that has a row isn't trained again.
+"""
+
+import csv
+import hashlib
+import json
+import os
+import platform
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.comparison.matrix import Run
+from msdgs_train.comparison.runner import final_metrics
+from msdgs_train.datasets.common.files import write_text
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.metrics_log import read_metrics
+from msdgs_train.evaluation.evaluate import evaluate_run
+
+SCENES = Path(__file__).with_name("bench.toml")
+SPLITS = ("val", "test")
+KEY = ("scene", "system", "seed", "minutes", "threads", "settings")
+COLUMNS = (
+    "date", "machine", *KEY, "seconds", "optimizer_steps", "gaussians", "train_psnr",
+    *(f"{split}_{name}" for split in SPLITS for name in ("psnr", "ssim", "lpips", "moving_psnr", "images")),
+)  # fmt: skip
+"""`*_images` has the PSNR of each image, in order; `*_moving_psnr` only where the region is known from the images;
+`train_psnr` is the moving average of the last steps."""
+
+Row = dict[str, str]
+
+
+@dataclass(frozen=True)
+class BenchScene:
+    """A dataset at one size."""
+
+    name: str
+    folder: Path
+    size: int
+    llffhold: int = 0
+    splits: tuple[str, ...] = SPLITS
+    short: bool = False
+    """Whether the short form has it."""
+
+
+def read_scenes(data: Path, *, short: bool, file: Path = SCENES) -> list[BenchScene]:
+    """The scenes of the benchmark, with folders below `data`. Raises `InvalidInput` if one has no folder."""
+    tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    scenes = [BenchScene(name, **{**table, "folder": data / table["folder"]}) for name, table in tables.items()]
+    chosen = [scene for scene in scenes if scene.short or not short]
+    missing = sorted({scene.folder.name for scene in chosen if not scene.folder.is_dir()})
+    if missing:
+        raise InvalidInput("data", f"a folder with datasets named {', '.join(missing)}", data)
+    return chosen
+
+
+def make_bench_runs(
+    systems: Mapping[str, TrainConfig], scenes: Sequence[BenchScene], seeds: Sequence[int], out: Path
+) -> list[Run]:
+    """One run per seed, scene and system, in this order: a benchmark that is stopped compares all systems."""
+    return [
+        Run(name, scene.name, seed, scene.folder.resolve(), out / name / f"{scene.name}_{seed}_{_digest(config)}",
+            config.updated(seed=seed, size=scene.size, llffhold=scene.llffhold))
+        for seed in seeds
+        for scene in scenes
+        for name, config in systems.items()
+    ]  # fmt: skip
+
+
+def key_of(run: Run) -> tuple[str, ...]:
+    """The values of `KEY`, which tell the rows of a CSV file apart."""
+    config = run.config.run
+    return run.scene, run.system, str(run.seed), f"{config.minutes:g}", str(config.threads), _digest(run.config)
+
+
+def _digest(config: TrainConfig) -> str:
+    """Eight digits that change with any setting besides those of `KEY`, the scene's and the machine's."""
+    same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1)
+    return hashlib.sha256(json.dumps(same.to_dict(), sort_keys=True).encode()).hexdigest()[:8]
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a CSV file; none if there is no such file. Raises `InvalidInput` if it has other columns."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise InvalidInput("csv", f"a file with the columns {', '.join(COLUMNS)}", path)
+        return list(reader)
+
+
+def append_row(path: Path, row: Row) -> None:
+    """Add a row, atomically."""
+    lines = [",".join(COLUMNS), *(",".join(each[name] for name in COLUMNS) for each in [*read_rows(path), row])]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def measure(run: Run, scene: BenchScene) -> Row:
+    """The row of a finished run: metrics of its last model on the images of all splits."""
+    metrics = final_metrics(run) or {}
+    row = dict(zip(KEY, key_of(run), strict=True)) | {
+        "date": date.today().isoformat(),
+        "machine": f"{platform.machine()} {os.cpu_count()} cores",
+        "seconds": f"{metrics['seconds']:.0f}",
+        "optimizer_steps": str(metrics["optimizer_steps"]),
+        "gaussians": str(metrics["gaussians"]),
+        "train_psnr": f"{[line for line in read_metrics(run.folder) if line['kind'] == 'train'][-1]['psnr']:.3f}",
+    }
+    for split in SPLITS:
+        found = split in scene.splits and split in metrics["splits"]
+        row |= {f"{split}_{name}": value for name, value in (_scores(run, split) if found else {}).items()}
+    return {name: row.get(name, "") for name in COLUMNS}
+
+
+def _scores(run: Run, split: str) -> dict[str, str]:
+    evaluation = evaluate_run(run.folder, run.data, split)
+    model = evaluation.models[0]
+    mean = model.mean
+    moving = mean.moving_psnr if evaluation.region_source == "images" else None
+    numbers = {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "moving_psnr": moving}
+    texts = {name: f"{value:.4f}" for name, value in numbers.items() if value is not None}
+    return texts | {"images": " ".join(f"{image.psnr:.2f}" for image in model.images)}

@@ -1,0 +1,96 @@
+"""The table and the figure of the benchmark of many scenes."""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from msdgs_train.comparison.bench import SPLITS, Row
+from msdgs_train.comparison.report import mean_and_deviation
+from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_train.evaluation.report import markdown_table
+
+TABLE, PLOT = "bench.md", "bench.png"
+RESAMPLES = 2000
+INTERVAL = (2.5, 97.5)  # percentiles of the bootstrap
+
+
+def write_bench(out: Path, rows: Sequence[Row]) -> list[Path]:
+    """Write the table and the figure into the folder `out`, each atomically; returns their paths."""
+    write_text(out / TABLE, as_markdown(rows))
+    with replacing(out / PLOT) as temporary:
+        draw(rows).savefig(temporary, dpi=110)
+    return [out / TABLE, out / PLOT]
+
+
+def as_markdown(rows: Sequence[Row]) -> str:
+    """A line per scene, and the mean over the scenes that all systems have; a column per system and split."""
+    systems, scenes = (list(dict.fromkeys(row[name] for row in rows)) for name in ("system", "scene"))
+    lines = [[scene, *(_cell(rows, scene, system, s) for s in SPLITS for system in systems)] for scene in scenes]
+    means = [_mean_over_scenes(rows, scenes, systems, split) for split in SPLITS]
+    lines.append(["mean", *(f"{value:.2f}" if value is not None else "–" for of_split in means for value in of_split)])
+    headings = ["scene", *(f"{system}, {split}" for split in SPLITS for system in systems)]
+    shown = [markdown_table(headings, lines)]
+    if len(systems) > 1:
+        gains = [[scene, *(_gain(rows, scene, system, systems[0]) for system in systems[1:])] for scene in scenes]
+        shown += ["", f"Gain over {systems[0]} on test images, dB, with the 95 % interval over images:", ""]
+        shown.append(markdown_table(["scene", *systems[1:]], gains))
+    first = rows[0]
+    budget = f"{first['minutes']} minutes per run on {first['threads']} thread(s) of {first['machine']}"
+    days = sorted({row["date"] for row in rows})
+    notes = f"PSNR in dB of the last model, mean ± standard deviation over seeds; {budget}; {days[0]} to {days[-1]}. "
+    notes += "Settings are chosen on val, results reported on test; the mean is over scenes that all systems have."
+    return "\n".join([*shown, "", notes]) + "\n"
+
+
+def draw(rows: Sequence[Row]) -> Figure:
+    """A dot per scene, system and seed: PSNR on test images, or on val where there are none."""
+    systems, scenes = (list(dict.fromkeys(row[name] for row in rows)) for name in ("system", "scene"))
+    figure = Figure(figsize=(8, 1.5 + 0.45 * len(scenes)), layout="constrained")
+    axes = figure.subplots()
+    for index, system in enumerate(systems):
+        own = [row for row in rows if row["system"] == system]
+        height = [scenes.index(row["scene"]) + 0.12 * (index - (len(systems) - 1) / 2) for row in own]
+        values = [float(row["test_psnr"] or row["val_psnr"]) for row in own]
+        axes.plot(values, height, "o", ms=5, alpha=0.8, label=system)
+    axes.set(yticks=range(len(scenes)), yticklabels=scenes, xlabel="PSNR on held-out images, dB")
+    axes.invert_yaxis()
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside lower center", ncols=min(len(systems), 4), fontsize="small")
+    return figure
+
+
+def paired_gain(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
+    """Mean of `other` − `one`, [images], and the limits of its 95 % bootstrap interval over images; seeded."""
+    gains = other - one
+    drawn = np.random.default_rng(0).integers(len(gains), size=(RESAMPLES, len(gains)))
+    low, high = np.percentile(gains[drawn].mean(axis=1), INTERVAL)
+    return float(gains.mean()), float(low), float(high)
+
+
+def _values(rows: Sequence[Row], scene: str, system: str, name: str) -> list[str]:
+    return [row[name] for row in rows if (row["scene"], row["system"]) == (scene, system) and row[name]]
+
+
+def _cell(rows: Sequence[Row], scene: str, system: str, split: str) -> str:
+    found = [float(value) for value in _values(rows, scene, system, f"{split}_psnr")]
+    return mean_and_deviation(found, 2) if found else "–"
+
+
+def _mean_over_scenes(
+    rows: Sequence[Row], scenes: Sequence[str], systems: Sequence[str], split: str
+) -> list[float | None]:
+    cells = [[_values(rows, scene, system, f"{split}_psnr") for system in systems] for scene in scenes]
+    complete = [[statistics.fmean(map(float, values)) for values in cell] for cell in cells if all(cell)]
+    return [statistics.fmean(column) for column in zip(*complete, strict=True)] or [None] * len(systems)
+
+
+def _gain(rows: Sequence[Row], scene: str, system: str, first: str) -> str:
+    """Over images; each is the mean over the seeds."""
+    images = [[np.array(v.split(), float) for v in _values(rows, scene, s, "test_images")] for s in (first, system)]
+    if not all(images):
+        return "–"
+    mean, low, high = paired_gain(*(np.mean(of_system, axis=0) for of_system in images))
+    return f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"

@@ -1,0 +1,115 @@
+"""The benchmark of many scenes: its rows, its table and that it goes on from its CSV file."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msdgs_serve.scene import InvalidInput
+from msdgs_train.cli import main as cli
+from msdgs_train.comparison import bench
+from msdgs_train.comparison.bench import COLUMNS, append_row, make_bench_runs, read_rows, read_scenes
+from msdgs_train.comparison.bench_report import as_markdown, paired_gain
+from msdgs_train.systems.registry import preset
+from tests.support.training_scene import write_scene
+
+SCENES = """
+[small]
+folder = "one"
+size = 12
+short = true
+[held_out]
+folder = "one"
+size = 12
+llffhold = 4
+splits = ["val"]
+[elsewhere]
+folder = "two"
+size = 12
+"""
+
+
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "bench.toml").write_text(SCENES)
+    monkeypatch.setattr(bench.read_scenes, "__kwdefaults__", {"file": tmp_path / "bench.toml"})
+    write_scene(tmp_path / "one")
+    return tmp_path
+
+
+def row(scene: str, system: str, seed: int, images: list[float]) -> bench.Row:
+    values = {"scene": scene, "system": system, "seed": str(seed), "minutes": "5", "threads": "2", "date": "2026-01-01"}
+    mean = f"{np.mean(images):.4f}"
+    scores = {"val_psnr": "20", "test_psnr": mean, "test_images": " ".join(f"{v:.2f}" for v in images)}
+    return dict.fromkeys(COLUMNS, "") | values | scores
+
+
+def test_scenes_are_of_the_short_form_or_all(data: Path) -> None:
+    assert [scene.name for scene in read_scenes(data, short=True)] == ["small"]
+    with pytest.raises(InvalidInput, match="datasets named two"):
+        read_scenes(data, short=False)
+
+
+def test_shipped_scenes_have_a_short_form_of_eight() -> None:
+    with pytest.raises(InvalidInput, match="toybench_slow"):
+        read_scenes(Path("nowhere"), short=True, file=bench.SCENES)
+    assert bench.SCENES.read_text().count("short = true") == 8
+
+
+def test_the_same_command_goes_on_from_its_rows(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    systems = data / "systems.toml"
+    systems.write_text('[tiny]\npreset = "static"\ninit_num_pts = 60\nmax_gaussians = 90\nsteps = 4\n')
+    command = ["bench", str(systems), "--data", str(data), "--out", str(data / "out"), "--minutes=1e-4", "--threads=1"]
+    assert cli.main(command) == 0
+    (first,) = read_rows(data / "out" / "bench.csv")
+    assert (first["scene"], first["system"], first["optimizer_steps"]) == ("small", "tiny", "3")
+    assert float(first["test_psnr"]) > 0
+    assert len(first["val_images"].split()) > 0
+    assert cli.main(command) == 0
+    assert read_rows(data / "out" / "bench.csv") == [first]
+    assert "tiny, small, seed 0" in capsys.readouterr().out
+    systems.write_text(systems.read_text() + "sh_degree = 0\n")
+    assert cli.main(command) == 0
+    assert [r["settings"] == first["settings"] for r in read_rows(data / "out" / "bench.csv")] == [True, False]
+
+
+def test_runs_are_of_each_scene_at_its_size(data: Path) -> None:
+    scenes = [*read_scenes(data, short=True), bench.BenchScene("held_out", data / "one", 12, 4, ("val",))]
+    runs = make_bench_runs({"a": preset("static"), "b": preset("static")}, scenes, (0, 1), data / "out")
+    assert [(run.seed, run.scene, run.system) for run in runs[:4]] == [
+        (0, "small", "a"), (0, "small", "b"), (0, "held_out", "a"), (0, "held_out", "b"),
+    ]  # fmt: skip
+    assert [run.config.data.llffhold for run in runs[:4]] == [0, 0, 4, 4]
+    assert len({run.folder for run in runs}) == 8
+
+
+def test_the_table_has_means_over_scenes_that_all_have_and_paired_gains() -> None:
+    rows = [
+        row("s1", "a", 0, [20.0, 30.0]), row("s1", "a", 1, [22.0, 32.0]), row("s1", "b", 0, [23.0, 33.0]),
+        row("s2", "a", 0, [10.0, 10.0]),
+    ]  # fmt: skip
+    table = as_markdown(rows)
+    assert "| s1 | 20.00 ± 0.00 | 20.00 | 26.00 ± 1.41 | 28.00 |" in table
+    assert "| s2 | 20.00 | – | 10.00 | – |" in table
+    assert "| mean | 20.00 | 20.00 | 26.00 | 28.00 |" in table
+    assert "| s1 | +2.00 (+2.00 to +2.00) |" in table
+
+
+def test_an_interval_covers_the_mean_gain() -> None:
+    generator = np.random.default_rng(1)
+    one = generator.normal(25, 3, 40)
+    mean, low, high = paired_gain(one, one + generator.normal(0.5, 0.2, 40))
+    assert low < mean < high
+    assert mean == pytest.approx(0.5, abs=0.15)
+    assert 0.05 < high - low < 0.25
+
+
+def test_a_csv_file_of_other_columns_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bench.csv"
+    append_row(path, row("s", "a", 0, [1.0]))
+    with path.open(newline="") as file:
+        assert len(list(csv.reader(file))) == 2
+    path.write_text("scene,system\n")
+    with pytest.raises(InvalidInput, match="columns"):
+        read_rows(path)
