@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from tests.support.scene_files import write_scene
-from tests.support.service import FRAME, ORBIT, check_problem, serving
+from tests.support.service import FRAME, MAX_SECONDS, ORBIT, check_problem, serving
 
 CASES = int(os.environ.get("MSDGS_FUZZ", "400"))
 SEEDED: dict[str, Any] = {
@@ -108,7 +108,7 @@ def test_every_call_answers_as_the_document_says(client: httpx.Client):
         @given(case=operation.as_strategy())
         def check(case: schemathesis.Case) -> None:
             # JSON Schema can't say which times and cameras a scene has, nor which fields go together
-            case.call_and_validate(excluded_checks=[positive_data_acceptance])
+            case.call_and_validate(excluded_checks=[positive_data_acceptance], timeout=MAX_SECONDS)
 
         check()
 
