@@ -53,7 +53,7 @@ def fit_flags(arguments: argparse.Namespace) -> list[object]:
     density = ["--refine-start-fraction", 0.08, "--refine-every-fraction", 0.04, "--grow-grad2d", 1e-3]
     pace = [*density, "--sh-degree-fraction", 0.2]
     rest = ["--window-full-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500, "--threads", 1]
-    return ["--steps", arguments.steps, "--max-minutes", arguments.minutes, *sizes, *pace, *rest]
+    return ["--preset", "msdgs-small", "--steps", arguments.steps, *sizes, *pace, *rest]
 
 
 def compare(url: str, frames: list[Frame], folder: Path, out: Path) -> None:
@@ -106,7 +106,6 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--port", type=int, default=8000, help="another one is used where it is taken")
     parser.add_argument("--size", type=int, default=100, help="width and height of the images")
     parser.add_argument("--steps", type=int, default=2500, help="of training")
-    parser.add_argument("--minutes", type=float, default=3.0, help="of training, at most")
     parser.add_argument("--out", type=Path, default=Path("out/demo_train.png"))
     parser.add_argument("--once", action="store_true", help="stop after the frames")
     return parser.parse_args()
