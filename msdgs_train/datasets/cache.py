@@ -19,13 +19,10 @@ class ImageCache:
 
     def image(self, frame: Frame, background: Tensor) -> Tensor:
         """Return the image of a frame, [H, W, 3] in [0, 1], over a background color, [3]."""
-        return torch.from_numpy(composite(self._rgba(frame), background.numpy()))
+        return torch.from_numpy(composite(self.rgba(frame), background.numpy()))
 
-    def transparency(self, frame: Frame) -> Tensor:
-        """Return 1 − alpha of the image of a frame, [H, W] in [0, 1]."""
-        return torch.from_numpy(1 - self._rgba(frame)[:, :, 3].astype(np.float32) / 255)
-
-    def _rgba(self, frame: Frame) -> np.ndarray:
+    def rgba(self, frame: Frame) -> np.ndarray:
+        """Return the image of a frame, [H, W, 4] uint8, sRGB with straight alpha."""
         rgba = self._pixels.get(frame.image_path)
         if rgba is None:
             rgba = frame.load_rgba()

@@ -20,11 +20,13 @@ class WeightAverage(Generic[M]):
     @torch.no_grad()
     def add(self, model: M, steps: int = 1) -> None:
         """Add a model that stands for so many steps; the Gaussians must be the same, in the same order."""
+        if steps == 0:
+            return
         self._count = min(self._count + steps, self._most)
         if self.model is None:
             self.model = copy.deepcopy(model)
             return
-        fraction = min(steps / self._count, 1.0) if steps else 0.0
+        fraction = min(steps / self._count, 1.0)
         for average, last in zip(self.model.parameters(), model.parameters(), strict=True):
             if last.requires_grad:
                 average.lerp_(last, fraction)

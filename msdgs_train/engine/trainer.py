@@ -24,7 +24,7 @@ from msdgs_train.gaussians import safe_load
 from msdgs_train.systems.base import System, Target
 from msdgs_train.systems.registry import system_of
 
-FORMAT = "msdgs-checkpoint/2"
+FORMAT = "msdgs-checkpoint/3"
 MAX_SKIPPED_IN_A_ROW = 20
 ROLLBACK_LR = 0.5  # factor of the learning rates, each time that training returns to a checkpoint
 ROLLBACK_SEED = 1_000_003  # added to the seed of the images' order
@@ -199,10 +199,9 @@ class Trainer:
 
     @sharing_cores()
     def _differentiate(self, sample: TrainingSample, background: Tensor) -> ViewGradients:
-        image = self._images.image(sample.frame, background)
-        target = Target(image, self._images.transparency(sample.frame))
+        target = Target.over(self._images.rgba(sample.frame), background)
         view = self.system.loss(sample, target, background, self.step_count)
-        return differentiate(self.system.parameter_groups(), sample, view, image)
+        return differentiate(self.system.parameter_groups(), sample, view, target.rgb)
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":

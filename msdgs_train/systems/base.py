@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene import Camera
+from msdgs_train.datasets import composite
 from msdgs_train.engine.curriculum import TrainingSample
 from msdgs_train.layers.parameters import ParamGroup
 
@@ -15,7 +17,17 @@ class Target(NamedTuple):
     """A training image."""
 
     rgb: Tensor  # [H, W, 3] in [0, 1], over the background
-    transparency: Tensor  # [H, W], 1 − alpha
+    alpha: Tensor  # [H, W] uint8
+
+    @classmethod
+    def over(cls, rgba: np.ndarray, background: Tensor) -> "Target":
+        """An image, [H, W, 4] uint8 with straight alpha, over a background color, [3]."""
+        return cls(torch.from_numpy(composite(rgba, background.numpy())), torch.from_numpy(rgba[:, :, 3].copy()))
+
+    @property
+    def transparency(self) -> Tensor:
+        """[H, W], 1 − alpha in [0, 1]."""
+        return 1 - self.alpha.float() / 255
 
 
 class ViewLoss(NamedTuple):

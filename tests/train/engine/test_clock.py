@@ -1,8 +1,16 @@
 """A schedule that follows the clock."""
 
+import json
+from pathlib import Path
+
 import pytest
 
+from msdgs_train.datasets import load_scene
 from msdgs_train.engine.clock import Clock
+from msdgs_train.engine.run import fit
+from msdgs_train.engine.trainer import Trainer
+from msdgs_train.supports.nodes import NodesSupport
+from tests.support.training_scene import MLP_ON_NODES, small_config
 
 STEPS, LIMIT, HELD_OUT, IMAGES = 16_000, 300.0, 40, 2
 
@@ -31,3 +39,33 @@ def test_it_goes_on_from_where_a_stopped_run_was() -> None:
     clock = Clock(STEPS, LIMIT, 0, STEPS // 2)
     advances = [clock.advance(STEPS // 2, 1.0, IMAGES, 151.0 + i) for i in range(3)]
     assert advances == [53, 107, 161]
+
+
+@pytest.mark.usefixtures("no_curve")
+def test_a_run_that_has_no_time_left_ends_its_schedule(data: Path, tmp_path: Path) -> None:
+    config = small_config(minutes=1e-9)
+    outcome = fit(config, data, tmp_path / "run")
+    assert (outcome.status, outcome.step) == ("finished", config.run.steps)
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["optimizer_steps"] == 3
+    assert set(outcome.metrics) == {"test", "val"}
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
+def test_steps_that_the_clock_passes_over_take_effect_once(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The start of the deformation and density control are at none of the steps that are taken."""
+    placed: list[int] = []
+    place = NodesSupport.on_deform_start
+    monkeypatch.setattr(NodesSupport, "on_deform_start", lambda *given: placed.append(1) or place(*given))
+    trainer = Trainer(small_config(model=MLP_ON_NODES, reseed_fraction=0.0), load_scene(data))
+    sizes, steps = [trainer.system.size], trainer.schedule.num_steps
+    while trainer.step_count < steps:
+        trainer.step(min(5, steps - trainer.step_count))
+        sizes.append(trainer.system.size)
+        trainer.step(0)
+        assert trainer.system.size == sizes[-1]
+    assert trainer.schedule.deform_start_step % 5
+    assert placed == [1]
+    rounds = [step for step in range(1, steps + 1) if trainer.schedule.refines_at(step)]
+    changed = [number for number in range(1, len(sizes)) if sizes[number] != sizes[number - 1]]
+    assert changed
+    assert set(changed) <= {-(-step // 5) for step in rounds}

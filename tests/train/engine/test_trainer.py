@@ -143,16 +143,6 @@ def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_curve")
-def test_a_run_that_has_no_time_left_ends_its_schedule(data: Path, tmp_path: Path) -> None:
-    config = small_config(minutes=1e-9)
-    outcome = fit(config, data, tmp_path / "run")
-    assert (outcome.status, outcome.step) == ("finished", config.run.steps)
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["optimizer_steps"] == 3
-    assert set(outcome.metrics) == {"test", "val"}
-    assert (tmp_path / "run" / "checkpoint.pt").exists()
-
-
-@pytest.mark.usefixtures("no_curve")
 def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: Path) -> None:
     config, run = small_config(steps=2), tmp_path / "run"
     with pytest.raises(InvalidInput, match="with a checkpoint"):
