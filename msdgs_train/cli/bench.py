@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.compare import comparison_progress
 from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console
 from msdgs_train.comparison.matrix import Budget, Run, read_systems
@@ -45,9 +44,9 @@ class Bench:
 
     def execute(self) -> int:
         from msdgs_train.comparison.bench import (
-            KEY,
             append_row,
             key_of,
+            key_of_row,
             make_bench_runs,
             measure,
             read_rows,
@@ -58,26 +57,21 @@ class Bench:
         from msdgs_train.comparison.runner import train_all
 
         minutes, csv = self.minutes or (30.0 if self.whole else 5.0), self.csv or self.out / "bench.csv"
-        if not self.seeds:
-            raise InvalidInput("seeds", "given, one or more", "none")
         scenes = {scene.name: scene for scene in read_scenes(self.data, short=not self.whole)}
         systems = read_systems(self.systems, Budget(steps=None, minutes=minutes, threads=self.threads))
         runs = make_bench_runs(systems, list(scenes.values()), self.seeds, self.out)
-        done = {tuple(row[name] for name in KEY) for row in read_rows(csv)}
-        failed: list[Run] = []
-        with comparison_progress(len(runs)) as on_end:
+        done = set(map(key_of_row, read_rows(csv)))
+        left = [run for run in runs if key_of(run) not in done]
+        with comparison_progress(len(left)) as on_end:
 
             def finish(run: Run, end: "RunEnd") -> None:
                 on_end(run, end)
-                if end.status == "failed":
-                    failed.append(run)
-                elif end.status != "interrupted":
+                if end.status in ("finished", "was finished"):
                     append_row(csv, measure(run, scenes[run.scene]))
 
-            left = [run for run in runs if key_of(run) not in done]
             complete = train_all(left, processes(1), finish)
         wanted = {key_of(run) for run in runs}
-        rows = [row for row in read_rows(csv) if tuple(row[name] for name in KEY) in wanted]
+        rows = [row for row in read_rows(csv) if key_of_row(row) in wanted]
         if rows:
             paths = write_bench(self.out, rows)
             console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, markup=False, highlight=False)
@@ -85,4 +79,4 @@ class Bench:
         if not complete:
             console.print("interrupted; the same command continues", soft_wrap=True)
             return EXIT_INTERRUPTED
-        return EXIT_INVALID if failed else 0
+        return 0 if len(rows) == len(runs) else EXIT_INVALID

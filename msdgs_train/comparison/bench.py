@@ -6,6 +6,7 @@ reported. A run that has a row isn't trained again.
 
 import csv
 import hashlib
+import io
 import json
 import os
 import platform
@@ -16,7 +17,7 @@ from datetime import date
 from pathlib import Path
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.comparison.matrix import Run
+from msdgs_train.comparison.matrix import Run, require_unique
 from msdgs_train.comparison.runner import final_metrics
 from msdgs_train.datasets.common.files import write_text
 from msdgs_train.engine.config import TrainConfig
@@ -64,6 +65,7 @@ def make_bench_runs(
     systems: Mapping[str, TrainConfig], scenes: Sequence[BenchScene], seeds: Sequence[int], out: Path
 ) -> list[Run]:
     """One run per seed, scene and system, in this order: a benchmark that is stopped compares all systems."""
+    require_unique("seed", map(str, seeds))
     return [
         Run(name, scene.name, seed, scene.folder.resolve(), out / name / f"{scene.name}_{seed}_{_digest(config)}",
             config.updated(seed=seed, size=scene.size, llffhold=scene.llffhold))
@@ -77,6 +79,11 @@ def key_of(run: Run) -> tuple[str, ...]:
     """The values of `KEY`, which tell the rows of a CSV file apart."""
     config = run.config.run
     return run.scene, run.system, str(run.seed), f"{config.minutes:g}", str(config.threads), _digest(run.config)
+
+
+def key_of_row(row: Row) -> tuple[str, ...]:
+    """The same of a row."""
+    return tuple(row[name] for name in KEY)
 
 
 def _digest(config: TrainConfig) -> str:
@@ -98,9 +105,12 @@ def read_rows(path: Path) -> list[Row]:
 
 def append_row(path: Path, row: Row) -> None:
     """Add a row, atomically."""
-    lines = [",".join(COLUMNS), *(",".join(each[name] for name in COLUMNS) for each in [*read_rows(path), row])]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([*read_rows(path), row])
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, "\n".join(lines) + "\n")
+    write_text(path, text.getvalue())
 
 
 def measure(run: Run, scene: BenchScene) -> Row:

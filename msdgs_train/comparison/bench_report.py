@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from msdgs_train.comparison.bench import SPLITS, Row
-from msdgs_train.comparison.report import mean_and_deviation
-from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_train.comparison.report import mean_and_deviation, save_figure
+from msdgs_train.datasets.common.files import write_text
 from msdgs_train.evaluation.report import markdown_table
 
 TABLE, PLOT = "bench.md", "bench.png"
@@ -20,14 +20,13 @@ INTERVAL = (2.5, 97.5)  # percentiles of the bootstrap
 def write_bench(out: Path, rows: Sequence[Row]) -> list[Path]:
     """Write the table and the figure into the folder `out`, each atomically; returns their paths."""
     write_text(out / TABLE, as_markdown(rows))
-    with replacing(out / PLOT) as temporary:
-        draw(rows).savefig(temporary, dpi=110)
+    save_figure(draw(rows), out / PLOT)
     return [out / TABLE, out / PLOT]
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
     """A line per scene, and the mean over the scenes that all systems have; a column per system and split."""
-    systems, scenes = (list(dict.fromkeys(row[name] for row in rows)) for name in ("system", "scene"))
+    systems, scenes = _names(rows, "system"), _names(rows, "scene")
     lines = [[scene, *(_cell(rows, scene, system, s) for s in SPLITS for system in systems)] for scene in scenes]
     means = [_mean_over_scenes(rows, scenes, systems, split) for split in SPLITS]
     lines.append(["mean", *(f"{value:.2f}" if value is not None else "–" for of_split in means for value in of_split)])
@@ -47,7 +46,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """A dot per scene, system and seed: PSNR on test images, or on val where there are none."""
-    systems, scenes = (list(dict.fromkeys(row[name] for row in rows)) for name in ("system", "scene"))
+    systems, scenes = _names(rows, "system"), _names(rows, "scene")
     figure = Figure(figsize=(8, 1.5 + 0.45 * len(scenes)), layout="constrained")
     axes = figure.subplots()
     for index, system in enumerate(systems):
@@ -68,6 +67,11 @@ def paired_gain(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float
     drawn = np.random.default_rng(0).integers(len(gains), size=(RESAMPLES, len(gains)))
     low, high = np.percentile(gains[drawn].mean(axis=1), INTERVAL)
     return float(gains.mean()), float(low), float(high)
+
+
+def _names(rows: Sequence[Row], column: str) -> list[str]:
+    """The different values of a column, in order."""
+    return list(dict.fromkeys(row[column] for row in rows))
 
 
 def _values(rows: Sequence[Row], scene: str, system: str, name: str) -> list[str]:

@@ -67,15 +67,15 @@ def read_systems(sources: Sequence[str], budget: Budget) -> dict[str, TrainConfi
     """
     tables = [pair for source in sources for pair in _tables(source)]
     configs = [(name, _config(name, table, budget)) for name, table in tables]
-    _require_unique("system", (name for name, _ in configs))
+    require_unique("system", (name for name, _ in configs))
     return dict(configs)
 
 
 def make_runs(systems: Mapping[str, TrainConfig], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
     """Return one run per system, scene and seed, ordered by seed: if the comparison is stopped early, it has results of
     every system."""
-    _require_unique("scene", (scene.resolve().name for scene in scenes))
-    _require_unique("seed", map(str, seeds))
+    require_unique("scene", (scene.resolve().name for scene in scenes))
+    require_unique("seed", map(str, seeds))
     return [
         Run(name, data.name, seed, data, out / name / f"{data.name}_{seed}", config.updated(seed=seed))
         for seed in seeds
@@ -110,7 +110,8 @@ def _config(name: str, table: Mapping[str, Any], budget: Budget) -> TrainConfig:
         raise InvalidInput("config", "made of valid settings", f"system `{name}`: {error}") from error
 
 
-def _require_unique(kind: str, given: Iterable[str]) -> None:
+def require_unique(kind: str, given: Iterable[str]) -> None:
+    """Raise `InvalidInput` if no name is given, or one twice."""
     names = list(given)
     if not names:
         raise InvalidInput(kind, "given, one or more", "none")

@@ -41,8 +41,8 @@ def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list
     """
     write_text(out / TABLE, as_markdown(results, missing))
     write_text(out / NUMBERS, json.dumps(as_json(results, missing), indent=2) + "\n")
-    _save(draw_time(results), out / TIME_PLOT)
-    _save(draw_layers(results), out / LAYERS_PLOT)
+    save_figure(draw_time(results), out / TIME_PLOT)
+    save_figure(draw_layers(results), out / LAYERS_PLOT)
     return [out / name for name in (TABLE, NUMBERS, TIME_PLOT, LAYERS_PLOT)]
 
 
@@ -180,6 +180,7 @@ def _groups(results: Sequence[Result], key: Callable[[Result], Any]) -> dict[Any
     return groups
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, atomically."""
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)
