@@ -131,8 +131,8 @@ def measure(run: Run, scene: BenchScene) -> Row:
 
 
 def _scores(run: Run, split: str) -> dict[str, str]:
-    evaluation = evaluate_run(run.folder, run.data, split)
-    model = evaluation.models[0]
+    evaluation = evaluate_run(run.folder, run.data, split, last_only=True)
+    (model,) = evaluation.models
     mean = model.mean
     moving = mean.moving_psnr if evaluation.region_source == "images" else None
     numbers = {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "moving_psnr": moving}
