@@ -5,9 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians.config import ModelConfig
-from msdgs_train.layers.spline import SplineConfig, SplineLayer, cubic_weights
+from msdgs_train.layers.spline import SplineConfig, SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
 from tests.support.models import NODES, SPLINE, random_model
 from tests.support.reference_deformation import plain_step
@@ -50,16 +48,6 @@ def test_gradients() -> None:
     assert torch.autograd.gradcheck(step, [curve.detach().requires_grad_() for curve in curves.values()])
 
 
-def test_weights_of_knots_sum_to_one() -> None:
-    assert float(cubic_weights(time(0.37)).sum()) == pytest.approx(1)
-
-
-def test_a_new_layer_moves_nothing() -> None:
-    step = SplineLayer(SplineConfig(num_knots=4), 5, (0.0, 1.0)).double()(torch.zeros(5, 3).double(), time(0.7))
-    for delta in (step.delta_means, step.delta_scales, step.delta_quats):
-        assert float(delta.abs().max().detach()) <= EXACT
-
-
 def test_beyond_the_window_translations_stay_and_rotations_continue() -> None:
     layer = SplineLayer(SplineConfig(num_knots=40), 1, (0.0, 1.0))
     angles = 0.1 * torch.arange(43)
@@ -95,10 +83,3 @@ def test_rigid_motions_stay_rigid() -> None:
     assert isinstance(model.support, NodesSupport)
     matrices = model.support.motions(model.deformation, time(0.3))[:, :9].view(-1, 3, 3).detach()
     assert float((matrices @ matrices.transpose(1, 2) - torch.eye(3)).abs().max()) <= EXACT
-
-
-def test_curves_are_of_nodes() -> None:
-    with pytest.raises(InvalidInput, match=r"`model\.layers\.0` must be of another kind"):
-        ModelConfig(layers=(SPLINE,))
-    with pytest.raises(InvalidInput, match=r"model\.layers\.0\.num_knots"):
-        ModelConfig(support=NODES, layers=(SplineConfig(num_knots=0),))
