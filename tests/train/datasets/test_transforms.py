@@ -123,7 +123,7 @@ def test_every_8th_frame_by_name_is_for_testing(tmp_path: Path):
 
 def test_lists_of_file_names_make_the_splits(tmp_path: Path):
     names = {"train": ["./images/f_02.png", "images/f_00.png"], "test": ["images/f_01.png"]}
-    content = nerfstudio_json(4, **{f"{split}_filenames": listed for split, listed in names.items()})
+    content = {**nerfstudio_json(4), **{f"{split}_filenames": listed for split, listed in names.items()}}
     splits = load_scene(write_nerfstudio(tmp_path, content=content)).splits
     found = {split: [frame.image_path.name for frame in frames] for split, frames in splits.items()}
     assert found == {"train": ["f_00.png", "f_02.png"], "val": [], "test": ["f_01.png"]}

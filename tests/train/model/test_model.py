@@ -163,7 +163,7 @@ def test_quaternions_without_direction_become_identity():
         *(("layers", layers) for layers in (-1, 1.5, True, "mlp")),
         ("layers.0` must be of another kind", (SPLINE,)),  # curves are of nodes
         ("support", "nodes"),
-        *(("support.num_nodes", NodesConfig(num_nodes=count)) for count in (0, 2.0)),
+        *(("support.num_nodes", NodesConfig(num_nodes=count)) for count in (0, 2.0)),  # pyright: ignore
         *(("support.k_nearest", NodesConfig(k_nearest=count)) for count in (0, 9)),
         ("embedding_dim", -1),
         ("scale_space", "activated"),
