@@ -67,12 +67,6 @@ def with_first(value: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-@pytest.mark.parametrize("contents", [SCENE_BYTES, STATIC_BYTES], ids=["moving", "static"])
-def test_an_unchanged_file_is_read(tmp_path: Path, contents: bytes):
-    (tmp_path / "scene.onnx").write_bytes(contents)
-    assert len(DeformationSession(tmp_path / "scene.onnx").gaussians(0.5)) == 20
-
-
 def test_metadata_reads_what_it_writes():
     metadata = SceneMetadata.from_properties(properties(onnx.load_from_string(SCENE_BYTES)), "scene.onnx")
     again = SceneMetadata.from_properties(metadata.to_properties(), "scene.onnx")

@@ -73,16 +73,6 @@ def test_heads_of_opacity_and_color(heads: dict[str, bool], layers: tuple[str, .
     assert torch.equal(model.pose(0.1, sh_degree=1).sh, early.sh[:, :4])
 
 
-@pytest.mark.parametrize("count", [1, 3, 10])
-def test_any_number_of_layers(count: int):
-    model = random_model(layers=("mlp",) * count, noise=0.02)
-    assert len(model.deformation) == count
-    before = model.pose(0.4).means
-    with torch.no_grad():
-        model.get_parameter(f"deformation.layers.{count - 1}.heads.bias")[:3] += 1.0
-    assert not torch.equal(model.pose(0.4).means, before), "the last layer counts"
-
-
 def test_stopping_after_a_step_is_a_model_of_fewer_layers():
     model, shorter = random_model(layers=("mlp",) * 3), random_model(layers=("mlp",))
     shorter.load_state_dict(model.state_dict(), strict=False)

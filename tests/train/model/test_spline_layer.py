@@ -37,17 +37,6 @@ def test_motions_are_on_splines(t: float) -> None:
     assert torch.equal(step.weight, torch.ones(3, 1, dtype=torch.float64))
 
 
-def test_gradients() -> None:
-    layer = layer_of(2, 3)
-    curves = dict(layer.named_parameters())
-
-    def step(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        replaced = dict(zip(curves, values, strict=True))
-        return torch.func.functional_call(layer, replaced, (torch.zeros(2, 3).double(), time(0.41)))[:3]
-
-    assert torch.autograd.gradcheck(step, [curve.detach().requires_grad_() for curve in curves.values()])
-
-
 def test_beyond_the_window_translations_stay_and_rotations_continue() -> None:
     layer = SplineLayer(SplineConfig(num_knots=40), 1, (0.0, 1.0))
     angles = 0.1 * torch.arange(43)
