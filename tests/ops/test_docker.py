@@ -19,16 +19,15 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from msdgs_serve.api.keys import MIN_KEY_LENGTH
-from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
-from msdgs_serve.api.work import WorkQueue
-from msdgs_serve.pose_cache import PoseCache
-from msdgs_serve.store import SceneStore
 from tests.support.processes import ROOT, free_port
 from tests.support.scene_files import write_scene
 from tests.support.service import in_this_process, serving
 
 DOCKER = ROOT / "docker"
+COMPOSITION = yaml.safe_load((DOCKER / "compose.yaml").read_text())
+SERVICES, VOLUMES = COMPOSITION["services"], COMPOSITION["volumes"]
+(SCRAPED,) = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yaml").read_text())["scrape_configs"]
 SKIPPED = 77
 METRICS_KEY, READER_KEY = "metrics-0123456789", "reader-0123456789"
 PIN = re.compile(r"^([\w.-]+)==([^\s;\\]+)", re.MULTILINE)
@@ -75,54 +74,43 @@ def test_what_images_copy_is_sent_to_the_build():
         assert any(Path(file).match(pattern) for pattern in sent), file
 
 
-def composition() -> dict[str, Any]:
-    return yaml.safe_load((DOCKER / "compose.yaml").read_text())["services"]
-
-
-def test_services_have_no_rights_they_don_t_need():
-    for name, service in composition().items():
+def test_services_have_limits_and_no_rights_they_don_t_need():
+    for name, service in SERVICES.items():
         assert service["cap_drop"] == ["ALL"], name
         assert service["security_opt"] == ["no-new-privileges:true"], f"{name}: and Docker's own seccomp profile"
         assert service["read_only"], name
         assert service["user"].split(":")[0] not in ("0", "root"), name
         assert not {"privileged", "cap_add", "devices", "pid", "network_mode", "userns_mode"} & service.keys(), name
-
-
-def test_services_have_limits():
-    for name, service in composition().items():
         assert service["mem_limit"] == service["memswap_limit"], name
         assert 0 < service["pids_limit"] <= 512, name
 
 
 def test_nothing_can_be_run_from_where_a_service_may_write():
-    volumes = yaml.safe_load((DOCKER / "compose.yaml").read_text())["volumes"]
-    for name, service in composition().items():
+    for name, service in SERVICES.items():
         assert all("noexec" in each for each in service.get("tmpfs", ())), name
         writable = [each.split(":")[0] for each in service.get("volumes", ()) if not each.endswith(":ro")]
         assert writable == {"render": ["uploads"], "prometheus": ["measurements"]}.get(name, [])
-    assert volumes["uploads"]["driver_opts"]["o"].startswith("noexec,nosuid,nodev")
+    assert VOLUMES["uploads"]["driver_opts"]["o"].startswith("noexec,nosuid,nodev")
 
 
 def test_prometheus_has_a_key_where_keys_are_asked_for():
-    document = yaml.safe_load((DOCKER / "compose.yaml").read_text())
-    (job,) = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yaml").read_text())["scrape_configs"]
-    (secret,) = document["services"]["prometheus"]["secrets"]
-    assert job["authorization"]["credentials_file"] == f"/run/secrets/{secret}"
-    default = re.search(r":-(\S+)}", document["secrets"][secret]["file"])
+    (secret,) = SERVICES["prometheus"]["secrets"]
+    assert SCRAPED["authorization"]["credentials_file"] == f"/run/secrets/{secret}"
+    default = re.search(r":-(\S+)}", COMPOSITION["secrets"][secret]["file"])
     assert default
     assert len((DOCKER / default[1]).read_text().strip()) < MIN_KEY_LENGTH, "the default must not be a valid key"
 
 
 def test_the_proxy_says_whom_it_asks_for_and_is_believed():
     assert "proxy_set_header X-Forwarded-For $remote_addr;" in (DOCKER / "nginx" / "nginx.conf").read_text()
-    render = composition()["render"]
+    render = SERVICES["render"]
     assert render["environment"]["MSDGS_PROXIES"] == "*"
     assert "ports" not in render, "or everybody would be believed"
 
 
 def test_the_service_is_told_nothing_that_it_doesn_t_know():
     known = {f"MSDGS_{name.upper()}" for name in Settings.model_fields}
-    assert composition()["render"]["environment"].keys() <= known
+    assert SERVICES["render"]["environment"].keys() <= known
     in_image = re.findall(r"MSDGS_\w+", (DOCKER / "Dockerfile").read_text())
     assert in_image
     assert set(in_image) <= known
@@ -131,17 +119,6 @@ def test_the_service_is_told_nothing_that_it_doesn_t_know():
 def queries_of_the_dashboard() -> list[str]:
     dashboard = json.loads((DOCKER / "grafana" / "dashboards" / "msdgs.json").read_text())
     return [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
-
-
-def test_the_dashboard_asks_for_metrics_that_there_are():
-    metrics = Metrics(SceneStore([]), PoseCache(0), WorkQueue(1, 1, 1.0))
-    metrics.count_request("POST", "/render", 200, 0.1, 100)
-    metrics.count_problem("invalid")
-    metrics.count_stages({"draw": 0.1})
-    exposed = set(re.findall(r"^(\w+)[{ ]", metrics.page().decode(), re.MULTILINE))
-    named = set(re.findall(r"\b(?:msdgs|process)_\w+", " ".join(queries_of_the_dashboard())))
-    assert named
-    assert named <= exposed
 
 
 @pytest.mark.slow

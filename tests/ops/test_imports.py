@@ -35,23 +35,17 @@ def test_import_contracts_hold() -> None:
     assert finished.returncode == 0, finished.stdout + finished.stderr
 
 
-def test_importing_the_package_loads_nothing_heavy() -> None:
-    assert not modules_after("import msdgs_serve") & HEAVY
-
-
-def test_no_module_of_the_service_loads_what_training_needs() -> None:
-    loaded = modules_after(IMPORT_ALL.format(skip="msdgs_serve.client"))  # httpx loads rich where it is installed
-    assert "fastapi" in loaded
-    assert not loaded & NOT_FOR_SERVING
-
-
-def test_only_the_api_loads_http() -> None:
-    loaded = modules_after(IMPORT_ALL.format(skip="msdgs_serve.api"))
-    assert "numba" in loaded
-    assert not loaded & HTTP
-
-
-def test_the_serving_demo_needs_only_the_standard_library() -> None:
-    loaded = modules_after("import sys; sys.path.insert(0, 'examples'); import demo")
-    assert "serving" in loaded
-    assert not loaded & (HEAVY | HTTP | NOT_FOR_SERVING)
+@pytest.mark.parametrize(
+    ("code", "needed", "unwanted"),
+    [
+        ("import msdgs_serve", "msdgs_serve", HEAVY),
+        (IMPORT_ALL.format(skip="msdgs_serve.client"), "fastapi", NOT_FOR_SERVING),  # httpx loads rich where it is
+        (IMPORT_ALL.format(skip="msdgs_serve.api"), "numba", HTTP),
+        ("import sys; sys.path.insert(0, 'examples'); import demo", "serving", HEAVY | HTTP | NOT_FOR_SERVING),
+    ],
+    ids=["package", "service", "service without its API", "serving demo"],
+)
+def test_imports_load_nothing_that_they_do_not_need(code: str, needed: str, unwanted: set[str]) -> None:
+    loaded = modules_after(code)
+    assert needed in loaded
+    assert not loaded & unwanted

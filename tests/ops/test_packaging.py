@@ -58,12 +58,9 @@ def clean_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
 
 
-def test_nothing_of_training_is_installed(described: dict) -> None:
-    assert not {"torch", "onnx", "tyro", "rich", "matplotlib", "pytest"} & set(described["distributions"])
-
-
-def test_the_package_is_what_was_installed(environment: Path, described: dict) -> None:
+def test_the_package_is_installed_and_nothing_of_training(environment: Path, described: dict) -> None:
     assert Path(described["where"]).is_relative_to(environment)
+    assert not {"torch", "onnx", "tyro", "rich", "matplotlib", "pytest"} & set(described["distributions"])
 
 
 def test_the_wheel_holds_the_two_packages_and_their_data(described: dict) -> None:

@@ -64,16 +64,16 @@ def flip(contents: bytes) -> bytes:
 @pytest.mark.xdist_group("kernel files")  # one worker, so that the folder is compiled once
 @pytest.mark.parametrize(
     ("suffix", "damage"),
-    [(".nbi", cut), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", lambda _: b""), (".nbc", flip)],
-    ids=["index cut", "index empty", "code cut", "code empty", "code flipped"],
+    [(".nbi", cut), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", lambda _: b""), (".nbc", flip), (".nbc", None)],
+    ids=["index cut", "index empty", "code cut", "code empty", "code flipped", "code missing"],
 )
 def test_a_damaged_file_is_compiled_again_and_replaced(
-    room: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes]
+    room: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes] | None
 ):
     cache = tmp_path / "cache"
     shutil.copytree(compiled, cache)
     (file,) = cache.rglob(f"*.double-*{suffix}")
-    file.write_bytes(damage(file.read_bytes()))
+    file.write_bytes(damage(file.read_bytes())) if damage else file.unlink()
     assert call(room, cache) == (42.0, True)
     assert call(room, cache) == (42.0, False)
 
@@ -143,13 +143,6 @@ def test_code_of_older_sources_goes(tmp_path: Path):
     files_of(tmp_path).save("float64", "new code")
     assert len(list(tmp_path.glob("*.nbc"))) == 1
     assert files_of(tmp_path).load("float64") == "new code"
-
-
-def test_code_whose_file_is_missing_is_compiled_again(tmp_path: Path):
-    files_of(tmp_path).save("float32", "code")
-    for file in tmp_path.glob("*.nbc"):
-        file.unlink()
-    assert files_of(tmp_path).load("float32") is None
 
 
 CALLER_OF_OTHERS = """

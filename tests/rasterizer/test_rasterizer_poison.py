@@ -1,41 +1,23 @@
 """Extreme values are rendered correctly by `rasterize`, and invalid ones are refused by name."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from msdgs_serve.rasterizer import GSPLAT
-from msdgs_serve.scene import Camera, Gaussians, InvalidInput
-from tests.support.scenes import as_dtype, draw, front_camera, gaussians_of, random_scene
+from msdgs_serve.scene import Gaussians, InvalidInput
+from tests.support.scenes import FIELDS, Scene, as_dtype, draw, front_camera, gaussians_of, random_scene
 
 BACKGROUND = (0.2, 0.6, 0.9)
-FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
-def poisoned(field: str, value: object) -> tuple[Gaussians, Camera]:
+def poisoned(field: str, value: object) -> Scene:
     gaussians, camera = random_scene(30, 20)
     array = getattr(gaussians, field).copy()
     array[7] = value
     return replace(gaussians, **{field: array}), camera
-
-
-@pytest.mark.parametrize(
-    ("field", "poison"), [*((field, np.nan) for field in FIELDS), ("quats", 0.0), ("scales", 0.0), ("opacities", 1.5)]
-)
-def test_gaussians_are_validated(field: str, poison: float):
-    """All invalid values are tested in tests/scene/test_scene_gaussians.py."""
-    with pytest.raises(InvalidInput) as error:
-        draw(*poisoned(field, poison))
-    assert error.value.field == f"gaussians.{field}"
-
-
-@pytest.mark.parametrize("background", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0), 0.5, np.zeros((2, 3))])
-def test_bad_background_is_refused_by_name(background: npt.ArrayLike):
-    with pytest.raises(InvalidInput) as error:
-        draw(*random_scene(30, 5), background=background)
-    assert error.value.field == "background"
 
 
 BAD_OPTIONS = {
@@ -48,37 +30,39 @@ BAD_OPTIONS = {
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [(field, value) for field, values in BAD_OPTIONS.items() for value in values]
+    ("field", "scene", "settings"),
+    [
+        *((f"gaussians.{field}", poisoned(field, np.nan), {}) for field in FIELDS),
+        *((f"gaussians.{field}", poisoned(field, value), {}) for field, value in (("quats", 0), ("opacities", 1.5))),
+        *(
+            ("background", random_scene(30, 5), {"background": background})
+            for background in ((np.nan, 0, 0), (0, np.inf, 0), (0, 0), 0.5, np.zeros((2, 3)))
+        ),
+        *(
+            (f"options.{field}", random_scene(30, 5), {"options": GSPLAT._replace(**{field: value})})
+            for field, values in BAD_OPTIONS.items()
+            for value in values
+        ),
+    ],
 )
-def test_bad_options_are_refused_by_name(field: str, value: float):
+def test_invalid_input_is_refused_by_name(field: str, scene: Scene, settings: dict[str, Any]):
+    """All invalid Gaussians are tested in tests/scene/test_scene_gaussians.py."""
     with pytest.raises(InvalidInput) as error:
-        draw(*random_scene(30, 5), options=GSPLAT._replace(**{field: value}))
-    assert error.value.field == f"options.{field}"
+        draw(*scene, **settings)
+    assert error.value.field == field
+
+
+BEHIND = gaussians_of([[0, 0, -1], [0, 0, 0], [0.1, 0, -5]], scales=3.0, opacities=1.0)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("degree", range(4))
-def test_no_gaussians_are_the_background(dtype: type, degree: int):
-    gaussians, camera = random_scene(30, 0, sh_degree=degree)
-    image = draw(as_dtype(gaussians, dtype), camera, background=BACKGROUND)
+@pytest.mark.parametrize("gaussians", [BEHIND, *(random_scene(30, 0, sh_degree=degree)[0] for degree in range(4))])
+def test_none_and_all_behind_the_camera_are_the_background(gaussians: Gaussians, dtype: type):
+    image = draw(as_dtype(gaussians, dtype), front_camera(), background=BACKGROUND)
     np.testing.assert_array_equal(image.rgb, np.broadcast_to(np.array(BACKGROUND, dtype), image.rgb.shape))
     assert not image.alpha.any()
     assert np.isinf(image.depth).all()
     assert image.rgb.dtype == dtype
-
-
-def test_all_behind_the_camera_are_the_background():
-    gaussians = gaussians_of([[0, 0, -1], [0, 0, 0], [0.1, 0, -5]], scales=3.0, opacities=1.0)
-    image = draw(gaussians, front_camera(), background=BACKGROUND)
-    np.testing.assert_array_equal(image.rgb, np.broadcast_to(np.array(BACKGROUND, np.float32), image.rgb.shape))
-
-
-def test_one_pixel_and_one_gaussian():
-    camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, np.eye(4))
-    image = draw(gaussians_of([[0, 0, 2]], opacities=0.5, rgb=[1, 0, 0.5]), camera)
-    np.testing.assert_array_equal(image.rgb, np.array([[[0.5, 0, 0.25]]], np.float32))
-    assert image.alpha == 0.5
-    assert image.depth == 2
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

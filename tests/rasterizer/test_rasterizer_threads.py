@@ -10,13 +10,11 @@ from numba.core.dispatcher import Dispatcher
 from msdgs_serve.rasterizer import Rendering
 from msdgs_serve.scene import Gaussians
 from tests.support.processes import run_python
-from tests.support.scenes import as_dtype, draw, random_scene
-
-FIELDS = ("means", "quats", "scales", "opacities", "sh")
+from tests.support.scenes import FIELDS, as_dtype, draw, random_scene
 
 COUNT_COMPILATIONS = """
 from tests.rasterizer.test_rasterizer_threads import kernels
-from tests.support.scenes import draw, random_scene
+from tests.support.scenes import FIELDS, draw, random_scene
 draw(*random_scene(40, 12, 19, 13))
 stats = [kernel.stats for kernel in kernels()]
 print(sum(sum(s.cache_hits.values()) for s in stats), sum(sum(s.cache_misses.values()) for s in stats))

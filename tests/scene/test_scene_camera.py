@@ -1,12 +1,17 @@
-"""Cameras project points to known pixels, and invalid cameras are refused."""
+"""Cameras project points to known pixels, invalid ones are refused, and the default view of a scene."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
+from msdgs_serve.framing import framing
 from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.baked import SceneCamera, SceneMetadata
 from msdgs_serve.scene.camera import look_at, orbit
+from tests.support.scene_files import UP, metadata
 from tests.support.scenes import random_camera
 from tests.support.tolerances import assert_close
 
@@ -109,43 +114,30 @@ def test_poison_is_refused_by_name(field: str, poison: object):
     assert error.value.field == f"camera.{field}"
 
 
-@pytest.mark.parametrize("fov_y", [0.0, 180.0, -10.0, 190.0, math.nan])
-def test_fov_out_of_range_is_refused(fov_y: float):
-    with pytest.raises(InvalidInput, match=r"`camera\.fov_y` must be in \(0, 180\) degrees, got "):
-        Camera.from_fov(np.eye(4), 40, 30, fov_y)
+ORIGIN, Z = [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize(
-    ("field", "eye", "target", "up"),
+    ("field", "made", "arguments"),
     [
-        ("target", [1, 2, 3], [1, 2, 3], [0, 0, 1]),
-        ("up", [0, 0, 3], [0, 0, 0], [0, 0, 1]),
-        ("up", [0, 0, 3], [0, 0, 0], [0, 0, 0]),
-        ("eye", [0, 0, np.nan], [0, 0, 0], [0, 0, 1]),
-        ("target", [0, 0, 3], [np.inf, 0, 0], [0, 1, 0]),
-        ("up", [0, 0, 3], [0, 0, 0], [1, 0]),
+        *(("fov_y", Camera.from_fov, (np.eye(4), 40, 30, fov_y)) for fov_y in (0.0, 180.0, -10.0, 190.0, math.nan)),
+        ("target", look_at, ([1, 2, 3], [1, 2, 3], Z)),
+        ("up", look_at, ([0, 0, 3], ORIGIN, Z)),
+        ("up", look_at, ([0, 0, 3], ORIGIN, ORIGIN)),
+        ("eye", look_at, ([0, 0, math.nan], ORIGIN, Z)),
+        ("target", look_at, ([0, 0, 3], [math.inf, 0, 0], [0, 1, 0])),
+        ("up", look_at, ([0, 0, 3], ORIGIN, [1, 0])),
+        ("distance", orbit, (ORIGIN, 0.0, 0.0, 0.0, Z)),
+        ("distance", orbit, (ORIGIN, math.inf, 0.0, 0.0, Z)),
+        ("azimuth", orbit, (ORIGIN, 1.0, math.nan, 0.0, Z)),
+        ("elevation", orbit, (ORIGIN, 1.0, 0.0, 90.0, Z)),
+        ("elevation", orbit, (ORIGIN, 1.0, 0.0, math.nan, Z)),
+        ("up", orbit, (ORIGIN, 1.0, 0.0, 0.0, ORIGIN)),
     ],
 )
-def test_look_at_without_a_direction_is_refused(field: str, eye: object, target: object, up: object):
-    with pytest.raises(InvalidInput) as error:
-        look_at(np.array(eye, float), np.array(target, float), np.array(up, float))
-    assert error.value.field == f"camera.{field}"
-
-
-@pytest.mark.parametrize(
-    ("field", "distance", "azimuth", "elevation", "up"),
-    [
-        ("distance", 0.0, 0.0, 0.0, [0, 0, 1]),
-        ("distance", math.inf, 0.0, 0.0, [0, 0, 1]),
-        ("azimuth", 1.0, math.nan, 0.0, [0, 0, 1]),
-        ("elevation", 1.0, 0.0, 90.0, [0, 0, 1]),
-        ("elevation", 1.0, 0.0, math.nan, [0, 0, 1]),
-        ("up", 1.0, 0.0, 0.0, [0, 0, 0]),
-    ],
-)
-def test_orbit_out_of_range_is_refused(field: str, distance: float, azimuth: float, elevation: float, up: object):
-    with pytest.raises(InvalidInput) as error:
-        orbit(np.zeros(3), distance, azimuth, elevation, np.array(up, float))
+def test_views_that_cannot_be_are_refused_by_name(field: str, made: Callable[..., object], arguments: tuple[Any, ...]):
+    with pytest.raises(InvalidInput, match=rf"`camera\.{field}` must be ") as error:
+        made(*(np.array(value, float) if isinstance(value, list) else value for value in arguments))
     assert error.value.field == f"camera.{field}"
 
 
@@ -176,3 +168,32 @@ def test_a_resized_camera_keeps_its_model():
     camera = Camera(10.0, 12.0, 4.0, 3.0, 8, 6, np.eye(4), "fisheye", (0.1, 0.0, 0.0, 0.0)).resized(16, 12)
     assert (camera.model, camera.distortion) == ("fisheye", (0.1, 0.0, 0.0, 0.0))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 24, 8, 6)
+
+
+PIVOT = np.array([0.5, -0.25, 0.75])  # on the grid that targets are rounded to
+FAR_OUT = ((-1.0, -1.0, -1.0), (1.0, 9.0, 7.0))
+
+
+def seen_by(*poses: np.ndarray) -> SceneMetadata:
+    """A scene with cameras of these poses, [4, 4], and bounds whose middle is beside what they look at."""
+    cameras = tuple(SceneCamera(str(i), 0.0, Camera.from_fov(pose, 64, 48, 40.0)) for i, pose in enumerate(poses))
+    return metadata(cameras=cameras, bounds=FAR_OUT)
+
+
+def test_the_target_is_what_the_cameras_look_at():
+    seen = framing(seen_by(*(orbit(PIVOT, 4.0, azimuth, 20, UP) for azimuth in (0, 70, 200))))
+    assert_close(seen.target, PIVOT, "rotation")
+    assert_close(seen.distance, 4.0, "rotation")
+
+
+@pytest.mark.parametrize("sideways", [0.0, 0.3])
+def test_cameras_side_by_side_leave_the_middle_of_the_bounds(sideways: float):
+    ahead = orbit(PIVOT, 4.0, 0, 20, UP)
+    beside = ahead.copy()
+    beside[:3, 3] += sideways * ahead[:3, 0]
+    assert_close(framing(seen_by(ahead, beside)).target, [0, 4, 3], "rotation")
+
+
+def test_cameras_that_look_away_from_each_other_leave_the_middle_of_the_bounds():
+    poses = [orbit(PIVOT, 0.1, azimuth, 20, UP) @ np.diag([-1.0, 1.0, -1.0, 1.0]) for azimuth in (0, 70, 200)]
+    assert_close(framing(seen_by(*poses)).target, [0, 4, 3], "rotation")

@@ -1,12 +1,16 @@
-"""`Gaussians.validate` refuses invalid arrays by name."""
+"""Gaussians, their rotations and their spherical harmonics: laws, references, and invalid arrays refused by name."""
 
 import numpy as np
 import pytest
+import torch
+from gsplat.cuda._torch_impl import _spherical_harmonics
 
 from msdgs_serve.scene import Gaussians, InvalidInput
-from tests.support.scenes import random_scene, select
-
-FIELDS = ("means", "quats", "scales", "opacities", "sh")
+from msdgs_serve.scene.quaternion import from_matrix, normalize, to_matrix
+from msdgs_serve.scene.spherical_harmonics import SH_DEGREES, rgb_to_sh_dc, sh_basis, sh_coefficients, sh_to_rgb
+from tests.support import reference
+from tests.support.scenes import FIELDS, random_scene, unit_quats
+from tests.support.tolerances import assert_close
 
 
 def changed(field: str, value: object) -> Gaussians:
@@ -31,22 +35,17 @@ def test_valid_ones_pass(count: int, degree: int):
     assert gaussians.sh_degree == degree
 
 
-@pytest.mark.parametrize("field", FIELDS)
-@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf])
-def test_not_finite_is_refused_by_name(field: str, poison: float):
-    with pytest.raises(InvalidInput, match="NaN or infinite") as error:
-        poisoned(field, poison).validate()
-    assert error.value.field == f"gaussians.{field}"
-
-
-OUT_OF_RANGE = {"quats": (0.0, [2.0, 0, 0, 0]), "scales": (0.0, -1.0), "opacities": (-0.01, 1.01)}
-
-
 @pytest.mark.parametrize(
-    ("field", "poison"), [(field, value) for field, values in OUT_OF_RANGE.items() for value in values]
+    ("field", "poison", "problem"),
+    [
+        *((field, value, "NaN or infinite") for field in FIELDS for value in (np.nan, np.inf, -np.inf)),
+        *(("quats", value, None) for value in (0.0, [2.0, 0, 0, 0])),
+        *(("scales", value, None) for value in (0.0, -1.0)),
+        *(("opacities", value, None) for value in (-0.01, 1.01)),
+    ],
 )
-def test_out_of_range_is_refused_by_name(field: str, poison: object):
-    with pytest.raises(InvalidInput) as error:
+def test_poison_is_refused_by_name(field: str, poison: object, problem: str | None):
+    with pytest.raises(InvalidInput, match=problem) as error:
         poisoned(field, poison).validate()
     assert error.value.field == f"gaussians.{field}"
 
@@ -69,13 +68,90 @@ def test_wrong_shapes_are_refused_by_name(field: str, shape: tuple[int, ...]):
     assert error.value.field.startswith("gaussians.")
 
 
-def test_opacity_may_be_0_and_1():
-    poisoned("opacities", 0.0).validate()
-    poisoned("opacities", 1.0).validate()
+def rotations() -> np.ndarray:
+    """Return random rotations [N, 4] and those near a division by zero: identity, half turns, almost half turns."""
+    half_turns = np.eye(4)[1:]
+    near_half_turns = half_turns + np.array([1e-9, 0, 1e-10, 0])
+    tiny = np.array([[1, 1e-9, 0, 0], [1, 0, -1e-16, 1e-16]])
+    quats = np.concatenate(
+        [unit_quats(np.random.default_rng(0), 200), np.eye(4)[:1], half_turns, near_half_turns, tiny]
+    )
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def test_selection_keeps_the_rows_together():
-    gaussians, _ = random_scene(0, 5)
-    some = select(gaussians, np.array([3, 1]))
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(some, name), getattr(gaussians, name)[[3, 1]])
+def test_matrices_agree_with_rodrigues():
+    quats = rotations()
+    assert_close(to_matrix(quats), np.stack([reference.quaternion_matrix(q) for q in quats]), "rotation")
+
+
+def test_from_matrix_inverts_to_matrix():
+    quats = rotations()
+    back = from_matrix(to_matrix(quats))
+    assert (back[:, 0] >= 0).all()
+    assert_close(np.abs((back * quats).sum(axis=1)), np.ones(len(quats)), "rotation")
+    assert_close(to_matrix(back), to_matrix(quats), "rotation")
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 5), (0,)])
+def test_leading_axes_are_kept(shape: tuple[int, ...]):
+    quats = np.broadcast_to([0.6, 0.8, 0.0, 0.0], (*shape, 4))
+    assert to_matrix(quats).shape == (*shape, 3, 3)
+    assert from_matrix(to_matrix(quats)).shape == (*shape, 4)
+    assert normalize(quats).shape == (*shape, 4)
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e-3, 1.0, 1e3, 1e30])
+def test_normalize_at_any_size(size: float):
+    direction = np.array([1, -2, 3, -4], np.float32)
+    quat = normalize(direction * np.float32(size))
+    assert_close(quat, direction / np.sqrt(30), "float32.relative")
+    assert quat.dtype == np.float32
+
+
+@pytest.mark.parametrize("poison", [np.zeros(4), np.full(4, 1e-9), [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]])
+def test_no_direction_is_refused(poison: object):
+    quats = np.tile([1.0, 0, 0, 0], (3, 1))
+    quats[1] = poison
+    with pytest.raises(InvalidInput, match="quats"):
+        normalize(quats)
+
+
+def directions(count: int = 200) -> np.ndarray:
+    """Return random directions and those along the axes."""
+    random = np.random.default_rng(0).normal(size=(count, 3))
+    return np.concatenate([random / np.linalg.norm(random, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+
+
+@pytest.mark.parametrize(("dtype", "row"), [(np.float64, "sh_basis"), (np.float32, "sh_basis.float32")])
+@pytest.mark.parametrize("degree", range(4))
+def test_basis_agrees_with_definition(degree: int, dtype: type, row: str):
+    got = sh_basis(directions().astype(dtype), degree)
+    assert got.dtype == dtype
+    assert_close(got, reference.sh_basis(directions(), degree), row)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_colors_agree_with_gsplat(degree: int):
+    sh = np.random.default_rng(1).normal(size=(len(directions()), sh_coefficients(degree), 3))
+    want = _spherical_harmonics(degree, torch.from_numpy(directions()), torch.from_numpy(sh)).numpy()
+    assert_close(sh_to_rgb(sh, directions()), np.maximum(want + 0.5, 0), "sh_basis.gsplat")
+
+
+def test_colors_are_clamped_below_and_not_above():
+    sh = np.array([[[-10.0, 0.0, 10.0]]])
+    rgb = sh_to_rgb(sh, np.array([[0.0, 0.0, 1.0]]))[0]
+    assert rgb[0] == 0
+    assert rgb[1] == 0.5
+    assert rgb[2] > 3
+
+
+def test_constant_coefficient_gives_its_color_everywhere():
+    rgb = np.array([0.1, 0.5, 0.9])
+    sh = np.zeros((16, 3))
+    sh[0] = rgb_to_sh_dc(rgb)
+    got = sh_to_rgb(np.broadcast_to(sh, (len(directions()), 16, 3)), directions())
+    assert_close(got, np.broadcast_to(rgb, got.shape), "sh_basis")
+
+
+def test_counts_of_coefficients():
+    assert {sh_coefficients(degree): degree for degree in range(4)} == SH_DEGREES

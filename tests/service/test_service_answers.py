@@ -167,7 +167,7 @@ def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
 
 
 def test_gaussians_a_pixel_are_counted(client: httpx.Client):
-    """As numbers and as an image; tests/rasterizer/test_rasterizer_counts.py counts them one by one."""
+    """As numbers and as an image; tests/rasterizer/test_rasterizer_oracle.py counts them one by one."""
     counts = array(client, channels=["gaussians"])[..., 0]
     assert counts.max() >= 1
     np.testing.assert_array_equal(counts, counts.round())

@@ -14,6 +14,7 @@ Scene = tuple[Gaussians, Camera]
 draw = functools.partial(rasterize, depth=True)
 """All that is drawn without naming a further channel."""
 
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
 IDENTITY_ROTATION = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -56,20 +57,17 @@ def random_scene(seed: int, count: int, width: int = 53, height: int = 37, *, sh
 
 def as_dtype(gaussians: Gaussians, dtype: type) -> Gaussians:
     """The same numbers, rounded to `dtype`."""
-    fields = ("means", "quats", "scales", "opacities", "sh")
-    return Gaussians(**{name: getattr(gaussians, name).astype(dtype) for name in fields})
+    return Gaussians(**{name: getattr(gaussians, name).astype(dtype) for name in FIELDS})
 
 
 def select(gaussians: Gaussians, index: np.ndarray | slice) -> Gaussians:
     """The Gaussians at `index`, in that order."""
-    g = gaussians
-    return Gaussians(g.means[index], g.quats[index], g.scales[index], g.opacities[index], g.sh[index])
+    return Gaussians(**{name: getattr(gaussians, name)[index] for name in FIELDS})
 
 
 def joined(*parts: Gaussians) -> Gaussians:
     """All Gaussians of several sets, in order."""
-    fields = ("means", "quats", "scales", "opacities", "sh")
-    return Gaussians(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in fields})
+    return Gaussians(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in FIELDS})
 
 
 def front_camera(width: int = 53, height: int = 37, focal: float = 40.0) -> Camera:
@@ -235,22 +233,8 @@ def oblong_pixels() -> Scene:
 ADVERSARIAL: dict[str, Callable[[], Scene]] = {
     scene.__name__: scene
     for scene in (
-        equal_depths,
-        behind_camera,
-        near_plane,
-        off_axis_89,
-        inside_splat,
-        needles,
-        giants,
-        subpixel,
-        opacity_extremes,
-        crowd,
-        needles_of_a_million,
-        giants_without_end,
-        ten_thousand_on_a_pixel,
-        at_the_camera,
-        through_the_near_plane,
-        principal_point_outside,
-        oblong_pixels,
+        equal_depths, behind_camera, near_plane, off_axis_89, inside_splat, needles, giants, subpixel, opacity_extremes,
+        crowd, needles_of_a_million, giants_without_end, ten_thousand_on_a_pixel, at_the_camera, through_the_near_plane,
+        principal_point_outside, oblong_pixels,
     )
-}
+}  # fmt: skip

@@ -70,7 +70,6 @@ TABLE = (
     Row("flip.relative", 1e-5, "the same program; in the rendering it is given, the last bits may differ"),
     Row("loss_gradient", 1e-7, "central differences with steps of 1e-7 and 1e-6 of a loss of size 1"),
     # the deformation network
-    Row("motion_gradient", 1e-8, "central differences with a step of 1e-5: 1e-16 / 1e-5, and the third derivative"),
     Row("skinning_gradient", 2e-7, "central differences with a step of 1e-6: 1e-13 / 1e-6; relative if above 1"),
     Row("encoding.float64", 1e-12, "sines of phases up to 1024, each rounded once"),
     Row("encoding.float32", 1e-5, "phases are exact products; what is left is the sine's own rounding"),

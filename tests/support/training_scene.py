@@ -12,13 +12,17 @@ import torch
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
+from msdgs_train.datasets import SceneData
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import to_bytes
+from msdgs_train.engine.optimizer import make_optimizer
 from msdgs_train.engine.run import Observer
+from msdgs_train.engine.schedule import Schedule
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import LayerConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.parameters import ParamGroup, constant
@@ -30,6 +34,8 @@ from tests.support.scenes import gaussians_of
 
 SIZE = 24
 FOV = 40.0
+FEW = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90"]
+"""Options of a small run on the command line."""
 
 MLP = MLPConfig(width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8, time_features=4)
 PLANE = PlaneConfig(features=4, resolution=6, time_resolution=5, width=8)
@@ -37,11 +43,15 @@ SMALL_MODEL = ModelConfig(sh_degree=1, layers=(MLP, MLP), embedding_dim=4)
 MOTION_BASES = ModelConfig(
     sh_degree=1, support=NodesConfig(num_nodes=4), layers=(SplineConfig(num_knots=8),), embedding_dim=0
 )
-MLP_ON_NODES = ModelConfig(sh_degree=1, support=NodesConfig(num_nodes=6), layers=(MLP, MLP), embedding_dim=4)
-MIXED_ON_NODES = ModelConfig(
-    sh_degree=1, support=NodesConfig(num_nodes=6), layers=(SplineConfig(num_knots=8), PLANE, MLP), embedding_dim=4
-)
-MIXED_ON_GAUSSIANS = ModelConfig(sh_degree=1, layers=(PLANE, MLP), embedding_dim=4)
+MODELS = {
+    "mlp": SMALL_MODEL,
+    "motion bases": MOTION_BASES,
+    "mlp on nodes": dataclasses.replace(SMALL_MODEL, support=NodesConfig(num_nodes=6)),
+    "mixed on nodes": dataclasses.replace(
+        SMALL_MODEL, support=NodesConfig(num_nodes=6), layers=(SplineConfig(num_knots=8), PLANE, MLP)
+    ),
+    "mixed on gaussians": dataclasses.replace(SMALL_MODEL, layers=(PLANE, MLP)),
+}
 
 
 def small_config(**changes: Any) -> TrainConfig:
@@ -58,6 +68,27 @@ def small_config(**changes: Any) -> TrainConfig:
 def parameter_groups(gaussians: CanonicalGaussians) -> list[ParamGroup]:
     """A group of its own for each attribute, all with one rate."""
     return [ParamGroup(name, [p], constant(1e-3), "static") for name, p in gaussians.named_parameters()]
+
+
+def with_moments(gaussians: CanonicalGaussians, schedule: Schedule) -> RowSurgery:
+    """After a step of Adam without a gradient; the first moment of row k is k + 1, the second 10 times as large."""
+    optimizer = make_optimizer(parameter_groups(gaussians), schedule)
+    for p in gaussians.parameters():
+        p.grad = torch.zeros_like(p)
+    optimizer.step()
+    for p in gaussians.parameters():
+        rows = torch.arange(1, len(p) + 1, dtype=torch.float32).reshape(-1, *[1] * (p.ndim - 1))
+        optimizer.state[p]["exp_avg"] += rows
+        optimizer.state[p]["exp_avg_sq"] += 10 * rows
+    return RowSurgery(gaussians, optimizer)
+
+
+def moment_rows(surgery: RowSurgery, name: str) -> list[float]:
+    """The first moments of a parameter, by row."""
+    state = surgery.optimizer.state[surgery.gaussians.get_parameter(name)]
+    first, second = (state[m].reshape(len(surgery.gaussians), -1)[:, 0] for m in ("exp_avg", "exp_avg_sq"))
+    assert torch.equal(second, 10 * first)
+    return first.tolist()
 
 
 def _narrow(layer: LayerConfig) -> LayerConfig:
@@ -87,6 +118,14 @@ def splatting(trainer: Trainer) -> GaussianSplatting:
     """The system of a trainer, which is one of Gaussians."""
     assert isinstance(trainer.system, GaussianSplatting)
     return trainer.system
+
+
+def trained(config: TrainConfig, scene: SceneData, steps: int) -> Trainer:
+    """A trainer after so many steps."""
+    trainer = Trainer(config, scene)
+    for _ in range(steps):
+        trainer.step()
+    return trainer
 
 
 class StopAfter(Observer):

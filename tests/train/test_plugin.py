@@ -15,16 +15,14 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.renderer import Renderer
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import load_model
-from msdgs_train.layers.base import PAPER_HEADS, SceneBounds
-from msdgs_train.layers.chain import MultiStepDeformation
+from tests.support import plugin_example
 from tests.support.images import decode
-from tests.support.plugin_example import FourierConfig
 from tests.support.processes import ROOT, bodies, chromium, image, run_python, wait_until_still
 from tests.support.service import serving
 from tests.support.tolerances import assert_close, tolerance
 from tests.support.training_scene import assert_same_bits, state_of
 
-PLUGIN = ROOT / "tests" / "support" / "plugin_example.py"
+PLUGIN = Path(plugin_example.__file__)
 SMALL = ["--steps=24", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--eval-every=0", "--sh-degree=1"]
 SMALL += ["--static-fraction=0.2", "--refine-start-fraction=0.17", "--refine-every-fraction=0.17"]
 
@@ -104,18 +102,6 @@ def test_without_the_plugin_it_is_named_what_is_missing(data: Path, trained: Pat
     assert "--plugin MODULE, got fourier" in run("msdgs_train", "eval", trained, code=2)
     missing = run("msdgs_train", *fit, "--plugin", tmp_path / "none.py", code=2)
     assert "`plugin` must be a module that can be imported, or a Python file" in missing
-
-
-def test_a_fourier_layer_has_the_period_of_its_time_range() -> None:
-    layer = FourierConfig(frequencies=3).build(SceneBounds(1.0, (2.0, 6.0)), PAPER_HEADS, None).double()
-    means = torch.randn(7, 3, dtype=torch.float64)
-    with torch.no_grad():
-        layer.matrices.normal_()
-        layer.offsets.normal_()
-        first, last, middle = (layer(means, torch.tensor(t).double()) for t in (2.0, 6.0, 4.0))
-    assert_close(first.delta_means, last.delta_means, "encoding.float32")
-    assert float((first.delta_means - middle.delta_means).abs().max()) > 0.1
-    assert MultiStepDeformation([layer]).operations() == 2 * 3 * 11
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import av
 import numpy as np
 from av.video.reformatter import Interpolation
 
+from msdgs_train.datasets import SceneData
 from msdgs_train.datasets.common.images import write_png
 from tests.support.reference import quaternion_matrix
 from tests.train.datasets.lens import Lens
@@ -60,6 +61,13 @@ def write_image(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         write_png(path, image)
+
+
+def points_of(scene: SceneData) -> tuple[list[list[float]], np.ndarray]:
+    """Sparse points and their colors, both of which there must be."""
+    assert scene.points is not None
+    assert scene.point_colors is not None
+    return scene.points.tolist(), scene.point_colors
 
 
 # NeRF's JSON, of D-NeRF and nerfstudio: camera to world in OpenGL axes, which are right, up and back

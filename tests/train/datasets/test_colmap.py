@@ -6,7 +6,7 @@ import pytest
 
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from tests.support.tolerances import assert_close
-from tests.train.datasets.layouts import COLMAP_POINTS, write_colmap
+from tests.train.datasets.layouts import COLMAP_POINTS, points_of, write_colmap
 
 SPLIT_OF_9 = {"train": [f"v_{index:02}" for index in range(1, 8)], "val": [], "test": ["v_00", "v_08"]}
 both = pytest.mark.parametrize("ending", ["bin", "txt"])
@@ -16,10 +16,9 @@ both = pytest.mark.parametrize("ending", ["bin", "txt"])
 @pytest.mark.parametrize("place", ["0", "."])
 def test_points_colors_and_size_of_the_scene(tmp_path: Path, ending: str, place: str):
     scene = load_scene(write_colmap(tmp_path, names=("0.png",), ending=ending, place=place))
-    assert scene.points is not None
-    assert scene.point_colors is not None
-    assert scene.points.tolist() == [list(position) for position, _ in COLMAP_POINTS]
-    assert_close(scene.point_colors, [[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]], "sh_basis")
+    points, colors = points_of(scene)
+    assert points == [list(position) for position, _ in COLMAP_POINTS]
+    assert_close(colors, [[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]], "sh_basis")
     assert 2.0 < scene.scene_half_size <= 3.0
 
 
@@ -36,17 +35,7 @@ def test_times_are_linear_in_the_numbers_found(tmp_path: Path):
     names = ["cam2/take 3 frame 100.png", "cam1/take 3 frame 110.png", "cam1/take 3 frame 140.jpg.png"]
     scene = load_scene(write_colmap(tmp_path, names=tuple(names), ending="txt"))
     times = {frame.name: frame.t for frames in scene.splits.values() for frame in frames}
-    assert times == {
-        "cam1_take 3 frame 110": 0.25,
-        "cam1_take 3 frame 140.jpg": 1.0,
-        "cam2_take 3 frame 100": 0.0,
-    }
-
-
-def test_equal_numbers_make_a_static_scene(tmp_path: Path):
-    scene = load_scene(write_colmap(tmp_path, names=("c1/0005.png", "c2/0005.png")))
-    assert scene.time_range == (0.0, 0.0)
-    assert len(scene.splits["train"]) == 1
+    assert times == {"cam1_take 3 frame 110": 0.25, "cam1_take 3 frame 140.jpg": 1.0, "cam2_take 3 frame 100": 0.0}
 
 
 def test_names_without_a_time_are_named(tmp_path: Path):

@@ -47,21 +47,6 @@ def test_the_same_size_changes_nothing():
     assert (resize_area(rgba, 12, 8) == rgba).all()
 
 
-def test_halves_are_the_exact_box():
-    rgba = image(0, 16, 8).astype(np.int64)
-    rgba[..., 3] = 255
-    got = resize_area(rgba.astype(np.uint8), 8, 4)
-    total = rgba[0::2, 0::2] + rgba[1::2, 0::2] + rgba[0::2, 1::2] + rgba[1::2, 1::2]
-    assert (got == (total + 2) // 4).all()
-
-
-def test_color_behind_transparent_pixels_does_not_bleed_in():
-    rgba = np.zeros((2, 2, 4), np.uint8)
-    rgba[0, 0] = [200, 100, 50, 255]
-    rgba[1, 1] = [0, 255, 0, 0]
-    assert resize_area(rgba, 1, 1).tolist() == [[[200, 100, 50, 64]]]
-
-
 def test_reducing_and_compositing_commute():
     """As light does: straight colors averaged without their alpha would give a dark rim."""
     rgba = image(3, 40, 20)

@@ -1,16 +1,20 @@
-"""What holds of every layout: where its cameras look, how images are reduced and straightened, and its sizes."""
+"""What holds of every layout: where its cameras look, how images are reduced and straightened, and how large it is."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from msdgs_serve.scene import InvalidInput
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.camera import orbit
 from msdgs_train.datasets import Frame, SceneData, load_scene
+from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import write_png
 from tests.support.tolerances import assert_close, tolerance
+from tests.train.datasets import layouts
 from tests.train.datasets.layouts import LAYOUTS, Layout, Pose, flat, pose
 from tests.train.datasets.lens import Lens, centroids, frame_pixels, image_of_dots
 
@@ -86,3 +90,51 @@ def test_a_size_is_at_most_the_width(tmp_path: Path, layout: Layout):
         with pytest.raises(InvalidInput, match="`size` must be") as caught:
             load_scene(folder, size)
         assert caught.value.field == "size"
+
+
+AT_0 = {id_: {"time_id": 0} for id_ in layouts.HYPERNERF_IDS}
+UNTIMED = layouts.dnerf_json()
+for each in UNTIMED["frames"]:
+    del each["time"]
+STATIC: dict[str, Callable[[Path], Path]] = {
+    "dnerf": lambda folder: layouts.write_dnerf(folder, splits={"train": UNTIMED}),
+    "nerfstudio": layouts.write_nerfstudio,
+    "hypernerf": lambda folder: layouts.write_hypernerf(
+        folder, files={**layouts.hypernerf_json(), "metadata.json": AT_0}
+    ),
+    "neu3d": lambda folder: layouts.write_neu3d(folder, count=1),
+    "colmap": lambda folder: layouts.write_colmap(folder, names=("c1/0005.png", "c2/0005.png")),
+}
+
+
+@pytest.mark.parametrize("write", STATIC.values(), ids=STATIC)
+def test_a_scene_without_times_or_of_one_time_is_static(tmp_path: Path, write: Callable[[Path], Path]):
+    scene = load_scene(write(tmp_path))
+    assert scene.time_range == (0.0, 0.0)
+    assert {frame.t for frame in scene.splits["train"]} == {0.0}
+
+
+def cameras_around(target: tuple[float, float, float]) -> list[Camera]:
+    """On a ring, 4 from the target, at which all of them look."""
+    poses = [orbit(np.array(target), 4.0, azimuth, 37.0, np.array([0.0, 0.0, 1.0])) for azimuth in range(0, 360, 30)]
+    return [Camera.from_fov(pose, 20, 10, 40.0) for pose in poses]
+
+
+def test_few_points_that_are_far_off_count_for_nothing():
+    points = np.random.default_rng(0).uniform(-1, 1, size=(1000, 3))
+    clean = scene_half_size(points, cameras_around((0, 0, 0)))
+    points[:5] *= 1e6
+    assert 0.9 < clean < scene_half_size(points, []) < 1.0
+
+
+def test_without_points_it_is_the_distance_to_where_all_cameras_look():
+    assert_close(scene_half_size(None, cameras_around((0, 0, 0))), 4.0, "rotation")
+    assert_close(scene_half_size(np.empty((0, 3)), cameras_around((3, -5, 1))), 9.0, "rotation")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_parallel_axes_meet_nowhere(count: int):
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = 2.0 * np.arange(count)
+    extent = scene_half_size(None, [Camera.from_fov(pose, 20, 10, 40.0) for pose in poses])
+    assert extent == (4.0 if count == 3 else 1.0)

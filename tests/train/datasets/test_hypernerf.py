@@ -40,12 +40,6 @@ def test_warp_ids_serve_where_there_are_no_time_ids(tmp_path: Path):
     assert scene.time_range == (0.25, 1.0)
 
 
-def test_a_scene_whose_ids_are_all_0_is_static(tmp_path: Path):
-    files = hypernerf_json()
-    files["metadata.json"] = {id_: {"time_id": 0} for id_ in HYPERNERF_IDS}
-    assert load_scene(write_hypernerf(tmp_path, files=files)).time_range == (0.0, 0.0)
-
-
 def test_the_smallest_copy_that_is_wide_enough_is_read(tmp_path: Path):
     write_hypernerf(tmp_path, LENSES["pinhole"], 2, 4, 16)
     for size, reduction in ((None, 2), (160, 2), (81, 2), (80, 4), (21, 4), (20, 16), (7, 16)):

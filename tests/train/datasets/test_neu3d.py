@@ -11,7 +11,7 @@ from msdgs_train.datasets.common import video
 from msdgs_train.datasets.common.images import resize_area, write_png
 from tests.support.tolerances import assert_close, tolerance
 from tests.train.datasets import layouts
-from tests.train.datasets.layouts import SMALL, poses_bounds, write_neu3d, write_neu3d_videos, write_video
+from tests.train.datasets.layouts import SMALL, points_of, poses_bounds, write_neu3d, write_neu3d_videos, write_video
 
 COUNT = 7
 
@@ -63,11 +63,6 @@ def test_a_camera_may_be_left_out_and_numbers_need_no_zeros(tmp_path: Path):
     assert [frame.name[:5] for frame in scene.splits["train"][::3]] == ["cam2_", "cam10"]
     for row, frame in zip(poses[1:], scene.splits["train"][::3], strict=True):
         assert (frame.camera.position == row[[3, 8, 13]]).all()
-
-
-def test_a_single_frame_is_static(tmp_path: Path):
-    scene = load_scene(write_neu3d(tmp_path, count=1))
-    assert scene.time_range == (0.0, 0.0)
 
 
 def waves(width: int, height: int) -> np.ndarray:
@@ -150,8 +145,6 @@ def test_points_beside_the_poses(tmp_path: Path):
     tail = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / "points3D_downsample.ply").write_text("no points")
     (tmp_path / "points3D_downsample2.ply").write_text(header + tail + "1 2 3 255 0 51\n-0.5 0 0 0 0 0\n")
-    scene = load_scene(tmp_path)
-    assert scene.points is not None
-    assert scene.point_colors is not None
-    assert scene.points.tolist() == [[1, 2, 3], [-0.5, 0, 0]]
-    assert scene.point_colors.tolist() == [[1, 0, 0.2], [0, 0, 0]]
+    points, colors = points_of(load_scene(tmp_path))
+    assert points == [[1, 2, 3], [-0.5, 0, 0]]
+    assert colors.tolist() == [[1, 0, 0.2], [0, 0, 0]]

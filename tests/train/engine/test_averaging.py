@@ -21,6 +21,7 @@ from tests.support.training_scene import (
     small_config,
     splatting,
     state_of,
+    trained,
 )
 
 pytestmark = pytest.mark.slow
@@ -62,9 +63,7 @@ def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
 
 
 def test_it_is_evaluated_shown_and_saved(data: Path, tmp_path: Path) -> None:
-    trainer = Trainer(CONFIG, load_scene(data))
-    for _ in range(STEPS):
-        trainer.step()
+    trainer = trained(CONFIG, load_scene(data), STEPS)
     trainer.system.save(tmp_path / "model.pt", STEPS)
     saved = load_model(tmp_path / "model.pt")
     last = LoadedModel(splatting(trainer).model, saved.scene, STEPS)
@@ -92,18 +91,10 @@ def test_resuming_changes_no_bit_of_it(data: Path, tmp_path: Path, stop: int, co
         torch.testing.assert_close(saved.model.state_dict(), kept, rtol=0, atol=0)
 
 
-def _saved(data: Path, path: Path, steps: int) -> Trainer:
-    trainer = Trainer(CONFIG, load_scene(data))
-    for _ in range(steps):
-        trainer.step()
-    trainer.save_checkpoint(path, 0.0)
-    return trainer
-
-
 def test_with_more_steps_it_begins_again(data: Path, tmp_path: Path) -> None:
     """Density control continues then, and changes the Gaussians."""
-    before = _saved(data, tmp_path / "checkpoint.pt", STEPS)
-    longer = Trainer(CONFIG.updated(steps=2 * STEPS), before.scene)
+    trained(CONFIG, load_scene(data), STEPS).save_checkpoint(tmp_path / "checkpoint.pt", 0.0)
+    longer = Trainer(CONFIG.updated(steps=2 * STEPS), load_scene(data))
     longer.load_checkpoint(tmp_path / "checkpoint.pt")
     assert splatting(longer).eval_model is splatting(longer).model
     longer.step()
@@ -111,8 +102,8 @@ def test_with_more_steps_it_begins_again(data: Path, tmp_path: Path) -> None:
 
 
 def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_path: Path) -> None:
-    before = _saved(data, tmp_path / "checkpoint.pt", 12)
-    shorter = Trainer(CONFIG.updated(steps=14), before.scene)
+    trained(CONFIG, load_scene(data), 12).save_checkpoint(tmp_path / "checkpoint.pt", 0.0)
+    shorter = Trainer(CONFIG.updated(steps=14), load_scene(data))
     shorter.load_checkpoint(tmp_path / "checkpoint.pt")
     seen = []
     for _ in range(2):
@@ -130,8 +121,6 @@ def test_it_begins_when_gaussians_and_motions_stay_what_they_are(last: str) -> N
         window_full_fraction=ends["windows"],
         refine_stop_fraction=ends["density control"],
     )
-    assert [step for step in range(1, STEPS + 1) if Schedule.from_config(config).averages_at(step)] == list(
-        range(13, STEPS + 1)
-    )
-    off = Schedule.from_config(config.updated(ema_fraction=0.0))
+    on, off = Schedule.from_config(config), Schedule.from_config(config.updated(ema_fraction=0.0))
+    assert [step for step in range(1, STEPS + 1) if on.averages_at(step)] == list(range(13, STEPS + 1))
     assert not any(off.averages_at(step) for step in range(1, STEPS + 1))

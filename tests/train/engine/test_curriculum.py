@@ -1,27 +1,24 @@
 """Which images come, and what they update: passes, the time window, and the three kinds of samples."""
 
-import json
 from collections import Counter
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import SceneData, load_scene
-from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum import MIN_NEW_FRAME_DISTANCE, NEW_FRAME_BORDER, TrainingSample, WindowCurriculum
 from msdgs_train.engine.gradients import average_gradients
 from msdgs_train.engine.optimizer import NEW_FRAME_LR_MULTIPLIER, step_with_new_frames
 from msdgs_train.engine.schedule import Schedule
-from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.spline import SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
 from msdgs_train.systems import gaussian_splatting as system_module
-from tests.support.training_scene import MIXED_ON_NODES, MOTION_BASES, SMALL_MODEL, small_config, splatting, write_scene
+from tests.support.training_scene import MODELS, MOTION_BASES, small_config, splatting, trained, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +26,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneData:
     return load_scene(write_scene(tmp_path_factory.mktemp("scene"), train=41))
 
 
+PHASES = {"static_fraction": 0.1, "static_window_fraction": 0.1, "window_full_fraction": 0.6}
+
+
 def samples(scene: SceneData, numbers: range, **changes: Any) -> list[TrainingSample]:
     """Some of a run of 1,000 steps: 100 on all images, 100 around the middle, then up to step 600."""
-    settings = {"steps": 1000, "static_fraction": 0.1, "static_window_fraction": 0.1, "window_full_fraction": 0.6}
-    schedule = Schedule.from_config(small_config(**{**settings, **changes}))
+    schedule = Schedule.from_config(small_config(**{**PHASES, "steps": 1000, "window_start_widths": (0.1,), **changes}))
     curriculum = WindowCurriculum(schedule, scene.splits["train"], scene.time_range)
     generator = torch.Generator().manual_seed(0)
     return [curriculum.next(number, number // schedule.config.run.batch_size, generator) for number in numbers]
@@ -56,88 +55,65 @@ def test_first_and_last_all_images_update_everything(scene: SceneData) -> None:
         assert {sample.update for sample in part} == {"all"}
 
 
-def test_time_window_grows_from_the_middle(scene: SceneData) -> None:
-    for step, sample in enumerate(samples(scene, range(1000), window_start_widths=(0.1,))):
-        if 100 <= step < 600:
-            window = 0.1 + 0.4 * max(step - 200, 0) / 400
-            inside = distance(scene, sample.frame.t) <= window + 1e-9
-            assert inside == (sample.update != "static")
-            assert distance(scene, sample.t) <= window + 1e-9
+@pytest.mark.parametrize(("starts", "batch_size"), [((0.1,), 1), ((0.1,), 2), ((0.1, 0.3), 1), ((0.1, 0.3, 0.2), 1)])
+def test_windows_grow_from_the_middle_one_after_the_other(
+    scene: SceneData, starts: tuple[float, ...], batch_size: int
+) -> None:
+    """Each in an equal part of the steps 200 to 600; what updates motion lies at the border."""
+    edges = np.linspace(200, 600, len(starts) + 1)
+    numbers = range(600 * batch_size)
+    drawn = samples(scene, numbers, window_start_widths=starts, batch_size=batch_size)
+    for number, sample in zip(numbers, drawn, strict=True):
+        step = number // batch_size
+        if step < 100:
+            continue
+        part = np.searchsorted(edges[1:], step, side="right")
+        window = np.interp(step, edges[part : part + 2], (starts[part], 0.5)) + 1e-9
+        assert (distance(scene, sample.frame.t) <= window) == (sample.update != "static")
+        assert distance(scene, sample.t) <= window
+        if sample.update == "motion":
+            assert step >= 200
+            outermost = max(d for f in scene.splits["train"] if (d := distance(scene, f.t)) <= window)
+            border = max(window - NEW_FRAME_BORDER, MIN_NEW_FRAME_DISTANCE * window)
+            assert distance(scene, sample.frame.t) >= min(outermost, border) - 2e-9
 
 
-def test_second_window_grows_as_the_first(scene: SceneData) -> None:
-    changes = {"window_start_widths": (0.1, 0.3)}
-    for step, sample in enumerate(samples(scene, range(1000), **changes)):
-        if 200 <= step < 600:
-            window = 0.1 + 0.4 * (step - 200) / 200 if step < 400 else 0.3 + 0.2 * (step - 400) / 200
-            assert (distance(scene, sample.frame.t) <= window + 1e-9) == (sample.update != "static")
-            assert distance(scene, sample.t) <= window + 1e-9
+TWO_WINDOWS = {"window_start_widths": (0.1, 0.3), "window_full_fraction": 0.9, "steps": 2000}
 
 
-def test_all_images_of_the_second_window_update_everything(scene: SceneData) -> None:
-    changes = {"window_start_widths": (0.1, 0.3), "window_full_fraction": 0.9, "steps": 2000}
-    updates = Counter(sample.update for sample in samples(scene, range(480, 800), **changes))
-    assert updates == {"all": 80, "motion": 160, "static": 80}
-    second = samples(scene, range(1101, 1800), **changes)
-    assert {sample.update for sample in second} == {"all"}
-    inside = [frame for frame in scene.splits["train"] if distance(scene, frame.t) <= 0.3]
-    drawn = Counter(sample.frame.name for sample in second)
-    times = [drawn[frame.name] for frame in inside]
+@pytest.mark.parametrize(
+    ("numbers", "changes", "updates"),
+    [
+        (range(200, 560), {}, {"all": 90, "motion": 180, "static": 90}),
+        (range(400, 1120), {"batch_size": 2}, {"all": 180, "motion": 360, "static": 180}),
+        (range(200, 560), {"new_frames_motion_only": False}, {"all": 270, "static": 90}),
+        (range(200, 560), {"outside_frames_static_only": False}, {"all": 180, "motion": 180}),
+        (range(480, 800), TWO_WINDOWS, {"all": 80, "motion": 160, "static": 80}),
+        (range(1101, 1800), TWO_WINDOWS, {"all": 699}),
+    ],
+)
+def test_kinds_of_samples_while_a_window_grows(
+    scene: SceneData, numbers: range, changes: dict[str, Any], updates: dict[str, int]
+) -> None:
+    assert Counter(sample.update for sample in samples(scene, numbers, **changes)) == updates
+
+
+def test_samples_of_one_step_differ(scene: SceneData) -> None:
+    drawn = samples(scene, range(400, 404), batch_size=2)
+    assert [sample.update for sample in drawn] == ["static", "motion", "all", "motion"]
+
+
+def test_the_second_window_draws_all_of_its_images_alike(scene: SceneData) -> None:
+    drawn = Counter(sample.frame.name for sample in samples(scene, range(1101, 1800), **TWO_WINDOWS))
+    times = [drawn[frame.name] for frame in scene.splits["train"] if distance(scene, frame.t) <= 0.3]
     assert max(times) - min(times) <= 2
 
 
 def test_second_window_keeps_the_motions_of_the_first(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
     extrapolated = []
     monkeypatch.setattr(SplineLayer, "on_window", lambda _, before, after: extrapolated.append((before, after)))
-    changes = {"static_fraction": 0.1, "static_window_fraction": 0.1, "window_full_fraction": 0.6, "steps": 50}
-    config = small_config(model=MOTION_BASES, window_start_widths=(0.1, 0.2), **changes)
-    trainer = Trainer(config, scene)
-    while trainer.step_count < 50:
-        trainer.step()
+    trained(small_config(model=MOTION_BASES, window_start_widths=(0.1, 0.2), steps=50, **PHASES), scene, 50)
     assert extrapolated == [(pytest.approx(0.1 + 0.04 * k), pytest.approx(0.14 + 0.04 * k)) for k in range(9)]
-
-
-def test_only_the_first_window_takes_in_times_that_were_never_in_it() -> None:
-    config = small_config(
-        steps=1000,
-        static_fraction=0.1,
-        static_window_fraction=0.1,
-        window_full_fraction=0.6,
-        window_start_widths=(0.03, 0.3),
-    )
-    schedule = Schedule.from_config(config)
-    assert [step for step in range(1000) if schedule.is_first_pass(step)] == list(range(401))
-
-
-def test_samples_of_one_step_differ_and_share_its_window(scene: SceneData) -> None:
-    drawn = samples(scene, range(400, 1120), batch_size=2, window_start_widths=(0.1,))
-    assert [sample.update for sample in drawn[:4]] == ["static", "motion", "all", "motion"]
-    assert Counter(sample.update for sample in drawn) == {"all": 180, "motion": 360, "static": 180}
-    for number, sample in enumerate(drawn, 400):
-        window = 0.1 + 0.4 * (number // 2 - 200) / 400
-        assert distance(scene, sample.t) <= window + 1e-9
-
-
-def test_of_four_samples_two_update_motion_and_one_static_parts(scene: SceneData) -> None:
-    drawn = samples(scene, range(200, 560), window_start_widths=(0.1,))
-    assert Counter(sample.update for sample in drawn) == {"all": 90, "motion": 180, "static": 90}
-
-
-def test_switches(scene: SceneData) -> None:
-    drawn = samples(scene, range(200, 560), window_start_widths=(0.1,), new_frames_motion_only=False)
-    assert Counter(sample.update for sample in drawn) == {"all": 270, "static": 90}
-    drawn = samples(scene, range(200, 560), window_start_widths=(0.1,), outside_frames_static_only=False)
-    assert Counter(sample.update for sample in drawn) == {"all": 180, "motion": 180}
-
-
-def test_new_images_update_motion(scene: SceneData) -> None:
-    for step, sample in enumerate(samples(scene, range(600), window_start_widths=(0.1,))):
-        if sample.update == "motion":
-            window = 0.1 + 0.4 * (step - 200) / 400
-            assert step >= 200
-            outermost = max(d for f in scene.splits["train"] if (d := distance(scene, f.t)) <= window + 1e-9)
-            border = max(window - NEW_FRAME_BORDER, MIN_NEW_FRAME_DISTANCE * window)
-            assert distance(scene, sample.frame.t) >= min(outermost, border) - 1e-9
 
 
 def test_a_single_time_leaves_no_window_empty(tmp_path: Path) -> None:
@@ -145,21 +121,11 @@ def test_a_single_time_leaves_no_window_empty(tmp_path: Path) -> None:
     assert {sample.frame.name for sample in samples(scene, range(1000))} == {scene.splits["train"][0].name}
 
 
-@pytest.mark.parametrize("model", [SMALL_MODEL, MIXED_ON_NODES], ids=["mlp on gaussians", "mixed on nodes"])
-def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, model: ModelConfig) -> None:
-    config = small_config(
-        model=model,
-        static_fraction=0.1,
-        static_window_fraction=0.1,
-        refine_every_fraction=0.0,
-        steps=100,
-        window_full_fraction=0.6,
-    )
-    trainer = Trainer(config, scene)
-    while trainer.step_count < 22:
-        trainer.step()
-    groups = trainer.system.parameter_groups()
-    seen = set()
+@pytest.mark.parametrize("name", ["mlp", "mixed on nodes"])
+def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, name: str) -> None:
+    model = MODELS[name]
+    trainer = trained(small_config(model=model, refine_every_fraction=0.0, steps=100, **PHASES), scene, 22)
+    groups, seen = trainer.system.parameter_groups(), set()
     for _ in range(12):
         before = [(group.role, p, p.detach().clone()) for group in groups for p in group.params]
         views = trainer._render_and_backward()
@@ -181,12 +147,8 @@ def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, model: 
 
 
 def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: SceneData) -> None:
-    config = small_config(
-        model=MOTION_BASES, static_fraction=0.1, static_window_fraction=0.1, steps=100, refine_every_fraction=0.0
-    )
-    trainer = Trainer(config, scene)
-    while trainer.step_count < 25:
-        trainer.step()
+    config = small_config(model=MOTION_BASES, steps=100, refine_every_fraction=0.0, **PHASES)
+    trainer = trained(config, scene, 25)
     (layer,) = splatting(trainer).model.deformation
     assert isinstance(layer, SplineLayer)
     curves = {"transls": layer.transls, "rots": layer.rots, "stretches": layer.stretches}
@@ -210,58 +172,26 @@ def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: Scen
         )
 
 
-def test_only_new_frames_are_asked_for_larger_steps(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[float] = []
-    monkeypatch.setattr(SplineLayer, "new_frame_rows", lambda _, times: asked.extend(times) or [])
-    config = small_config(model=MOTION_BASES, static_fraction=0.1, static_window_fraction=0.1, steps=100)
-    trainer, expected = Trainer(config, scene), []
-    curriculum = WindowCurriculum(trainer.schedule, scene.splits["train"], scene.time_range)
-    generator = torch.Generator().manual_seed(config.run.seed)
-    for step in range(40):
-        sample = curriculum.next(step, step, generator)
-        expected += [sample.t] if sample.update == "motion" else []
-        trainer.step()
-    assert asked == expected != []
-
-
-def test_pooled_images_are_compared_for_samples_of_motion(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    compared = []
-    monkeypatch.setattr(system_module, "pooled_l1", lambda *images: compared.append(images) or 0.0)
-    config = small_config(static_fraction=0.1, static_window_fraction=0.1, steps=100, pooled_l1_weight=1.0)
-    trainer, updates = Trainer(config, scene), []
-    while trainer.step_count < 40:
-        (view,) = trainer._render_and_backward()
-        updates.append(view.sample.update)
-        trainer.step_count += 1
-        trainer.optimizer_steps += 1
-    assert len(compared) == updates.count("motion") > 0
-
-
-def test_motion_at_new_frames_need_not_be_smooth(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    smoothness, rigidity, samples_seen = [], [], []
-    monkeypatch.setattr(SplineLayer, "temporal_smoothness", lambda _, t: smoothness.append(float(t)) or 0.0)
-    monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, chain, t: rigidity.append(float(t)) or 0.0)
-    config = small_config(
-        model=MOTION_BASES,
-        static_fraction=0.1,
-        static_window_fraction=0.1,
-        steps=100,
-        outside_frames_static_only=False,
-    )
-    trainer = Trainer(config, scene)
-    while trainer.step_count < 40:
-        (view,) = trainer._render_and_backward()
-        samples_seen += [view.sample] if trainer.schedule.deforms(trainer.step_count) else []
-        trainer.step_count += 1
-        trainer.optimizer_steps += 1
-    assert {sample.update for sample in samples_seen} == {"all", "motion"}
-    assert rigidity == [pytest.approx(sample.t) for sample in samples_seen]
-    assert smoothness == [pytest.approx(sample.t) for sample in samples_seen if sample.update != "motion"]
+def test_what_is_asked_for_follows_the_sample(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of new frames larger steps and pooled images; motion must be smooth at the others, and rigid at all of them."""
+    drawn, larger, pooled, smooth, rigid = [], [], [], [], []
+    next_sample = WindowCurriculum.next
+    monkeypatch.setattr(WindowCurriculum, "next", lambda *args: drawn.append(next_sample(*args)) or drawn[-1])
+    monkeypatch.setattr(SplineLayer, "new_frame_rows", lambda _, times: larger.extend(times) or [])
+    monkeypatch.setattr(system_module, "pooled_l1", lambda *images: pooled.append(images) or 0.0)
+    monkeypatch.setattr(SplineLayer, "temporal_smoothness", lambda _, t: smooth.append(float(t)) or 0.0)
+    monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, chain, t: rigid.append(float(t)) or 0.0)
+    trained(small_config(model=MOTION_BASES, steps=100, pooled_l1_weight=1.0, **PHASES), scene, 40)
+    deformed = [sample for sample in drawn[20:] if sample.update != "static"]
+    new, others = ([s.t for s in deformed if (s.update == "motion") == is_new] for is_new in (True, False))
+    assert larger == new != []
+    assert len(pooled) == len(new)
+    assert smooth == pytest.approx(others)
+    assert rigid == pytest.approx([sample.t for sample in deformed])
 
 
 def test_phases_follow_each_other_and_cover_the_run() -> None:
-    settings = {"steps": 1000, "static_fraction": 0.1, "static_window_fraction": 0.1, "window_full_fraction": 0.6}
-    two = small_config(**settings, window_start_widths=(0.1, 0.3))
+    two = small_config(**PHASES, steps=1000, window_start_widths=(0.1, 0.3))
     assert [tuple(phase) for phase in Schedule.from_config(two).phases()] == [
         ("static, all images", 0, 100),
         ("static, first time window", 100, 200),
@@ -276,27 +206,3 @@ def test_phases_follow_each_other_and_cover_the_run() -> None:
     ]
     static = two.updated(model=ModelConfig(layers=(), embedding_dim=0))
     assert [tuple(phase) for phase in Schedule.from_config(static).phases()] == [("static, all images", 0, 1000)]
-
-
-@pytest.mark.parametrize("starts", [(), [0.6], [-0.1], [float("nan")], ["0.1"], [True], 0.1])
-def test_starts_of_windows_that_cannot_be_are_named(starts: object) -> None:
-    with pytest.raises(InvalidInput, match=r"config\.window_start_widths"):
-        small_config(window_start_widths=starts)
-
-
-def test_starts_of_windows_read_from_json_are_the_same() -> None:
-    config = small_config(window_start_widths=(0.1, 0.3, 0.3))
-    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-
-
-def test_a_third_window_grows_as_the_second() -> None:
-    config = small_config(
-        steps=1000,
-        static_fraction=0.1,
-        static_window_fraction=0.1,
-        window_full_fraction=0.8,
-        window_start_widths=(0.1, 0.3, 0.2),
-    )
-    schedule = Schedule.from_config(config)
-    windows = [schedule.window(step) for step in (200, 300, 400, 500, 600, 700, 800)]
-    assert windows == pytest.approx([0.1, 0.3, 0.3, 0.4, 0.2, 0.35, 0.5])

@@ -1,9 +1,10 @@
 """The live view: what it draws, that training isn't changed by it, and pausing."""
 
+import contextlib
 import itertools
-import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,13 +26,12 @@ from msdgs_train.viewer.snapshot import Snapshot, snapshot_of_training
 from msdgs_train.viewer.training_view import TrainingView
 from msdgs_train.viewer.viewer import MOVING_PART, Viewer, Wanted, show_model
 from tests.support.models import SCENE, random_model
+from tests.support.processes import wait_for
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import FOV, small_config
-from tests.train.engine.viewer_page import PageClient, PageServer, page, wait_for
+from tests.support.training_scene import FEW, FOV, assert_same_bits, small_config, state_of
+from tests.train.engine.viewer_page import PageClient, PageServer, page
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
-
-pytestmark = pytest.mark.usefixtures("no_curve")
 
 __all__ = ["page"]
 
@@ -43,6 +43,15 @@ CLOSER = Camera.from_look_at(np.array([1.0, -2.0, 1.5]), np.zeros(3), np.array([
 @pytest.fixture
 def loaded() -> LoadedModel:
     return LoadedModel(random_model(noise=0.2), SCENE, 7)
+
+
+@contextlib.contextmanager
+def viewed(page: PageServer, model: LoadedModel) -> Iterator[tuple[Viewer, PageClient]]:
+    """A model file in a viewer, and a browser that looks at it."""
+    with Viewer("127.0.0.1", 0) as viewer:
+        show_model(viewer, model, "model.pt")
+        page.clients[0] = client = PageClient(VIEW)
+        yield viewer, client
 
 
 def _expected(loaded: LoadedModel, camera: Camera, t: float, layers: int) -> np.ndarray:
@@ -70,9 +79,7 @@ def test_a_browsers_camera_is_ours() -> None:
 
 
 def test_small_while_it_moves_and_large_when_it_is_still(page: PageServer, loaded: LoadedModel) -> None:
-    with Viewer("127.0.0.1", 0) as viewer:
-        show_model(viewer, loaded, "model.pt")
-        page.clients[3] = client = PageClient(VIEW)
+    with viewed(page, loaded) as (_, client):
         wait_for(lambda: len(client.images) == 2)
         small = VIEW.resized(round(MOVING_PART * WIDTH), round(MOVING_PART * HEIGHT))
         np.testing.assert_array_equal(client.images[0], _expected(loaded, small, 0.5, 2))
@@ -86,24 +93,20 @@ def test_small_while_it_moves_and_large_when_it_is_still(page: PageServer, loade
 
 
 def test_controls_change_what_is_drawn(page: PageServer, loaded: LoadedModel) -> None:
-    with Viewer("127.0.0.1", 0) as viewer:
-        show_model(viewer, loaded, "model.pt")
-        page.clients[0] = client = PageClient(VIEW)
+    with viewed(page, loaded) as (_, client):
         wait_for(lambda: len(client.images) == 2)
         assert page.controls["layers"].limits == (0, 2, 1)
         page.controls["time"].value, page.controls["layers"].value = 0.9, 1
         wait_for(lambda: np.array_equal(client.images[-1], _expected(loaded, VIEW, 0.9, 1)))
         page.controls["channel"].value = "alpha"
-        wait_for(lambda: client.images[-1].shape == (HEIGHT, WIDTH, 3) and np.ptp(client.images[-1], axis=2).max() == 0)
+        wait_for(lambda: client.images[-1].shape == (HEIGHT, WIDTH, 3) and _is_grey(client.images[-1]))
         page.controls["resolution"].value = 30
         wait_for(lambda: client.images[-1].shape == (20, 30, 3))
 
 
 def test_playing_goes_round(page: PageServer, loaded: LoadedModel) -> None:
     scene = SceneInfo(time_range=(0.2, 0.8), background=SCENE.background, cameras=SCENE.cameras)
-    with Viewer("127.0.0.1", 0) as viewer:
-        show_model(viewer, loaded._replace(scene=scene), "model.pt")
-        page.clients[0] = PageClient(VIEW)
+    with viewed(page, loaded._replace(scene=scene)):
         page.controls["speed"].value, page.controls["play"].value = 2.0, True
         seen: list[float] = []
 
@@ -132,9 +135,7 @@ def test_depth_is_white_where_it_is_nearest() -> None:
 
 def test_a_model_without_motion_or_cameras_can_be_seen(page: PageServer) -> None:
     static = LoadedModel(random_model(layers=(), embedding_dim=0), SceneInfo(time_range=(1.0, 1.0)), 3)
-    with Viewer("127.0.0.1", 0) as viewer:
-        show_model(viewer, static, "model.pt")
-        page.clients[0] = client = PageClient(VIEW)
+    with viewed(page, static) as (_, client):
         wait_for(lambda: len(client.images) == 2)
         assert client.images[1].any()
 
@@ -143,9 +144,7 @@ def test_what_is_not_finite_is_said_and_drawn_when_it_is_again(page: PageServer,
     broken = random_model(noise=0.2)
     with torch.no_grad():
         broken.gaussians.means[5] = float("nan")
-    with Viewer("127.0.0.1", 0) as viewer:
-        show_model(viewer, loaded._replace(model=broken), "model.pt")
-        page.clients[0] = client = PageClient(VIEW)
+    with viewed(page, loaded._replace(model=broken)) as (viewer, client):
         wait_for(lambda: "can't be drawn" in page.texts[1].content)
         assert client.images == []
         viewer.show(Snapshot(loaded.model, loaded.scene.background))
@@ -203,27 +202,9 @@ def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, ba
     drawings = [drawn for drawn in looks_on.client.images if drawn.shape == (HEIGHT, WIDTH, 3)]
     assert len(drawings) >= 2
     assert not np.array_equal(drawings[0], drawings[-1]), "training should have been seen"
-    alone, seen = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("alone", "seen"))
-    for part in ("system", "optimizer", "generators", "curriculum", "averages"):
-        _assert_equal(alone[part], seen[part])
+    assert_same_bits(state_of(tmp_path / "alone"), state_of(tmp_path / "seen"))
     assert "**step 24** of 24" in page.texts[0].content
     assert "PSNR" in page.texts[0].content
-
-
-def _assert_equal(one: object, other: object) -> None:
-    if isinstance(one, dict):
-        assert isinstance(other, dict)
-        assert one.keys() == other.keys()
-        one, other = list(one.values()), list(other.values())
-    if isinstance(one, list | tuple):
-        assert isinstance(other, list | tuple)
-        for a, b in zip(one, other, strict=True):
-            _assert_equal(a, b)
-    elif isinstance(one, torch.Tensor):
-        assert isinstance(other, torch.Tensor)
-        assert torch.equal(one, other)
-    else:
-        assert one == other
 
 
 class _Stoppable(Observer):
@@ -280,8 +261,7 @@ def test_the_page_stays_after_the_run(
         wait_for(lambda: len(client.images) > before)
 
     monkeypatch.setattr(Viewer, "wait_for_interrupt", ctrl_c)
-    options = ["--steps", "2", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--viewer"]
-    assert cli.main(["fit", str(data), str(tmp_path / "run"), *options]) == 0
+    assert cli.main(["fit", str(data), str(tmp_path / "run"), "--steps=2", *FEW, "--viewer"]) == 0
     printed = capsys.readouterr().out
     assert "viewer: http://localhost:8080" in printed
     assert "Ctrl-C closes it" in printed
@@ -300,28 +280,3 @@ def test_a_model_file_is_viewed(
     monkeypatch.setattr(Viewer, "wait_for_interrupt", ctrl_c)
     assert cli.main(["view", str(tmp_path / "model.pt")]) == 0
     np.testing.assert_array_equal(client.images[1], _expected(loaded, VIEW, 0.5, 2))
-
-
-def test_without_viser_the_extra_is_named_before_anything_is_done(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "viser", None)
-    save_model(tmp_path / "model.pt", random_model(), SCENE, 7)
-    for command in (["fit", str(data), str(tmp_path / "run"), "--viewer"], ["view", str(tmp_path / "model.pt")]):
-        assert cli.main(command) == cli.EXIT_INVALID
-        assert "pip install 'msdgs[viewer]'" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
-    commands = (
-        (["fit", "--help"], ["--viewer", "while it trains"]),
-        (["fit", "--help-all"], ["--viewer-port", "--viewer-host"]),
-        (["view", "--help"], ["MODEL", "--port", "after each layer"]),
-    )
-    for command, words in commands:
-        with pytest.raises(SystemExit):
-            cli.main(command)
-        text = " ".join(capsys.readouterr().out.split())
-        for word in [*words, "msdgs[viewer]"]:
-            assert word in text

@@ -1,11 +1,9 @@
 """The live view in a browser: a run is looked at, paused, stopped, and seen when it is over."""
 
 import contextlib
-import os
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,14 +19,14 @@ from msdgs_train.viewer.snapshot import Snapshot
 from msdgs_train.viewer.viewer import Viewer
 from tests.support.images import decode
 from tests.support.models import random_model
-from tests.support.processes import ROOT, WEBGL, chromium
+from tests.support.processes import WEBGL, chromium, program, wait_for
 from tests.support.tolerances import assert_close
-from tests.train.engine.viewer_page import wait_for
+from tests.support.training_scene import FEW
 
 pytest.importorskip("viser", reason="viser isn't installed: `make test-viewer`, or pip install 'msdgs[viewer]'")
 pytestmark = pytest.mark.slow
 
-SMALL = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--layers", *["mlp:width=16,depth=2"] * 2]
+OPTIONS = [*FEW, "--layers", *["mlp:width=16,depth=2"] * 2, "--viewer", "--viewer-port=0"]
 MILLISECONDS = 60_000
 
 
@@ -46,24 +44,9 @@ def page(browser: Browser) -> Iterator[Page]:
         yield page
 
 
-@contextlib.contextmanager
-def _fit(data: Path, run: Path, steps: int) -> Iterator[subprocess.Popen[str]]:
-    """A run with a view in a process of its own, which doesn't outlive the block."""
-    command = [sys.executable, "-m", "msdgs_train", "fit", str(data), str(run), "--steps", str(steps), *SMALL]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-    command += ["--viewer", "--viewer-port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def _address(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
-    said = re.search(r"http://localhost:\d+", process.stdout.readline())
-    assert said is not None
-    return said[0]
+    return next(said[0] for line in process.stdout if (said := re.search(r"http://localhost:\d+", line)))
 
 
 def _shown(page: Page) -> np.ndarray:
@@ -77,7 +60,7 @@ def _step(page: Page) -> int:
 
 
 def test_a_run_is_seen_paused_and_stopped(data: Path, tmp_path: Path, page: Page) -> None:
-    with _fit(data, tmp_path / "run", 1_000_000) as process:
+    with program("msdgs_train", "fit", data, tmp_path / "run", "--steps=1000000", *OPTIONS) as process:
         page.goto(_address(process))
         page.locator("strong", has_text="step").wait_for()
         wait_for(lambda: len(np.unique(_shown(page).reshape(-1, 3), axis=0)) > 50)
@@ -96,7 +79,7 @@ def test_a_run_is_seen_paused_and_stopped(data: Path, tmp_path: Path, page: Page
 
 
 def test_the_page_stays_until_ctrl_c(data: Path, tmp_path: Path, page: Page) -> None:
-    with _fit(data, tmp_path / "run", 3) as process:
+    with program("msdgs_train", "fit", data, tmp_path / "run", "--steps=3", *OPTIONS) as process:
         page.goto(_address(process))
         wait_for(lambda: len(np.unique(_shown(page).reshape(-1, 3), axis=0)) > 50)
         assert process.stdout is not None

@@ -2,7 +2,6 @@
 
 import io
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from msdgs_train.engine.run import RENDERS_PER_EVAL, Observer, fit
 from msdgs_train.engine.tensorboard_events import EVAL_SCALARS, FOLDER, TRAIN_SCALARS
 from msdgs_train.engine.trainer import StepResult
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import SIZE, small_config, write_scene
+from tests.support.training_scene import FEW, SIZE, small_config, write_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
 
@@ -96,25 +95,6 @@ def test_held_out_renderings_at_every_evaluation(data: Path, tmp_path: Path) -> 
 
 def test_the_command_line_asks_for_it(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    options = [
-        "--steps",
-        "2",
-        "--threads=1",
-        "--init-num-pts=60",
-        "--max-gaussians=90",
-        "--log-every=1",
-        "--tensorboard",
-    ]
-    assert cli.main(["fit", str(data), str(run), *options]) == 0
+    assert cli.main(["fit", str(data), str(run), "--steps=2", *FEW, "--log-every=1", "--tensorboard"]) == 0
     _assert_as_in_metrics(run)
     assert math.isfinite(_events(run).Scalars("test/psnr")[0].value)
-
-
-def test_without_the_package_the_extra_is_named_before_anything_is_done(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
-    monkeypatch.setitem(sys.modules, "tensorboard", None)
-    assert cli.main(["fit", str(data), str(tmp_path / "run"), "--tensorboard"]) == cli.EXIT_INVALID
-    assert "pip install 'msdgs[tensorboard]'" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()

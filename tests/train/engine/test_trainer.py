@@ -26,17 +26,13 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.layers.parameters import exponential
 from msdgs_train.layers.plane import PlaneConfig, PlaneLayer
-from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems import gaussian_splatting as system_module
 from msdgs_train.systems.base import Target
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import (
-    MIXED_ON_GAUSSIANS,
-    MIXED_ON_NODES,
     MLP,
-    MLP_ON_NODES,
-    MOTION_BASES,
+    MODELS,
     PLANE,
     SIZE,
     StopAfter,
@@ -44,14 +40,10 @@ from tests.support.training_scene import (
     small_config,
     splatting,
     state_of,
+    trained,
 )
 
 pytestmark = pytest.mark.slow
-
-
-def _steps(trainer: Trainer, count: int) -> None:
-    for _ in range(count):
-        trainer.step()
 
 
 @pytest.mark.parametrize("found", [20, 500])
@@ -67,16 +59,19 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     assert len(set(nearest)) == started
     np.testing.assert_allclose(first.means.detach(), points[nearest], atol=1e-6)
     np.testing.assert_allclose(first.sh_dc.detach()[:, 0] * SH_C0 + 0.5, colors[nearest], atol=1e-6)
-    _steps(trainer, 3)
+    trainer.step()
 
 
 RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "white": ({"background": "white"}, (3, 11, 16)),  # in the static phase, between and after densifications
     "random": ({"background": "random"}, (3, 11, 16)),
-    "motion bases": ({"model": MOTION_BASES, "window_start_widths": (0.03, 0.2)}, (8, 13)),  # in each of two windows
-    "mlp on nodes": ({"model": MLP_ON_NODES}, (3, 13)),
-    "mixed on nodes": ({"model": MIXED_ON_NODES, "batch_size": 2}, (13,)),
-    "mixed on gaussians": ({"model": MIXED_ON_GAUSSIANS}, (13,)),
+    "motion bases": (
+        {"model": MODELS["motion bases"], "window_start_widths": (0.03, 0.2)},
+        (8, 13),
+    ),  # in each of two windows
+    "mlp on nodes": ({"model": MODELS["mlp on nodes"]}, (3, 13)),
+    "mixed on nodes": ({"model": MODELS["mixed on nodes"], "batch_size": 2}, (13,)),
+    "mixed on gaussians": ({"model": MODELS["mixed on gaussians"]}, (13,)),
     "mcmc": ({"density_strategy": "mcmc"}, (11,)),
 }
 
@@ -92,9 +87,7 @@ def test_resuming_changes_no_bit(data: Path, tmp_path: Path, case: str, stop: in
     torch.manual_seed(stop)
     assert fit(config, data, tmp_path / "parts", resume=True).status == "finished"
     whole, parts = (state_of(tmp_path / name) for name in ("whole", "parts"))
-    assert len(whole["/system/model/gaussians.means"]) != config.density.init_num_pts, (
-        "density control should have taken part"
-    )
+    assert len(whole["/system/model/gaussians.means"]) != config.density.init_num_pts, "density control took no part"
     assert_same_bits(whole, parts)
     lines = [[{**line, "seconds": 0} for line in read_metrics(tmp_path / name)] for name in ("whole", "parts")]
     assert lines[0] == lines[1]
@@ -121,27 +114,6 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     assert all(a < b for a, b in zip(low, high, strict=True))
 
 
-def test_saved_model_renders_as_evaluated(data: Path, tmp_path: Path) -> None:
-    from msdgs_train.evaluation.metrics import image_metrics
-
-    trainer = Trainer(small_config(), load_scene(data))
-    _steps(trainer, 24)
-    trainer.system.save(tmp_path / "model.pt", 24)
-    model = load_model(tmp_path / "model.pt").model
-    for evaluated in trainer.evaluate("test"):
-        assert evaluated.rgb.shape == (SIZE, SIZE, 3)
-        posed = model.pose(evaluated.frame.t)
-        with torch.no_grad():
-            rgb = rasterize(*posed, evaluated.frame.camera, torch.ones(3))[0]
-        assert image_metrics(rgb, evaluated.target) == evaluated.metrics
-
-
-@pytest.mark.usefixtures("no_curve")
-def test_a_static_model_works_all_the_way(data: Path, tmp_path: Path) -> None:
-    model = ModelConfig(sh_degree=0, layers=(), embedding_dim=0)
-    assert fit(small_config(model=model), data, tmp_path / "run").status == "finished"
-
-
 @pytest.mark.usefixtures("no_curve")
 def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: Path) -> None:
     config, run = small_config(steps=2), tmp_path / "run"
@@ -156,15 +128,14 @@ def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: P
 
 
 def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = Trainer(small_config(steps=100, refine_every_fraction=0.0), load_scene(data))
-    trainer.step()
+    trainer = trained(small_config(steps=100, refine_every_fraction=0.0), load_scene(data), 1)
     before = [p.detach().clone() for p in splatting(trainer).model.parameters()]
     monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: rgb.sum() * float("nan"))
     result = trainer.step()
     assert (result.step, result.skipped) == (2, 1)
     assert all(torch.equal(a, b) for a, b in zip(before, splatting(trainer).model.parameters(), strict=True))
     with pytest.raises(TrainingDiverged, match="up to step 21"):
-        _steps(trainer, 19)
+        [trainer.step() for _ in range(19)]
 
 
 def test_images_of_a_step_share_it_evenly(data: Path) -> None:
@@ -235,9 +206,9 @@ def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     assert (outcome.status, outcome.step) == ("finished", 50)
     assert watched.seen == [(back_to, 0.5)]
     assert watched.steps == [*range(1, start + 20), *range(back_to + 1, 51)]
-    assert [line["step"] for line in read_metrics(run) if line["kind"] == "train"] == list(range(1, 51))
-    last = [line for line in read_metrics(run) if line["kind"] == "train"][-1]
-    assert (last["skipped"], last["step"]) == (20, 50)
+    lines = [line for line in read_metrics(run) if line["kind"] == "train"]
+    assert [line["step"] for line in lines] == list(range(1, 51))
+    assert lines[-1]["skipped"] == 20
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     assert state["rollbacks"] == 1
     rates = {group["name"]: group["lr"] for group in state["optimizer"]["param_groups"]}
@@ -260,20 +231,15 @@ def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
 
 
 def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_path: Path) -> None:
+    def next_frames(trainer: Trainer) -> list[str]:
+        return [trainer._curriculum.next(0, trainer._generator).frame.name for _ in range(7)]
+
     trainer, other = (Trainer(small_config(window_full_fraction=0.0), load_scene(data)) for _ in range(2))
-    first, second = ([_next_frame(each) for _ in range(7)] for each in (trainer, other))
-    assert first == second
+    first = next_frames(trainer)
+    assert first == next_frames(other)
     trainer.roll_back(tmp_path / "no checkpoint yet")
-    assert [_next_frame(trainer) for _ in range(7)] != first
+    assert next_frames(trainer) != first
     assert (trainer.rollbacks, trainer.lr_factor) == (1, 0.5)
-
-
-def _next_frame(trainer: Trainer) -> str:
-    return trainer._curriculum.next(trainer.step_count, trainer.step_count, trainer._generator).frame.name
-
-
-def _plane_differences(planes: np.ndarray, order: int, axis: int) -> float:
-    return float(np.mean(np.diff(planes, n=order, axis=axis) ** 2))
 
 
 @pytest.mark.parametrize("mcmc", [False, True])
@@ -290,11 +256,8 @@ def test_weighted_regularizers_are_added_to_the_loss(data: Path, monkeypatch: py
     with torch.no_grad():
         for grid in layer.plane_grids():
             grid.time.add_(torch.randn(grid.time.shape, generator=torch.Generator().manual_seed(1)))
-            space, time = grid.space.double().numpy(), grid.time.double().numpy()
-            expected += _plane_differences(time, 2, 1) + 1e3 * np.abs(1 - time).mean()
-            expected += sum(
-                10 * _plane_differences(space, 1, a) + 100 * _plane_differences(space, 2, a) for a in (1, 2)
-            )
+            expected += grid.time_smoothness() + 1e3 * grid.l1_time_planes()
+            expected += 10 * grid.plane_tv() + 100 * grid.plane_smoothness()
         posed = system.model.pose(0.3, sh_degree=0)
         if mcmc:
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
@@ -319,21 +282,10 @@ def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
 
 
 def test_an_outlier_of_a_gradient_is_clipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = Trainer(small_config(steps=100, static_fraction=0.0), load_scene(data))
     monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: 1e9 * (rgb - target).sum() ** 2)
-    _steps(trainer, 3)
+    trainer = trained(small_config(steps=100, static_fraction=0.0), load_scene(data), 3)
     gradients = [p.grad for p in splatting(trainer).model.deformation.parameters() if p.grad is not None]
     assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer_module.MAX_GRADIENT_NORM)
-
-
-def test_the_static_phase_leaves_the_deformation_alone(data: Path) -> None:
-    trainer = Trainer(small_config(static_fraction=0.25), load_scene(data))
-    deformation = splatting(trainer).model.deformation
-    before = [p.detach().clone() for p in deformation.parameters()]
-    _steps(trainer, 6)
-    assert all(torch.equal(a, b) for a, b in zip(before, deformation.parameters(), strict=True))
-    trainer.step()
-    assert not all(torch.equal(a, b) for a, b in zip(before, deformation.parameters(), strict=True))
 
 
 def _rates(config: TrainConfig, data: Path, step: int) -> dict[str, float]:
@@ -356,39 +308,12 @@ def test_learning_rates(data: Path) -> None:
     assert first["layers.0.network"] == middle["layers.0.network"] == 1.0, "held while the window grows, to step 18"
     assert last["layers.0.network"] == pytest.approx(1e-3)
     assert (middle["layers.1.network"], last["layers.1.network"]) == (2.0, pytest.approx(MLP.lr_final))
-    assert (middle["layers.2.grids"], last["layers.2.grids"]) == (
-        PLANE.grid_lr_init,
-        pytest.approx(PLANE.grid_lr_final),
-    )
+    grids = (PLANE.grid_lr_init, pytest.approx(PLANE.grid_lr_final))
+    assert (middle["layers.2.grids"], last["layers.2.grids"]) == grids
     assert (middle["skinning_logits"], last["skinning_logits"]) == (2e-2, pytest.approx(2e-3))
     assert first["modulation"] == first["embeddings"] > middle["modulation"] > last["modulation"]
     for group in ("raw_opacities", "log_scales", "raw_quats", "sh_dc", "sh_rest"):
         assert first[group] == middle[group] == last[group]
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("steps", 0), ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
-        ("mse_fraction", 1.1), ("pooled_l1_weight", -1.0), ("ema_fraction", -0.1),
-        ("max_gaussians", 10), ("background", "green"), ("minutes", 0.0), ("refine_every_fraction", -0.1),
-        ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),
-    ],
-)  # fmt: skip
-def test_settings_out_of_range_are_named(field: str, value: object) -> None:
-    with pytest.raises(InvalidInput, match=f"`config.{field}`"):
-        TrainConfig().updated(**{field: value})
-
-
-def test_settings_survive_json_and_strangers_are_refused() -> None:
-    config = small_config(background="random", size=SIZE)
-    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    with pytest.raises(InvalidInput, match="`color`"):
-        TrainConfig.from_dict({"color": 1})
-    with pytest.raises(InvalidInput, match="`color`"):
-        TrainConfig.from_dict({"run": {"color": 1}})
-    with pytest.raises(InvalidInput, match="`color`"):
-        config.updated(color=1)
 
 
 def test_metrics_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:

@@ -1,9 +1,7 @@
 """What stands in for viser where a test looks at what a viewer does, not at how a browser shows it."""
 
 import contextlib
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,8 +10,6 @@ import pytest
 
 from msdgs_serve.scene import Camera, quaternion
 from msdgs_train.viewer import viewer as viewer_module
-
-SECONDS = 60.0
 
 
 class PageClient:
@@ -87,11 +83,3 @@ def page(monkeypatch: pytest.MonkeyPatch) -> PageServer:
     server = PageServer()
     monkeypatch.setattr(viewer_module, "_serve", lambda host, port: server)
     return server
-
-
-def wait_for(holds: Callable[[], object], seconds: float = SECONDS) -> None:
-    """Until it does."""
-    deadline = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < deadline, "waited in vain"
-        threading.Event().wait(0.005)

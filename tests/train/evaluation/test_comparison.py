@@ -1,14 +1,12 @@
 """`msdgs-train compare`: the matrix, its runs, what is gone on with, and the table and plots at the end."""
 
+import contextlib
 import dataclasses
 import json
-import os
 import signal
 import subprocess
-import sys
-import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,12 +15,12 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli import main as cli
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 from msdgs_train.comparison.pools import RunEnd, processes
-from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, mean_and_deviation, table
+from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
 from msdgs_train.comparison.results import CurvePoint, Result
 from msdgs_train.comparison.runner import train_all
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.systems.registry import preset
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, program, wait_for
 from tests.support.training_scene import write_scene
 
 pytestmark = pytest.mark.slow
@@ -52,7 +50,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def systems_file(tmp_path: Path) -> Path:
     path = tmp_path / "systems.toml"
-    path.write_text(SYSTEMS.replace(", w = 1", " w=1"))
+    path.write_text(SYSTEMS)
     return path
 
 
@@ -124,15 +122,14 @@ def test_names_may_not_repeat(systems_file: Path, tmp_path: Path) -> None:
         make_runs(systems, [Path("a/one")], [0, 0], tmp_path)
 
 
-def made_result(system: str, layers: int, seed: int, psnr: float, **changes: Any) -> Result:
-    config = preset("msdgs-small").updated(seed=seed, layers=("mlp",) * layers)
+def made_result(system: str, layers: int, seed: int, psnr: float, kind: str = "mlp") -> Result:
+    config = preset("msdgs-small").updated(seed=seed, layers=(kind,) * layers)
     run = Run(system, "toy", seed, Path("toy"), Path("out") / f"{system}{seed}", config)
     curve = [CurvePoint(10 * i, i * 1.5, psnr - 3 + i) for i in range(1, 4)]
-    values: dict[str, Any] = {
-        "split": "test", "psnr": psnr, "ssim": 0.9, "deformation_parameters": 1000 * layers, "gaussians": 300,
-        "modulation_parameters": 50, "seconds": 60.0, "skipped": 0, "frame_ms": 4.0, "curve": curve,
-    }  # fmt: skip
-    return Result(run=run, **(values | changes))
+    return Result(
+        run=run, split="test", psnr=psnr, ssim=0.9, deformation_parameters=1000 * layers, gaussians=300,
+        modulation_parameters=50, seconds=60.0, skipped=0, frame_ms=4.0, curve=curve,
+    )  # fmt: skip
 
 
 RESULTS = [
@@ -141,11 +138,6 @@ RESULTS = [
     made_result("k2", 2, 0, 30.0),
     made_result("k4", 4, 0, 31.0),
 ]
-
-
-def test_spread_is_the_sample_standard_deviation() -> None:
-    assert mean_and_deviation([1.0, 2.0, 3.0], 2) == "2.00 ± 1.00"
-    assert mean_and_deviation([1234.5], 1) == "1,234.5"
 
 
 def test_the_table_has_a_row_for_each_system_and_scene() -> None:
@@ -165,7 +157,7 @@ def test_the_plots_show_errors() -> None:
     x, y = map(np.asarray, axes.get_lines()[1].get_data())
     assert x.tolist() == [1.5, 3.0, 4.5]
     assert y.tolist() == pytest.approx([10 ** (-psnr / 20) for psnr in (28, 29, 30)])
-    (axes,) = draw_layers([*RESULTS, _wide()]).axes
+    (axes,) = draw_layers([*RESULTS, made_result("wide", 2, 0, 28.0, "mlp:width=200")]).axes
     lines = [container[0].get_data() for container in axes.containers]
     aside = BESIDE / 2  # bars of the same K stand beside each other
     assert [list(x) for x, _ in lines] == [[1 - aside, 2 - aside, 4 - aside], [2 + aside]]
@@ -188,12 +180,6 @@ def test_each_scene_has_its_panel_and_each_system_its_look() -> None:
     assert [text.get_text() for text in legend.get_texts()] == systems
     panels = draw_layers([*RESULTS, *there]).axes
     assert [len(axes.containers) for axes in panels] == [1, 1]
-
-
-def _wide() -> Result:
-    result = made_result("wide", 2, 0, 28.0)
-    config = result.run.config.updated(layers=("mlp:width=200",) * 2)
-    return dataclasses.replace(result, run=dataclasses.replace(result.run, config=config))
 
 
 def arguments(systems_file: Path, data: Path, out: Path, *more: str) -> list[str]:
@@ -222,15 +208,9 @@ def test_from_nothing_to_the_table_and_not_again(
     assert (tmp_path / "out" / "comparison.md").read_text() in capsys.readouterr().out
     assert cli.main(command) == 0
     assert capsys.readouterr().out.count("was finished") == 6
-    assert cli.main([*command, "--size", "12"]) == cli.EXIT_INVALID
-    assert "other settings: size" in capsys.readouterr().err
-
-
-def test_no_jobs_are_refused(
-    systems_file: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main([*arguments(systems_file, data, tmp_path / "out"), "--jobs", "0"]) == cli.EXIT_INVALID
-    assert "`jobs` must be 1 or more" in capsys.readouterr().err
+    for option, message in (("--size=12", "other settings: size"), ("--jobs=0", "`jobs` must be 1 or more")):
+        assert cli.main([*command, option]) == cli.EXIT_INVALID
+        assert message in capsys.readouterr().err
 
 
 def test_a_run_that_fails_is_reported_and_the_others_continue(systems_file: Path, tmp_path: Path) -> None:
@@ -241,32 +221,20 @@ def test_a_run_that_fails_is_reported_and_the_others_continue(systems_file: Path
     assert all(how.status == "failed" and "nowhere" in how.message for _, how in ended)
 
 
-def begin_training(systems_file: Path, data: Path, out: Path) -> subprocess.Popen[str]:
+@contextlib.contextmanager
+def begun(systems_file: Path, data: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
     """A comparison in a process of its own, once its first run has begun."""
-    command = arguments(systems_file, data, out, "--seeds", "0")
-    command[command.index("--steps") + 1] = "100000"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "msdgs_train", *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        env=environment,
-    )  # fmt: skip
-    deadline = time.monotonic() + 300
-    while not (out / "static" / "scene_0" / "config.json").exists():
-        if process.poll() is not None or time.monotonic() > deadline:
-            process.kill()
-            pytest.fail(process.communicate()[0])
-        time.sleep(0.1)
-    return process
+    command = arguments(systems_file, data, out, "--seeds", "0", "--steps", "100000")
+    with program("msdgs_train", *command) as process:
+        wait_for(lambda: process.poll() is not None or (out / "static" / "scene_0" / "config.json").exists(), 300)
+        yield process
 
 
 def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    process = begin_training(systems_file, data, out)
-    try:
+    with begun(systems_file, data, out) as process:
         process.send_signal(signal.SIGINT)
         output = process.communicate(timeout=600)[0]
-    finally:
-        process.kill()
     assert process.returncode == cli.EXIT_INTERRUPTED, output
     assert "static, scene, seed 0: interrupted" in output
     assert "the same command continues" in output
@@ -276,7 +244,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Pat
 
 def test_where_the_command_is_killed_its_runs_save_and_end(systems_file: Path, data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    process = begin_training(systems_file, data, out)
-    process.kill()
-    process.communicate(timeout=600)  # ends when the last process that writes has ended
+    with begun(systems_file, data, out) as process:
+        process.kill()
+        process.communicate(timeout=600)  # ends when the last process that writes has ended
     assert (out / "static" / "scene_0" / "checkpoint.pt").exists()

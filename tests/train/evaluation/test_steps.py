@@ -96,12 +96,3 @@ def test_a_missing_or_broken_model_is_named(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "broken.pt").write_text("no")
     with pytest.raises(CheckpointInvalid):
         write_steps(tmp_path / "broken.pt", tmp_path / "steps.png")
-
-
-def test_help(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as exit_info:
-        cli.main(["steps", "--help"])
-    assert exit_info.value.code == 0
-    text = capsys.readouterr().out
-    for word in ("MODEL", "--t", "--out", "--size", "--camera", "layers", "nearest in time"):
-        assert word in text

@@ -7,31 +7,21 @@ import pytest
 import torch
 
 from msdgs_train.density.gradient import SPLIT_SHRINK, GradientStrategy
-from msdgs_train.engine.optimizer import make_optimizer
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
-from msdgs_train.layers.quaternions import rotate
-from tests.support.training_scene import parameter_groups, small_config
+from tests.support.training_scene import moment_rows, small_config, with_moments
 
 EXTENT = 4.0
 
 
 def _setup(count: int = 6, **changes: Any) -> tuple[CanonicalGaussians, RowSurgery, GradientStrategy]:
-    """Gaussians of scale 0.001 (to be cloned) and moments that tell the rows apart."""
+    """Gaussians of scale 0.001 (to be cloned)."""
     schedule = _schedule(init_num_pts=count, **changes)
     gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, 0, schedule.config.model.attributes())
     with torch.no_grad():
         gaussians.log_scales.fill_(math.log(0.001))
-    optimizer = make_optimizer(parameter_groups(gaussians), schedule)
-    for p in gaussians.parameters():
-        p.grad = torch.zeros_like(p)
-    optimizer.step()
-    for p in gaussians.parameters():
-        rows = torch.arange(1, count + 1, dtype=torch.float32).reshape(-1, *[1] * (p.ndim - 1))
-        optimizer.state[p]["exp_avg"] += rows
-        optimizer.state[p]["exp_avg_sq"] += 10 * rows
-    return gaussians, RowSurgery(gaussians, optimizer), GradientStrategy.start(schedule, EXTENT, count)
+    return gaussians, with_moments(gaussians, schedule), GradientStrategy.start(schedule, EXTENT, count)
 
 
 def _schedule(**changes: Any) -> Schedule:
@@ -42,13 +32,6 @@ def _accumulate(control: GradientStrategy, pixels: list[float]) -> None:
     """A gradient for each, in NDC units at 2 × 2 pixels."""
     grads = torch.tensor(pixels)
     control.accumulate(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), 2, 2)
-
-
-def _moment_rows(surgery: RowSurgery, name: str) -> list[float]:
-    state = surgery.optimizer.state[surgery.gaussians.get_parameter(name)]
-    first, second = (state[m].reshape(len(surgery.gaussians), -1)[:, 0] for m in ("exp_avg", "exp_avg_sq"))
-    assert torch.equal(second, 10 * first)
-    return first.tolist()
 
 
 def test_gradients_are_scaled_to_ndc_and_averaged_over_where_drawn() -> None:
@@ -68,7 +51,7 @@ def test_small_ones_are_cloned_as_they_are() -> None:
     for name, p in gaussians.named_parameters():
         assert torch.equal(p, before[name][[0, 1, 2, 3, 4, 5, 1, 4]]), name
         if p.numel():
-            assert _moment_rows(surgery, name) == [1, 2, 3, 4, 5, 6, 0, 0]
+            assert moment_rows(surgery, name) == [1, 2, 3, 4, 5, 6, 0, 0]
 
 
 def test_large_ones_are_split_inside_themselves() -> None:
@@ -84,7 +67,7 @@ def test_large_ones_are_split_inside_themselves() -> None:
     assert (halves[:, 1].abs() > 1e-3).all()
     assert (halves[:, [0, 2]].abs() < 1e-4).all()
     assert torch.allclose(gaussians.log_scales[5:, 0].exp(), torch.tensor(0.2 / SPLIT_SHRINK))
-    assert _moment_rows(surgery, "means") == [1, 2, 4, 5, 6, 0, 0]
+    assert moment_rows(surgery, "means") == [1, 2, 4, 5, 6, 0, 0]
 
 
 def test_low_opacity_ones_go_at_once_and_giants_after_the_first_reset() -> None:
@@ -94,7 +77,7 @@ def test_low_opacity_ones_go_at_once_and_giants_after_the_first_reset() -> None:
         gaussians.log_scales[1] = math.log(0.2 * EXTENT)
     assert control.densify(surgery, 8).pruned == 1
     assert control.densify(surgery, 12).pruned == 1
-    assert _moment_rows(surgery, "means") == [3, 4, 5, 6]
+    assert moment_rows(surgery, "means") == [3, 4, 5, 6]
 
 
 def test_a_scene_that_has_faded_is_left_alone() -> None:
@@ -123,8 +106,8 @@ def test_opacities_are_reset_and_so_are_their_moments() -> None:
     opacities = gaussians.raw_opacities.detach().sigmoid()
     assert float(opacities[0]) == pytest.approx(1 / (1 + math.exp(6)), rel=1e-5)
     assert torch.allclose(opacities[1:], torch.tensor(0.01))
-    assert _moment_rows(surgery, "raw_opacities") == [0] * 6
-    assert _moment_rows(surgery, "means") == [1, 2, 3, 4, 5, 6]
+    assert moment_rows(surgery, "raw_opacities") == [0] * 6
+    assert moment_rows(surgery, "means") == [1, 2, 3, 4, 5, 6]
 
 
 def test_the_next_step_moves_old_and_new_rows() -> None:
@@ -152,20 +135,9 @@ def test_splits_depend_on_the_seed_alone() -> None:
 
 
 def test_schedule() -> None:
-    on = _schedule(
-        steps=100,
-        refine_start_fraction=0.1,
-        refine_every_fraction=0.1,
-        reset_every_fraction=0.2,
-        refine_stop_fraction=0.5,
-    )
+    refines = {"refine_start_fraction": 0.1, "refine_every_fraction": 0.1, "refine_stop_fraction": 0.5}
+    on = _schedule(steps=100, reset_every_fraction=0.2, **refines)
     assert [s for s in range(1, 101) if on.refines_at(s)] == [10, 20, 30, 40, 50]
     assert [s for s in range(1, 101) if on.resets_at(s)] == [20, 40]
     off = _schedule(refine_every_fraction=0.0, reset_every_fraction=0.0)
     assert not any(off.refines_at(s) or off.resets_at(s) for s in range(1, 101))
-
-
-def test_rotation() -> None:
-    half = math.sqrt(0.5)
-    turned = rotate(torch.tensor([[half, 0, 0, half]]), torch.tensor([[1.0, 2.0, 3.0]]))
-    assert torch.allclose(turned, torch.tensor([[-2.0, 1.0, 3.0]]), atol=1e-6)

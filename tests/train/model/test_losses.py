@@ -1,13 +1,15 @@
-"""The photometric loss: against torchmetrics, against finite differences, and by its laws."""
+"""The photometric loss and metrics: against torchmetrics, against finite differences, and by their laws."""
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torchmetrics.functional.image import structural_similarity_index_measure
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from msdgs_serve.scene import InvalidInput
+from msdgs_train.evaluation.metrics import MAX_PSNR, ImageMetrics, image_metrics, mean_metrics, psnr
 from msdgs_train.losses.photometric import MSE_SCALE, masked_l1, photometric_loss, pooled_l1
 from msdgs_train.losses.ssim import RADIUS, ssim
 from tests.support.tolerances import assert_close, tolerance
@@ -38,19 +40,11 @@ def test_gradient_agrees_with_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda x: photometric_loss(x, target, 0.8), (rgb,), atol=atol, rtol=0, eps=1e-7)
 
 
-def test_equal_images_have_no_loss() -> None:
-    _, target = _pair(2, 20, 20)
-    assert float(ssim(target, target)) == pytest.approx(1.0)
-    assert float(photometric_loss(target, target, 0.8)) == pytest.approx(0.0, abs=1e-12)
-
-
 def test_ssim_is_symmetric_and_does_not_know_left_from_right() -> None:
     rgb, target = _pair(3, 17, 23)
-    value = float(ssim(rgb, target))
-    assert float(ssim(target, rgb)) == pytest.approx(value, rel=1e-12)
-    assert float(ssim(rgb.flip(1), target.flip(1))) == pytest.approx(value, rel=1e-12)
-    assert float(ssim(rgb.transpose(0, 1), target.transpose(0, 1))) == pytest.approx(value, rel=1e-12)
-    assert float(ssim(rgb.flip(2), target.flip(2))) == pytest.approx(value, rel=1e-12)
+    pairs = [(target, rgb), *((rgb.flip(axis), target.flip(axis)) for axis in (1, 2))]
+    pairs.append((rgb.transpose(0, 1), target.transpose(0, 1)))
+    assert [float(ssim(*pair)) for pair in pairs] == pytest.approx([float(ssim(rgb, target))] * 4, rel=1e-12)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1), (4, 4), (11, 11)])
@@ -62,12 +56,14 @@ def test_images_smaller_than_the_window(shape: tuple[int, int]) -> None:
     assert torch.isfinite(rgb.grad).all()
 
 
-def test_weight_mixes_the_two_terms() -> None:
+@pytest.mark.parametrize("mse_fraction", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("l1_weight", [0.0, 0.3, 0.8, 1.0])
+def test_weights_mix_the_three_terms(l1_weight: float, mse_fraction: float) -> None:
     rgb, target = _pair(5, 16, 16)
     l1, dssim = float((rgb - target).abs().mean()), 1 - float(ssim(rgb, target))
-    for weight in (0.0, 0.3, 1.0):
-        expected = weight * l1 + (1 - weight) * dssim
-        assert float(photometric_loss(rgb, target, weight)) == pytest.approx(expected, rel=1e-9)
+    squares = MSE_SCALE * float((rgb - target).square().mean())
+    expected = (1 - mse_fraction) * (l1_weight * l1 + (1 - l1_weight) * dssim) + mse_fraction * squares
+    assert float(photometric_loss(rgb, target, l1_weight, mse_fraction)) == pytest.approx(expected, rel=1e-9)
 
 
 def test_not_finite_pixels_are_not_hidden() -> None:
@@ -78,10 +74,9 @@ def test_not_finite_pixels_are_not_hidden() -> None:
 
 def test_shapes_that_disagree_are_refused() -> None:
     rgb, target = _pair(7, 16, 16)
-    with pytest.raises(InvalidInput, match="`target`"):
-        photometric_loss(rgb, target[:-1], 0.8)
-    with pytest.raises(InvalidInput, match="`target`"):
-        photometric_loss(rgb, target.float(), 0.8)
+    for other in (target[:-1], target.float()):
+        with pytest.raises(InvalidInput, match="`target`"):
+            photometric_loss(rgb, other, 0.8)
     with pytest.raises(InvalidInput, match="`rgb`"):
         ssim(rgb[..., 0], target[..., 0])
 
@@ -97,14 +92,6 @@ def test_what_has_moved_away_teaches_nothing_of_what_stands_still() -> None:
     elsewhere[2:7, 3:8] = False
     assert torch.equal(gradient.any(dim=2), elsewhere)
     assert float(loss.detach()) == pytest.approx(0.8 * 0.1 * float(elsewhere.double().mean()))
-
-
-@pytest.mark.parametrize("l1_weight", [0.8, 1.0])
-def test_squared_errors_take_their_part_of_the_loss(l1_weight: float) -> None:
-    rgb, target = torch.rand(2, 20, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    whole, squares = photometric_loss(rgb, target, l1_weight), MSE_SCALE * (rgb - target).square().mean()
-    assert float(photometric_loss(rgb, target, l1_weight, 0.3)) == pytest.approx(float(0.7 * whole + 0.3 * squares))
-    assert float(photometric_loss(rgb, target, l1_weight, 1.0)) == pytest.approx(float(squares))
 
 
 def _spot(left: torch.Tensor) -> torch.Tensor:
@@ -126,3 +113,25 @@ def test_blocks_of_images_smaller_than_they_are() -> None:
     rgb, target = torch.full((3, 5, 3), 0.75), torch.full((3, 5, 3), 0.5)
     assert float(pooled_l1(rgb, target)) == pytest.approx(3 * 0.25)
     assert float(pooled_l1(target, target)) == 0.0
+
+
+def test_psnr_is_that_of_torchmetrics() -> None:
+    rgb, target = _pair(0, 20, 30)
+    expected = peak_signal_noise_ratio(rgb, target, data_range=1.0)
+    assert_close(psnr(rgb, target), float(expected), "psnr.relative")
+
+
+def test_equal_images_have_no_loss_and_the_highest_psnr_and_nan_stays() -> None:
+    drawn = torch.rand(4, 4, 3, dtype=torch.float64)
+    assert float(photometric_loss(drawn, drawn, 0.8)) == pytest.approx(0.0, abs=1e-12)
+    assert psnr(drawn, drawn) == MAX_PSNR
+    assert math.isnan(psnr(drawn * math.nan, drawn))
+
+
+def test_renderings_are_clamped_first() -> None:
+    white = torch.ones(12, 12, 3)
+    assert image_metrics(white + 0.5, white) == pytest.approx((MAX_PSNR, 1.0))
+
+
+def test_mean_is_of_psnrs() -> None:
+    assert mean_metrics([ImageMetrics(20, 0.5), ImageMetrics(40, 0.7)]) == pytest.approx((30, 0.6))

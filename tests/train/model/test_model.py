@@ -17,8 +17,11 @@ from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.parts import to_text
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.layers.quaternions import unit_or_identity
+from msdgs_train.layers.spline import SplineConfig
+from msdgs_train.supports.base import SupportConfig
 from msdgs_train.supports.gaussians import GaussiansConfig
-from tests.support.models import NODES, random_model, small_config
+from msdgs_train.supports.nodes import NodesConfig
+from tests.support.models import NODES, SPLINE, random_model, small_config
 from tests.support.tolerances import assert_close
 
 
@@ -33,42 +36,13 @@ def test_canonical_gaussians_are_activated_only():
         assert torch.equal(got, same)
 
 
-def test_deltas_are_added_before_activation():
-    model = random_model().double()
-    g, posed = model.gaussians, model.pose(0.3)
-    deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
-    quats = g.raw_quats / g.raw_quats.norm(dim=1, keepdim=True) + deltas.quats
-    assert model.modulation is not None
-    log_scales = g.log_scales + model.modulation(g.attributes[EMBEDDINGS]).scales * deltas.scales  # equation 12
-    for got, want in (
-        (posed.means, g.means + deltas.means),
-        (posed.scales, log_scales.exp()),
-        (posed.quats, quats / quats.norm(dim=1, keepdim=True)),
-    ):
-        assert_close(got.detach(), want.detach(), "network.float64")
-
-
-def changed(config: dict[str, Any]) -> set[str]:
-    """What a modulation by other embeddings changes."""
-    model = random_model(**config)
-    before = model.pose(0.3)
-    with torch.no_grad():
-        model.gaussians.attributes[EMBEDDINGS].add_(1.0)
-    after = model.pose(0.3)
-    return {name for name in before._fields if not torch.equal(getattr(before, name), getattr(after, name))}
-
-
+@pytest.mark.parametrize("scale_space", ["log", "linear"])
 @pytest.mark.parametrize(
     "targets", [("means",), ("scales",), ("quats",), ("means", "quats"), ("quats", "scales", "means")]
 )
-@pytest.mark.parametrize("scale_space", ["log", "linear"])
-def test_modulation_changes_its_targets_only(targets: tuple[str, ...], scale_space: str):
-    assert changed({"modulation_targets": targets, "scale_space": scale_space}) == set(targets)
-
-
-@pytest.mark.parametrize("targets", [("means",), ("scales",), ("quats",), ("means", "scales", "quats")])
-def test_modulation_multiplies_the_sums_once(targets: tuple[Any, ...]):
-    model = random_model(modulation_targets=targets).double()
+def test_modulated_deltas_are_added_once_before_activation(targets: tuple[Any, ...], scale_space: Any):
+    """Equation 12, for the targets and nothing else."""
+    model = random_model(modulation_targets=targets, scale_space=scale_space, noise=0.2).double()
     g, posed = model.gaussians, model.pose(0.3)
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     assert model.modulation is not None
@@ -76,24 +50,14 @@ def test_modulation_multiplies_the_sums_once(targets: tuple[Any, ...]):
     assert list(factors) == [name for name in ("means", "scales", "quats") if name in targets]
     assert all((f - 1).abs().max() > 1e-3 for f in factors.values())
     means, scales, quats = (factors.get(name, 1.0) * getattr(deltas, name) for name in ("means", "scales", "quats"))
+    raw = unit_or_identity(g.raw_quats) + quats
+    linear = g.log_scales.exp() + scales
+    if scale_space == "linear":
+        assert 0 < (linear < MIN_SCALE).sum() < linear.numel() / 2
+    wanted_scales = (g.log_scales + scales).exp() if scale_space == "log" else linear.clamp(min=MIN_SCALE)
     assert_close(posed.means.detach(), (g.means + means).detach(), "network.float64")
-    assert_close(posed.scales.detach(), (g.log_scales + scales).exp().detach(), "network.float64")
-    assert_close(
-        posed.quats.detach(), unit_or_identity(unit_or_identity(g.raw_quats) + quats).detach(), "network.float64"
-    )
-
-
-def test_deltas_may_be_added_to_scales_themselves():
-    model = random_model(scale_space="linear", noise=0.2).double()
-    g, posed = model.gaussians, model.pose(0.3)
-    deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
-    assert model.modulation is not None
-    wanted = g.log_scales.exp() + model.modulation(g.attributes[EMBEDDINGS]).scales * deltas.scales
-    clamped = wanted < MIN_SCALE
-    assert 0 < clamped.sum() < clamped.numel() / 2
-    assert_close(posed.scales[~clamped].detach(), wanted[~clamped].detach(), "network.float64")
-    assert (posed.scales[clamped] == MIN_SCALE).all()
-    assert (random_model(scale_space="log", noise=0.2).pose(0.3).scales.double() - posed.scales).abs().max() > 0.1
+    assert_close(posed.scales.detach(), wanted_scales.detach(), "network.float64")
+    assert_close(posed.quats.detach(), (raw / raw.norm(dim=1, keepdim=True)).detach(), "network.float64")
 
 
 @pytest.mark.parametrize("heads", [{"opacity_head": True}, {"sh_head": True}, {"opacity_head": True, "sh_head": True}])
@@ -107,22 +71,6 @@ def test_heads_of_opacity_and_color(heads: dict[str, bool], layers: tuple[str, .
         assert torch.equal(getattr(early, name), getattr(canonical, name)) != moves
     assert ((late.opacities > 0) & (late.opacities < 1)).all()
     assert torch.equal(model.pose(0.1, sh_degree=1).sh, early.sh[:, :4])
-
-
-def test_a_model_without_weights_has_none():
-    with_weights, without = random_model(), random_model(weights=False)
-    fewer = sum(p.numel() for p in with_weights.parameters()) - sum(p.numel() for p in without.parameters())
-    assert fewer == 2 * (32 + 1)
-
-
-@pytest.mark.parametrize("count", [1, 3, 10])
-def test_any_number_of_layers(count: int):
-    model = random_model(layers=("mlp",) * count, noise=0.02)
-    assert len(model.deformation) == count
-    before = model.pose(0.4).means
-    with torch.no_grad():
-        model.get_parameter(f"deformation.layers.{count - 1}.heads.bias")[:3] += 1.0
-    assert not torch.equal(model.pose(0.4).means, before), "the last layer counts"
 
 
 def test_stopping_after_a_step_is_a_model_of_fewer_layers():
@@ -164,9 +112,11 @@ def test_sh_bands_above_a_degree_are_omitted(degree: int):
     assert random_model(sh_degree=degree).pose(0.5).sh.shape == (300, (degree + 1) ** 2, 3)
 
 
+@pytest.mark.parametrize("support", [GaussiansConfig(), NodesConfig(num_nodes=1)])
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_few_gaussians(count: int):
-    posed = random_model(count).pose(0.5)
+def test_few_gaussians(count: int, support: SupportConfig):
+    posed = random_model(count, support=support, layers=("mlp", "plane")).pose(0.5)
+    torch.cat([tensor.flatten() for tensor in posed]).sum().backward()
     assert [len(tensor) for tensor in posed] == [count] * 5
     assert all(tensor.isfinite().all() for tensor in posed)
 
@@ -199,26 +149,29 @@ def test_quaternions_without_direction_become_identity():
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("sh_degree", 4),
-        ("sh_degree", -1),
-        ("layers", -1),
-        ("layers", 1.5),
-        ("layers", True),
-        ("layers", "mlp"),
+        *(("sh_degree", degree) for degree in (4, -1)),
+        *(("layers", layers) for layers in (-1, 1.5, True, "mlp")),
+        ("layers.0` must be of another kind", (SPLINE,)),  # curves are of nodes
         ("support", "nodes"),
+        *(("support.num_nodes", NodesConfig(num_nodes=count)) for count in (0, 2.0)),  # pyright: ignore
+        *(("support.k_nearest", NodesConfig(k_nearest=count)) for count in (0, 9)),
         ("embedding_dim", -1),
         ("scale_space", "activated"),
         ("weights", 1),
         ("eps2d", -0.1),
         ("modulation_lr_init", 0.0),
-        ("modulation_targets", ()),
-        ("modulation_targets", ("scales", "scales")),
-        ("modulation_targets", ("opacities",)),
+        *(("modulation_targets", targets) for targets in ((), ("scales", "scales"), ("opacities",))),
     ],
 )
 def test_impossible_settings_are_refused_by_name(field: str, value: Any):
+    with pytest.raises(InvalidInput, match=rf"model\.{field}"):
+        ModelConfig(**{field.split(".")[0]: value})
+
+
+@pytest.mark.parametrize("field", ["scale_space", "opacity_head", "sh_head"])
+def test_what_nodes_cannot_change_is_refused(field: str):
     with pytest.raises(InvalidInput, match=f"model.{field}"):
-        ModelConfig(**{field: value})
+        ModelConfig(support=NODES, **{field: "linear" if field == "scale_space" else True})  # pyright: ignore
 
 
 @pytest.mark.parametrize(
@@ -233,11 +186,12 @@ def test_impossible_settings_are_refused_by_name(field: str, value: Any):
         ("features", PlaneConfig(features=0)),
         ("multires", PlaneConfig(multires=())),
         ("multires", PlaneConfig(multires=(1, 0))),
+        ("num_knots", SplineConfig(num_knots=0)),
     ],
 )
 def test_impossible_sizes_are_refused_by_layer_and_name(setting: str, layer: LayerConfig):
     with pytest.raises(InvalidInput, match=rf"model\.layers\.1\.{setting}"):
-        ModelConfig(layers=(MLPConfig(), layer))
+        ModelConfig(support=NODES, layers=(MLPConfig(), layer))
 
 
 @pytest.mark.parametrize(
@@ -313,6 +267,16 @@ def test_neighbor_distances_against_all_pairs(spread: str, count: int):
     assert_close(neighbor_distances(points), want.float(), "neighbor_distances")
 
 
-def test_points_in_one_place_have_a_scale():
+def test_neighbor_distances_of_points_alone_and_in_one_place():
+    for n in (0, 1):
+        assert torch.equal(neighbor_distances(torch.rand(n, 3)), torch.ones(n))
+    assert torch.equal(neighbor_distances(torch.ones(20, 3)), torch.zeros(20))
     gaussians = CanonicalGaussians.from_points(torch.zeros(5, 3), torch.rand(5, 3), 0, torch.Generator())
     assert gaussians.log_scales.isfinite().all()
+
+
+def test_a_point_that_is_not_finite_has_no_neighbors():
+    points = torch.rand(5, 3)
+    points[2, 1] = torch.nan
+    with pytest.raises(InvalidInput, match="`points` must be finite, got 1 of 5"):
+        neighbor_distances(points)

@@ -5,9 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.gaussians.config import ModelConfig
-from msdgs_train.layers.spline import SplineConfig, SplineLayer, cubic_weights
+from msdgs_train.layers.spline import SplineConfig, SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
 from tests.support.models import NODES, SPLINE, random_model
 from tests.support.reference_deformation import plain_step
@@ -37,27 +35,6 @@ def test_motions_are_on_splines(t: float) -> None:
     assert_close(step.delta_scales.detach(), want.scales, "rotation")
     assert_close(step.delta_quats.detach(), want.quats, "rotation")
     assert torch.equal(step.weight, torch.ones(3, 1, dtype=torch.float64))
-
-
-def test_gradients() -> None:
-    layer = layer_of(2, 3)
-    curves = dict(layer.named_parameters())
-
-    def step(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        replaced = dict(zip(curves, values, strict=True))
-        return torch.func.functional_call(layer, replaced, (torch.zeros(2, 3).double(), time(0.41)))[:3]
-
-    assert torch.autograd.gradcheck(step, [curve.detach().requires_grad_() for curve in curves.values()])
-
-
-def test_weights_of_knots_sum_to_one() -> None:
-    assert float(cubic_weights(time(0.37)).sum()) == pytest.approx(1)
-
-
-def test_a_new_layer_moves_nothing() -> None:
-    step = SplineLayer(SplineConfig(num_knots=4), 5, (0.0, 1.0)).double()(torch.zeros(5, 3).double(), time(0.7))
-    for delta in (step.delta_means, step.delta_scales, step.delta_quats):
-        assert float(delta.abs().max().detach()) <= EXACT
 
 
 def test_beyond_the_window_translations_stay_and_rotations_continue() -> None:
@@ -95,10 +72,3 @@ def test_rigid_motions_stay_rigid() -> None:
     assert isinstance(model.support, NodesSupport)
     matrices = model.support.motions(model.deformation, time(0.3))[:, :9].view(-1, 3, 3).detach()
     assert float((matrices @ matrices.transpose(1, 2) - torch.eye(3)).abs().max()) <= EXACT
-
-
-def test_curves_are_of_nodes() -> None:
-    with pytest.raises(InvalidInput, match=r"`model\.layers\.0` must be of another kind"):
-        ModelConfig(layers=(SPLINE,))
-    with pytest.raises(InvalidInput, match=r"model\.layers\.0\.num_knots"):
-        ModelConfig(support=NODES, layers=(SplineConfig(num_knots=0),))

@@ -1,17 +1,93 @@
-"""nerfstudio layout: angles, splits, times and points."""
+"""D-NeRF's and nerfstudio's JSON: splits, times, names, intrinsics, images that can't be used, and points."""
 
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from msdgs_train.datasets.common.images import write_png
 from tests.support.tolerances import assert_close
-from tests.train.datasets.layouts import LENSES, nerfstudio_json, write_nerfstudio
+from tests.train.datasets.layouts import (
+    CENTERED,
+    LENSES,
+    dnerf_json,
+    flat,
+    nerfstudio_json,
+    points_of,
+    write_dnerf,
+    write_nerfstudio,
+)
+
+
+def camera_with(folder: Path, frame: dict[str, float], **shared: float) -> Camera:
+    """Of the second frame, where the file says `shared` for all and the frame something of its own."""
+    content = {**dnerf_json(), **shared}
+    content["frames"][1].update(frame)
+    return load_scene(write_dnerf(folder, splits={"train": content})).splits["train"][1].camera
+
+
+def test_splits_times_and_names(tmp_path: Path):
+    content = {split: dnerf_json(split, times) for split, times in (("train", (0.2, 0.9)), ("test", (0.5, 1.0)))}
+    scene = load_scene(write_dnerf(tmp_path, splits=content))
+    assert [frame.t for frame in scene.splits["train"]] == [0.2, 0.9]
+    assert [frame.name for frame in scene.splits["test"]] == ["r_0", "r_1"]
+    assert scene.splits["val"] == []
+    assert scene.time_range == (0.2, 1.0)
+    assert scene.scene_half_size == 1.3
+    assert (scene.splits["train"][1].load_rgba()[..., :3] == 1).all()
+
+
+def test_every_nth_training_image_is_held_out(tmp_path: Path):
+    times = tuple(i / 10 for i in range(10))
+    folder = write_dnerf(tmp_path, splits={split: dnerf_json(split, times) for split in ("train", "test")})
+    splits = load_scene(folder, llffhold=4).splits
+    held_out = {split: [frame.t for frame in splits[split]] for split in ("test", "val", "train")}
+    assert held_out == {"test": [0.0, 0.4, 0.8], "val": [0.2, 0.6], "train": [0.1, 0.3, 0.5, 0.7, 0.9]}
+    assert {frame.image_path.parent.name for frames in splits.values() for frame in frames} == {"train"}
+    single = write_dnerf(folder, splits={"train": dnerf_json("train", (0.5,)), "test": dnerf_json("test", (0.5,))})
+    with pytest.raises(InvalidInput, match="`llffhold` must be fewer than the 1 training images, got 4"):
+        load_scene(single, llffhold=4)
+
+
+@pytest.mark.parametrize(
+    ("file_path", "file"),
+    [("train/r_0.png", "r_0.png"), ("./train/r_0.5", "r_0.5.png"), ("train/a", "a.jpg"), ("train/a.jpeg", "a.jpeg")],
+)
+def test_file_names_with_and_without_extension(tmp_path: Path, file_path: str, file: str):
+    content = dnerf_json(times=(0.0,))
+    folder = write_dnerf(tmp_path, splits={"train": content})
+    (folder / "train" / "r_0.png").rename(folder / "train" / file)  # read by content, not by extension
+    content["frames"][0]["file_path"] = file_path
+    (folder / "transforms_train.json").write_text(json.dumps(content))
+    assert load_scene(folder).splits["train"][0].image_path.name == file
+
+
+def test_intrinsics_of_a_frame_come_before_those_of_the_file_and_these_before_the_angle(tmp_path: Path):
+    camera = camera_with(tmp_path, {"fl_x": 41.0}, fl_x=31.0, fl_y=32.0, cx=9.0, cy=4.5, w=320, h=240)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 32.0, 9.0, 4.5)
+    camera = camera_with(tmp_path, {}, fl_x=31.0, cx=9.0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (31.0, 31.0, 9.0, 120.0)
+
+
+def test_float_images_are_refused(tmp_path: Path):
+    """Their values would be scene-linear, and splats blend in the display's space."""
+    content = dnerf_json(times=(0.0,))
+    path = write_dnerf(tmp_path, splits={"train": content}) / "train" / "r_0.exr"
+    writer = oiio.ImageOutput.create(str(path))
+    assert writer
+    writer.open(str(path), oiio.ImageSpec(20, 10, 4, "float"))
+    writer.write_image(np.zeros((10, 20, 4), np.float32))
+    writer.close()
+    content["frames"][0]["file_path"] = "train/r_0.exr"
+    write_png(tmp_path / "train" / "r_0.exr.png", flat(0, CENTERED))  # the name as it is comes first
+    with pytest.raises(DatasetInvalid, match="4 channels of float; 1 to 4 of 8 or 16 bits are supported"):
+        load_scene(write_dnerf(tmp_path, splits={"train": content}))
 
 
 def test_color_behind_transparent_pixels_does_not_bleed_into_undistorted_ones(tmp_path: Path):
@@ -46,37 +122,21 @@ def test_every_8th_frame_by_name_is_for_testing(tmp_path: Path):
 
 
 def test_lists_of_file_names_make_the_splits(tmp_path: Path):
-    lists: dict[str, Any] = {
-        "train_filenames": ["./images/f_02.png", "images/f_00.png"],
-        "test_filenames": ["images/f_01.png"],
-    }
-    scene = load_scene(write_nerfstudio(tmp_path, content=nerfstudio_json(4, **lists)))
-    assert [frame.image_path.name for frame in scene.splits["train"]] == ["f_00.png", "f_02.png"]
-    assert [frame.image_path.name for frame in scene.splits["test"]] == ["f_01.png"]
-    assert scene.splits["val"] == []
+    names = {"train": ["./images/f_02.png", "images/f_00.png"], "test": ["images/f_01.png"]}
+    content = {**nerfstudio_json(4), **{f"{split}_filenames": listed for split, listed in names.items()}}
+    splits = load_scene(write_nerfstudio(tmp_path, content=content)).splits
+    found = {split: [frame.image_path.name for frame in frames] for split, frames in splits.items()}
+    assert found == {"train": ["f_00.png", "f_02.png"], "val": [], "test": ["f_01.png"]}
 
 
 def test_times_are_kept_even_outside_0_and_1(tmp_path: Path):
     content = nerfstudio_json(3)
     for frame, time in zip(content["frames"], [12.5, -3, 40], strict=True):
-        frame["time"] = time
+        frame |= {"time": time, "mask_path": "masks/none.png"}  # masks are passed over
     scene = load_scene(write_nerfstudio(tmp_path, content=content))
     assert [frame.t for frame in scene.splits["test"] + scene.splits["train"]] == [12.5, -3.0, 40.0]
     assert scene.time_range == (-3.0, 40.0)
-
-
-def test_a_scene_without_times_is_static(tmp_path: Path):
-    scene = load_scene(write_nerfstudio(tmp_path, content=nerfstudio_json(3)))
-    assert [frame.t for frame in scene.splits["train"]] == [0.0, 0.0]
-    assert scene.time_range == (0.0, 0.0)
-    assert scene.points is None
-    assert scene.point_colors is None
-
-
-def test_masks_are_passed_over(tmp_path: Path):
-    content = nerfstudio_json(1)
-    content["frames"][0]["mask_path"] = "masks/none.png"
-    assert (load_scene(write_nerfstudio(tmp_path, content=content)).splits["train"][0].load_rgba()[..., 3] == 255).all()
+    assert (scene.splits["train"][0].load_rgba()[..., 3] == 255).all()
 
 
 HEADER = ["ply", "format {} 1.0", "comment c", "element vertex 2", "property float x", "property float y"]
@@ -98,11 +158,9 @@ def ply(encoding: str) -> bytes:
 def test_sparse_points_come_with_their_colors_in_the_axes_of_the_poses(tmp_path: Path, encoding: str):
     (tmp_path / "points.ply").write_bytes(ply(encoding))
     content = nerfstudio_json(ply_file_path="points.ply", applied_transform=np.eye(4)[[1, 0, 2]].tolist())
-    scene = load_scene(write_nerfstudio(tmp_path, content=content))
-    assert scene.points is not None
-    assert scene.point_colors is not None
-    assert scene.points.tolist() == [[1.0, -2.0, 0.5], [0.25, 0.0, -4.0]]
-    assert_close(scene.point_colors, [[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]], "sh_basis")
+    points, colors = points_of(load_scene(write_nerfstudio(tmp_path, content=content)))
+    assert points == [[1.0, -2.0, 0.5], [0.25, 0.0, -4.0]]
+    assert_close(colors, [[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]], "sh_basis")
 
 
 def without_color(content: bytes) -> bytes:
@@ -128,14 +186,12 @@ def test_points_may_lack_colors_and_files_points(tmp_path: Path):
 BAD_PLY = [
     (lambda content: content[:40], "`file` is not a complete PLY"),
     (lambda content: b"", "`file` is not a complete PLY"),
+    (lambda content: ply("binary_little_endian")[:-80], r"`file` is not .*element 'vertex'.*early end-of-file"),
     (lambda content: content[:-24], "`file` is not a complete PLY file: element 'vertex': "),
     (lambda content: content.replace(b"ascii", b"latin"), "`file` is not a complete PLY file: line 2: "),
     (lambda content: content.replace(b"vertex 2", b"vertex -2"), "`file` is not a complete PLY file: negative"),
     (lambda content: content.replace(b"element vertex", b"element edge"), "`element` vertex is missing"),
-    (
-        lambda content: content.replace(b"float y", b"float x"),
-        "`file` is not .* two properties with same name",
-    ),
+    (lambda content: content.replace(b"float y", b"float x"), "`file` is not .* two properties with same name"),
     (lambda content: content.replace(b"float y", b"float v"), "`property y` is missing or not a number"),
     (lambda content: content.replace(b"float y", b"list uchar int y"), "`file` is not a complete PLY file: "),
     (lambda content: content.replace(b"0.25", b"nan"), r"`vertex\[1\]` must be finite"),
@@ -148,10 +204,4 @@ BAD_PLY = [
 def test_bad_point_files_are_refused(tmp_path: Path, change: Callable[[bytes], bytes], message: str):
     (tmp_path / "points.ply").write_bytes(change(ply("ascii")))
     with pytest.raises(DatasetInvalid, match=rf"points\.ply: {message}"):
-        load_scene(write_nerfstudio(tmp_path, content=nerfstudio_json(ply_file_path="points.ply")))
-
-
-def test_a_binary_point_file_that_is_cut_off_is_refused(tmp_path: Path):
-    (tmp_path / "points.ply").write_bytes(ply("binary_little_endian")[:-80])
-    with pytest.raises(DatasetInvalid, match=r"`file` is not .*element 'vertex'.*early end-of-file"):
         load_scene(write_nerfstudio(tmp_path, content=nerfstudio_json(ply_file_path="points.ply")))
