@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 
+import pytest
 import uvicorn
 from starlette.responses import Response, StreamingResponse
 from starlette.types import ASGIApp
@@ -33,8 +34,6 @@ class Recorded(asyncio.Transport):
 
 
 def writes_of(app: ASGIApp, request: bytes) -> list[bytes]:
-    """Return the writes by which an application's response is sent."""
-
     async def ask() -> list[bytes]:
         config, state, transport = uvicorn.Config(app, log_config=None, lifespan="off"), ServerState(), Recorded()
         config.load()
@@ -52,17 +51,18 @@ def writes_of(app: ASGIApp, request: bytes) -> list[bytes]:
 GET = b"GET / HTTP/1.1\r\nHost: here\r\n\r\n"
 
 
-def test_an_answer_is_written_at_once():
-    (answer,) = writes_of(Response(b"body"), GET)
-    assert answer.startswith(b"HTTP/1.1 200 OK\r\n")
-    assert answer.endswith(b"\r\n\r\nbody")
-
-
-def test_an_answer_without_a_body_has_its_head():
-    for app, request in ((Response(status_code=304), GET), (Response(b"body"), GET.replace(b"GET", b"HEAD"))):
-        (answer,) = writes_of(app, request)
-        assert answer.startswith(b"HTTP/1.1 ")
-        assert answer.endswith(b"\r\n\r\n")
+@pytest.mark.parametrize(
+    ("response", "request_", "body"),
+    [
+        (Response(b"body"), GET, b"body"),
+        (Response(status_code=304), GET, b""),
+        (Response(b"body"), GET.replace(b"GET", b"HEAD"), b""),
+    ],
+)
+def test_an_answer_is_written_at_once(response: Response, request_: bytes, body: bytes):
+    (answer,) = writes_of(response, request_)
+    assert answer.startswith(b"HTTP/1.1 ")
+    assert answer.endswith(b"\r\n\r\n" + body)
 
 
 def test_parts_of_a_stream_are_written_as_they_come():

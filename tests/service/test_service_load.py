@@ -126,7 +126,6 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
 
 
 def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
-    """Send a request on a connection of its own, which its client leaves by closing it."""
     content = json.dumps(body)
     head = (
         f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(content)}\r\n\r\n"
@@ -203,7 +202,6 @@ def _listens(client: httpx.Client) -> bool:
 
 
 def test_a_cancelled_request_keeps_poses_of_others(scene: Path):
-    """A cancelled request leaves the poses of other requests in the cache."""
     cache, session = PoseCache(1 << 20), DeformationSession(scene)
     cancelled = RenderJob()
     cancelled.cancel()

@@ -86,7 +86,6 @@ def opened(page: Page, client: httpx.Client) -> Page:
 
 
 def image(page: Page) -> np.ndarray:
-    """Return the pixels of the canvas, [H, W, 3] from 0 to 255."""
     address = page.evaluate("document.getElementById('image').toDataURL('image/png')")
     return decode(base64.b64decode(address.split(",")[1]), "png")[0][..., :3]
 
@@ -342,12 +341,10 @@ def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_p
 
 
 def strongest_in_the_middle(image: np.ndarray) -> int:
-    """Return the index of the strongest channel at the center of an image."""
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
 def in_time(page: Page, holds: Callable[[], bool]) -> bool:
-    """Return whether a condition becomes true within a minute."""
     for _ in range(600):
         if holds():
             return True
