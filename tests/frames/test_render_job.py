@@ -13,13 +13,6 @@ from msdgs_serve.threads import checking, run_parallel
 from tests.support.scenes import front_camera, gaussians_of
 
 
-def test_a_cancelled_job_lets_no_stage_begin():
-    job = RenderJob()
-    job.cancel()
-    with pytest.raises(RenderCancelled), job.stage("draw"):
-        pytest.fail("must not begin")
-
-
 @pytest.mark.parametrize("threads", ["1", "3"])
 def test_parts_on_the_pool_end_with_it(threads: str, monkeypatch: pytest.MonkeyPatch):
     """The part that runs ends by itself, those after it don't begin."""
