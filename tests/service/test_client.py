@@ -76,13 +76,6 @@ def test_many_frames_and_one_that_fails(client: Client):
     assert (failed.status, list(failed.errors)) == (422, ["t"])
     with pytest.raises(Problem, match="frames"):
         list(client.render_many([]))
-
-
-def test_problems_name_the_field(client: Client):
-    with pytest.raises(Problem) as error:
-        client.render(Orbit(0, 90), 0.5)
-    assert error.value.status == 422
-    assert "camera.elevation" in error.value.errors
     with pytest.raises(Problem, match="no scene `nothing`"):
         client.scene("nothing")
 

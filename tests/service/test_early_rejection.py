@@ -47,15 +47,6 @@ def early_rejection(queue: WorkQueue) -> EarlyRejection:
     return EarlyRejection(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
 
 
-def test_only_a_full_queue_has_calls_turned_away(early_rejection: EarlyRejection, queue: WorkQueue):
-    assert early_rejection.answer(CALL, ("1.2.3.4", 5), ()) is None
-    with full(queue, 2):
-        answer = early_rejection.answer(CALL, ("1.2.3.4", 5), [(b"date", b"today")])
-    assert answer is not None
-    assert answer.startswith(b"HTTP/1.1 503 Service Unavailable\r\ndate: today\r\n")
-    assert early_rejection.answer(CALL, None, ()) is None
-
-
 @pytest.mark.parametrize(
     "data",
     [

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from unittest.mock import Mock
 
 import pytest
 import uvicorn
@@ -12,30 +13,10 @@ from uvicorn.server import ServerState
 from msdgs_serve.api.protocol import LimitedProtocol
 
 
-class Recorded(asyncio.Transport):
-    """A connection that records what is written and never blocks."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.writes: list[bytes] = []
-
-    def write(self, data: bytes | bytearray | memoryview) -> None:
-        if data:
-            self.writes.append(bytes(data))
-
-    def close(self) -> None:
-        pass
-
-    def is_closing(self) -> bool:
-        return False
-
-    def get_write_buffer_size(self) -> int:
-        return 0
-
-
 def writes_of(app: ASGIApp, request: bytes) -> list[bytes]:
     async def ask() -> list[bytes]:
-        config, state, transport = uvicorn.Config(app, log_config=None, lifespan="off"), ServerState(), Recorded()
+        transport = Mock(asyncio.Transport, is_closing=lambda: False, get_write_buffer_size=lambda: 0)
+        config, state = uvicorn.Config(app, log_config=None, lifespan="off"), ServerState()
         config.load()
         protocol = LimitedProtocol(config=config, server_state=state, app_state={}, header_seconds=9, read_seconds=9)
         protocol.connection_made(transport)
@@ -43,7 +24,7 @@ def writes_of(app: ASGIApp, request: bytes) -> list[bytes]:
         while state.tasks:
             await asyncio.sleep(0)
         protocol.connection_lost(None)
-        return transport.writes
+        return [bytes(call.args[0]) for call in transport.write.call_args_list if call.args[0]]
 
     return asyncio.run(ask())
 
