@@ -44,9 +44,9 @@ def metadata(**changes: Any) -> SceneMetadata:
     return replace(plain, **changes)
 
 
-def level_camera(width: int = 64, height: int | None = None, distance: float = 5.0) -> Camera:
-    """A camera at the height of the origin, which it looks at; square if no height is given."""
-    return Camera.from_fov(orbit(np.zeros(3), distance, 0, 0, UP), width, height or width, 40.0)
+def level_camera(size: int = 64) -> Camera:
+    """A square camera 5 units from the origin and at its height, which it looks at."""
+    return Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), size, size, 40.0)
 
 
 def write_scene(
