@@ -33,6 +33,19 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("scenes") / "balls.onnx")
 
 
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """An empty folder for scenes."""
+    (tmp_path / "scenes").mkdir()
+    return tmp_path / "scenes"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> bytes:
+    """The contents of a scene file."""
+    return write_scene(tmp_path / "scene.onnx").read_bytes()
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_sessionfinish(session: pytest.Session) -> Iterator[None]:
     """At the very end: what was not tested. In CI a skip that is not on the list is a failure."""

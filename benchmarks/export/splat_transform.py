@@ -48,7 +48,7 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
                 read = read_splats(theirs)
                 psnr = proof.psnr(read.gaussians, t0)
                 console.print(f"{suffix}: {len(read):,} Gaussians, {psnr:.1f} dB against the scene", markup=False)
-                require(psnr, LOSSY, theirs.name)
+                require(psnr, None, LOSSY, theirs.name)
     except subprocess.CalledProcessError as error:
         console.print(f"{package} refused: {error.stderr.decode(errors='replace').strip()}", markup=False)
         return 1

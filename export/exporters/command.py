@@ -71,7 +71,7 @@ def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: fl
             (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
         psnr = RoundTrip(session).psnr(written, t)
-        _require(options, psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
+        require(psnr, options.min_psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
     return psnr
 
 
@@ -111,7 +111,7 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
         worst = min(check.psnr(shown(number), times[number]) for number in compared)
-        _require(options, worst, LOSSLESS, out.name)
+        require(worst, options.min_psnr, LOSSLESS, out.name)
     return f"{len(times)} frames, {_megabytes(out)}, {worst:.1f} dB"
 
 
@@ -130,7 +130,7 @@ def _visionary(session: DeformationSession, options: ConvertOptions, console: Co
         temporary.write_bytes(model.SerializeToString())
         shown = visionary_of(temporary)
         worst = min(check.psnr(shown(t), t) for t in times.tolist())
-        _require(options, worst, LOSSY, out.name)
+        require(worst, options.min_psnr, LOSSY, out.name)
     scene_json = out.with_name(f"{out.name.removesuffix(VISIONARY)}.scene.json")
     write_text(scene_json, json.dumps(visionary_scene(out.name, metadata), indent=2) + "\n")
     console.print(f"{scene_json}: the scene.json of a folder for Visionary's editor", markup=False)
@@ -140,10 +140,6 @@ def _visionary(session: DeformationSession, options: ConvertOptions, console: Co
     if session.scene.moving_count and plan is not None and not plan.fitted:
         console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a faster scene")
     return f"{_megabytes(out)}, {worst:.1f} dB"
-
-
-def _require(options: ConvertOptions, psnr: float, default: float, what: str) -> None:
-    require(psnr, default if options.min_psnr is None else options.min_psnr, what)
 
 
 def _megabytes(file: Path) -> str:

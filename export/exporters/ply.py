@@ -5,22 +5,19 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement
 
+from export.importers.splats.base import logit
 from msdgs_serve.scene.gaussians import Gaussians
-
-MIN_LOGIT_DISTANCE = 1e-7
-"""Distance of written opacities from 0 and 1, which have no finite logit. No pixel of 8 bits differs by it."""
 
 
 def write_ply(file: Path, gaussians: Gaussians) -> None:
     """Write all Gaussians in storage space: logits of opacities, log-scales, wxyz quaternions; normals are 0."""
     rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)  # by channel
-    opacities = gaussians.opacities.astype(np.float64).clip(MIN_LOGIT_DISTANCE, 1 - MIN_LOGIT_DISTANCE)
     columns = {
         **_columns("xyz", gaussians.means),
         **{f"n{axis}": np.zeros(len(gaussians), np.float32) for axis in "xyz"},
         **_columns([f"f_dc_{i}" for i in range(3)], gaussians.sh[:, 0]),
         **_columns([f"f_rest_{i}" for i in range(rest.shape[1])], rest),
-        "opacity": np.log(opacities / (1 - opacities)),
+        "opacity": logit(gaussians.opacities),
         **_columns([f"scale_{i}" for i in range(3)], np.log(gaussians.scales.astype(np.float64))),
         **_columns([f"rot_{i}" for i in range(4)], gaussians.quats),
     }

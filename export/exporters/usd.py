@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from export.importers.splats.axes import from_right_up_back
+from export.importers.splats.base import as_float32
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 
@@ -35,17 +36,17 @@ def write_usd(
         g = gaussians(t)
         means, quats, sh = from_right_up_back(g.means, g.quats, g.sh)
         samples = {
-            "positions": vt.Vec3fArray.FromNumpy(_float32(means)),
-            "orientations": vt.QuatfArray.FromNumpy(_float32(quats[:, [1, 2, 3, 0]])),
-            "scales": vt.Vec3fArray.FromNumpy(_float32(g.scales)),
+            "positions": vt.Vec3fArray.FromNumpy(as_float32(means)),
+            "orientations": vt.QuatfArray.FromNumpy(as_float32(quats[:, [1, 2, 3, 0]])),
+            "scales": vt.Vec3fArray.FromNumpy(as_float32(g.scales)),
         }
         for name, values in samples.items():
             prim.GetAttribute(name).Set(values, *([number] if len(times) > 1 else []))
         if not number:
             harmonics = "radiance:sphericalHarmonics"
-            prim.GetAttribute("opacities").Set(vt.FloatArray.FromNumpy(_float32(g.opacities)))
+            prim.GetAttribute("opacities").Set(vt.FloatArray.FromNumpy(as_float32(g.opacities)))
             prim.GetAttribute(f"{harmonics}Degree").Set(g.sh_degree)
-            prim.GetAttribute(f"{harmonics}Coefficients").Set(vt.Vec3fArray.FromNumpy(_float32(sh).reshape(-1, 3)))
+            prim.GetAttribute(f"{harmonics}Coefficients").Set(vt.Vec3fArray.FromNumpy(as_float32(sh).reshape(-1, 3)))
         on_frame()
     if len(times) > 1:
         stage.SetTimeCodesPerSecond(FRAMES_A_SECOND)
@@ -67,8 +68,8 @@ def read_usd(file: Path) -> Callable[[int], Gaussians]:
         means, opacities = read("positions", frame), read("opacities")
         sh = read("radiance:sphericalHarmonicsCoefficients").reshape(len(means), (degree + 1) ** 2, 3)
         quats = read("orientations", frame)[:, [3, 0, 1, 2]]
-        means, quats, sh = (_float32(array) for array in from_right_up_back(means, quats, sh))
-        return Gaussians(means, quats, _float32(read("scales", frame)), _float32(opacities), sh).validate()
+        means, quats, sh = (as_float32(array) for array in from_right_up_back(means, quats, sh))
+        return Gaussians(means, quats, as_float32(read("scales", frame)), as_float32(opacities), sh).validate()
 
     return shown
 
@@ -82,7 +83,3 @@ def _modules(file: Path) -> tuple[Any, ...]:
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise InvalidInput("out", "another format, or OpenUSD 26.3 or later", f"{file.name} with an older version")
     return Usd, UsdVol, UsdGeom, Vt
-
-
-def _float32(array: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(array, np.float32)

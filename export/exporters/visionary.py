@@ -11,6 +11,7 @@ import onnx
 import onnxruntime as ort
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
+from export.importers.splats.base import as_float32
 from export.layers.graph import GraphBuilder
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene
@@ -166,4 +167,4 @@ def unpacked(gaussians: np.ndarray, colors: np.ndarray, count: int) -> Gaussians
     axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
     scales = np.sqrt(np.maximum(squares, 0)).clip(1e-9)
     arrays = (rows[:, :3], from_matrix(axes), scales, rows[:, 3], colors[:count].reshape(count, -1, 3))
-    return Gaussians(*(np.ascontiguousarray(a, np.float32) for a in arrays))
+    return Gaussians(*map(as_float32, arrays))

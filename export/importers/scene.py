@@ -10,7 +10,7 @@ import onnx
 
 from export.importers.splats.base import Splats
 from export.jobs.bake import Baked, Moving
-from export.jobs.write import properties, set_properties
+from export.jobs.write import properties, set_properties, write_measured
 from export.measure.poses import half_diagonal
 from export.plans.base import BASELINE
 from export.plans.registry import build
@@ -87,25 +87,22 @@ def write_imported(
     on_time: Callable[[], object] = lambda: None,
     rows: Callable[[float], slice] = lambda t: slice(None),
 ) -> BakedScene:
-    """Write a scene file beside `output`, compare it at some times with the imported files, then move it there.
+    """Write a scene file that is compared with the imported files at some times.
 
     `rows` are the rows of the scene that `expected` returns. The largest differences are stored in the metadata: of
     means relative to the half diagonal of the bounds or, further out, to the largest coordinate; of entries of rotation
     matrices; of scales relative to a Gaussian's largest. Raises `SceneFileInvalid`.
     """
-    with replacing(output) as temporary:
-        temporary.write_bytes(contents.SerializeToString())
-        session = DeformationSession(temporary)
+
+    def measured(session: DeformationSession) -> dict[str, Any]:
         worst = {"means": 0.0, "quats": 0.0, "scales": 0.0}
         for t in times:
             for name, error in _differences(session, expected(t), t, rows(t)).items():
                 worst[name] = max(worst[name], error)
             on_time()
-        measured = properties(contents)["measured_error"] | worst
-        measured |= {"against": "the files that were imported", "times": len(times)}
-        set_properties(contents, measured_error=measured)
-        temporary.write_bytes(contents.SerializeToString())
-        return DeformationSession(temporary).scene
+        return {**worst, "against": "the files that were imported", "times": len(times)}
+
+    return write_measured(output, contents, measured)
 
 
 def note_left_out(file: Path, lost: Sequence[dict[str, Any]]) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from export.layers.base import ModelNotExportable
+from export.layers.graph import to_numpy
 from msdgs_serve import __version__
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.errors import InvalidInput
@@ -76,11 +77,11 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
     scene = BakedScene(
         _metadata(model, info, kinds, checkpoint_sha256),
         moving_count=len(moving),
-        static_means=_array(canonical.means[len(moving) :]),
-        static_quats=_array(canonical.quats[len(moving) :]),
-        static_scales=_array(canonical.scales[len(moving) :]),
-        opacities=_array(canonical.opacities),
-        sh=_array(canonical.sh),
+        static_means=to_numpy(canonical.means[len(moving) :]),
+        static_quats=to_numpy(canonical.quats[len(moving) :]),
+        static_scales=to_numpy(canonical.scales[len(moving) :]),
+        opacities=to_numpy(canonical.opacities),
+        sh=to_numpy(canonical.sh),
     )
     return Baked(scene.validate("the baked scene"), moving, layers, model.support)
 
@@ -90,10 +91,10 @@ def _moving(model: DynamicGaussians) -> Moving:
     stored = {name: values for name, values in g.attributes.items() if name != EMBEDDINGS}
     factors = {} if model.modulation is None else model.modulation(g.attributes[EMBEDDINGS]).present()
     return Moving(
-        _array(g.means),
-        _array(g.log_scales),
-        _array(unit_or_identity(g.raw_quats)),
-        {head: _array(values) for head, values in factors.items()},
+        to_numpy(g.means),
+        to_numpy(g.log_scales),
+        to_numpy(unit_or_identity(g.raw_quats)),
+        {head: to_numpy(values) for head, values in factors.items()},
         {name: to_array(values) for name, values in stored.items()},
         model.support.baked(stored),
     )
@@ -139,7 +140,3 @@ def _refuse_heads(model: DynamicGaussians) -> None:
                 f"model.{option} is on, so `{stored}` change with time, but {CONTRACT} stores constants; "
                 "train without that head to export"
             )
-
-
-def _array(tensor: torch.Tensor) -> FloatArray:
-    return np.ascontiguousarray(tensor.detach().to("cpu", torch.float32).numpy())

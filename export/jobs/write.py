@@ -1,7 +1,6 @@
 """Writing and verifying a scene file."""
 
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +10,8 @@ import onnx
 from onnx import helper
 
 from export.measure.verify import TIMES, TOLERANCE, verify
-from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.baked import SceneMetadata
+from msdgs_serve.scene.baked import BakedScene, SceneMetadata
 from msdgs_train.datasets.common.files import replacing
 from msdgs_train.gaussians.model import DynamicGaussians
 
@@ -43,23 +41,30 @@ def write_scene(
     times: int = TIMES,
     on_time: Callable[[], object] = lambda: None,
 ) -> Exported:
-    """Write a scene file beside `output`, compare it with the model of its moving part, and only then move it there.
+    """Write a scene file that is compared with the model of its moving part.
 
-    `rendered` is the error of its frames, which is stored in its metadata. With it, a plan other than `network` isn't
-    held to `tolerance`: its frames have been compared.
+    `rendered` is the error of its frames, which is stored in its metadata.
     """
-    exact = rendered is None or properties(contents)["plan"] == BASELINE
+
+    def measured(session: DeformationSession) -> dict[str, Any]:
+        errors = verify(session, model, times=times, tolerance=tolerance, on_time=on_time)
+        return errors if rendered is None else {**errors, "rendered": rendered}
+
+    scene = write_measured(output, contents, measured)
+    return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
+
+
+def write_measured(
+    output: Path, contents: onnx.ModelProto, measure: Callable[[DeformationSession], dict[str, Any]]
+) -> BakedScene:
+    """Write a scene file beside `output`, add what `measure` finds to its `measured_error`, and only then move it
+    there."""
     with replacing(output) as temporary:
         temporary.write_bytes(contents.SerializeToString())
-        session, allowed = DeformationSession(temporary), tolerance if exact else math.inf
-        measured = verify(session, model, times=times, tolerance=allowed, on_time=on_time)
-        measured = properties(contents)["measured_error"] | measured  # keeps the error bound of a fitted plan
-        if rendered is not None:
-            measured |= {"rendered": rendered}
-        set_properties(contents, measured_error=measured)
+        measured = measure(DeformationSession(temporary))
+        set_properties(contents, measured_error=properties(contents)["measured_error"] | measured)
         temporary.write_bytes(contents.SerializeToString())
-        scene = DeformationSession(temporary).scene  # opened again: its metadata has changed
-    return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
+        return DeformationSession(temporary).scene  # opened again: its metadata has changed
 
 
 def properties(contents: onnx.ModelProto) -> dict[str, Any]:

@@ -58,6 +58,6 @@ class GraphBuilder:
 
 
 def to_numpy(tensor: torch.Tensor | torch.nn.Module) -> np.ndarray:
-    """A parameter or buffer as float32."""
+    """A parameter or buffer as contiguous float32."""
     assert isinstance(tensor, torch.Tensor)  # torch types every attribute of a module as either
-    return tensor.detach().to("cpu", torch.float32).numpy()
+    return np.ascontiguousarray(tensor.detach().to("cpu", torch.float32).numpy())

@@ -8,8 +8,9 @@ import numpy as np
 
 from export.jobs.bake import starting_cameras
 from export.measure.poses import usable_rows
+from export.measure.views import cameras_of
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize
-from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_train.evaluation.metrics import psnr_from_mse
 from msdgs_train.gaussians.model_file import SceneInfo
@@ -17,9 +18,6 @@ from msdgs_train.gaussians.model_file import SceneInfo
 NEAR = GSPLAT.near_plane
 MIN_OPACITY = GSPLAT.alpha_min
 """Fainter Gaussians are not drawn at all."""
-
-FALLBACK_SIZE = 256
-"""Width and height in pixels of the view of a scene without cameras."""
 
 
 class FrameDifference(NamedTuple):
@@ -61,7 +59,7 @@ class PoseRenderer:
 
     def __init__(self, scene: SceneInfo, options: RasterizerOptions = GSPLAT) -> None:
         self.background, self._options = scene.background, options
-        self.cameras = [c.camera for c in starting_cameras(scene)] or [_overview(scene)]
+        self.cameras = [c.camera for c in starting_cameras(scene)] or [cameras_of(scene)[0][1]]
 
     def draw(self, posed: Gaussians, camera: Camera, keep: np.ndarray | None = None) -> np.ndarray:
         """[H, W, 3] float64 in [0, 1], drawn in float32, of the Gaussians `keep`, [N] bool, or of all. Those without a
@@ -87,11 +85,3 @@ class PoseRenderer:
         depths = [project(means, camera)[1] for camera in self.cameras]
         in_front = [d[d > 0] for d in depths]
         return any(len(d) for d in in_front) and all((d <= NEAR).all() for d in in_front)
-
-
-def _overview(scene: SceneInfo) -> Camera:
-    """A camera that sees all of the scene's bounds."""
-    low, high = np.array(scene.bounds)
-    distance = 1.5 * max(float(np.linalg.norm(high - low)), 1e-30)
-    pose = orbit((low + high) / 2, distance, 30.0, 20.0, np.array([0.0, 0.0, 1.0]))
-    return Camera.from_fov(pose, FALLBACK_SIZE, FALLBACK_SIZE, 40.0)

@@ -88,13 +88,11 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_spac
         graph.constant(f"log_scales.{name}", np.array(limit, np.float32))
         for name, limit in (("min", -LOG_SCALE_LIMIT), ("max", LOG_SCALE_LIMIT))
     ]
-    if deltas is None:
-        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], output)
-    elif delta_space == "raw":
-        log_scales = graph.node("Add", [log_scales, deltas], "log_scales")
-        graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], output)
-    else:
-        canonical = graph.node("Exp", [graph.node("Clip", [log_scales, *limits], "log_scales.bounded")], "ids.scales")
+    if deltas is not None and delta_space == "raw":
+        log_scales, deltas = graph.node("Add", [log_scales, deltas], "log_scales"), None
+    bounded = graph.node("Clip", [log_scales, *limits], "log_scales.bounded")
+    canonical = graph.node("Exp", [bounded], output if deltas is None else "ids.scales")
+    if deltas is not None:
         least = graph.constant("scales.min", np.array(MIN_SCALE, np.float32))
         graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], output)
 

@@ -11,7 +11,7 @@ from export.plans.keyframes import KEYFRAMES
 from export.plans.lowrank import LOWRANK
 from export.plans.network import NETWORK, PREFIX
 from export.plans.scene_graph import static_graph
-from export.trajectories.sampling import Trajectories, trajectories_of
+from export.trajectories.sampling import Trajectories
 from msdgs_serve.scene.errors import InvalidInput
 
 PLANS: dict[str, Plan] = {plan.name: plan for plan in (NETWORK, PREFIX, INT8, LOWRANK, KEYFRAMES)}
@@ -58,11 +58,11 @@ def _exists(spec: PlanSpec) -> bool:
 def build(plan: str | PlanSpec, baked: Baked, trajectories: Trajectories | None = None) -> onnx.ModelProto:
     """The scene file of a plan. If nothing moves, its graph has no nodes.
 
-    Fitted plans use the scene's `trajectories`; by default they are sampled, once for all plans of a scene. The error
-    bound of a fitted plan is stored as `measured_error` until the file itself is measured. Raises `InvalidInput` for a
-    plan that doesn't exist or isn't possible for this scene.
+    Fitted plans use the scene's `trajectories`; by default they are sampled. The error bound of a fitted plan is stored
+    as `measured_error` until the file itself is measured. Raises `InvalidInput` for a plan that doesn't exist or isn't
+    possible for this scene.
     """
     spec = parse(plan)
     if not len(baked.moving):
         return static_graph(baked, str(spec))
-    return PLANS[spec.name].build(baked, spec, lambda: trajectories or trajectories_of(baked))
+    return PLANS[spec.name].build(baked, spec, lambda: trajectories or Trajectories(baked))

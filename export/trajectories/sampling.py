@@ -196,24 +196,6 @@ def distances(differences: np.ndarray, rotation_weights: np.ndarray) -> npt.NDAr
     return np.sqrt(np.maximum(np.maximum(moves, turns), squares[..., SCALES].max((-1, -2))))
 
 
-_KEPT = 2
-_recent: dict[bytes, Trajectories] = {}
-
-
-def trajectories_of(baked: Baked) -> Trajectories:
-    """The trajectories of a scene's moving Gaussians, sampled once for all plans; the last two scenes are cached."""
-    digest = hashlib.sha256(repr((baked.scene.metadata.time_range, pixel(baked))).encode() + layers_digest(baked))
-    m = baked.moving
-    for values in (m.means, m.log_scales, m.quats, *m.modulation.values(), *m.attributes.values()):
-        digest.update(values.tobytes())
-    key = digest.digest()
-    kept = _recent.pop(key, None) or Trajectories(baked)
-    while len(_recent) >= _KEPT:
-        del _recent[next(iter(_recent))]
-    _recent[key] = kept
-    return kept
-
-
 def layers_digest(baked: Baked) -> bytes:
     """SHA-256 of the layers."""
     digest = hashlib.sha256(repr(sorted(baked.moving.modulation)).encode())

@@ -3,8 +3,9 @@
 import itertools
 import math
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ import onnx
 import torch
 
 from export.jobs.bake import bake
-from export.measure.frames import PoseRenderer, compare, in_frame
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed
 from export.plans.registry import build
 from export.precision.formats import FLOAT32, in_format
@@ -25,25 +25,19 @@ from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.mlp import MLPConfig, PositionalEncoding, frequency_matrix
 from msdgs_train.layers.plane import PlaneConfig
-from tests.export.stability_rows import Row, measured, refused, relative
-from tests.support.models import CAMERA, MLP, SCENE, export_scene, random_model
+from tests.export.stability_rows import Change, Row, measured, refused, relative, worst_frame
+from tests.export.stability_rows import changed as any_changed
+from tests.support.models import CAMERA, MLP, SCENE, export_scene
 
 COUNT = 60
-Change = Callable[[DynamicGaussians], object]
-SMOOTH = replace(MLP, xyz_frequencies=6)
+changed = partial(any_changed, count=COUNT, layers=(replace(MLP, xyz_frequencies=6),))
+UNSEEN = (0.0, 0.137, 0.419, 0.733, 0.951, 1.0)
+"""Parts of the time range, between which the assessment looks at others."""
+
 MOVES, SCALES = "pose from the scene file", "scales from the file, relative"
 
 
-def changed(change: Change = lambda model: None, count: int = COUNT, **config: Any) -> DynamicGaussians:
-    """Return a random model of one layer after a change."""
-    model = random_model(count, **{"sh_degree": 0, "layers": (SMOOTH,), **config})
-    with torch.no_grad():
-        change(model)
-    return model
-
-
 def exported(model: DynamicGaussians, scene: SceneInfo = SCENE) -> DeformationSession:
-    """Export a model and open its scene file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder)
         save_model(path / "model.pt", model, scene, 1)
@@ -152,30 +146,15 @@ def extents() -> Iterator[Row]:
                 continue
             unstable = session.scene.metadata.measured_error["unstable"]["count"]
             if unstable:  # no float32 file could keep the poses, so frames decide
-                seen, psnr = frames_error(model, scene, session)
+                times = np.interp(UNSEEN, (0, 1), scene.time_range).tolist()
+                seen, psnr = worst_frame(model, session.gaussians, times, scene)
                 quantity = f"frames of the scene file, {unstable} of {COUNT} Gaussians unstable, {seen} in them"
                 yield measured(case, quantity, psnr, "stability.accepted_db")
             else:
                 yield measured(case, MOVES, file_error(model, scene, session), "export.relative")
 
 
-def frames_error(model: DynamicGaussians, scene: SceneInfo, session: DeformationSession) -> tuple[int, float]:
-    """Return the most Gaussians in a frame and the worst PSNR of the file against the model in float64, at times that
-    the assessment did not use."""
-    view, double = PoseRenderer(scene), in_format(model, FLOAT32).double()
-    t0, t1 = scene.time_range
-    seen, worst = 0, math.inf
-    for t in t0 + (t1 - t0) * np.array([0.0, 0.137, 0.419, 0.733, 0.951, 1.0]):
-        got = session.gaussians(float(t))
-        exact = posed(double, float(t))
-        for camera in view.cameras:
-            seen = max(seen, int(in_frame(exact.means, camera).sum()))
-            worst = min(worst, compare(view.draw(got, camera), view.draw(exact, camera)).psnr)
-    return seen, worst
-
-
 def _scaled(kind: str, factor: float) -> tuple[DynamicGaussians, SceneInfo]:
-    """Return a scene whose size, cameras and motion are `factor` times as large."""
     like = changed(layers=(kind, kind))
     model = DynamicGaussians(like.config, like.gaussians, SceneBounds(1.3 * factor))
     own = ("cells", "first_time", "time_cells")
@@ -236,7 +215,6 @@ def poison() -> Iterator[Row]:
 
 
 def _contents() -> dict[str, Any]:
-    """Return the contents of a model file with both kinds of layers."""
     model = changed(count=3, layers=(replace(MLP, width=4), PlaneConfig(resolution=2, time_resolution=2, width=4)))
     with tempfile.TemporaryDirectory() as folder:
         save_model(Path(folder) / "model.pt", model, SCENE, 1)

@@ -5,15 +5,26 @@ exception than the package's own, a refusal that doesn't name its reason, NaN.
 """
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
+from export.measure.frames import PoseRenderer, compare, in_frame
+from export.measure.poses import posed
+from export.precision.formats import FLOAT32, in_format
+from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import SceneInfo
+from tests.support.models import SCENE, random_model
 from tests.support.tolerances import tolerance
 
 HOLDS, REFUSED, FAILS = "holds", "refused", "fails"
+
+
+Change = Callable[[DynamicGaussians], object]
 
 
 class Row(NamedTuple):
@@ -54,6 +65,30 @@ def shortened(message: str, length: int = 110) -> str:
     """The message without the folder of a file, cut at a word."""
     message = " ".join(word.rsplit("/", 1)[-1] if word.startswith("/") else word for word in message.split())
     return message if len(message) <= length else message[:length].rsplit(" ", 1)[0] + " …"
+
+
+def changed(change: Change = lambda model: None, count: int = 100, **config: Any) -> DynamicGaussians:
+    """Return a random model after a change."""
+    model = random_model(count, **{"sh_degree": 0, **config})
+    with torch.no_grad():
+        change(model)
+    return model
+
+
+def worst_frame(
+    model: DynamicGaussians, pose: Callable[[float], Gaussians], times: Iterable[float],
+    scene: SceneInfo = SCENE, cameras: int | None = None,
+) -> tuple[int, float]:  # fmt: skip
+    """Return the most Gaussians in a frame and the worst PSNR against the model in float64, of poses at some times seen
+    by the first cameras of the scene, or by all."""
+    view, double = PoseRenderer(scene), in_format(model, FLOAT32).double()
+    seen, worst = 0, math.inf
+    for t in times:
+        got, exact = pose(t), posed(double, t)
+        for camera in view.cameras[:cameras]:
+            seen = max(seen, int(in_frame(exact.means, camera).sum()))
+            worst = min(worst, compare(view.draw(got, camera), view.draw(exact, camera)).psnr)
+    return seen, worst
 
 
 def relative(got: np.ndarray, want: np.ndarray) -> float:

@@ -8,30 +8,18 @@ import numpy as np
 import torch
 
 from export.measure.amplification import growth
-from export.measure.frames import PoseRenderer, compare, in_frame
 from export.measure.poses import posed
 from export.measure.stability import assess
 from export.precision.formats import FLOAT32, in_format
 from export.precision.report import StabilityReport
 from msdgs_train.gaussians.model import DynamicGaussians
-from tests.export.stability_rows import Row, measured, refused
-from tests.support.models import MLP, NODES, PLANE, SCENE, SMALL_LAYERS, random_model
+from tests.export.stability_rows import Change, Row, changed, measured, refused, worst_frame
+from tests.support.models import MLP, NODES, PLANE, SCENE, SMALL_LAYERS
 from tests.support.tolerances import tolerance
 
-COUNT = 100
 TIMES = 3
 UNSEEN_TIMES = (0.137, 0.4321, 0.777)
 """None of them is one that `assess` looks at."""
-
-Change = Callable[[DynamicGaussians], None]
-
-
-def stiff(change: Change = lambda model: None, **config: Any) -> DynamicGaussians:
-    """A random model, changed."""
-    model = random_model(COUNT, sh_degree=0, **config)
-    with torch.no_grad():
-        change(model)
-    return model
 
 
 def steps_times(factor: float) -> Change:
@@ -91,25 +79,25 @@ def layers(count: int, kind: str = "mlp") -> dict[str, Any]:
 
 
 CASES: dict[str, Callable[[], DynamicGaussians]] = {
-    **{f"K = 2, steps × {s}": lambda s=s: stiff(steps_times(s)) for s in (1, 4, 16, 64)},
-    **{f"K = 2, field rougher × {s}": lambda s=s: stiff(rougher(s)) for s in (4, 16, 64)},
-    **{f"K = 2, all weights × {s}": lambda s=s: stiff(all_times(s)) for s in (2, 64)},
-    **{f"K = {k}": lambda k=k: stiff(**layers(k)) for k in (1, 4, 16, 64)},
-    "K = 64, small steps": lambda: stiff(steps_times(0.02), **layers(64)),
-    "K = 64, steps × 64": lambda: stiff(steps_times(64), **layers(64)),
-    "K = 64, all weights × 64": lambda: stiff(all_times(64), **layers(64)),
-    "K = 2, frequencies to 2^12": lambda: stiff(layers=(replace(MLP, xyz_frequencies=13, time_frequencies=13),) * 2),
-    "K = 2, frequencies to 2^12, steps × 16": lambda: stiff(
+    **{f"K = 2, steps × {s}": lambda s=s: changed(steps_times(s)) for s in (1, 4, 16, 64)},
+    **{f"K = 2, field rougher × {s}": lambda s=s: changed(rougher(s)) for s in (4, 16, 64)},
+    **{f"K = 2, all weights × {s}": lambda s=s: changed(all_times(s)) for s in (2, 64)},
+    **{f"K = {k}": lambda k=k: changed(**layers(k)) for k in (1, 4, 16, 64)},
+    "K = 64, small steps": lambda: changed(steps_times(0.02), **layers(64)),
+    "K = 64, steps × 64": lambda: changed(steps_times(64), **layers(64)),
+    "K = 64, all weights × 64": lambda: changed(all_times(64), **layers(64)),
+    "K = 2, frequencies to 2^12": lambda: changed(layers=(replace(MLP, xyz_frequencies=13, time_frequencies=13),) * 2),
+    "K = 2, frequencies to 2^12, steps × 16": lambda: changed(
         steps_times(16), layers=(replace(MLP, xyz_frequencies=13),) * 2
     ),
-    "K = 4, all weights w = 0": lambda: stiff(saturated(-200), **layers(4)),
-    "K = 2, all weights w = 1": lambda: stiff(saturated(200)),
-    "K = 2, no weights": lambda: stiff(weights=False),
-    "K = 2, planes": lambda: stiff(**layers(2, "plane")),
-    "K = 8, planes": lambda: stiff(**layers(8, "plane")),
-    "K = 8, planes, steps × 64": lambda: stiff(steps_times(64), **layers(8, "plane")),
-    **{f"K = 2 on nodes, steps × {s}": lambda s=s: stiff(steps_times(s), support=NODES) for s in (1, 16)},
-    "K = 8, planes on nodes": lambda: stiff(support=NODES, **layers(8, "plane")),
+    "K = 4, all weights w = 0": lambda: changed(saturated(-200), **layers(4)),
+    "K = 2, all weights w = 1": lambda: changed(saturated(200)),
+    "K = 2, no weights": lambda: changed(weights=False),
+    "K = 2, planes": lambda: changed(**layers(2, "plane")),
+    "K = 8, planes": lambda: changed(**layers(8, "plane")),
+    "K = 8, planes, steps × 64": lambda: changed(steps_times(64), **layers(8, "plane")),
+    **{f"K = 2 on nodes, steps × {s}": lambda s=s: changed(steps_times(s), support=NODES) for s in (1, 16)},
+    "K = 8, planes on nodes": lambda: changed(support=NODES, **layers(8, "plane")),
 }
 
 
@@ -120,8 +108,8 @@ def rows_of(case: str) -> list[Row]:
     name = f"{case}: amplified × {report.worst_amplification:.2g}"
     rows = _predicted(name, report)
     if report.refusal("network") is None:
-        seen, psnr = _unseen(model)
-        quantity = f"float32 frames at other times, {seen} of {COUNT} Gaussians in them"
+        seen, psnr = worst_frame(model, lambda t: posed(model, t), UNSEEN_TIMES, cameras=1)
+        quantity = f"float32 frames at other times, {seen} of {len(model.gaussians)} Gaussians in them"
         return [*rows, measured(name, quantity, psnr, "stability.accepted_db")]
     row = refused(name, lambda: report.require("network"), "float", quantity="float32 plan")
     if not report.broken and report.refusal("lowrank:8") is not None:
@@ -138,21 +126,10 @@ def _predicted(name: str, report: StabilityReport) -> list[Row]:
     return [measured(name, quantity, float(ratios.max()), "stability.predicted")] if small.any() else []
 
 
-def _unseen(model: DynamicGaussians) -> tuple[int, float]:
-    """Gaussians in float32 frames, and dB of the worst, at times that the assessment didn't choose."""
-    double, view = in_format(model, FLOAT32).double(), PoseRenderer(SCENE)
-    camera, seen, worst = view.cameras[0], 0, np.inf
-    for t in UNSEEN_TIMES:
-        single, exact = posed(model, t), posed(double, t)
-        seen = max(seen, int(in_frame(exact.means, camera).sum()))
-        worst = min(worst, compare(view.draw(single, camera), view.draw(exact, camera)).psnr)
-    return seen, worst
-
-
 def jacobian_rows() -> Iterator[Row]:
     """The products of Jacobians against central differences through the whole chain."""
     for layer in (replace(MLP, xyz_frequencies=4), PLANE):
-        model = stiff(layers=(layer,) * 3).double()
+        model = changed(layers=(layer,) * 3).double()
         means = model.gaussians.means.detach()
         found = growth(model.deformation, in_format(model, FLOAT32).deformation, means, 0.3)
         step, columns, t = 1e-7, [], torch.tensor(0.3, dtype=torch.double)
@@ -168,7 +145,6 @@ def jacobian_rows() -> Iterator[Row]:
 
 
 def all_rows() -> Iterator[Row]:
-    """Every row of this file."""
     yield from jacobian_rows()
     for case in CASES:
         yield from rows_of(case)

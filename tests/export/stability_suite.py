@@ -15,7 +15,6 @@ TABLE = ROOT / "docs" / "data" / "stability.csv"
 
 
 def all_rows() -> Iterator[Row]:
-    """Every row, stiff cases first."""
     yield from stability_stiff.all_rows()
     for group in stability_extreme.GROUPS:
         yield from group()

@@ -44,14 +44,6 @@ def test_each_row_has_the_nodes_and_weights_of_its_gaussian(count: int, nodes: i
     np.testing.assert_array_equal(stored["weights"].sum(axis=1), WEIGHT_ONE)
 
 
-def test_gaussians_in_spatial_order_keep_their_order():
-    means, node_ids, weights = skinning(3000, 200, 4)
-    order = morton_order(means)
-    sorted_ = block_layout(means[order], node_ids[order], weights[order])
-    np.testing.assert_array_equal(sorted_.rows[:3000], np.arange(3000))
-    assert not np.array_equal(block_layout(means, node_ids, weights).rows[:3000], np.arange(3000))
-
-
 def test_morton_order_of_a_grid_visits_each_octant_at_once():
     grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     shuffled = grid[np.random.default_rng(1).permutation(64)]

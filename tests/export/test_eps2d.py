@@ -39,7 +39,6 @@ NARROW = GSPLAT._replace(eps2d=EPS2D)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a model and its scene file."""
     folder = tmp_path_factory.mktemp("narrow")
     model = random_model(count=60, eps2d=EPS2D)
     with torch.no_grad():

@@ -23,7 +23,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model_file import CheckpointInvalid, load_model, save_model
-from tests.export import test_importers_4dgs, test_importers_runs
+from tests.support.foreign_runs import deformgs_state, fourdgs_state, write_deformgs, write_fourdgs
 from tests.support.memory import measured
 from tests.support.models import SCENE, random_model
 from tests.support.splat_files import FORMATS, drawn, sog_bytes, some_gaussians, write_sog, write_splats
@@ -115,10 +115,8 @@ KINDS = {
     "sog": Kind(sog_zip, lambda folder, files: read_splats(files[0]).gaussians),
     "sog folder": Kind(sog_folder, lambda folder, files: read_splats(folder / "sog").gaussians),
     "sequence": Kind(frames, read_frames),
-    "deformgs": Kind(
-        run_of(test_importers_runs.write_run, test_importers_runs.their_state(True)), read_run("deformgs")
-    ),
-    "4dgs": Kind(run_of(test_importers_4dgs.write_run, test_importers_4dgs.their_state((1,))), read_run("4dgs")),
+    "deformgs": Kind(run_of(write_deformgs, deformgs_state(True)), read_run("deformgs")),
+    "4dgs": Kind(run_of(write_fourdgs, fourdgs_state((1,))), read_run("4dgs")),
 }
 
 
@@ -133,9 +131,9 @@ def test_damaged_files_are_refused_or_drawn(tmp_path: Path, name: str):
     for _ in range(DAMAGED):
         file = files[rng.integers(len(files))]
         file.write_bytes(damaged(whole[file], rng))
-        taken, memory = measured(lambda: refused_or_drawn(kind, tmp_path, files))
-        refused += taken.refused
-        worst, slowest = max(worst, memory), max(slowest, taken.seconds)
+        (was_refused, seconds), memory = measured(lambda: refused_or_drawn(kind, tmp_path, files))
+        refused += was_refused
+        worst, slowest = max(worst, memory), max(slowest, seconds)
         file.write_bytes(whole[file])
     print(
         f"\n{name}: {DAMAGED:,} files, {refused:,} refused, {DAMAGED - refused:,} drawn, slowest {slowest:.2f} s, "
@@ -145,20 +143,16 @@ def test_damaged_files_are_refused_or_drawn(tmp_path: Path, name: str):
     assert worst <= 2 * sound + tolerance("damaged_file.megabytes")
 
 
-class Taken(NamedTuple):
-    refused: bool
-    seconds: float
-
-
-def refused_or_drawn(kind: Kind, folder: Path, files: list[Path]) -> Taken:
+def refused_or_drawn(kind: Kind, folder: Path, files: list[Path]) -> tuple[bool, float]:
+    """Return whether the files are refused, and the seconds that reading them took."""
     start = time.process_time()
     try:
         read = kind.read(folder, files)
     except ImportFailed:
-        return Taken(True, time.process_time() - start)
+        return True, time.process_time() - start
     seconds = time.process_time() - start
     assert np.isfinite(drawn(read)).all()
-    return Taken(False, seconds)
+    return False, seconds
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:

@@ -1,10 +1,12 @@
-"""Import of Deformable-3D-Gaussians runs, compared with their network, which is written here in a few lines."""
+"""Import of runs of Deformable-3D-Gaussians and 4DGaussians, compared with their own networks."""
 
+import json
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from rich.console import Console
@@ -16,104 +18,89 @@ from export.importers.errors import ImportFailed
 from export.importers.runs import base
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
+from export.jobs.write import properties
 from export.measure.poses import posed
+from export.options import ExportOptions
+from export.to_onnx import main as to_onnx
+from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import load_model
-from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
+from msdgs_train.layers.plane import PlaneConfig
+from tests.support import foreign_runs as foreign
+from tests.support.foreign_runs import COUNT, SWITCHES, State
+from tests.support.splat_files import some_gaussians
 from tests.support.tolerances import tolerance
 
 QUIET = Console(quiet=True)
-COUNT = 50
 
 
-def encode(x: Tensor, frequencies: int) -> Tensor:
-    parts = [x]
-    for k in range(frequencies):
-        parts += [torch.sin(2.0**k * x), torch.cos(2.0**k * x)]
-    return torch.cat(parts, dim=-1)
+def imported(run: Path, kind: str) -> tuple[DynamicGaussians, list[dict[str, Any]]]:
+    lost = write_model(run, kind, run.parent / "model.pt", QUIET)
+    return load_model(run.parent / "model.pt").model, lost
 
 
-def their_state(blender: bool, depth: int = 8, width: int = 64) -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    state: dict[str, Tensor] = {}
-
-    def linear(name: str, inputs: int, outputs: int, size: float = 1.0) -> None:
-        state[f"{name}.weight"] = size * torch.randn(outputs, inputs, generator=generator) / inputs**0.5
-        state[f"{name}.bias"] = 0.1 * size * torch.randn(outputs, generator=generator)
-
-    if blender:
-        linear("timenet.0", 13, 256)
-        linear("timenet.2", 256, 30)
-    inputs = 63 + (30 if blender else 21)
-    for i in range(depth):
-        linear(f"linear.{i}", inputs if i == 0 else width + inputs if i == depth // 2 + 1 else width, width)
-    for name, size in (("gaussian_warp", 3), ("gaussian_scaling", 3), ("gaussian_rotation", 4)):
-        linear(name, width, size, 0.1)
-    return state
+def check_poses(
+    model: DynamicGaussians, t: float, means: Tensor, quats: Tensor, scales: Tensor, unit: Tensor | float = 1.0
+) -> None:
+    """Compare poses in float64: scales in a unit, and `quats` of any length."""
+    with torch.no_grad():
+        found = model.double().pose(t)
+    turned = found.quats - quats / quats.norm(dim=1, keepdim=True)
+    for errors in (found.means - means, turned, (found.scales - scales) / unit):
+        assert errors.abs().max() < tolerance("import.network")
 
 
-def their_deltas(state: dict[str, Tensor], x: Tensor, t: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the deltas of positions, rotations and scales by their network in float64."""
-    s = {name: tensor.double() for name, tensor in state.items()}
-
-    def linear(name: str, value: Tensor) -> Tensor:
-        return value @ s[f"{name}.weight"].T + s[f"{name}.bias"]
-
-    blender = "timenet.0.weight" in s
-    time = encode(torch.full((len(x), 1), t, dtype=torch.float64), 6 if blender else 10)
-    if blender:
-        time = linear("timenet.2", linear("timenet.0", time).relu())
-    given = torch.cat([encode(x.double(), 10), time], dim=-1)
-    depth, hidden = sum(n.startswith("linear.") and n.endswith("bias") for n in s), given
-    for i in range(depth):
-        hidden = linear(f"linear.{i}", hidden).relu()
-        if i == depth // 2:
-            hidden = torch.cat([given, hidden], dim=-1)
-    return linear("gaussian_warp", hidden), linear("gaussian_rotation", hidden), linear("gaussian_scaling", hidden)
-
-
-def write_run(folder: Path, state: dict[str, Tensor]) -> Path:
-    for iteration in (7_000, 40_000):
-        cloud = folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
-        network = folder / "deform" / f"iteration_{iteration}" / "deform.pth"
-        cloud.parent.mkdir(parents=True)
-        network.parent.mkdir(parents=True)
-        cloud.write_bytes(ply_bytes(inria_columns(some_gaussians(COUNT, 3, seed=iteration))))
-        torch.save(state, network)
-    (folder / "cfg_args").write_text("Namespace(sh_degree=3, white_background=True, source_path=open('x'))")
-    return folder
+def stored(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    g = some_gaussians(COUNT, 3, seed)
+    means, quats, scales = (torch.from_numpy(array).double() for array in (g.means, g.quats, g.scales))
+    return means, quats, scales
 
 
 @pytest.mark.parametrize("blender", [True, False])
 @pytest.mark.parametrize("depth", [4, 8])
-def test_the_network_is_theirs(tmp_path: Path, blender: bool, depth: int):
-    state = their_state(blender, depth)
-    run = write_run(tmp_path / "run", state)
+def test_the_network_of_deformgs_is_theirs(tmp_path: Path, blender: bool, depth: int):
+    state = foreign.deformgs_state(blender, depth)
+    run = foreign.write_deformgs(tmp_path / "run", state)
     assert detect_format(run) == "deformgs"
-    (lost,) = write_model(run, "deformgs", tmp_path / "model.pt", QUIET)
+    model, (lost,) = imported(run, "deformgs")
     assert (lost["rule"], lost["count"]) == ("quaternion_fidelity", COUNT)
     assert 10 < lost["worst_frame_db"] < 100
-    model, info, step = load_model(tmp_path / "model.pt")
-    g = some_gaussians(COUNT, 3, seed=40_000)
+    _, info, step = load_model(tmp_path / "model.pt")
     assert (step, info.background, model.config.scale_space) == (40_000, (1.0, 1.0, 1.0), "linear")
-    means, quats, scales = (torch.from_numpy(a).double() for a in (g.means, g.quats, g.scales))
+    means, quats, scales = stored(40_000)
     for t in (0.0, 0.37, 1.0):
-        d_means, d_quats, d_scales = their_deltas(state, means, t)
-        with torch.no_grad():
-            posed = model.double().pose(t)
-        assert (posed.means - means - d_means).abs().max() < tolerance("import.network")
-        assert (posed.scales - (scales + d_scales).clamp_min(2.1e-9)).abs().max() < tolerance("import.network")
-        theirs = quats + d_quats
-        assert (posed.quats - theirs / theirs.norm(dim=1, keepdim=True)).abs().max() < tolerance("import.network")
+        d_means, d_quats, d_scales = foreign.deformgs_deltas(state, means.float(), t)
+        check_poses(model, t, means + d_means, quats + d_quats, (scales + d_scales).clamp_min(2.1e-9))
+
+
+@pytest.mark.parametrize("lengths", [0.0, 0.5])
+@pytest.mark.parametrize("scales", [(1,), (1, 2), (2, 4)])
+def test_the_network_of_4dgs_is_theirs(tmp_path: Path, scales: tuple[int, ...], lengths: float):
+    state = foreign.fourdgs_state(scales)
+    run = foreign.write_fourdgs(tmp_path / "run", state, lengths=lengths)
+    assert detect_format(run) == "4dgs"
+    model, lost = imported(run, "4dgs")
+    assert lost == []
+    _, info, step = load_model(tmp_path / "model.pt")
+    assert (step, info.background, model.config.scale_space) == (20_000, (1.0, 1.0, 1.0), "log")
+    (layer,) = model.config.layers
+    assert isinstance(layer, PlaneConfig)
+    assert layer.time_resolution == foreign.TIME - (foreign.TIME - 1) // 2
+    means, quats, sizes = stored()
+    raw_quats = quats * torch.linspace(1 - lengths, 1 + lengths, COUNT, dtype=torch.float64)[:, None]
+    for t in (0.0, 0.37, 0.95, 1.0):
+        theirs = foreign.fourdgs_deltas(state, means, t)
+        turned, scaled = raw_quats + theirs["rotations"], sizes * theirs["scales"].exp()
+        check_poses(model, t, means + theirs["pos"], turned, scaled, unit=sizes)
 
 
 def test_shapes_are_compared_with_those_that_they_draw(tmp_path: Path):
-    state = their_state(True)
-    write_model(write_run(tmp_path / "run", state), "deformgs", tmp_path / "model.pt", QUIET)
-    model, g = load_model(tmp_path / "model.pt").model, some_gaussians(COUNT, 3, seed=40_000)
+    state = foreign.deformgs_state(True)
+    model, _ = imported(foreign.write_deformgs(tmp_path / "run", state), "deformgs")
+    g = some_gaussians(COUNT, 3, seed=40_000)
     drawn, off = as_trained(model, 0.37, posed(model, 0.37))
-    _, d_quats, d_scales = (d.numpy() for d in their_deltas(state, torch.from_numpy(g.means).double(), 0.37))
+    _, d_quats, d_scales = (d.numpy() for d in foreign.deformgs_deltas(state, torch.from_numpy(g.means).double(), 0.37))
     quats, scales = g.quats + d_quats, g.scales + d_scales
     squares = np.square(quats).sum(1)[:, None, None]  # a matrix of a length s is I + s² (R - I)
     matrices = (1 - squares) * np.eye(3) + squares * Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
@@ -124,18 +111,69 @@ def test_shapes_are_compared_with_those_that_they_draw(tmp_path: Path):
     assert off == pytest.approx(np.abs(np.linalg.norm(quats, axis=1) - 1).max(), rel=tolerance("import.network"))
 
 
+def test_deltas_that_are_switched_off_are_zero(tmp_path: Path):
+    switches = "no_dx=False, no_ds=True, no_dr=True, white_background=False"
+    model, _ = imported(foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state(), switches), "4dgs")
+    with torch.no_grad():
+        early, late = model.pose(0.0), model.pose(1.0)
+    assert load_model(tmp_path / "model.pt").scene.background == (0.0, 0.0, 0.0)
+    assert torch.equal(early.quats, late.quats)
+    assert torch.equal(early.scales, late.scales)
+    assert not torch.equal(early.means, late.means)
+
+
+def test_changing_opacities_and_colors_are_held_and_the_cost_is_said(tmp_path: Path):
+    state = foreign.fourdgs_state()
+    model, (lost,) = imported(
+        foreign.write_fourdgs(tmp_path / "run", state, SWITCHES + ", no_do=False, no_dshs=False"), "4dgs"
+    )
+    g = some_gaussians(COUNT, 3)
+    means, logits = torch.from_numpy(g.means), torch.from_numpy(g.opacities).double().logit()
+    theirs = [foreign.fourdgs_deltas(state, means, float(t)) for t in np.linspace(0, 1, 401)]
+    opacities = torch.stack([(logits + d["opacity"][:, 0]).sigmoid() for d in theirs])
+    with torch.no_grad():
+        held = model.pose(0.5)
+    assert (held.opacities - opacities.mean(dim=0)).abs().max() < tolerance("import.mean_over_time")
+    sh = torch.stack([torch.from_numpy(g.sh).double() + d["shs"].reshape(COUNT, 16, 3) for d in theirs])
+    mean = (opacities[..., None, None] * sh).sum(dim=0) / opacities.sum(dim=0)[:, None, None]
+    assert (held.sh - mean).abs().max() < tolerance("import.mean_over_time")
+    assert lost["count"] == COUNT
+    for plane in (2, 4, 5):  # most Gaussians come and go
+        state[f"deformation_net.grid.grids.0.{plane}"] *= torch.linspace(0, 1.5, foreign.TIME)[:, None]
+    state["deformation_net.opacity_deform.3.weight"] *= 300
+    _, (more,) = imported(foreign.write_fourdgs(tmp_path / "more", state, SWITCHES + ", no_do=False"), "4dgs")
+    assert more["worst_frame_db"] < min(lost["worst_frame_db"], 40)
+
+
+def test_a_run_is_exported_and_lists_what_is_held(tmp_path: Path):
+    run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)), SWITCHES + ", no_do=False, no_dshs=True")
+    assert to_onnx(ExportOptions(run, tmp_path / "scene.onnx", quick=True, times=3)) == 0
+    assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.layers == ("plane",)
+    left_out = {each["rule"]: each for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"]}
+    assert "opacities and colors" in left_out["static_appearance"]["what"]
+
+
 def assert_refused(run: Path, kind: str, message: str):
     with pytest.raises(ImportFailed, match=message):
         write_model(run, kind, run.parent / "model.pt", QUIET)
     assert not (run.parent / "model.pt").exists()
 
 
-def network_of(run: Path) -> Path:
-    return run / "deform" / "iteration_40000" / "deform.pth"
+def on_which_device(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return a list of the devices on which networks are made from now on; on `meta` they take no memory."""
+    built: list[str] = []
+
+    def model(*given: Any) -> DynamicGaussians:
+        made = DynamicGaussians(*given)
+        built.append(next(made.deformation.parameters()).device.type)
+        return made
+
+    monkeypatch.setattr(base, "DynamicGaussians", model)
+    return built
 
 
 PLAIN = "isn't a dense tensor of plain numbers"
-UNIMPORTABLE = [
+DEFORMGS_CHANGES: list[tuple[State, str]] = [
     ({"branch_w.weight": torch.zeros(3, 64)}, "is_6dof"),
     ({"linear.3.weight": torch.zeros(64, 7)}, r"`linear.3.weight` has shape \(64, 7\), not 64 × 64"),
     ({"gaussian_warp.bias": torch.full((3,), np.nan)}, r"`gaussian_warp.bias` holds NaN"),
@@ -153,64 +191,93 @@ UNIMPORTABLE = [
     ({"timenet.0.weight": torch.zeros(256, 2_051)}, r"reads 1,025 frequencies of time"),
     ({"linear.0.weight": torch.zeros(64, 2_064)}, r"reads 1,000 frequencies of time"),
 ]
+FOURDGS_CHANGES: list[tuple[State, str]] = [
+    ({"feature_out.2.weight": torch.zeros(foreign.WIDTH, foreign.WIDTH)}, r"defor_depth above 1"),
+    ({"static_mlp.1.weight": torch.zeros(1)}, r"static_mlp, which no layer"),
+    ({"grid.grids.0.3": torch.zeros(1, foreign.CHANNELS, 7, 8)}, r"grids.0.3` has shape \(1, 6, 7, 8\)"),
+    ({"grid.aabb": torch.ones(2, 3)}, r"its box is flat"),
+    ({"pos_deform.3.bias": torch.full((3,), np.inf)}, r"`deformation_net.pos_deform.3.bias` holds"),
+    ({"grid.grids.0.2": torch.ones(1, foreign.CHANNELS, 1, 8)}, r"planes of \[8\] nodes over space and 1"),
+    ({"feature_out.0.bias": torch.zeros(4_096)}, r"feature_out.0.weight` has shape \(16, 6\), not 4096 × 6"),
+    ({"feature_out.0.bias": torch.zeros(50_000)}, r"has 50,000 units a layer and 1 grids of 6 channels"),
+    ({"feature_out.0.bias": torch.zeros(0)}, r"has 0 units a layer"),
+    ({"grid.grids.0.2": torch.ones(1, 5_000, 12, 8)}, r"1 grids of 5,000 channels"),
+    ({"grid.grids.0.2": torch.ones(1, 6, 12, 4_096)}, r"grids.0.0` has shape \(1, 6, 8, 8\), not 1 × 6 × 4096"),
+]
 
 
-@pytest.mark.parametrize(("change", "message"), UNIMPORTABLE)
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [("deformgs", *each) for each in DEFORMGS_CHANGES] + [("4dgs", *each) for each in FOURDGS_CHANGES],
+)
 def test_a_network_that_differs_is_named_before_memory_is_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Tensor], message: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, change: State, message: str
 ):
-    of_blender = "linear.0.weight" not in change
-    run, built = write_run(tmp_path / "run", their_state(of_blender) | change), on_which_device(monkeypatch)
-    assert_refused(run, "deformgs", message)
+    if kind == "deformgs":
+        run = foreign.write_deformgs(tmp_path / "run", foreign.deformgs_state("linear.0.weight" not in change) | change)
+    else:
+        changed = {f"deformation_net.{name}": tensor for name, tensor in change.items()}
+        run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)) | changed)
+    built = on_which_device(monkeypatch)
+    assert_refused(run, kind, message)
     assert set(built) <= {"meta"}
 
 
+def test_switches_that_make_another_network_are_named(tmp_path: Path):
+    run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)), SWITCHES + ", apply_rotation=True")
+    assert_refused(run, "4dgs", r"apply_rotation")
+
+
+@pytest.mark.parametrize(
+    "contents",
+    [
+        "[" * 100_000,
+        json.dumps([foreign.stored_camera(0) | {"width": float("inf")}]),
+        json.dumps([foreign.stored_camera(0) | {"height": 10**400}]),
+        json.dumps([foreign.stored_camera(0) | {"fx": 10**400}]),
+        "{}",
+    ],
+    ids=["deep", "infinite", "huge", "huge fx", "no list"],
+)
+def test_cameras_that_cannot_be_are_refused_by_the_name_of_their_file(tmp_path: Path, contents: str):
+    run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)))
+    (run / "cameras.json").write_text(contents)
+    assert_refused(run, "4dgs", r"cameras.json: isn't a list of cameras")
+
+
+def network_of(run: Path) -> Path:
+    return run / "deform" / "iteration_40000" / "deform.pth"
+
+
 def test_a_run_without_a_network_is_refused(tmp_path: Path):
-    run = write_run(tmp_path / "run", their_state(True))
+    run = foreign.write_deformgs(tmp_path / "run", foreign.deformgs_state(True))
     network_of(run).unlink()
     assert_refused(run, "deformgs", r"no deform/iteration_40000/deform.pth")
 
 
-def test_rotations_so_long_that_shapes_overflow_are_refused_by_the_runs_name(tmp_path: Path):
-    state = their_state(True)
-    state["gaussian_rotation.bias"] = torch.full((4,), 1e18)  # poses are sound: rotations are made unit
-    state["gaussian_scaling.bias"] = torch.full((3,), 1e5)
-    message = r"run.*its network gives Gaussians that can't be used: `gaussians.scales`"
-    assert_refused(write_run(tmp_path / "run", state), "deformgs", message)
-
-
-def test_two_layers_whose_heads_read_the_input_again_are_refused(tmp_path: Path):
-    run = write_run(tmp_path / "run", their_state(True, depth=2))
-    assert_refused(run, "deformgs", r"has 2 hidden layers; from 3 to 64")
-
-
-def test_a_storage_is_no_two_tensors(tmp_path: Path):
-    state = their_state(True)
-    run = write_run(tmp_path / "run", state | {"linear.3.weight": state["linear.2.weight"]})
-    assert_refused(run, "deformgs", r"`linear.3.weight` .*isn't stored in full")
+def test_states_that_cannot_be_used_are_refused_by_the_runs_name(tmp_path: Path):
+    state = foreign.deformgs_state(True)
+    long = {  # poses are sound, since rotations are made unit, but shapes overflow
+        "gaussian_rotation.bias": torch.full((4,), 1e18),
+        "gaussian_scaling.bias": torch.full((3,), 1e5),
+    }
+    two_layers = foreign.deformgs_state(True, depth=2)  # whose heads read the input again
+    for name, changed, message in (
+        ("long", state | long, r"long.*its network gives Gaussians that can't be used: `gaussians.scales`"),
+        ("two", two_layers, r"has 2 hidden layers; from 3 to 64"),
+        ("shared", state | {"linear.3.weight": state["linear.2.weight"]}, r"`linear.3.weight` .*isn't stored in full"),
+    ):
+        assert_refused(foreign.write_deformgs(tmp_path / name, changed), "deformgs", message)
 
 
 def test_a_checkpoint_that_unpacks_to_more_than_itself_is_refused(tmp_path: Path):
-    run = write_run(tmp_path / "run", {"linear.0.weight": torch.zeros(1_000_000)})
+    run = foreign.write_deformgs(tmp_path / "run", {"linear.0.weight": torch.zeros(1_000_000)})
     with zipfile.ZipFile(network_of(run)) as whole:
         parts = {name: whole.read(name) for name in whole.namelist()}
     with zipfile.ZipFile(network_of(run), "w", zipfile.ZIP_DEFLATED) as packed:
         for name, contents in parts.items():
             packed.writestr(name, contents)
     assert_refused(run, "deformgs", r"is packed: it holds 4,\d{3},\d{3} bytes")
-
-
-def on_which_device(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return a list of the devices on which networks are made from now on; on `meta` they take no memory."""
-    built: list[str] = []
-
-    def model(*given: Any) -> DynamicGaussians:
-        made = DynamicGaussians(*given)
-        built.append(next(made.deformation.parameters()).device.type)
-        return made
-
-    monkeypatch.setattr(base, "DynamicGaussians", model)
-    return built
 
 
 class Evil:
@@ -222,7 +289,7 @@ class Evil:
 
 def test_no_code_in_a_checkpoint_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    run = write_run(tmp_path / "run", their_state(True))
+    run = foreign.write_deformgs(tmp_path / "run", foreign.deformgs_state(True))
     torch.save({"linear.0.weight": Evil()}, network_of(run))
     assert_refused(run, "deformgs", r"isn't a whole torch checkpoint of plain values")
     assert not (tmp_path / "ran").exists()

@@ -27,7 +27,6 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from msdgs_train.supports.gaussians import GaussiansConfig
 from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, random_model
 from tests.support.tolerances import tolerance
 
@@ -224,19 +223,6 @@ def test_more_poses_and_more_terms_are_closer():
         assert errors == sorted(errors, reverse=True)
 
 
-@pytest.mark.parametrize("support", [GaussiansConfig(), NODES], ids=lambda support: support.kind)
-def test_a_kind_of_layer_from_elsewhere_is_exported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, support: SupportConfig
-):
-    fourier = import_module("tests.support.plugin_example").FourierConfig(frequencies=2)
-    model = random_model(60, layers=(fourier, SLOW), support=support, noise=0.02)
-    baked = bake(model, SCENE, "0" * 64)
-    check_against_model(opened(tmp_path / "scene.onnx", build("network", baked)), model)
-    monkeypatch.delitem(LAYERS, "fourier")
-    with pytest.raises(ModelNotExportable, match="'fourier' can't be exported; those that can: mlp"):
-        build("network", baked)
-
-
 class RigidConfig(SupportConfig):
     """Settings of a kind of support that the package doesn't have."""
 
@@ -268,13 +254,17 @@ class RigidExport(SupportExport):
         return summed_deltas(graph, inputs.layers, origin, inputs.time, inputs.steps, list(HEAD_COLUMNS))
 
 
-def test_a_kind_of_support_from_elsewhere_is_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    model = random_model(60, layers=(SLOW, COARSE), support=RigidConfig(), noise=0.02)
+def test_kinds_of_supports_and_layers_from_elsewhere_are_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fourier = import_module("tests.support.plugin_example").FourierConfig(frequencies=2)
+    model = random_model(60, layers=(fourier, SLOW, COARSE), support=RigidConfig(), noise=0.02)
     baked = bake(model, SCENE, "0" * 64)
     with pytest.raises(ModelNotExportable, match="'rigid' can't be exported; those that can: gaussians, nodes"):
         build("network", baked)
     monkeypatch.setitem(SUPPORTS, "rigid", RigidExport())
     check_against_model(opened(tmp_path / "scene.onnx", build("network", baked)), model)
+    monkeypatch.delitem(LAYERS, "fourier")
+    with pytest.raises(ModelNotExportable, match="'fourier' can't be exported; those that can: mlp"):
+        build("network", baked)
 
 
 def test_a_plan_from_elsewhere_is_parsed_and_built(monkeypatch: pytest.MonkeyPatch):

@@ -1,24 +1,21 @@
 """What fitted plans are fitted to: samples as dense as the motion needs, and a motion too fast for them is found."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.interpolate import BSpline
 
 from export.jobs.bake import Baked, bake
 from export.plans.registry import build
 from export.trajectories import sampling as module
-from export.trajectories.adaptive import adaptive_knots, fitted
 from export.trajectories.poses import ExactPoses, SinglePoses, pixel
 from export.trajectories.sampling import Trajectories
 from export.trajectories.splines import design, fitting, samples_for
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
-from tests.support.models import PLANE, SCENE, random_model
+from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance
 
 pytestmark = pytest.mark.slow
@@ -78,21 +75,6 @@ def test_a_fast_motion_that_a_coarse_sampling_misses_is_caught(sampled, tmp_path
     assert off < tolerance("fast_motion")
 
 
-def test_slow_motion_is_sampled_once(sampled):
-    times: list[float] = []
-
-    def motion(t: float) -> np.ndarray:
-        times.append(t)
-        return of_first(lambda t: np.sin(6 * t), 0.5)(t)
-
-    _, trajectories = sampled(motion)
-    assert len(set(times)) == module.COARSE + 1 + module.PROBES
-    assert len(times) == len(set(times)) + module.PROBES  # which float32 is compared at as well
-    assert not len(trajectories.unresolved)
-    grid = trajectories.on_grid(257, np.array([0, 3]))
-    assert_close(grid[0, :, 0], np.sin(6 * np.linspace(0, 1, 257)).astype(np.float32), "cubic_between")
-
-
 @pytest.mark.parametrize("plan", ["keyframes:0.05", "lowrank:0.05"])
 def test_amplitudes_far_apart_keep_the_same_error(sampled, tmp_path: Path, plan: str):
     sizes = np.logspace(-4, 2, COUNT)
@@ -129,36 +111,6 @@ def test_where_float32_is_not_exact_enough_no_sample_is_taken_in_it(monkeypatch:
     assert_close(got[:, 7, :3], want[:, :3].astype(np.float32), "float32.relative")
 
 
-def test_further_pruned_trajectories_are_not_fitted_again(sampled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def motion(t: float) -> np.ndarray:
-        return np.stack([np.sin((1 + i) * t) * np.array([1, 0.5, 0]) for i in range(COUNT)])
-
-    _, trajectories = sampled(motion)
-    every, some, tried = np.arange(COUNT), np.arange(3, COUNT, 4), list[int]()
-    poses, errors = adaptive_knots(trajectories, every, 0.05)
-    assert len(poses.grids) > 1
-
-    def counted(trajectories: Trajectories, ids: np.ndarray, count: int):
-        tried.extend([count] * len(ids))
-        return fitted(trajectories, ids, count)
-
-    monkeypatch.setattr("export.trajectories.adaptive.fitted", counted)
-    again, errors_again = adaptive_knots(trajectories.some(some), np.arange(len(some)), 0.05)
-    assert len(tried) == len(some)
-    assert_close(errors_again, errors[some], "fitted_beside_others")
-    sizes = {int(i): stored.points.shape[1] for rows, stored in poses.grids for i in rows}
-    assert all(sizes[int(some[i])] == stored.points.shape[1] for rows, stored in again.grids for i in rows)
-
-
-def test_a_scene_is_sampled_once_for_all_plans():
-    model = random_model(5, layers=(replace(PLANE, time_resolution=5),))
-    kept = module.trajectories_of(bake(model, SCENE, "0" * 64))
-    assert module.trajectories_of(bake(model, SCENE, "1" * 64)) is kept
-    with torch.no_grad():
-        model.gaussians.means.add_(0.1)
-    assert module.trajectories_of(bake(model, SCENE, "0" * 64)) is not kept
-
-
 def test_unresolved_motion_is_counted(sampled):
     _, trajectories = sampled(of_first(lambda t: np.sin(2 * np.pi * 9000 * t)))
     assert list(trajectories.unresolved) == [0]
@@ -171,18 +123,6 @@ def test_a_rotation_past_half_a_turn_has_one_sign_along_time():
     samples[0, :, 6:] = quats * np.where(np.arange(9) % 2, -1, 1)[:, None]
     module.give_one_sign(samples)
     assert_close(samples[0, :, 6:], quats.astype(np.float32), "encoding.float32")
-
-
-def test_progress_is_told_time_by_time():
-    told: list[list[int]] = []
-
-    def track(what: str, steps: int):
-        told.append([steps])
-        return lambda: told[-1].append(len(told[-1]))
-
-    Trajectories(bake(random_model(5), SCENE, "0" * 64), track)
-    assert told
-    assert all(done == list(range(1, steps + 1)) for steps, *done in told)
 
 
 @pytest.mark.parametrize("count", [4, 5, 12, 67])

@@ -1,5 +1,6 @@
 """Pruning: only what moves stays in the graph, each rule can be switched off, and the error allowed is kept."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from export.pruning import RULES
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
+from msdgs_serve.scene.baked import BakedScene
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
@@ -23,9 +25,6 @@ from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_ob
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
-
-GAUSSIAN_BYTES = 40 + 4
-"""Bytes of a static Gaussian's pose and opacity; an SH coefficient has 12 bytes."""
 
 OBJECT_X = 0.6  # between the ground and the object
 
@@ -49,17 +48,6 @@ def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: Sc
     return worst
 
 
-def test_of_a_scene_with_one_moving_object_only_that_stays_in_the_graph(tmp_path: Path):
-    model = moving_object()
-    job = job_of(tmp_path, model)
-    candidate = job.candidate("network", 50.0)
-    scene = candidate.session.scene
-    moving = candidate.pruned.ids[: scene.moving_count]
-    assert 0 < scene.moving_count <= OBJECT
-    assert (job.model.gaussians.means[moving, 0] > OBJECT_X).all()
-    assert independent_worst_db(candidate, model, SCENE) >= 50
-
-
 def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_path: Path):
     job = job_of(tmp_path, with_hidden_one(moving_object()))
     candidate = job.candidate("network", 50.0)
@@ -69,6 +57,8 @@ def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_p
     assert means[:, 2].min() > -2  # without the hidden one
     assert (means[: scene.moving_count, 0] > OBJECT_X).all()
     assert (means[scene.moving_count :, 0] < OBJECT_X).all()
+    assert 0 < scene.moving_count <= OBJECT
+    assert independent_worst_db(candidate, job.model, SCENE) >= 50
     assert left_out["static"]["count"] == scene.static_count
     assert (left_out["layers"]["count"], left_out["layers"]["of"]) == (1, 2)
     assert (left_out["heads"]["count"], left_out["heads"]["of"]) == (2, 3)
@@ -81,20 +71,22 @@ def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_p
     assert "scale_modulation" not in stored
 
 
-@pytest.mark.parametrize("rule", list(RULES))
-def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str):
-    others = [name for name in RULES if name != rule]
-    candidate = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0)
-    scene = candidate.session.scene
-    assert rule not in {entry["rule"] for entry in scene.metadata.left_out}
-    if rule == "static":
-        assert scene.static_count == 0
-    if rule == "invisible":
-        assert len(scene) == GROUND + OBJECT
-    if rule == "layers":
-        assert len(scene.metadata.layers) == 2
-    if rule == "sh":
-        assert scene.metadata.sh_degree == 1
+KEPT: dict[str, Callable[[BakedScene], bool]] = {
+    "static": lambda scene: scene.static_count == 0,
+    "invisible": lambda scene: len(scene) == GROUND + OBJECT,
+    "layers": lambda scene: len(scene.metadata.layers) == 2,
+    "sh": lambda scene: scene.metadata.sh_degree == 1,
+}
+"""What a scene shows of a rule that was switched off."""
+
+
+@pytest.mark.parametrize("rule", [*RULES, None])
+def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str | None):
+    off = [rule] if rule else list(RULES)
+    others = [name for name in RULES if name not in off]
+    scene = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0).session.scene
+    assert not {entry["rule"] for entry in scene.metadata.left_out} & set(off)
+    assert all(KEPT[name](scene) for name in off if name in KEPT)
 
 
 def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -104,26 +96,6 @@ def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pyte
     assert "layers" not in left_out
     assert "static" in left_out
     assert len(pruned.moving.deformation) == 2
-
-
-def test_without_rules_nothing_is_left_out(tmp_path: Path):
-    candidate = job_of(tmp_path, with_hidden_one(moving_object()), rules=()).candidate("network", 20.0)
-    assert candidate.session.scene.moving_count == GROUND + OBJECT
-    assert candidate.session.scene.metadata.left_out == ()
-
-
-def test_a_scene_that_does_not_move_has_no_graph_and_the_size_of_its_gaussians(tmp_path: Path):
-    model = random_model(3000, layers=("mlp",), sh_degree=3)
-    heads = model.deformation.layers[0].get_submodule("heads")
-    with torch.no_grad():
-        for parameter in heads.parameters():
-            parameter.zero_()
-    rules = [rule for rule in RULES if rule not in ("invisible", "sh")]
-    candidate = job_of(tmp_path, model, rules=rules).candidate("network", 50.0)
-    assert not onnx.load(candidate.path).graph.node
-    assert candidate.session.scene.static_count == 3000
-    stored = 3000 * (GAUSSIAN_BYTES + 16 * 12)
-    assert stored < candidate.size < 1.05 * stored
 
 
 @pytest.mark.parametrize("pruning_db", [30.0, 45.0, 60.0])
@@ -174,8 +146,7 @@ def test_times_that_decide_are_not_the_times_that_are_measured():
     cameras = cameras_of(SCENE)
     deciding = {view.t for view in selection_views(cameras, (0.0, 1.0), 33)}
     measured = {view.t for view in evaluation_views(cameras, (0.0, 1.0), 16, 3)}
-    assert len(deciding) == 33
-    assert len(measured) == 16
+    assert (len(deciding), len(measured)) == (33, 16)
     assert deciding & measured == {0.0, 1.0}
 
 

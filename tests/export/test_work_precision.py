@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import onnx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,11 +15,12 @@ from PIL import Image
 
 from export.jobs.job import ExportJob
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.jobs.sweep import DEFAULT_RASTERIZER, Point, QuickEstimate, Sweep, SweepResult, choose, front
+from export.jobs.sweep import DEFAULT_RASTERIZER, Point, Sweep, SweepResult, choose, front
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
 from export.options import ExportOptions
 from export.plans.registry import PLANS
+from export.pruning import RULES
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
@@ -47,7 +47,6 @@ POINT_FIELDS = {
 
 
 def point(milliseconds: float, db: float, rasterizer: str = DEFAULT_RASTERIZER) -> Point:
-    """Return a point with this time and error."""
     times = FrameTime(*(Milliseconds(milliseconds, milliseconds),) * 3)
     error = RenderedError(db, db, None, 0.0, 0.0, 0.0, 1)
     return Point(cast(Any, SimpleNamespace()), rasterizer, times, error, None, None)
@@ -90,7 +89,6 @@ def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tup
 
 @pytest.fixture(scope="module", autouse=True)
 def few_candidates() -> Iterator[None]:
-    """Limit the sweep to few candidates."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.jobs.sweep.PRUNING_STEPS", (5.0, 1.0, -5.0))
         for name, texts in (("lowrank", []), ("keyframes", ["keyframes:2.0"])):
@@ -114,38 +112,6 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
     chosen = result.points[result.chosen]
     assert chosen.milliseconds == min(p.milliseconds for p in within)
     assert any(p.candidate.session.scene.moving_count <= OBJECT for p in within)
-
-
-def test_layers_that_would_take_many_times_what_another_plan_takes_are_not_tried(swept: tuple[ExportJob, SweepResult]):
-    job, _ = swept
-    whole, fitted = job.candidate("network", None), job.candidate("keyframes:9", None)
-    sweep = Sweep(job, 45.0)
-    sweep.estimates = [
-        QuickEstimate(whole, 90_000, 89_000, 90),
-        QuickEstimate(fitted, 50, 5, 60),
-    ]
-    sweep.baseline = sweep.estimates[0]
-    assert sweep._estimate("network", 46.0) is None
-    assert sweep._estimate("int8", None) is None
-    assert [why for _, why in sweep.refused if "keyframes:9 takes 50 ms" in why] == [why for _, why in sweep.refused]
-    sweep.estimates[1] = replace(sweep.estimates[1], worst_db=44)  # too far off to do without the layers
-    assert sweep._too_expensive("network", None) is None
-
-
-def test_of_similarly_fast_plans_the_smallest_is_pruned(swept: tuple[ExportJob, SweepResult]):
-    def estimate(plan: str, cpu: float, size: int, db: float = 60.0) -> QuickEstimate:
-        return QuickEstimate(cast(Any, SimpleNamespace(plan=plan, size=size)), cpu + 30, cpu, db)
-
-    sweep = Sweep(swept[0], 45.0)
-    fine, coarse = estimate("keyframes:0.03", 10.0, 600), estimate("keyframes:0.1", 11.0, 400)
-    assert sweep._pairs([fine, coarse, estimate("prefix:1", 30.0, 2), estimate("int8", 1.0, 1, db=20.0)], 50.0) == {
-        ("keyframes:0.1", 50.0)
-    }
-    assert sweep._pairs([fine, replace(coarse, worst_db=51.0)], 50.0) == {
-        ("keyframes:0.03", 50.0),
-        ("keyframes:0.1", 50.0),
-    }
-    assert sweep._pairs([], 50.0) == set()
 
 
 def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
@@ -213,6 +179,10 @@ def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: p
         ({"times": 1}, "times"),
         ({"data": Path("nowhere")}, "nowhere"),
         ({"output": Path("nowhere") / "s.onnx"}, "in a folder that exists"),
+        ({"model": Path("missing.pt")}, "missing.pt"),
+        ({"model": Path("empty.pt")}, "empty.pt"),
+        ({"model": Path("text.pt")}, "text.pt"),
+        ({"model": Path("folder.pt")}, "folder.pt"),
         *(
             ({"min_psnr": value}, "`min_psnr` must be a PSNR in dB from 10 to 100")
             for value in (float("nan"), float("inf"), -1.0, 0.0, 101.0)
@@ -220,12 +190,24 @@ def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: p
     ],
 )
 def test_invalid_options_are_refused_by_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
-):
-    wishes: dict[str, Any] = {"output": tmp_path / "s.onnx"} | settings
-    assert main(ExportOptions(saved(tmp_path, random_model(60)), **wishes)) == 1
-    assert message in capsys.readouterr().err
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    settings: dict[str, Any], message: str,
+):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    Path("empty.pt").touch()
+    Path("text.pt").write_text("no model")
+    Path("folder.pt").mkdir()
+    wishes: dict[str, Any] = {"model": saved(tmp_path, random_model(60)), "output": tmp_path / "s.onnx"} | settings
+    assert main(ExportOptions(**wishes)) == 1
+    shown = capsys.readouterr().err
+    assert "error: " in shown
+    assert message in shown
     assert not (tmp_path / "s.onnx").exists()
+
+
+def test_each_rule_of_pruning_has_a_switch():
+    switches: dict[str, Any] = {f"keep_{rule}": True for rule in RULES}
+    assert ExportOptions(Path("model.pt"), **switches).keep == set(RULES)
 
 
 def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -260,12 +242,3 @@ def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.Monke
     settings: dict[str, Any] = {} if place.endswith("run") else {"quick": True}
     assert main(ExportOptions(checkpoint, **settings)) == 130
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path != checkpoint} == old
-
-
-def test_switched_off_on_the_command_line(tmp_path: Path):
-    off: dict[str, Any] = {"keep_static": True, "keep_invisible": True, "keep_layers": True}
-    assert main(ExportOptions(saved(tmp_path, moving_object()), quick=True, **off)) == 0
-    scene = DeformationSession(tmp_path / "model.onnx").scene
-    assert (scene.moving_count, scene.static_count) == (GROUND + OBJECT, 0)
-    assert scene.metadata.layers == ("mlp", "mlp")
-    assert onnx.load(tmp_path / "model.onnx").graph.node

@@ -32,16 +32,18 @@ def test_png_holds_the_nearest_of_256_levels():
     assert np.abs(pixels / 255 - image.rgb).max() <= 0.5 / 255 + 1e-6
 
 
-def test_transparent_png_holds_straight_alpha():
+@pytest.mark.parametrize("image_format", ["png", "webp"])
+def test_transparent_images_hold_straight_alpha(image_format: ImageFormat):
     image = make_image(transparent=True)
-    pixels, _ = decode(encode(image, "png"), "png")
+    pixels, _ = decode(encode(image, image_format), image_format)
     assert pixels.shape == (HEIGHT, WIDTH, 4)
-    covered = image.alpha > 0
-    assert not covered.all()
     np.testing.assert_array_less(np.abs(pixels[..., 3] / 255 - image.alpha), 0.5 / 255 + 1e-6)
-    straight = image.rgb[covered] / image.alpha[covered][:, None]
-    np.testing.assert_array_less(np.abs(pixels[covered][:, :3] / 255 - straight), 0.5 / 255 + 1e-5)
-    assert (pixels[~covered] == 0).all()
+    if image_format == "png":
+        covered = image.alpha > 0
+        assert not covered.all()
+        straight = image.rgb[covered] / image.alpha[covered][:, None]
+        np.testing.assert_array_less(np.abs(pixels[covered][:, :3] / 255 - straight), 0.5 / 255 + 1e-5)
+        assert (pixels[~covered] == 0).all()
 
 
 @pytest.mark.parametrize("image_format", ["jpeg", "webp"])
@@ -54,12 +56,6 @@ def test_lossy_formats_come_close_and_closer_with_quality(image_format: ImageFor
         errors.append(psnr(pixels / 255, image.rgb))
     assert errors[0] < errors[1]
     assert errors[1] > 35
-
-
-def test_transparent_webp_keeps_alpha_exactly():
-    image = make_image(transparent=True)
-    pixels, _ = decode(encode(image, "webp"), "webp")
-    assert np.abs(pixels[..., 3] / 255 - image.alpha).max() <= 0.5 / 255 + 1e-6
 
 
 def test_exr_holds_linear_premultiplied_color_and_depth():
@@ -75,26 +71,18 @@ def test_exr_holds_linear_premultiplied_color_and_depth():
     assert np.isinf(pixels[..., 4][image.alpha == 0]).all()
 
 
-def test_opaque_exr_is_the_display_image_linearised():
+@pytest.mark.parametrize("brightness", [1.0, 1.5])
+def test_opaque_exr_is_the_display_image_linearised(brightness: float):
     image = make_image()
-    pixels, _ = decode(encode(image, "exr"), "exr")
+    image = Image(brightness * image.rgb, image.alpha, image.depth)
+    pixels, spec = decode(encode(image, "exr"), "exr")
     assert (pixels[..., 3] == 1).all()
-    np.testing.assert_allclose(linear_to_srgb(pixels[..., :3]), image.rgb, atol=1e-6)
+    np.testing.assert_allclose(linear_to_srgb(pixels[..., :3]), image.rgb, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(pixels[..., 4], image.depth)
-
-
-def test_exr_header_says_its_color_space():
-    _, spec = decode(encode(make_image(), "exr"), "exr")
     assert spec.getattribute("oiio:ColorSpace") == "lin_rec709_scene"
     np.testing.assert_allclose(spec.getattribute("chromaticities")[:2], (0.64, 0.33), rtol=1e-6)
-
-
-def test_exr_keeps_colors_above_one_and_8_bits_clip_them():
-    bright = Image(np.full((2, 2, 3), 1.5, np.float32), np.ones((2, 2), np.float32), np.ones((2, 2), np.float32))
-    linear, _ = decode(encode(bright, "exr"), "exr")
-    np.testing.assert_allclose(linear_to_srgb(linear[..., :3]), 1.5, rtol=1e-5)
-    eight_bits, _ = decode(encode(bright, "png"), "png")
-    assert (eight_bits == 255).all()
+    eight_bits, _ = decode(encode(image, "png"), "png")
+    assert (eight_bits[image.rgb > 1] == 255).all()
 
 
 @pytest.mark.parametrize("image_format", FORMATS)
@@ -146,8 +134,7 @@ def test_channels_of_different_sizes_are_refused():
 
 def test_srgb_transfer_against_known_values_and_back():
     # IEC 61966-2-1: mid grey 0.5 encoded is 0.21404 linear; the two pieces meet
-    np.testing.assert_allclose(
-        srgb_to_linear(np.array([0.0, 0.04045, 0.5, 1.0])), [0, 0.0031308, 0.2140411, 1], atol=1e-7
-    )
+    known = srgb_to_linear(np.array([0.0, 0.04045, 0.5, 1.0]))
+    np.testing.assert_allclose(known, [0, 0.0031308, 0.2140411, 1], atol=1e-7)
     values = np.linspace(0, 4, 1001)
     np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(values)), values, atol=1e-6)

@@ -1,11 +1,17 @@
-"""Work that several threads take parts of."""
+"""Work that several threads take parts of, and that ends where its job is cancelled."""
 
 import threading
 
+import numpy as np
 import pytest
 
 from msdgs_serve import threads
-from msdgs_serve.threads import THREADS_VARIABLE, run_together
+from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.rasterizer.compositing import TILES_PER_ROUND
+from msdgs_serve.rasterizer.view import TILE
+from msdgs_serve.render_job import RenderCancelled, RenderJob
+from msdgs_serve.threads import THREADS_VARIABLE, checking, run_parallel, run_together
+from tests.support.scenes import front_camera, gaussians_of
 
 
 @pytest.fixture
@@ -64,3 +70,43 @@ def test_one_thread_works_alone(monkeypatch: pytest.MonkeyPatch):
     calls = []
     run_together(lambda *numbers: bool(calls.append((threading.get_ident(), numbers))), (1, 2))
     assert calls == [(threading.get_ident(), (1, 2))]
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_parts_on_the_pool_end_with_it(threads: str, monkeypatch: pytest.MonkeyPatch):
+    """The part that runs ends by itself, those after it don't begin."""
+    monkeypatch.setenv(THREADS_VARIABLE, threads)
+    job, begun = RenderJob(), []
+
+    def part(number: int) -> None:
+        begun.append(number)
+        job.cancel()
+
+    with pytest.raises(RenderCancelled), job.stage("draw"):
+        run_parallel(part, [(number,) for number in range(100)])
+    assert 1 <= len(begun) < 10
+    run_parallel(part, [(0,)])  # outside of the stage nothing is checked
+
+
+def test_a_large_frame_can_be_given_up_between_its_rounds():
+    side = TILE * int(np.sqrt(3 * TILES_PER_ROUND))
+    gaussians, camera = gaussians_of([[0, 0, 2]]), front_camera(side, side)
+    caller, checks = threading.get_ident(), [0]
+
+    def check() -> None:
+        """Counts the caller's own: how many helpers begin before all is done is up to chance."""
+        checks[0] += threading.get_ident() == caller
+
+    with checking(check):
+        rasterize(gaussians, camera)
+    last = checks[0]
+    checks[0] = 0
+
+    def give_up() -> None:
+        check()
+        if checks[0] == last and threading.get_ident() == caller:
+            raise RenderCancelled("enough")
+
+    with pytest.raises(RenderCancelled), checking(give_up):
+        rasterize(gaussians, camera)
+    assert checks[0] == last >= 5

@@ -16,15 +16,15 @@ from msdgs_serve import blocks
 from msdgs_serve.camera_path import read_nerfstudio
 from msdgs_serve.imaging import Image, encode
 from msdgs_serve.render_cli import INTERRUPTED, main
-from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
+from msdgs_serve.scene import InvalidInput
+from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.video import write_video
 from tests.support.images import decode, psnr
-from tests.support.scene_files import UP
+from tests.support.scene_files import level_camera
 from tests.support.service import check_problem, serving
 
 SIZE = 64
-POSE = orbit(np.zeros(3), 5.0, 0, 0, UP)
+POSE = level_camera().camera_to_world
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0, "distance": 5, "fov_y": 40}
 
 
@@ -52,8 +52,7 @@ def test_nerfstudios_path_is_read():
     path = read_nerfstudio(nerfstudio(), (0.0, 2.0))
     assert path.fps == 12
     assert [t for _, t in path.frames] == [0.0, 1.0, 2.0]
-    expected = Camera.from_fov(POSE, SIZE, SIZE, 40.0)
-    camera = path.frames[0][0]
+    camera, expected = path.frames[0][0], level_camera(SIZE)
     np.testing.assert_allclose(camera.camera_to_world, expected.camera_to_world, atol=1e-12)
     assert (camera.fx, camera.cx, camera.width) == pytest.approx((expected.fx, expected.cx, SIZE))
     document = nerfstudio()

@@ -13,10 +13,8 @@ import pytest
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import FORMATS
-from msdgs_serve.scene import Camera
-from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
 from tests.support.images import decode, linear_to_srgb
-from tests.support.scene_files import UP, metadata, write_scene
+from tests.support.scene_files import level_camera, metadata, write_scene
 from tests.support.scenes import draw
 from tests.support.service import ORBIT, check_problem, eventually, serving
 
@@ -31,13 +29,7 @@ def client(scene: Path) -> Iterator[httpx.Client]:
         yield client
 
 
-def level_pose() -> np.ndarray:
-    """Return the pose of the camera `LEVEL`."""
-    return orbit(np.zeros(3), 5.0, 0, 0, UP)
-
-
 def render(client: httpx.Client, **changes: Any) -> np.ndarray:
-    """Return the pixels of `FRAME` with some keys changed."""
     body = {**FRAME, **changes}
     response = client.post("/render", json=body)
     assert response.status_code == 200, response.text
@@ -48,8 +40,7 @@ def render(client: httpx.Client, **changes: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
 def test_the_frame_is_what_the_rasterizer_draws(client: httpx.Client, scene: Path, t: float):
-    camera = Camera.from_fov(level_pose(), SIZE, SIZE, 40.0)
-    drawn = draw(DeformationSession(scene).gaussians(t), camera, background=metadata().background)
+    drawn = draw(DeformationSession(scene).gaussians(t), level_camera(SIZE), background=metadata().background)
     assert np.abs(render(client, t=t) / 255 - drawn.rgb).max() <= 0.5 / 255 + 1e-6
     float_pixels = render(client, t=t, format="exr", background="scene")
     assert np.abs(linear_to_srgb(float_pixels[..., :3]) - drawn.rgb).max() < 1e-5
@@ -80,34 +71,18 @@ def test_layers_are_applied_one_after_the_other(tmp_path: Path, client: httpx.Cl
     check_problem(client.post("/render", json={**FRAME, "steps": 0}), 422, "steps")
 
 
-def test_one_view_said_in_four_ways(client: httpx.Client):
-    pose = level_pose()
-    focal = SIZE / 2 / np.tan(np.radians(20))
-    cameras = [
-        {"type": "look_at", "eye": pose[:3, 3].tolist(), "target": [0, 0, 0], "up": [0, 0, 1], "fov_y": 40},
-        {"type": "matrix", "camera_to_world": pose.tolist(), "fov_y": 40},
-        {"type": "matrix", "camera_to_world": pose.tolist(), "fx": focal, "fy": focal, "cx": 32, "cy": 32},
-        {"type": "matrix", "camera_to_world": (pose @ OPENGL_TO_OPENCV).tolist(), "axes": "opengl", "fx": focal},
-    ]
-    expected = render(client).astype(int)
-    for camera in cameras:
-        assert np.abs(render(client, camera=camera) - expected).max() <= 1
-
-
 def test_cameras_of_other_models(client: httpx.Client):
     """All models agree at the center of the image and differ away from it."""
-    pose = level_pose()
+    pose = level_camera(SIZE).camera_to_world
     matrix = {"type": "matrix", "camera_to_world": pose.tolist(), "fx": 100.0}
-    pinhole = render(client, camera=matrix).astype(int)
+    pinhole, middle = render(client, camera=matrix).astype(int), (SIZE // 2, SIZE // 2)
     for changes in ({"model": "fisheye"}, {"model": "fisheye", "distortion": [0.5, 0, 0, 0]}):
         other = render(client, camera={**matrix, **changes}).astype(int)
-        assert np.abs(other[SIZE // 2, SIZE // 2] - pinhole[SIZE // 2, SIZE // 2]).max() <= 2
+        assert np.abs(other[middle] - pinhole[middle]).max() <= 2
         assert np.abs(other - pinhole).max() > 5
-    flat = render(client, camera={**matrix, "model": "orthographic", "fx": 20.0}).astype(int)
-    nearer = pose.copy()
-    nearer[:3, 3] += pose[:3, 2]
-    moved = {**matrix, "camera_to_world": nearer.tolist(), "model": "orthographic", "fx": 20.0}
-    np.testing.assert_allclose(render(client, camera=moved), flat, atol=1)
+    flat = {**matrix, "model": "orthographic", "fx": 20.0}
+    nearer = {**flat, "camera_to_world": (pose + np.outer(pose[:, 2], [0, 0, 0, 1])).tolist()}
+    np.testing.assert_allclose(render(client, camera=nearer), render(client, camera=flat).astype(int), atol=1)
 
 
 def test_a_camera_of_the_scene_by_index_or_name(client: httpx.Client):
@@ -120,18 +95,11 @@ def test_a_camera_of_the_scene_by_index_or_name(client: httpx.Client):
     np.testing.assert_array_equal(
         render(client, camera={"type": "matrix", **intrinsics}, width=64, height=48), by_index
     )
-
-
-def test_omitted_camera_fields_come_from_the_scene(client: httpx.Client):
     short = render(client, camera={"type": "orbit", "azimuth": 90, "elevation": 20}, width=None, height=None)
-    first = render(client, camera={"type": "scene", "name": "view_90"}, width=None, height=None)
-    assert np.abs(short.astype(int) - first).max() <= 1
-
-
-def test_a_side_left_out_follows_the_other(client: httpx.Client):
-    camera = {"type": "scene", "index": 0}
-    assert render(client, camera=camera, width=128, height=None).shape == (96, 128, 3)
-    assert render(client, camera=camera, width=None, height=12).shape == (12, 16, 3)
+    assert np.abs(short.astype(int) - by_index).max() <= 1, "omitted fields come from the scene"
+    for given, shape in (({"width": 128}, (96, 128, 3)), ({"height": 12}, (12, 16, 3))):
+        size = {"width": None, "height": None, **given}
+        assert render(client, camera={"type": "scene", "index": 0}, **size).shape == shape
 
 
 def test_a_scene_without_cameras_is_framed_by_its_bounds(tmp_path: Path):
@@ -142,15 +110,10 @@ def test_a_scene_without_cameras_is_framed_by_its_bounds(tmp_path: Path):
         check_problem(client.post("/render", json={**FRAME, "camera": {"type": "scene"}}), 422, "camera.index")
 
 
-@pytest.mark.parametrize("image_format", FORMATS)
-def test_one_pixel(client: httpx.Client, image_format: str):
-    assert render(client, width=1, height=1, format=image_format).shape[:2] == (1, 1)
-
-
 def test_eight_clients_at_once_get_the_bytes_that_one_gets(client: httpx.Client):
     formats = itertools.cycle(FORMATS)
     bodies = [
-        {**FRAME, "width": 20 + 9 * i, "height": 90 - 7 * i, "t": i % 3 / 2, "format": next(formats)} for i in range(8)
+        {**FRAME, "width": 1 + 12 * i, "height": 78 - 11 * i, "t": i % 3 / 2, "format": next(formats)} for i in range(8)
     ]
 
     def post(body: dict[str, Any]) -> bytes:
@@ -214,7 +177,6 @@ def test_a_scene_broken_from_the_start_is_unavailable_without_saying_where_it_li
 
 
 def examples(client: httpx.Client) -> dict[str, Any]:
-    """Return the examples of `POST /render` in the OpenAPI document."""
     call = client.get("/openapi.json").json()["paths"]["/render"]["post"]
     return call["requestBody"]["content"]["application/json"]["examples"]
 
@@ -227,20 +189,6 @@ def test_every_example_in_the_documentation_works(client: httpx.Client):
         assert response.status_code == 200, (name, response.text)
         pixels, _ = decode(response.content, example["value"].get("format", "png"))
         assert pixels[..., :3].std() > 0, f"{name} shows nothing"
-
-
-def test_the_openapi_document_is_complete(client: httpx.Client):
-    document = client.get("/openapi.json").json()
-    text = client.get("/openapi.json").text
-    schemas = document["components"]["schemas"]
-    for reference in {part.split('"')[0] for part in text.split('"#/components/schemas/')[1:]}:
-        assert reference in schemas
-    assert set(document["paths"]) == {
-        *("/render", "/render/batch", "/render/video", "/scenes", "/scenes/{name}", "/scenes/{name}/report"),
-        *("/live", "/ready", "/metrics"),
-    }
-    expected = {"200", "304", "400", "404", "408", "413", "422", "503", "504"}
-    assert set(document["paths"]["/render"]["post"]["responses"]) == expected
 
 
 def test_pages_about_the_calls_need_nothing_from_elsewhere(client: httpx.Client):

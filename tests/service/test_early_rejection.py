@@ -36,7 +36,6 @@ def full(queue: WorkQueue, places: int) -> Iterator[None]:
 
 @pytest.fixture
 def queue() -> Iterator[WorkQueue]:
-    """Yield a queue of two places."""
     queue = WorkQueue(workers=1, waiting=1, seconds=20)
     yield queue
     queue.shut_down()
@@ -44,18 +43,8 @@ def queue() -> Iterator[WorkQueue]:
 
 @pytest.fixture
 def early_rejection(queue: WorkQueue) -> EarlyRejection:
-    """Return the early rejection of that queue."""
     renderer = Renderer()
     return EarlyRejection(queue, Metrics(SceneStore([]), renderer.cache, queue), max_body_bytes=8)
-
-
-def test_only_a_full_queue_has_calls_turned_away(early_rejection: EarlyRejection, queue: WorkQueue):
-    assert early_rejection.answer(CALL, ("1.2.3.4", 5), ()) is None
-    with full(queue, 2):
-        answer = early_rejection.answer(CALL, ("1.2.3.4", 5), [(b"date", b"today")])
-    assert answer is not None
-    assert answer.startswith(b"HTTP/1.1 503 Service Unavailable\r\ndate: today\r\n")
-    assert early_rejection.answer(CALL, None, ()) is None
 
 
 @pytest.mark.parametrize(
@@ -94,7 +83,6 @@ def test_unusual_requests_are_left_to_the_application(early_rejection: EarlyReje
 
 
 def sent(connection: socket.socket, data: bytes) -> tuple[int, dict[str, str], bytes]:
-    """Return status, headers and body of the answer to `data`."""
     connection.sendall(data)
     response = HTTPResponse(connection)
     response.begin()

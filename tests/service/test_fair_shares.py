@@ -1,6 +1,7 @@
-"""How many places in the queue each client has, and whose work is done next."""
+"""How many places in the queue each client has, when they are free again, and whose work is done next."""
 
 import asyncio
+import contextvars
 import threading
 import weakref
 from collections.abc import AsyncGenerator, Iterator
@@ -15,6 +16,7 @@ from msdgs_serve.api.app import create_app
 from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.routes import batch, video
 from msdgs_serve.api.schemas import VideoRequest
+from msdgs_serve.api.server import Server
 from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.turns import PART_INTERVAL, Turns
@@ -23,7 +25,7 @@ from msdgs_serve.imaging import Image
 from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
-from tests.support.service import FRAME, ORBIT, serving
+from tests.support.service import FRAME, ORBIT, in_this_process, serving
 
 MANY = 40
 
@@ -51,15 +53,6 @@ def test_single_frames_come_in_between_parts_which_have_their_turns_too():
         PART_INTERVAL - 1
     ) + ["part of 1"]
     assert done[2 * PART_INTERVAL :] == ["single", "single", "part of 2"]
-
-
-def test_removed_work_is_skipped():
-    turns: Turns[str] = Turns()
-    for item in ("a1", "a2", "b1"):
-        turns.add(item, item[0], part=item[0] == "b")
-    for item in ("a1", "b1", "b1"):
-        turns.remove(item)
-    assert order(turns) == ["a2"]
 
 
 @pytest.fixture
@@ -123,6 +116,32 @@ def test_parts_keep_their_place_until_the_call_and_its_work_have_ended(queue: Wo
     assert queue.waiting == queue.running == 0
 
 
+def fill(queue: WorkQueue, calls: ExitStack) -> None:
+    assert sum(places(queue, calls, client) for client in ("two", "three", "four", "five")) == queue.waiting == 8
+
+
+def test_the_place_of_a_call_is_free_after_its_work_and_later_work_is_never_refused(queue: WorkQueue):
+    async def call() -> None:
+        with queue.admitted("one"), ExitStack() as calls:
+            await queue.run(lambda: None, RenderJob())
+            while queue.waiting:  # the future is done a moment before its callbacks have run
+                await asyncio.sleep(0.001)
+            fill(queue, calls)
+            await queue.run(lambda: None, RenderJob())
+
+    asyncio.run(call())
+
+
+def test_work_of_a_call_that_was_not_admitted_is_refused_where_all_places_are_taken(queue: WorkQueue):
+    async def work() -> None:
+        with pytest.raises(RequestRejected):
+            await queue.run(lambda: None, RenderJob())
+
+    with ExitStack() as calls:
+        fill(queue, calls)
+        contextvars.Context().run(lambda: asyncio.run(work()))
+
+
 @pytest.fixture
 def service(scene: Path) -> Iterator[Service]:
     app = create_app(SceneStore([scene]), Renderer(), Settings(scenes=[scene], max_batch=MANY))
@@ -132,7 +151,6 @@ def service(scene: Path) -> Iterator[Service]:
 
 @pytest.fixture
 def images(service: Service, monkeypatch: pytest.MonkeyPatch) -> list[weakref.ref[Image]]:
-    """Return a list that references to all rendered images are added to."""
     drawn: list[weakref.ref[Image]] = []
     original = service.renderer.render
 
@@ -199,24 +217,20 @@ def test_a_film_fails_in_time_to_say_so_or_is_cut_off(scene: Path):
         assert client.post("/render/video", json=body).status_code == 200
 
 
-def test_a_list_of_times_is_drawn_in_parts(service: Service, scene: Path):
+@in_this_process
+def test_a_list_of_times_is_drawn_in_parts(scene: Path):
     """Otherwise one request would occupy a thread for all of its frames."""
-    parts = []
-    original = service.queue.run
+    servers: list[Server] = []
+    with serving(scene, server=servers) as client:
+        queue, parts = servers[0].service.queue, []
+        original = queue.run
 
-    async def run(work: Any, job: RenderJob, *, part: bool = False) -> Any:
-        parts.append(part)
-        return await original(work, job, part=part)
+        async def run(work: Any, job: RenderJob, *, part: bool = False) -> Any:
+            parts.append(part)
+            return await original(work, job, part=part)
 
-    service.queue.run = run  # pyright: ignore[reportAttributeAccessIssue]
-    app_frames = [{**FRAME, "t": [0.0, 0.5, 1.0], "format": name} for name in ("png", "npy")]
-
-    async def ask() -> list[int]:
-        app = create_app(SceneStore([scene]), service.renderer, service.settings)
-        app.state.service = service
-        transport = httpx.ASGITransport(app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
-            return [(await client.post("/render", json=frame)).status_code for frame in app_frames]
-
-    assert asyncio.run(ask()) == [200, 200]
+        queue.run = run  # pyright: ignore[reportAttributeAccessIssue]
+        for image_format in ("png", "npy"):
+            response = client.post("/render", json={**FRAME, "t": [0.0, 0.5, 1.0], "format": image_format})
+            assert response.status_code == 200
     assert parts == [True] * 8

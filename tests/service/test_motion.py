@@ -11,7 +11,7 @@ from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import orbit
 from tests.support.images import decode
-from tests.support.scene_files import UP
+from tests.support.scene_files import UP, level_camera
 from tests.support.service import serving
 from tests.support.tolerances import assert_close
 
@@ -21,7 +21,6 @@ FRAME = {"camera": ORBIT, "width": SIZE, "height": SIZE, "t": 0.1, "channels": [
 
 
 def place(camera: Camera, point: list[float]) -> np.ndarray:
-    """Return the pixel [2] of a point."""
     x, y, z = (camera.world_to_camera @ [*point, 1])[:3]
     return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
@@ -42,7 +41,7 @@ def test_the_ball_goes_where_its_centre_goes(scene: Path, t: float, dt: float):
 
 def test_a_frame_warped_by_its_motion_is_the_later_frame(scene: Path):
     """Compare the vectors of all pixels that the moving ball covers well with its known translation."""
-    camera = Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), SIZE, SIZE, 40.0)
+    camera = level_camera(SIZE)
     session = DeformationSession(scene)
     now = Renderer().render(session, camera, 0.0, RenderOptions("transparent", motion_dt=0.1))
     later = Renderer().render(session, camera, 0.1, RenderOptions("transparent"))

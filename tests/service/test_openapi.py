@@ -96,6 +96,16 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
         assert client.post("/render", json={**FRAME, "scene": "balls"}).status_code == 200
 
 
+def test_the_calls_are_these(client: httpx.Client):
+    paths = client.get("/openapi.json").json()["paths"]
+    assert set(paths) == {
+        *("/render", "/render/batch", "/render/video", "/scenes", "/scenes/{name}", "/scenes/{name}/report"),
+        *("/live", "/ready", "/metrics"),
+    }
+    answers = {"200", "304", "400", "404", "408", "413", "422", "503", "504"}
+    assert set(paths["/render"]["post"]["responses"]) == answers
+
+
 @pytest.mark.slow
 def test_every_call_answers_as_the_document_says(client: httpx.Client):
     schema = schemathesis.openapi.from_url(f"{str(client.base_url).rstrip('/')}/openapi.json")
@@ -185,7 +195,6 @@ def instances(schema: Document, document: Document) -> Iterator[Any]:
 
 
 def leaves(value: Any, at: Leaf = ()) -> Iterator[Leaf]:
-    """Yield the paths of all parts of a value, at any depth."""
     if at:
         yield at
     parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -231,7 +240,6 @@ def text_of(body: Any, *, twice: bool) -> bytes:
 
 
 def named(field: str, leaf: Leaf) -> bool:
-    """Return whether an error's field is the leaf, a parent of it, or inside it."""
     got, wanted = field.split("."), [str(part) for part in leaf]
     length = min(len(got), len(wanted))
     return got[:length] == wanted[:length]

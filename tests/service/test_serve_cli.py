@@ -29,7 +29,6 @@ def scene(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def process(scene: Path) -> Iterator[subprocess.Popen[str]]:
-    """Yield the service on a free port."""
     command = [*COMMAND, str(scene), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -39,7 +38,6 @@ def process(scene: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def read_until(process: subprocess.Popen[str], pattern: str) -> str:
-    """Return the output up to the first line that matches."""
     assert process.stdout
     printed = ""
     for line in process.stdout:

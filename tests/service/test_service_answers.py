@@ -243,7 +243,6 @@ def test_other_web_pages_may_call_only_where_they_are_named(scene: Path, client:
 
 
 def numbers(client: httpx.Client, name: str) -> dict[str, float]:
-    """Return the values of a metric by their labels."""
     lines = client.get("/metrics").text.splitlines()
     pairs = [line.rsplit(" ", 1) for line in lines if line.startswith((f"{name}{{", f"{name} "))]
     return {labels.removeprefix(name): float(value) for labels, value in pairs}
@@ -269,8 +268,3 @@ def test_metrics_are_what_the_client_counted(scene: Path):
 def test_unknown_methods_are_counted_as_one(client: httpx.Client):
     assert client.request("BREW", "/render").status_code == 405
     assert 'method="other"' in client.get("/metrics").text
-
-
-def test_a_service_is_ready_when_scenes_are_loaded(client: httpx.Client):
-    assert client.get("/ready").json() == {"status": "ready"}
-    assert client.get("/live").json()["status"] == "ok"

@@ -1,5 +1,6 @@
 """Overload: requests beyond the queue are rejected at once with Retry-After, and accepted ones are finished."""
 
+import contextlib
 import json
 import math
 import signal
@@ -55,10 +56,14 @@ def poses() -> Iterator[SlowPoses]:
     poses.go_on.set()
 
 
-def renderer_with(poses: SlowPoses) -> Renderer:
-    renderer = Renderer()
+@contextlib.contextmanager
+def serving_slowly(scene: Path, poses: SlowPoses, **settings: Any) -> Iterator[tuple[httpx.Client, Server]]:
+    """A client of a service that is slow from now on, and its server."""
+    renderer, servers = Renderer(), list[Server]()
     renderer.cache = poses
-    return renderer
+    with serving(scene, renderer=renderer, server=servers, **settings) as client:
+        poses.slow = True
+        yield client, servers[0]
 
 
 def is_cancelled(job: RenderJob) -> bool:
@@ -70,13 +75,11 @@ def is_cancelled(job: RenderJob) -> bool:
 
 
 def test_requests_beyond_the_queue_are_rejected_with_retry_after(scene: Path, poses: SlowPoses):
-    server: list[Server] = []
     with (
-        serving(scene, renderer=renderer_with(poses), server=server, concurrent_renders=2, queued_renders=3) as client,
+        serving_slowly(scene, poses, concurrent_renders=2, queued_renders=3) as (client, server),
         ThreadPoolExecutor(5) as pool,
     ):
-        poses.slow = True
-        queue = server[0].service.queue
+        queue = server.service.queue
 
         def ask(number: int) -> httpx.Response:
             """Send a request as the client of an address, which a proxy names."""
@@ -107,32 +110,25 @@ def test_requests_beyond_the_queue_are_rejected_with_retry_after(scene: Path, po
 
 
 def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: SlowPoses):
-    server: list[Server] = []
-    with serving(
-        scene, renderer=renderer_with(poses), server=server, render_seconds=0.3, concurrent_renders=1
-    ) as client:
-        poses.slow = True
+    with serving_slowly(scene, poses, render_seconds=0.3, concurrent_renders=1) as (client, server):
         started = time.monotonic()
         response = client.post("/render", json=FRAME)
         assert time.monotonic() - started >= 0.3
         check_problem(response, 504)
-        assert server[0].service.queue.running == 1, "the place is taken as long as the thread is"
+        assert server.service.queue.running == 1, "the place is taken as long as the thread is"
         waiting = client.post("/render", json=FRAME)
         assert waiting.status_code == 504, "the time in line counts"
         poses.slow = False
         poses.go_on.set()
-        eventually(lambda: server[0].service.queue.running == 0)
+        eventually(lambda: server.service.queue.running == 0)
         assert client.post("/render", json=FRAME).status_code == 200
 
 
 def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
-    """Send a request on a connection of its own, which its client leaves by closing it."""
     content = json.dumps(body)
-    head = (
-        f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(content)}\r\n\r\n"
-    )
+    head = f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(content)}"
     connection = connect(client)
-    connection.sendall((head + content).encode())
+    connection.sendall(f"{head}\r\n\r\n{content}".encode())
     return connection
 
 
@@ -141,26 +137,20 @@ def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> 
 def test_work_for_a_client_that_is_gone_ends(scene: Path, poses: SlowPoses, path: str, part: float):
     samples = 40
     body: dict[str, Any] = {**FRAME, "shutter": {"open": -0.1, "close": 0.1, "samples": samples}}
-    server: list[Server] = []
-    with serving(scene, renderer=renderer_with(poses), server=server) as client:
-        poses.slow, poses.last = True, part * samples
+    with serving_slowly(scene, poses) as (client, server):
+        poses.last = part * samples
         poses.go_on.set()
         connection = leave(client, {"frames": [body, {**body, "t": 0.6}]} if path.endswith("batch") else body, path)
         eventually(lambda: poses.begun >= poses.last)
         connection.close()
-        queue = server[0].service.queue
+        queue = server.service.queue
         eventually(lambda: queue.running == queue.waiting == 0)
         assert poses.begun < samples
 
 
 def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: SlowPoses):
-    server: list[Server] = []
-    with (
-        serving(scene, renderer=renderer_with(poses), server=server, concurrent_renders=1) as client,
-        ThreadPoolExecutor(1) as pool,
-    ):
-        queue = server[0].service.queue
-        poses.slow = True
+    with serving_slowly(scene, poses, concurrent_renders=1) as (client, server), ThreadPoolExecutor(1) as pool:
+        queue = server.service.queue
         first = pool.submit(client.post, "/render", json=FRAME)
         eventually(lambda: queue.running == 1)
         connection = leave(client, FRAME)
@@ -173,17 +163,15 @@ def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: Sl
 
 
 def test_a_stopping_service_finishes_accepted_requests(scene: Path, poses: SlowPoses):
-    server: list[Server] = []
     with (
-        serving(scene, renderer=renderer_with(poses), server=server) as client,
+        serving_slowly(scene, poses) as (client, server),
         httpx.Client(base_url=client.base_url) as other,
         ThreadPoolExecutor(8) as pool,
     ):
-        poses.slow = True
         frames = [pool.submit(client.post, "/render", json=FRAME) for _ in range(8)]
-        queue = server[0].service.queue
+        queue = server.service.queue
         eventually(lambda: queue.running + queue.waiting == 8)
-        server[0].handle_exit(signal.SIGTERM, None)
+        server.handle_exit(signal.SIGTERM, None)
         assert other.get("/ready").status_code == 503
         assert other.get("/live").status_code == 200
         refused = other.post("/render", json=FRAME)
@@ -191,7 +179,7 @@ def test_a_stopping_service_finishes_accepted_requests(scene: Path, poses: SlowP
         assert refused.headers["Retry-After"]
         poses.go_on.set()
         assert [frame.result(MAX_SECONDS).status_code for frame in frames] == [200] * 8
-        eventually(lambda: not server[0].started or not _listens(client))
+        eventually(lambda: not server.started or not _listens(client))
 
 
 def _listens(client: httpx.Client) -> bool:
@@ -203,7 +191,6 @@ def _listens(client: httpx.Client) -> bool:
 
 
 def test_a_cancelled_request_keeps_poses_of_others(scene: Path):
-    """A cancelled request leaves the poses of other requests in the cache."""
     cache, session = PoseCache(1 << 20), DeformationSession(scene)
     cancelled = RenderJob()
     cancelled.cancel()

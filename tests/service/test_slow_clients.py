@@ -31,7 +31,6 @@ def client(scene: Path, server: list[Server]) -> Iterator[httpx.Client]:
 
 
 def begun(client: httpx.Client, first: bytes) -> socket.socket:
-    """Return a connection on which these bytes were sent."""
     connection = connect(client)
     connection.sendall(first)
     return connection
@@ -47,7 +46,6 @@ def takes(connection: socket.socket, drip: bytes) -> bool:
 
 
 def rest_of(connection: socket.socket) -> bytes:
-    """Return all bytes until the service closes the connection."""
     received = b""
     try:
         while part := connection.recv(65536):

@@ -68,9 +68,14 @@ def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, fo
 
 
 @pytest.mark.parametrize("content", [b"", b"no scene", b"\x08\x0a"], ids=["empty", "text", "beginning"])
-def test_invalid_files_are_refused_and_leave_no_file(client: httpx.Client, folder: Path, content: bytes):
+def test_invalid_files_are_refused_and_change_nothing(client: httpx.Client, folder: Path, file: bytes, content: bytes):
     check_problem(add(client, content), 422)
     assert files(folder) == []
+    assert add(client, file).status_code == 201
+    check_problem(add(client, content, replace="true"), 422)
+    assert files(folder) == ["walk.onnx"]
+    assert client.get("/scenes").json()["scenes"][0]["problem"] is False
+    assert client.post("/render", json=FRAME).status_code == 200
 
 
 @in_this_process

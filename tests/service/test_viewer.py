@@ -323,12 +323,10 @@ def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_p
 
 
 def strongest_in_the_middle(image: np.ndarray) -> int:
-    """Return the index of the strongest channel at the center of an image."""
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
 def in_time(page: Page, holds: Callable[[], bool]) -> bool:
-    """Return whether a condition becomes true within a minute."""
     for _ in range(600):
         if holds():
             return True

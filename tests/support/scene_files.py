@@ -44,6 +44,11 @@ def metadata(**changes: Any) -> SceneMetadata:
     return replace(plain, **changes)
 
 
+def level_camera(size: int = 64) -> Camera:
+    """A square camera 5 units from the origin and at its height, which it looks at."""
+    return Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), size, size, 40.0)
+
+
 def write_scene(
     path: Path, *, static_color: Color = RED, moving: bool = True, steps: bool = False, **changes: Any
 ) -> Path:

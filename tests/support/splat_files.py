@@ -63,25 +63,20 @@ def ply_bytes(columns: dict[str, np.ndarray], form: str = "binary_little_endian"
 def compressed_ply_bytes(g: Gaussians) -> bytes:
     """SuperSplat's: one chunk a 256 Gaussians, bytes of -4 to 4 for harmonics beyond degree 0."""
     chunks, packed = [], []
-    colors = g.sh[:, 0] * 0.28209479177387814 + 0.5
     for start in range(0, len(g), 256):
         part = slice(start, start + 256)
-        ranges = [(a[part].min(0), a[part].max(0)) for a in (g.means, np.log(g.scales), colors)]
-        chunks.append(np.concatenate([np.concatenate(each) for each in ranges]))
-        for i in range(*part.indices(len(g))):
-            quat = g.quats[i]
-            largest = int(np.argmax(np.abs(quat)))
-            small = np.delete(quat * np.sign(quat[largest]), largest) / np.sqrt(2) + 0.5
-            rotation = largest
-            for value in small:
-                rotation = rotation << 10 | round(float(value) * 1023)
-            words = [_field(g.means[i], ranges[0], (11, 10, 11)), rotation]
-            words.append(_field(np.log(g.scales[i]), ranges[1], (11, 10, 11)))
-            words.append(_field(colors[i], ranges[2], (8, 8, 8)) << 8 | round(255 * float(g.opacities[i])))
-            packed.append(words)
-    ends = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
-    sizes = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
-    names = ends + sizes + [f"{end}_{axis}" for end in ("min", "max") for axis in "rgb"]
+        ends, words = [], []
+        for values, bits in ((g.means, (11, 10, 11)), (np.log(g.scales), (11, 10, 11)), (_colors(g), (8, 8, 8))):
+            low, high = values[part].min(axis=0), values[part].max(axis=0)
+            ends += [low, high]
+            words.append(_fields((values[part] - low) / np.maximum(high - low, 1e-30), bits))
+        largest, small = _three_smallest(g.quats[part])
+        rotations = largest << 30 | _fields(small / np.sqrt(2) + 0.5, (10, 10, 10))
+        opacities = np.round(255 * g.opacities[part]).astype(np.int64)
+        chunks.append(np.concatenate(ends))
+        packed.append(np.column_stack([words[0], rotations, words[1], words[2] << 8 | opacities]))
+    kinds = ("xyz", ("scale_x", "scale_y", "scale_z"), "rgb")
+    names = [f"{end}_{axis}" for axes in kinds for end in ("min", "max") for axis in axes]
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
     lines += [f"property float {name}" for name in names] + [f"element vertex {len(g)}"]
     lines += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
@@ -89,42 +84,50 @@ def compressed_ply_bytes(g: Gaussians) -> bytes:
     if rest.size:
         lines += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
     header = "\n".join([*lines, "end_header", ""]).encode()
-    body = np.array(chunks, "<f4").tobytes() + np.array(packed, "<u4").tobytes()
+    body = np.array(chunks, "<f4").tobytes() + np.concatenate(packed).astype("<u4").tobytes()
     return header + body + ((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).tobytes()
 
 
-def _field(values: np.ndarray, ends: tuple[np.ndarray, np.ndarray], bits: tuple[int, ...]) -> int:
-    packed = 0
-    for value, low, high, size in zip(values, *ends, bits, strict=True):
-        part = 0.0 if high == low else (float(value) - float(low)) / (float(high) - float(low))
-        packed = packed << size | round(part * (2**size - 1))
+def _colors(g: Gaussians) -> np.ndarray:
+    return g.sh[:, 0] * 0.28209479177387814 + 0.5
+
+
+def _three_smallest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The place [N] of the largest component, and the others [N, 3] where it is positive."""
+    largest = np.abs(quats).argmax(axis=1)
+    return largest, np.array([np.delete(q * np.sign(q[k]), k) for q, k in zip(quats, largest, strict=True)])
+
+
+def _fields(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """[N] integers of the bits of numbers from 0 to 1, [N, 3]."""
+    packed = np.zeros(len(parts), np.int64)
+    for column, size in zip(parts.T.astype(np.float64), bits, strict=True):
+        packed = packed << size | np.round(column * (2**size - 1)).astype(np.int64)
     return packed
+
+
+def _rgba(g: Gaussians) -> np.ndarray:
+    return np.column_stack([255 * _colors(g), 255 * g.opacities]).round().clip(0, 255).astype(np.uint8)
 
 
 def splat_bytes(g: Gaussians) -> bytes:
     """`.splat`, degree 0."""
-    body = b""
-    for i in range(len(g)):
-        rgb = (g.sh[i, 0] * 0.28209479177387814 + 0.5) * 255
-        color = np.append(rgb, 255 * g.opacities[i]).round().clip(0, 255).astype(np.uint8)
-        quat = (g.quats[i] * 128 + 128).round().clip(0, 255).astype(np.uint8)
-        body += struct.pack("<6f", *g.means[i], *g.scales[i]) + color.tobytes() + quat.tobytes()
-    return body
+    rows = np.empty(len(g), [("numbers", "<f4", 6), ("color", "u1", 4), ("rotation", "u1", 4)])
+    rows["numbers"], rows["color"] = np.column_stack([g.means, g.scales]), _rgba(g)
+    rows["rotation"] = (g.quats * 128 + 128).round().clip(0, 255)
+    return rows.tobytes()
 
 
 def ksplat_bytes(g: Gaussians) -> bytes:
     """`.ksplat` 0.1 of one section, degree 0, compression level 0: nothing but colors is rounded."""
+    rows = np.empty(len(g), [("numbers", "<f4", 10), ("color", "u1", 4)])
+    rows["numbers"], rows["color"] = np.column_stack([g.means, g.scales, g.quats]), _rgba(g)
     header, section = bytearray(4096), bytearray(1024)
     header[:2] = (0, 1)
     struct.pack_into("<4I", header, 4, 1, 1, len(g), len(g))
     struct.pack_into("<2I", section, 0, len(g), len(g))
-    body = b""
-    for i in range(len(g)):
-        rgb = (g.sh[i, 0] * 0.28209479177387814 + 0.5) * 255
-        color = np.append(rgb, 255 * g.opacities[i]).round().clip(0, 255).astype(np.uint8)
-        body += struct.pack("<10f", *g.means[i], *g.scales[i], *g.quats[i]) + color.tobytes()
-    struct.pack_into("<I", section, 28, len(body))
-    return bytes(header + section) + body
+    struct.pack_into("<I", section, 28, rows.nbytes)
+    return bytes(header + section) + rows.tobytes()
 
 
 def spz3_bytes(g: Gaussians) -> bytes:
@@ -166,8 +169,7 @@ def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
     fixed = np.round((logs - mins) / (maxs - mins) * 65535).astype(np.int64)
     scales = np.linspace(-5, -1, 256)
     colors = np.linspace(-2, 2, 256)
-    largest = np.abs(g.quats).argmax(axis=1)
-    small = np.array([np.delete(q * np.sign(q[k]), k) for q, k in zip(g.quats, largest, strict=True)])
+    largest, small = _three_smallest(g.quats)
     textures = {
         "means_l.webp": fixed & 255,
         "means_u.webp": fixed >> 8,

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from export.importers.runs.base import Loss
+from export.importers.splats.base import as_float32, logit
 from export.measure.frames import compare, render
 from export.measure.poses import posed
 from export.measure.rendered_error import ExactFrames
@@ -29,9 +30,6 @@ FRAMES = 12
 
 TIMES = 41
 """Number of times over which opacities and colors are averaged."""
-
-MIN_LOGIT_DISTANCE = 1e-7
-"""Distance of opacities from 0 and 1, which have no finite logit."""
 
 
 def quaternion_fidelity(model: DynamicGaussians, info: SceneInfo) -> Loss:
@@ -79,9 +77,8 @@ def _unnormalized_matrices(quats: torch.Tensor) -> torch.Tensor:
 def static_appearance(model: DynamicGaussians, info: SceneInfo) -> tuple[DynamicGaussians, Loss]:
     """The model without its heads of opacity and SH, with mean opacities, and mean colors weighted by opacity."""
     opacities, sh = _means(model, info.time_range)
-    opacities = opacities.clamp(MIN_LOGIT_DISTANCE, 1 - MIN_LOGIT_DISTANCE)
     tensors = dict(model.gaussians.named_parameters()) | {
-        "raw_opacities": opacities.logit().float(),
+        "raw_opacities": torch.from_numpy(as_float32(logit(opacities.numpy()))),
         "sh_dc": sh[:, :1].float(),
         "sh_rest": sh[:, 1:].float(),
     }

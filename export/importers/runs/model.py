@@ -18,7 +18,7 @@ from export.importers.runs.fidelity import static_appearance
 from export.importers.runs.fourdgs import FourDGSImporter
 from export.importers.runs.state import RunFolder
 from export.importers.scene import metadata_of
-from export.importers.splats.base import Splats
+from export.importers.splats.base import Splats, as_float32, logit
 from export.importers.splats.formats import read_splats
 from export.measure.poses import posed
 from msdgs_serve.scene.camera import Camera
@@ -94,10 +94,8 @@ def canonical(source: Splats) -> CanonicalGaussians:
     """Activated Gaussians in storage space, with the stored norms of their quaternions."""
     g = source.gaussians
     lengths = np.ones(len(g), np.float32) if source.quat_lengths is None else source.quat_lengths
-    opacities = g.opacities.astype(np.float64).clip(1e-7, 1 - 1e-7)
-    raw_opacities = np.log(opacities / (1 - opacities))
-    arrays = (g.means, np.log(g.scales), g.quats * lengths[:, None], raw_opacities, g.sh[:, :1], g.sh[:, 1:])
-    return CanonicalGaussians(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
+    arrays = (g.means, np.log(g.scales), g.quats * lengths[:, None], logit(g.opacities), g.sh[:, :1], g.sh[:, 1:])
+    return CanonicalGaussians(*(torch.from_numpy(as_float32(array)) for array in arrays))
 
 
 def _cameras(file: Path) -> list[dict[str, Any]]:

@@ -19,6 +19,10 @@ MAX_SH = 1e4
 """Largest SH coefficient; usual ones are below 10."""
 
 
+MIN_LOGIT_DISTANCE = 1e-7
+"""Distance of opacities from 0 and 1, which have no finite logit. No pixel of 8 bits differs by it."""
+
+
 @dataclass(frozen=True)
 class Splats:
     """The Gaussians of one file, float32, in its own order and axes."""
@@ -76,13 +80,13 @@ def splats(
     rows = slice(None) if count == len(good) else good
     scales = np.exp(log_scales[rows].astype(np.float64).clip(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
     gaussians = Gaussians(
-        _float32(means[rows]),
-        _float32(raw_quats[rows] / norms[rows, None]),
-        _float32(scales),
-        _float32(opacities[rows].clip(0, 1)),
-        _float32(sh[rows]),
+        as_float32(means[rows]),
+        as_float32(raw_quats[rows] / norms[rows, None]),
+        as_float32(scales),
+        as_float32(opacities[rows].clip(0, 1)),
+        as_float32(sh[rows]),
     )
-    return Splats(gaussians.validate(), len(good) - count, antialiasing, _float32(norms[rows]))
+    return Splats(gaussians.validate(), len(good) - count, antialiasing, as_float32(norms[rows]))
 
 
 def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:
@@ -90,6 +94,12 @@ def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:
     x = raw_opacities.astype(np.float64)
     small = np.exp(-np.abs(x))
     return np.where(x >= 0, 1 / (1 + small), small / (1 + small))
+
+
+def logit(opacities: np.ndarray) -> np.ndarray:
+    """Finite logits of opacities, in float64."""
+    x = opacities.astype(np.float64).clip(MIN_LOGIT_DISTANCE, 1 - MIN_LOGIT_DISTANCE)
+    return np.log(x / (1 - x))
 
 
 def smallest_three(values: np.ndarray, largest: np.ndarray) -> np.ndarray:
@@ -106,5 +116,6 @@ def smallest_three(values: np.ndarray, largest: np.ndarray) -> np.ndarray:
     return quats
 
 
-def _float32(array: np.ndarray) -> FloatArray:
+def as_float32(array: np.ndarray) -> FloatArray:
+    """The array in float32, contiguous."""
     return np.ascontiguousarray(array, dtype=np.float32)
