@@ -92,7 +92,7 @@ def test_an_extra_that_is_missing_is_named_before_anything_is_done(
         ("--layers mlp hash", "mlp, plane, spline"),
         ("--layers mlp:hight=3", "`hight`"),
         ("--layers mlp:width=0", "model.layers.0.width"),
-        ("--layers spline", "--model.support nodes"),
+        ("--support gaussians --layers spline", "--model.support nodes"),
         ("--support cage", "gaussians, nodes"),
     ],
 )
