@@ -104,7 +104,7 @@ class PruningStatistics:
             frame = render(drawn, view.camera, self.background, self.model.rasterizer)
             worst = min(worst, compare(frame, self._frames[i]).psnr)
             if worst < min_db:
-                self._order.remove(i)  # probably the worst one next time too
+                self._order.remove(i)  # probably the worst one in the next call too
                 self._order.insert(0, i)
                 break
         return worst

@@ -1,12 +1,12 @@
 """The order of the images, and the parameters that each of them updates.
 
-First all images train a static scene. Then what moves is tracked from the middle of the scene's time outwards, in a
-window that grows image by image, once or more. While it grows for the first time, of four samples
+First all images train a static scene. Then motion is tracked from the middle of the scene's time in a window that
+grows in both directions, once or more. While it grows for the first time, of four samples
 
 - one is drawn from all images of the window alike, and updates everything;
 - two are drawn from the newest ones, at its border, and update motion alone: canonical Gaussians that learned from so
   few images as often would overfit them and lose their textures;
-- one is drawn from those outside, and updates what is static alone, where static parts are visible: otherwise the few
+- one is drawn from those outside, and updates static parts alone, where they are visible: otherwise the few
   images in the middle of time would be explained by any geometry that their few cameras can't tell from the true one.
 
 When it grows again, motion is nearly right: all images of the window update everything.

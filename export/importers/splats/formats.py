@@ -27,7 +27,7 @@ READERS: dict[str, Callable[[Path], Splats]] = {
 """Readers by name of the format."""
 
 UNPACKED = {"spz", "spz:unturned", "sog", "ksplat"}
-"""Those that native code unpacks, in a process of its own; the others are numbers as they are."""
+"""Formats that native code decompresses, in a subprocess; the others are read by NumPy."""
 
 
 def splat_format(path: Path) -> str | None:
