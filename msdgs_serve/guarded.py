@@ -41,7 +41,13 @@ def call_guarded(function: Callable[..., None], *arguments: Any, limits: Process
     environment = {**os.environ, THREADS_VARIABLE: "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, stdout=answer, stderr=subprocess.DEVNULL, timeout=limits.seconds, check=False, env=environment
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=answer,
+            stderr=subprocess.DEVNULL,
+            timeout=limits.seconds,
+            check=False,
+            env=environment,
         )
     except subprocess.TimeoutExpired:
         raise ProcessFailed(f"isn't read within {limits.seconds:g} s") from None
@@ -75,7 +81,7 @@ def _limit(limits: ProcessLimits) -> None:
     if sys.platform == "linux":  # other systems don't enforce it
         values[resource.RLIMIT_DATA] = limits.memory
     for which, value in values.items():
-_, hard = resource.getrlimit(which)
+        _, hard = resource.getrlimit(which)
         value = value if hard == resource.RLIM_INFINITY else min(value, hard)
         resource.setrlimit(which, (value, value))
 

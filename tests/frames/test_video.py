@@ -1,4 +1,4 @@
-"""Camera paths, films over HTTP, and `msdgs-render`."""
+"""Camera paths, videos over HTTP, and `msdgs-render`."""
 
 import io
 import json
@@ -80,7 +80,7 @@ def test_nerfstudios_path_is_read():
     ],
     ids=str,
 )
-def test_a_path_that_is_wrong_is_told_where(client: httpx.Client, changes: dict[str, Any], field: str):
+def test_an_invalid_path_is_refused_by_key(client: httpx.Client, changes: dict[str, Any], field: str):
     document = nerfstudio(**changes)
     with pytest.raises(InvalidInput) as error:
         read_nerfstudio(document, (0.0, 1.0))
@@ -92,7 +92,7 @@ def test_a_path_that_is_wrong_is_told_where(client: httpx.Client, changes: dict[
 
 
 @pytest.mark.parametrize("video_format", ["mp4", "webm"])
-def test_a_film_shows_the_frames(client: httpx.Client, video_format: str):
+def test_a_video_shows_the_frames(client: httpx.Client, video_format: str):
     times = [0.0, 0.25, 0.5, 0.75, 1.0]
     body = {"frames": [{"camera": ORBIT, "t": t} for t in times], "width": SIZE, "height": SIZE, "fps": 5.0}
     response = client.post("/render/video", json={**body, "format": video_format})
@@ -149,7 +149,7 @@ def run(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-def test_images_of_a_turn(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_images_of_an_orbit(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "frames"
     assert run(scene, out, "--frames", 3, "--width", 20, "--height", 10) == 0
     files = sorted(out.glob("frame_*.png"))
@@ -181,7 +181,7 @@ def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pyt
     assert [path.name for path in tmp_path.iterdir()] == ["turn.mp4"]
 
 
-def test_a_path_of_nerfstudio_on_disk(scene: Path, tmp_path: Path):
+def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
     (tmp_path / "path.json").write_text(json.dumps(nerfstudio()))
     assert run(scene, tmp_path / "out", "--path", tmp_path / "path.json", "--format", "exr") == 0
     pixels, spec = decode((tmp_path / "out" / "frame_00002.exr").read_bytes(), "exr")
@@ -202,7 +202,7 @@ def test_a_path_of_nerfstudio_on_disk(scene: Path, tmp_path: Path):
         (["scene", "out", "--quality", "80"], "quality"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_errors_are_one_line(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     arguments: list[str], message: str,
 ):  # fmt: skip

@@ -19,7 +19,7 @@ from export.importers.splats.spz import read_spz
 READERS: dict[str, Callable[[Path], Splats]] = {
     "ply": read_ply,
     "spz": read_spz,
-    "spz:unturned": partial(read_spz, turned=False),
+    "spz:unturned": partial(read_spz, converted=False),
     "sog": read_sog,
     "splat": read_splat,
     "ksplat": read_ksplat,

@@ -130,7 +130,7 @@ def test_every_parameter_is_reached_by_gradients():
         assert parameter.grad.any(), name
 
 
-def test_detached_means_get_the_gradient_of_a_shift():
+def test_detached_means_get_the_gradient_of_a_translation():
     for detach in (True, False):
         model = random_model(support=GaussiansConfig(detach_deform_input=detach))
         gradient = torch.autograd.grad(model.pose(0.3).means.sum(), model.gaussians.means)[0]
