@@ -93,7 +93,7 @@ def available() -> None:
     if shutil.which(DOCKER) is None:
         raise Skipped(f"there is no {DOCKER} command")
     if output(DOCKER, "info", check=False).returncode != 0:
-        raise Skipped("no Docker daemon responses")
+        raise Skipped("no Docker daemon answers")
     if output(DOCKER, "compose", "version", check=False).returncode != 0:
         raise Skipped("there is no docker compose; docker-compose 1 can't read compose.yaml")
     for image in (BASE_IMAGE, PROXY_IMAGE):
@@ -336,12 +336,12 @@ def post(url: str, t: float, azimuth: int, request_id: str) -> Response:
 
 
 def get(url: str, headers: dict[str, str] | None = None) -> Response:
-    """Return status and body of a GET; status 0 without an response."""
+    """Return status and body of a GET; status 0 without a response."""
     return ask(urllib.request.Request(url, headers=headers or {}))
 
 
 def ask(request: urllib.request.Request) -> Response:
-    """Return status and body of a request; status 0 without an response."""
+    """Return status and body of a request; status 0 without a response."""
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
         with direct.open(request, timeout=60) as response:

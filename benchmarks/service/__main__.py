@@ -176,7 +176,7 @@ def main(scene: Path = SCENE, only: tuple[Part, ...] = (), minutes: float = 0.7,
             print(f"{name}: {(PARTS[name].__doc__ or '').splitlines()[0]}", flush=True)
             for row in PARTS[name](settings):
                 rows.append(row)
-                print(f"  {row.what}: {row.measured} (bound: {row.bound})", flush=True)
+                print(f"  {row.name}: {row.measured} (bound: {row.bound})", flush=True)
     return 0 if print_rows(rows) else 1
 
 

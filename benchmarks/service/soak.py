@@ -94,8 +94,8 @@ def shares(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
     p99 = {path: 1000 * float(np.quantile(took, 0.99)) for path, took in times.items()}
     ratio = p99["/render/batch"] / p99["/render"]
     measured = f"{ratio:.2f}: {p99['/render/batch']:.0f} and {p99['/render']:.0f} ms, of {[*map(len, times.values())]}"
-    what = f"a frame's p99 beside {NEIGHBORS} clients of batches, relative to {NEIGHBORS} clients of frames"
-    yield Row(what, "<= 3", measured, ratio <= 3)
+    name = f"a frame's p99 beside {NEIGHBORS} clients of batches, relative to {NEIGHBORS} clients of frames"
+    yield Row(name, "<= 3", measured, ratio <= 3)
 
 
 def _beside(running: list[Running], seconds: float, frame: Any, path: str, body: Any) -> list[float]:
@@ -162,10 +162,10 @@ class Soak:
         with self._lock:
             self.statuses += client.statuses
 
-    def _expect(self, holds: bool, what: str) -> None:
+    def _expect(self, holds: bool, problem: str) -> None:
         if not holds:
             with self._lock:
-                self.wrong.append(what)
+                self.wrong.append(problem)
 
     def _frame(self, client: Client, chance: random.Random) -> None:
         wanted = chance.choice(self._wanted)
@@ -314,7 +314,7 @@ def main(
     Each client has a key of its own. Use an idle machine.
 
     Args:
-        part: What to measure.
+        part: The measurement.
         scene: A scene file whose time range is [0, 1].
         minutes: By default 30 for `soak` and 0.5 for each half of `shares`.
     """

@@ -49,7 +49,7 @@ LEGEND = """\
 - **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
   a Gaussian, in scene units and in pixels, transparent and hidden ones included.
 - **held-out**: mean PSNR in dB against held-out images.
-- Points with other rasterizer options show what these would gain. A file can't select them, so none is chosen.
+- Points with other rasterizer options show their effect. A file can't select them, so none is chosen.
 """
 
 

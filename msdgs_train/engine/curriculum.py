@@ -3,7 +3,7 @@
 First all images train a static scene. Then motion is tracked from the middle of the scene's time in a window that
 grows in both directions, once or more. While it grows for the first time, of four samples
 
-- one is drawn from all images of the window alike, and updates everything;
+- one is drawn uniformly from all images of the window, and updates everything;
 - two are drawn from the newest ones, at its border, and update motion alone: canonical Gaussians that learned from so
   few images as often would overfit them and lose their textures;
 - one is drawn from those outside, and updates static parts alone, where they are visible: otherwise the few

@@ -60,13 +60,13 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_p
     ahead = front(points)
     assert ahead
     for i, a in enumerate(points):
-        beaten = any(
+        dominated = any(
             b.milliseconds <= a.milliseconds
             and b.error.psnr_worst >= a.error.psnr_worst
             and (b.milliseconds, b.error.psnr_worst) != (a.milliseconds, a.error.psnr_worst)
             for b in points
         )
-        assert not (beaten and i in ahead)
+        assert not (dominated and i in ahead)
     best = choose(points, min_psnr)
     within = [p for p in points if p.error.psnr_worst >= min_psnr]
     assert (best is None) == (not within)

@@ -14,7 +14,7 @@ from msdgs_serve.scene import Gaussians, InvalidInput
 from msdgs_serve.scene.baked import BakedScene
 from tests.support.scene_files import level_camera, metadata, write_scene
 
-FAINT = GSPLAT._replace(alpha_max=0.5)
+CAPPED = GSPLAT._replace(alpha_max=0.5)
 POSE_BYTES = 2 * 10 * 4  # two Gaussians: means, quats, scales
 
 
@@ -52,7 +52,7 @@ def test_options_and_the_scene_choose_the_rasterizer(session: DeformationSession
     mip = DeformationSession(write_scene(tmp_path / "mip.onnx", antialiasing="mip"))
     plain = rasterize(session.gaussians(0.5), camera, background=background).rgb
     for drawn, options, rasterizer in (
-        (session, RenderOptions(rasterizer=FAINT), FAINT),
+        (session, RenderOptions(rasterizer=CAPPED), CAPPED),
         (mip, RenderOptions(), GSPLAT._replace(mip=True)),
     ):
         image = Renderer().render(drawn, camera, 0.5, options)

@@ -35,8 +35,8 @@ def nerfstudio(count: int = 3, **changes: Any) -> dict[str, Any]:
     return {**path, "render_width": SIZE, "render_height": SIZE, **changes}
 
 
-def frames_of(film: bytes) -> tuple[list[np.ndarray], float]:
-    with av.open(io.BytesIO(film), "r") as container:
+def frames_of(video: bytes) -> tuple[list[np.ndarray], float]:
+    with av.open(io.BytesIO(video), "r") as container:
         rate = container.streams.video[0].average_rate
         assert rate is not None
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], float(rate)
@@ -109,7 +109,7 @@ def test_a_video_shows_the_frames(client: httpx.Client, video_format: str):
 
 def test_an_animated_webp_shows_the_frames(tmp_path: Path):
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
-    path = tmp_path / "film.webp"
+    path = tmp_path / "video.webp"
     with path.open("wb") as file:
         assert write_video((np.full((SIZE, SIZE, 3), color, np.uint8) for color in colors), 5.0, "webp", file) == 3
     file = oiio.ImageInput.open(str(path))
@@ -161,7 +161,7 @@ def test_images_of_an_orbit(scene: Path, tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    film, drawn = tmp_path / "turn.mp4", []
+    video, drawn = tmp_path / "orbit.mp4", []
 
     def encode_two(image: Image, *arguments: Any) -> bytes:
         if len(drawn) == 2:
@@ -169,16 +169,16 @@ def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pyt
         drawn.append(image.t)
         return encode(image, *arguments)
 
-    command = (scene, film, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
+    command = (scene, video, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
     monkeypatch.setattr(blocks, "encode", encode_two)
     assert run(*command) == INTERRUPTED
-    assert not film.exists()
+    assert not video.exists()
     monkeypatch.setattr(blocks, "encode", lambda image, *more: drawn.append(image.t) or encode(image, *more))
     assert run(*command) == 0
     assert drawn == [0.0, 0.25, 0.5, 0.75, 1.0]
-    frames, rate = frames_of(film.read_bytes())
+    frames, rate = frames_of(video.read_bytes())
     assert (len(frames), rate) == (5, 10)
-    assert [path.name for path in tmp_path.iterdir()] == ["turn.mp4"]
+    assert [path.name for path in tmp_path.iterdir()] == ["orbit.mp4"]
 
 
 def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
@@ -195,8 +195,8 @@ def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
         (["scene", "out", "--path", "missing.json"], "missing.json"),
         (["scene", "out", "--frames", "0"], "--frames"),
         (["scene", "out", "--width", "10"], "--height"),
-        (["scene", "film.gif"], "mp4, webm, webp"),
-        (["scene", "film.mp4", "--transparent"], "--transparent"),
+        (["scene", "video.gif"], "mp4, webm, webp"),
+        (["scene", "video.mp4", "--transparent"], "--transparent"),
         (["scene", "taken"], "an empty folder"),
         (["missing.onnx", "out"], "missing.onnx"),
         (["scene", "out", "--quality", "80"], "quality"),

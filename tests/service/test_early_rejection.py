@@ -113,5 +113,5 @@ def test_the_answer_is_that_of_the_application(tmp_path: Path, caplog: pytest.Lo
         counted = client.get("/metrics").text.splitlines()
         assert [line.split()[-1] for name in REFUSED for line in counted if line.startswith(name)] == ["4.0", "4.0"]
     lines = [vars(record)["facts"] for record in caplog.records if vars(record)["facts"]["status"] == 503]
-    alike = [{name: fact for name, fact in line.items() if name != "milliseconds"} for line in lines]
-    assert alike == alike[:1] * 4
+    facts = [{name: fact for name, fact in line.items() if name != "milliseconds"} for line in lines]
+    assert facts == facts[:1] * 4

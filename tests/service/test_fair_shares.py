@@ -167,7 +167,7 @@ def times(count: int) -> list[float]:
     return [number / count for number in range(count)]
 
 
-def film(service: Service) -> AsyncGenerator[bytes]:
+def streamed_video(service: Service) -> AsyncGenerator[bytes]:
     frames = [{"camera": ORBIT, "t": t} for t in times(MANY)]
     body = VideoRequest.model_validate({"frames": frames, "width": 32, "height": 32})
     return video._stream_video(service, body, *video._path(service, body))
@@ -177,7 +177,7 @@ def lines(service: Service) -> AsyncGenerator[Any]:
     return batch._items(service, [{**FRAME, "t": t} for t in times(MANY)], multipart=False)
 
 
-@pytest.mark.parametrize("made", [film, lines])
+@pytest.mark.parametrize("made", [streamed_video, lines])
 def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images: list[weakref.ref[Image]], made: Any):
     """A video or batch has one frame in memory, and renders none before the previous one is sent."""
 

@@ -31,7 +31,7 @@ OPERATORS = (
     "NonZero", "OneHot", "Pad", "RandomNormal", "Range", "Resize", "Scan", "Shape", "Slice", "StringNormalizer", "Tile",
     "TopK", "Transpose", "", "add", "Bogus",
 )  # fmt: skip
-ALIKE = (
+SAME_INPUTS = (
     ("Add", "Sub", "Mul", "Div", "Max", "Min", "Pow"),
     ("Cos", "Exp", "Floor", "Identity", "Log", "Relu", "Sigmoid", "Sin", "Sqrt"),
     ("Less", "Equal"),
@@ -134,7 +134,7 @@ def _change_elements(elements: Any, field: FieldDescriptor, model: onnx.ModelPro
 def swap_operator(model: onnx.ModelProto, rng: Rng) -> None:
     """Replace an operator by one that takes the same inputs."""
     node = pick(rng, model.graph.node)
-    for operators in ALIKE:
+    for operators in SAME_INPUTS:
         if node.op_type in operators:
             node.op_type = pick(rng, operators)
 

@@ -147,7 +147,7 @@ def needles() -> Scene:
     return gaussians_of(means, scales=scales, quats=unit_quats(rng, count)), front_camera()
 
 
-def giants() -> Scene:
+def huge() -> Scene:
     """Each covers the whole image, some are a thousand times as large."""
     means = np.column_stack([np.linspace(-1, 1, 6), np.linspace(1, -1, 6), np.linspace(2, 8, 6)])
     return gaussians_of(means, scales=[1, 3, 10, 30, 100, 1000], opacities=0.2), front_camera()
@@ -193,8 +193,8 @@ def unbounded_splats() -> Scene:
     log_scales = np.linspace(0, 20, 21)
     scales = np.exp(np.column_stack([log_scales, log_scales, np.where(np.arange(21) % 2, log_scales, -3)]))
     means = np.column_stack([rng.uniform(-1, 1, size=(21, 2)), np.linspace(2, 8, 21)])
-    giants = gaussians_of(means, scales=scales, opacities=0.15, quats=unit_quats(rng, 21))
-    return joined(giants, gaussians_of(means[::2] * [0.5, 0.5, 1] - [0, 0, 0.1], scales=0.1)), front_camera()
+    huge = gaussians_of(means, scales=scales, opacities=0.15, quats=unit_quats(rng, 21))
+    return joined(huge, gaussians_of(means[::2] * [0.5, 0.5, 1] - [0, 0, 0.1], scales=0.1)), front_camera()
 
 
 def ten_thousand_on_a_pixel() -> Scene:
@@ -233,7 +233,7 @@ def oblong_pixels() -> Scene:
 ADVERSARIAL: dict[str, Callable[[], Scene]] = {
     scene.__name__: scene
     for scene in (
-        equal_depths, behind_camera, near_plane, off_axis_89, inside_splat, needles, giants, subpixel, opacity_extremes,
+        equal_depths, behind_camera, near_plane, off_axis_89, inside_splat, needles, huge, subpixel, opacity_extremes,
         crowd, needles_of_a_million, unbounded_splats, ten_thousand_on_a_pixel, at_the_camera, through_the_near_plane,
         principal_point_outside, oblong_pixels,
     )

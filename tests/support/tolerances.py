@@ -100,7 +100,11 @@ TABLE = (
         2.0,
         "a first-order bound, each layer's error measured once; roundings of the sum of deltas come on top",
     ),
-    Row("stability.spectral_norm.relative", 1e-12, "a root of a cubic in float64, of matrices whose entries are alike"),
+    Row(
+        "stability.spectral_norm.relative",
+        1e-12,
+        "a root of a cubic in float64, of matrices with entries of similar size",
+    ),
     Row("stability.none", 0.0, "a count of pixels that must be 0"),
     Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
     Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),

@@ -66,5 +66,5 @@ def read_splats(path: Path, file_format: str | None = None) -> Splats:
 
 
 def read_arrays(path: Path, file_format: str) -> dict[str, np.ndarray]:
-    """What a reader returns, as arrays. Raises `ImportFailed`."""
+    """The result of a reader as arrays. Raises `ImportFailed`."""
     return READERS[file_format](path).to_arrays()

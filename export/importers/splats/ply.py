@@ -183,6 +183,6 @@ class _Columns:
 
     def _column(self, name: str) -> np.ndarray:
         if not self.has(name):
-            what = "a cloud of points without Gaussians" if not self.has("opacity") else "not a whole splat"
-            raise ImportFailed(self._file, f"`{self._element.name}` has no property `{name}`; it is {what}")
+            content = "a cloud of points without Gaussians" if not self.has("opacity") else "not a whole splat"
+            raise ImportFailed(self._file, f"`{self._element.name}` has no property `{name}`; it is {content}")
         return np.asarray(self._element.data[name])

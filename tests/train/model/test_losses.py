@@ -23,7 +23,7 @@ def _pair(seed: int, height: int, width: int, dtype: torch.dtype = torch.float64
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_ssim_is_that_of_torchmetrics(dtype: torch.dtype) -> None:
-    """With black all around the images, for torchmetrics mirrors them at the border."""
+    """With black all around the images, since torchmetrics mirrors them at the border."""
     rgb, target = _pair(0, 40, 31, dtype)
     padded = [torch.nn.functional.pad(v, (0, 0, *4 * [2 * RADIUS])) for v in (rgb, target)]
     expected: Any = structural_similarity_index_measure(
