@@ -270,7 +270,7 @@ def write_colmap(
     place: str = "0",
     poses: list[tuple[float, ...]] | None = None,
 ) -> Path:
-    """Write text files; the second image has no observations."""
+    """Write a sparse model and its images; the second image has no observations."""
     sparse = folder / "sparse" / place
     sparse.mkdir(parents=True, exist_ok=True)
     known = [pose(index) for index in range(len(names))]

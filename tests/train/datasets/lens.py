@@ -52,7 +52,7 @@ class Lens(NamedTuple):
 
 
 def frame_pixels(frame: Frame, points: np.ndarray) -> np.ndarray:
-    """[N, 2] pixels of [N, 3] world points in a frame's stored image of full `size`."""
+    """[N, 2] pixels of [N, 3] world points in the stored image of a frame that isn't downscaled."""
     camera, local = frame.camera, points @ frame.camera.world_to_camera[:3, :3].T
     x, y, z = (local + frame.camera.world_to_camera[:3, 3]).T
     x, y = x / z, y / z

@@ -81,7 +81,7 @@ def test_size_reduces_a_video_as_it_does_images(tmp_path: Path, size: int):
     for frame, drawn in zip(load_scene(tmp_path, size).splits["train"], drawings, strict=True):
         rgba = np.dstack([drawn, np.full((120, 160), 255, np.uint8)])
         want = resize_area(rgba, size, round(size * 0.75))[..., :3].astype(float)
-        assert np.abs(frame.load_rgba()[..., :3] - want).mean() < tolerance("video_picture.mean")
+        assert np.abs(frame.load_rgba()[..., :3] - want).mean() < tolerance("video_image.mean")
 
 
 def test_the_color_matrix_is_the_one_that_the_video_names(tmp_path: Path):

@@ -120,7 +120,7 @@ def test_images_have_no_subpixel_offset(scene: SceneData, axis: int):
         for shift in shifts
     ]
     square, slope, _ = np.polyfit(shifts, np.mean(errors, axis=1), 2)
-    assert abs(-slope / (2 * square)) < tolerance("picture_offset")
+    assert abs(-slope / (2 * square)) < tolerance("image_offset")
 
 
 @pytest.mark.parametrize("name", OBJECTS)

@@ -111,6 +111,6 @@ def test_a_browsers_camera_begins_at_the_first_image(data: Path, page: Page, ope
 
 
 def _camera(viewer: Viewer) -> Any:
-    """The last image of the only browser; None before the first."""
+    """The camera that the only browser requests; None before the first request."""
     wanted = [browser.wanted for browser in viewer._browsers.values()]
     return wanted[0].camera(1.0) if wanted and wanted[0] else None

@@ -79,7 +79,7 @@ class PageServer:
 
 @pytest.fixture
 def page(monkeypatch: pytest.MonkeyPatch) -> PageServer:
-    """Replace viser; returns the list of servers that viewers create."""
+    """Replace viser; returns the server of all viewers."""
     server = PageServer()
     monkeypatch.setattr(viewer_module, "_serve", lambda host, port: server)
     return server
