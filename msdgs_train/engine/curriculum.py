@@ -12,7 +12,7 @@ grows in both directions, once or more. While it grows for the first time, of fo
 When it grows again, motion is nearly right: all images of the window update everything.
 """
 
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,22 +34,6 @@ class TrainingSample(NamedTuple):
     frame: Frame
     t: float  # of the Gaussians: the image's, or the nearest within the window
     update: Update  # which parameters learn from it
-
-
-class Curriculum(Protocol):
-    """The order of the images of a run."""
-
-    def next(self, number: int, step: int, generator: torch.Generator) -> TrainingSample:
-        """The sample of this number, in this step of the schedule, both counted from 0."""
-        ...
-
-    def state(self) -> Tensor:
-        """The state besides the generator, for `load_state`."""
-        ...
-
-    def load_state(self, state: Tensor) -> None:
-        """Continue from a state; an empty one starts a new pass."""
-        ...
 
 
 class WindowCurriculum:

@@ -107,7 +107,7 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
     assert turned.max() < tolerance("spz_rotation")
 
 
-@pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it softer"), (0.3, ""), (0.5, "draw it harder")])
+@pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it blurrier"), (0.3, ""), (0.5, "draw it sharper")])
 def test_differences_of_other_renderers_are_printed(tmp_path: Path, eps2d: float, said: str):
     printed = StringIO()
     scene = scene_file(tmp_path, eps2d=eps2d)

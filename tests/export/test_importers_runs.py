@@ -278,18 +278,3 @@ def test_a_checkpoint_that_unpacks_to_more_than_itself_is_refused(tmp_path: Path
         for name, contents in parts.items():
             packed.writestr(name, contents)
     assert_refused(run, "deformgs", r"is packed: it holds 4,\d{3},\d{3} bytes")
-
-
-class Evil:
-    """Runs code when unpickled."""
-
-    def __reduce__(self) -> tuple:
-        return Path.touch, (Path("ran"),)
-
-
-def test_no_code_in_a_checkpoint_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(tmp_path)
-    run = foreign.write_deformgs(tmp_path / "run", foreign.deformgs_state(True))
-    torch.save({"linear.0.weight": Evil()}, network_of(run))
-    assert_refused(run, "deformgs", r"isn't a whole torch checkpoint of plain values")
-    assert not (tmp_path / "ran").exists()
