@@ -32,16 +32,16 @@ def test_each_row_has_the_nodes_and_weights_of_its_gaussian(count: int, nodes: i
     layout = block_layout(means, node_ids, weights)
     stored = layout.attributes
     assert set(layout.rows) == set(range(count))
-    blocks, _, size = stored["ids"].shape
+    blocks, size, _ = stored["ids"].shape
     dense = np.zeros((blocks * size, nodes))
     for block in range(blocks):
         for row in range(size):
-            of_row = stored["nodes"][block][stored["ids"][block, :, row]]
-            np.add.at(dense[block * size + row], of_row, stored["weights"][block, :, row] / WEIGHT_ONE)
+            of_row = stored["nodes"][block][stored["ids"][block, row]]
+            np.add.at(dense[block * size + row], of_row, stored["weights"][block, row] / WEIGHT_ONE)
     want = np.zeros((count, nodes))
     np.put_along_axis(want, node_ids, weights, axis=1)
     np.testing.assert_allclose(dense, want[layout.rows], atol=follows / WEIGHT_ONE)
-    np.testing.assert_array_equal(stored["weights"].sum(axis=1), WEIGHT_ONE)
+    np.testing.assert_array_equal(stored["weights"].sum(axis=2), WEIGHT_ONE)
 
 
 def test_morton_order_of_a_grid_visits_each_octant_at_once():
