@@ -28,8 +28,8 @@ class NodesExport(SupportExport):
     heads_are_removable = False
 
     def bytes_per_gaussian(self, support: Support) -> int:
-        """A weight in 16 bits and an index in 8 bits for each node that a Gaussian follows."""
-        return 3 * cast(NodesSupport, support).config.followed
+        """An index in 8 bits and, but for the last, a weight in 16 bits for each node that a Gaussian follows."""
+        return 3 * cast(NodesSupport, support).config.followed - 2
 
     def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout:
         """Blocks of Gaussians that are near each other."""
@@ -68,24 +68,29 @@ def _blend(graph: GraphBuilder, inputs: SupportInputs) -> Blend:
     # [B, S, 16]: half the time of motions in columns, [B, 16, S], where the second matrix is the large one
     blended = graph.node("MatMul", [_weights(graph, ids, weights, nodes.shape[1]), followed], "skinning.blended")
     names = ["skinning.matrices", "skinning.offsets", "skinning.rots"]
-    motions = graph.split(columns_of(graph, blended, 16, count), names, [9, 3, 4], axis=0)
+    matrices, offsets, rots = graph.split(columns_of(graph, blended, 16, count), names, [9, 3, 4], axis=0)
     axes = _matrices(graph, "skinning.axes", inputs.quats)  # constant: computed when the file is opened
-    canonical = [columns_of(graph, v, w, count) for v, w in ((inputs.means, 3), (inputs.quats, 4), (axes, 9))]
-    return Blend(*motions, *canonical, count)
+    sizes = ((inputs.means, 3), (inputs.quats, 4), (axes, 9))
+    means, quats, axes = (columns_of(graph, value, width, count) for value, width in sizes)
+    return Blend(matrices, offsets, rots, means, quats, axes, count)
 
 
 def _weights(graph: GraphBuilder, ids: np.ndarray, weights: np.ndarray, width: int) -> str:
-    """[B, S, U] skinning weights of all nodes of a block. Constant: onnxruntime computes them when it opens the
-    file."""
+    """[B, S, U] skinning weights of all nodes of a block. Constant: onnxruntime computes them when it opens the file.
+
+    The last weight of a Gaussian isn't stored: it is what the others leave.
+    """
     own = graph.constant("skinning.own", np.arange(width))
     one = graph.constant("skinning.one", np.array([1 / WEIGHT_ONE], np.float32))
-    total = ""
+    left, total = graph.constant("skinning.all", np.array([WEIGHT_ONE], np.float32)), ""
     for f in range(ids.shape[2]):
-        name = f"skinning.node{f}"
-        followed = graph.node("Equal", [_stored_ids(graph, name, ids[..., f, None]), own], f"{name}.equal")
-        stored = graph.constant(f"{name}.stored_weight", weights[..., f, None])
-        weight = graph.node("Cast", [stored], f"{name}.number", to=TensorProto.FLOAT)
+        name, weight = f"skinning.node{f}", left
+        if f + 1 < ids.shape[2]:
+            stored = graph.constant(f"{name}.stored_weight", weights[..., f, None])
+            weight = graph.node("Cast", [stored], f"{name}.number", to=TensorProto.FLOAT)
+            left = graph.node("Sub", [left, weight], f"{name}.left")
         weight = graph.node("Mul", [weight, one], f"{name}.weight")
+        followed = graph.node("Equal", [_stored_ids(graph, name, ids[..., f, None]), own], f"{name}.equal")
         place = graph.node("Cast", [followed], f"{name}.place", to=TensorProto.FLOAT)
         term = graph.node("Mul", [place, weight], f"{name}.matrix")
         total = graph.node("Add", [total, term], f"{name}.sum") if total else term
