@@ -19,7 +19,7 @@ from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.nodes import NodesSupport
 
-IDENTITY = np.array([1, 0, 0, 0], np.float32)
+IDENTITY, CONJUGATE = np.array([1, 0, 0, 0], np.float32), np.array([1, -1, -1, -1], np.float32)
 
 
 class NodesExport(SupportExport):
@@ -69,7 +69,9 @@ def _blend(graph: GraphBuilder, inputs: SupportInputs) -> Blend:
     blended = graph.node("MatMul", [_weights(graph, ids, weights, nodes.shape[1]), followed], "skinning.blended")
     names = ["skinning.matrices", "skinning.offsets", "skinning.rots"]
     matrices, offsets, rots = graph.split(columns_of(graph, blended, 16, count), names, [9, 3, 4], axis=0)
-    axes = _matrices(graph, "skinning.axes", inputs.quats)  # constant: computed when the file is opened
+    # constant, so computed when the file is opened: the rows of the inverse rotation are the axes
+    inverse = graph.node("Mul", [inputs.quats, graph.constant("conjugate", CONJUGATE)], "skinning.inverse")
+    axes = _matrices(graph, "skinning.axes", inverse)
     sizes = ((inputs.means, 3), (inputs.quats, 4), (axes, 9))
     means, quats, axes = (columns_of(graph, value, width, count) for value, width in sizes)
     return Blend(matrices, offsets, rots, means, quats, axes, count)

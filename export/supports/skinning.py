@@ -25,7 +25,7 @@ class Blend(NamedTuple):
     rots: str  # [4, R] of any norm
     means: str  # [3, R]
     quats: str  # [4, R]
-    axes: str  # [9, R] rotation matrices of `quats`, row by row
+    axes: str  # [9, R] the three axes of each Gaussian: columns of the rotation matrices of `quats`
     count: int  # R
 
 
@@ -81,22 +81,24 @@ def _rows(graph: GraphBuilder, columns: str, width: int, count: int) -> str:
 
 def _moved(graph: GraphBuilder, blend: Blend) -> str:
     """[3, R] means, moved."""
-    matrices = reshaped(graph, blend.matrices, (3, 3, blend.count), "skinning.means.matrices")
-    products = graph.node("Mul", [matrices, blend.means], "skinning.means.products")
-    sums = _sums(graph, products, 3)  # [3, 1, R]
-    turned = reshaped(graph, sums, (3, blend.count), "skinning.means.turned")
+    turned = _turned(graph, blend, blend.means, "skinning.means.turned")
     return graph.node("Add", [turned, blend.offsets], "skinning.means")
 
 
 def _squares(graph: GraphBuilder, blend: Blend, axes: str) -> str:
-    """[3, R] squared lengths of three axes, the columns of matrices [9, R], as the motions change them."""
-    matrices = reshaped(graph, blend.matrices, (3, 3, 1, blend.count), "skinning.stretch.matrices")
-    vectors = reshaped(graph, axes, (1, 3, 3, blend.count), "skinning.stretch.vectors")
-    products = graph.node("Mul", [matrices, vectors], "skinning.stretch.products")
-    terms = reshaped(graph, products, (3, 3, 3 * blend.count), "skinning.stretch.terms")
-    moved = reshaped(graph, _sums(graph, terms, 3), (3, 3 * blend.count), "skinning.stretch.moved")
-    squares = _sums(graph, graph.node("Mul", [moved, moved], "skinning.stretch.squares"), 3)  # [1, 3 · R]
-    return reshaped(graph, squares, (3, blend.count), "skinning.stretch.lengths")
+    """[3, R] squared lengths of three axes, [9, R], as the motions change them."""
+    squares = []
+    for axis in graph.split(axes, [f"{axes}.{k}" for k in range(3)], [3, 3, 3], axis=0):
+        turned = _turned(graph, blend, axis, f"{axis}.turned")
+        squares.append(_sums(graph, graph.node("Mul", [turned, turned], f"{axis}.squares"), 3))
+    return graph.node("Concat", squares, f"{axes}.squares", axis=0)
+
+
+def _turned(graph: GraphBuilder, blend: Blend, vectors: str, output: str) -> str:
+    """[3, R] products of the blended matrices and vectors, [3, R]."""
+    matrices = reshaped(graph, blend.matrices, (3, 3, blend.count), f"{output}.matrices")
+    sums = _sums(graph, graph.node("Mul", [matrices, vectors], f"{output}.products"), 3)  # [3, 1, R]
+    return reshaped(graph, sums, (3, blend.count), output)
 
 
 def _scaled_axes(graph: GraphBuilder, blend: Blend, log_scales: str) -> tuple[str, str]:
@@ -104,7 +106,7 @@ def _scaled_axes(graph: GraphBuilder, blend: Blend, log_scales: str) -> tuple[st
     constant: onnxruntime computes them when it opens the file."""
     bounded = _clipped(graph, log_scales, -2 * LOG_SCALE_LIMIT, 2 * LOG_SCALE_LIMIT)  # their squares are finite
     scales = graph.node("Exp", [bounded], "skinning.canonical_scales")
-    place = graph.constant("skinning.stretch.place", np.tile(np.eye(3, dtype=np.float32), (3, 1)))
+    place = graph.constant("skinning.stretch.place", np.repeat(np.eye(3, dtype=np.float32), 3, axis=0))
     lengths = graph.node("MatMul", [place, scales], "skinning.stretch.canonical_lengths")
     axes = graph.node("Mul", [blend.axes, lengths], "skinning.stretch.scaled")
     least = graph.node("Mul", [scales, _number(graph, "skinning.least", MIN_STRETCH)], "skinning.least_scales")
