@@ -52,12 +52,9 @@ def skinned_poses(graph: GraphBuilder, blend: Blend, log_scales: str) -> dict[st
     nearly_zero = graph.constant("skinning.quats.least", np.array([[MIN_NORM], [0], [0], [0]], np.float32))
     rotated = graph.node("Add", [_rotated(graph, blend), nearly_zero], "skinning.quats.some")
     limit = math.exp(LOG_SCALE_LIMIT)
-    columns = {
-        "means": _moved(graph, blend),
-        "scales": _clipped(graph, scales, 1 / limit, limit),
-        "quats": _unit(graph, rotated),
-    }
-    return {part: _rows(graph, value, WIDTHS[part], blend.count) for part, value in columns.items()}
+    columns = {"means": _moved(graph, blend), "scales": scales, "quats": _unit(graph, rotated)}
+    poses = {part: _rows(graph, value, WIDTHS[part], blend.count) for part, value in columns.items()}
+    return {**poses, "scales": _clipped(graph, poses["scales"], 1 / limit, limit)}
 
 
 def columns_of(graph: GraphBuilder, rows: str, width: int, count: int) -> str:
