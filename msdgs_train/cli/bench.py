@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -37,10 +37,16 @@ class Bench:
     """All scenes, for 30 minutes each if --minutes isn't given."""
     minutes: float | None = None
     """Minutes per run; 5 if not given."""
+    scenes: tuple[str, ...] = ()
+    """Scenes by name, in place of those of the short or the whole form."""
     seeds: tuple[int, ...] = (0,)
     """One run per seed; the table shows mean and standard deviation."""
     threads: int = 2
-    """CPU threads of each run; runs come one after the other."""
+    """CPU threads of each run."""
+    jobs: int = 1
+    """Runs in parallel; together with --threads, no more than the machine has cores."""
+    time: Literal["wall", "cpu"] = "wall"
+    """What --minutes count: time that passes, or CPU time of all threads, on a machine that does other work too."""
 
     def execute(self) -> int:
         from msdgs_train.comparison.bench import (
@@ -57,8 +63,9 @@ class Bench:
         from msdgs_train.comparison.runner import train_all
 
         minutes, csv = self.minutes or (30.0 if self.whole else 5.0), self.csv or self.out / "bench.csv"
-        scenes = {scene.name: scene for scene in read_scenes(self.data, short=not self.whole)}
-        systems = read_systems(self.systems, Budget(steps=None, minutes=minutes, threads=self.threads))
+        budget = Budget(steps=None, minutes=minutes, threads=self.threads, time=self.time)
+        scenes = {scene.name: scene for scene in read_scenes(self.data, short=not self.whole, names=self.scenes)}
+        systems = read_systems(self.systems, budget)
         runs = make_bench_runs(systems, list(scenes.values()), self.seeds, self.out)
         done = set(map(key_of_row, read_rows(csv)))
         left = [run for run in runs if key_of(run) not in done]
@@ -69,7 +76,7 @@ class Bench:
                 if end.status in ("finished", "was finished"):
                     append_row(csv, measure(run, scenes[run.scene]))
 
-            complete = train_all(left, processes(1), finish)
+            complete = train_all(left, processes(self.jobs), finish)
         wanted = {key_of(run) for run in runs}
         rows = [row for row in read_rows(csv) if key_of_row(row) in wanted]
         if rows:

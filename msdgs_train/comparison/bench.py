@@ -26,7 +26,7 @@ from msdgs_train.evaluation.evaluate import evaluate_run
 
 SCENES = Path(__file__).with_name("bench.toml")
 SPLITS = ("val", "test")
-KEY = ("scene", "system", "seed", "minutes", "threads", "settings")
+KEY = ("scene", "system", "seed", "minutes", "time", "threads", "settings")
 COLUMNS = (
     "date", "machine", *KEY, "seconds", "optimizer_steps", "gaussians", "train_psnr",
     *(f"{split}_{name}" for split in SPLITS for name in ("psnr", "ssim", "lpips", "moving_psnr", "images")),
@@ -50,11 +50,17 @@ class BenchScene:
     """Whether the short form has it."""
 
 
-def read_scenes(data: Path, *, short: bool, file: Path = SCENES) -> list[BenchScene]:
-    """The scenes of the benchmark, with folders below `data`. Raises `InvalidInput` if one has no folder."""
+def read_scenes(data: Path, *, short: bool, names: Sequence[str] = (), file: Path = SCENES) -> list[BenchScene]:
+    """The scenes of the benchmark, or those with the given names, with folders below `data`.
+
+    Raises `InvalidInput` if a name is unknown or a scene has no folder.
+    """
     tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    unknown = [name for name in names if name not in tables]
+    if unknown:
+        raise InvalidInput("scenes", f"of {', '.join(tables)}", unknown[0])
     scenes = [BenchScene(name, **{**table, "folder": data / table["folder"]}) for name, table in tables.items()]
-    chosen = [scene for scene in scenes if scene.short or not short]
+    chosen = [scene for scene in scenes if (scene.name in names if names else scene.short or not short)]
     missing = sorted({scene.folder.name for scene in chosen if not scene.folder.is_dir()})
     if missing:
         raise InvalidInput("data", f"a folder with datasets named {', '.join(missing)}", data)
@@ -78,7 +84,8 @@ def make_bench_runs(
 def key_of(run: Run) -> tuple[str, ...]:
     """The values of `KEY`, which tell the rows of a CSV file apart."""
     config = run.config.run
-    return run.scene, run.system, str(run.seed), f"{config.minutes:g}", str(config.threads), _digest(run.config)
+    shared = f"{config.minutes:g}", config.time, str(config.threads)
+    return run.scene, run.system, str(run.seed), *shared, _digest(run.config)
 
 
 def key_of_row(row: Row) -> tuple[str, ...]:
@@ -88,7 +95,7 @@ def key_of_row(row: Row) -> tuple[str, ...]:
 
 def _digest(config: TrainConfig) -> str:
     """Eight digits that change with any setting besides those of `KEY`, the scene's and the machine's."""
-    same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1)
+    same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1, time="wall")
     return hashlib.sha256(json.dumps(same.to_dict(), sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -33,11 +33,15 @@ def as_markdown(rows: Sequence[Row]) -> str:
     headings = ["scene", *(f"{system}, {split}" for split in SPLITS for system in systems)]
     shown = [markdown_table(headings, lines)]
     if len(systems) > 1:
-        gains = [[scene, *(_gain(rows, scene, system, systems[0]) for system in systems[1:])] for scene in scenes]
+        gains = [
+            [name, *(_gain(rows, of, system, systems[0]) for system in systems[1:])]
+            for name, of in [*((scene, [scene]) for scene in scenes), ("mean", scenes)]
+        ]
         shown += ["", f"Gain over {systems[0]} on test images, dB, with the 95 % interval over images:", ""]
         shown.append(markdown_table(["scene", *systems[1:]], gains))
     first = rows[0]
-    budget = f"{first['minutes']} minutes per run on {first['threads']} thread(s) of {first['machine']}"
+    kind = "minutes of CPU time" if first["time"] == "cpu" else "minutes"
+    budget = f"{first['minutes']} {kind} per run on {first['threads']} thread(s) of {first['machine']}"
     days = sorted({row["date"] for row in rows})
     notes = f"PSNR in dB of the last model, mean ± standard deviation over seeds; {budget}; {days[0]} to {days[-1]}. "
     notes += "Settings are chosen on val, results reported on test; the mean is over scenes that all systems have."
@@ -61,12 +65,17 @@ def draw(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def paired_gain(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
-    """Mean of `other` − `one`, [images], and the limits of its 95 % bootstrap interval over images; seeded."""
-    gains = other - one
-    drawn = np.random.default_rng(0).integers(len(gains), size=(RESAMPLES, len(gains)))
-    low, high = np.percentile(gains[drawn].mean(axis=1), INTERVAL)
-    return float(gains.mean()), float(low), float(high)
+def paired_gain(gains: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """Mean over scenes of the mean gain over images, and the limits of its 95 % bootstrap interval over the images of
+    each scene; seeded.
+
+    Args:
+        gains: an array per scene, the difference between two systems for each image.
+    """
+    generator = np.random.default_rng(0)
+    drawn = [of[generator.integers(len(of), size=(RESAMPLES, len(of)))].mean(axis=1) for of in gains]
+    low, high = np.percentile(np.mean(drawn, axis=0), INTERVAL)
+    return float(np.mean([of.mean() for of in gains])), float(low), float(high)
 
 
 def _names(rows: Sequence[Row], column: str) -> list[str]:
@@ -91,10 +100,14 @@ def _mean_over_scenes(
     return [statistics.fmean(column) for column in zip(*complete, strict=True)] or [None] * len(systems)
 
 
-def _gain(rows: Sequence[Row], scene: str, system: str, first: str) -> str:
-    """Over images; each is the mean over the seeds."""
-    images = [[np.array(v.split(), float) for v in _values(rows, scene, s, "test_images")] for s in (first, system)]
-    if not all(images):
+def _gain(rows: Sequence[Row], scenes: Sequence[str], system: str, first: str) -> str:
+    """Over scenes that both systems have, and over images, each the mean over the seeds."""
+    gains = []
+    for scene in scenes:
+        images = [[np.array(v.split(), float) for v in _values(rows, scene, s, "test_images")] for s in (first, system)]
+        if all(images):
+            gains.append(np.mean(images[1], axis=0) - np.mean(images[0], axis=0))
+    if not gains:
         return "–"
-    mean, low, high = paired_gain(*(np.mean(of_system, axis=0) for of_system in images))
+    mean, low, high = paired_gain(gains)
     return f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"

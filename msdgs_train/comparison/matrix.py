@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
@@ -32,10 +32,12 @@ class Budget:
     """Maximum Gaussians of all systems; their own settings if not given."""
     threads: int = 1
     """CPU threads of each run."""
+    time: Literal["wall", "cpu"] = "wall"
+    """What --minutes count: time that passes, or CPU time of all threads of a run."""
 
     def settings(self) -> dict[str, Any]:
         """Return the settings of `TrainConfig`."""
-        given = {"minutes": self.minutes, "threads": self.threads, "eval_every": 0}
+        given = {"minutes": self.minutes, "threads": self.threads, "time": self.time, "eval_every": 0}
         if self.steps is not None:
             every = max(self.steps // EVALUATIONS, 1)
             given |= {"eval_every": every, "checkpoint_every": every, "log_every": max(self.steps // LOG_LINES, 1)}

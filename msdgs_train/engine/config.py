@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -37,11 +37,15 @@ class RunConfig(Checked):
     minutes: float | None = None
     """Length of the run by the clock, evaluation and saving included: schedules are laid out over this time, and the
     bits depend on the speed of the machine."""
+    time: Literal["wall", "cpu"] = "wall"
+    """What `minutes` and reports count: time that passes, or the CPU time of all threads, which other work on the
+    machine hardly changes."""
 
     def __post_init__(self) -> None:
         self.require_counts("steps", "batch_size", "threads")
         self.require_counts("seed", least=0)
         self.require_positive_or_none("minutes")
+        self.require(("time",), "wall or cpu", lambda v: v in ("wall", "cpu"))
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,8 @@ class Run:
         self.config, self.observer = state.trainer.config, observer
         self.splits = [split for split in EVAL_SPLITS if state.trainer.scene.splits.get(split)]
         self.selection_split = _selection_split(state.trainer.scene)
-        self.started = time.perf_counter() - state.seconds
+        self._now = time.process_time if self.config.run.time == "cpu" else time.perf_counter
+        self.started = self._now() - state.seconds
         self.clock, self.advance = self._new_clock(), 1
 
     def execute(self) -> RunResult:
@@ -131,13 +132,13 @@ class Run:
     def _train(self) -> Status:
         steps, is_first = self.config.run.steps, True
         while self.trainer.step_count < steps:
-            before = time.perf_counter()
+            before = self._now()
             try:
                 result = self.trainer.step(self.advance)
             except TrainingDiverged as error:
                 self._roll_back(error)
                 continue
-            taken = time.perf_counter() - before
+            taken = self._now() - before
             self._after_step(result)
             if self.clock and not is_first:  # the first one compiles kernels
                 images = self.config.run.batch_size
@@ -167,10 +168,10 @@ class Run:
 
     def _is_stopped(self) -> bool:
         """Wait while paused, which doesn't count as training time; whether the run is to stop."""
-        since = time.perf_counter()
+        since = self._now()
         while self.observer.is_paused() and not self.observer.should_stop():
             time.sleep(PAUSE_SECONDS)
-        self.started += time.perf_counter() - since
+        self.started += self._now() - since
         return self.observer.should_stop()
 
     def _after_step(self, result: StepResult) -> None:
@@ -227,7 +228,7 @@ class Run:
         (self.folder / FINAL_METRICS).write_text(json.dumps(metrics, indent=2) + "\n")
 
     def _seconds(self) -> float:
-        return time.perf_counter() - self.started
+        return self._now() - self.started
 
 
 def _selection_split(scene: SceneData) -> str | None:

@@ -33,7 +33,7 @@ size = 12
 @pytest.fixture
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "bench.toml").write_text(SCENES)
-    monkeypatch.setattr(bench.read_scenes, "__kwdefaults__", {"file": tmp_path / "bench.toml"})
+    monkeypatch.setattr(bench.read_scenes, "__kwdefaults__", {"names": (), "file": tmp_path / "bench.toml"})
     write_scene(tmp_path / "one")
     return tmp_path
 
@@ -47,6 +47,9 @@ def row(scene: str, system: str, seed: int, images: list[float]) -> bench.Row:
 
 def test_scenes_are_of_the_short_form_or_all(data: Path) -> None:
     assert [scene.name for scene in read_scenes(data, short=True)] == ["small"]
+    assert [scene.name for scene in read_scenes(data, short=True, names=["held_out"])] == ["held_out"]
+    with pytest.raises(InvalidInput, match="`scenes` must be of small, held_out, elsewhere, got nowhere"):
+        read_scenes(data, short=True, names=["nowhere"])
     with pytest.raises(InvalidInput, match="datasets named two"):
         read_scenes(data, short=False)
 
@@ -61,9 +64,11 @@ def test_the_same_command_goes_on_from_its_rows(data: Path, capsys: pytest.Captu
     systems = data / "systems.toml"
     systems.write_text('[tiny]\npreset = "static"\ninit_num_pts = 60\nmax_gaussians = 90\nsteps = 4\n')
     command = ["bench", str(systems), "--data", str(data), "--out", str(data / "out"), "--minutes=1e-4", "--threads=1"]
+    command += ["--time=cpu"]
     assert cli.main(command) == 0
     (first,) = read_rows(data / "out" / "bench.csv")
-    assert (first["scene"], first["system"], first["optimizer_steps"]) == ("small", "tiny", "3")
+    shown = [first[name] for name in ("scene", "system", "optimizer_steps", "time")]
+    assert shown == ["small", "tiny", "3", "cpu"]
     assert float(first["test_psnr"]) > 0
     assert len(first["val_images"].split()) > 0
     assert cli.main(command) == 0
@@ -94,12 +99,12 @@ def test_the_table_has_means_over_scenes_that_all_have_and_paired_gains() -> Non
     assert "| s2 | 20.00 | – | 10.00 | – |" in table
     assert "| mean | 20.00 | 20.00 | 26.00 | 28.00 |" in table
     assert "| s1 | +2.00 (+2.00 to +2.00) |" in table
+    assert "| mean | +2.00 (+2.00 to +2.00) |" in table
 
 
 def test_an_interval_covers_the_mean_gain() -> None:
     generator = np.random.default_rng(1)
-    one = generator.normal(25, 3, 40)
-    mean, low, high = paired_gain(one, one + generator.normal(0.5, 0.2, 40))
+    mean, low, high = paired_gain([generator.normal(0.5, 0.2, 40)])
     assert low < mean < high
     assert mean == pytest.approx(0.5, abs=0.15)
     assert 0.05 < high - low < 0.25
