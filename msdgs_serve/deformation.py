@@ -58,7 +58,7 @@ class DeformationSession:
         scene_file = read_scene_file(contents, self._file, limits or GraphLimits())
         del contents  # `scene_file` has copies of all large arrays
         self.cost = scene_file.cost
-        self._steps = scene_file.steps
+        self._steps, self._outputs, self._selected = scene_file.steps, scene_file.outputs, scene_file.selected
         self._chunk = chunk or (max(scene_file.moving_count, 1) if scene_file.poses_all else CHUNK)
         self.scene = self._read_scene(scene_file)
         self._session = self._open(scene_file.graph, thread_count() if scene_file.poses_all else 1)
@@ -93,19 +93,9 @@ class DeformationSession:
         """
         t = self._checked_time(t)
         self.check_steps(steps)
-        every = np.arange(self.scene.moving_count) if ids is None else self._checked_ids(ids)
-        posed = {name: np.empty((len(every), _SIZES[name]), np.float32) for name in MOVING_OUTPUTS}
-
-        def run(start: int, stop: int) -> None:
-            outputs = self._run(t, every[start:stop], steps)
-            for name, output in zip(MOVING_OUTPUTS, outputs, strict=True):
-                expected = posed[name][start:stop]
-                if output.shape != expected.shape:
-                    raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
-                expected[:] = output
-
+        ids = None if ids is None else self._checked_ids(ids)
         with sharing_cores():
-            run_parallel(run, [(i, min(i + self._chunk, len(every))) for i in range(0, len(every), self._chunk)])
+            posed = self._pose_selected(t, ids, steps) if self._selected else self._pose_all(t, ids, steps)
         self._check_finite(t, posed)
         return posed["means"], posed["quats"], posed["scales"]
 
@@ -124,6 +114,28 @@ class DeformationSession:
                 raise
             name = error.field.removeprefix("gaussians.")
             raise SceneFileInvalid(self._file, name, f"can't be used at t = {t}: {error}") from error
+
+    def _pose_selected(self, t: float, ids: npt.NDArray[np.int64] | None, steps: float | None) -> dict[str, FloatArray]:
+        """Poses by a graph that selects the ids, chunk by chunk."""
+        every = np.arange(self.scene.moving_count) if ids is None else ids
+        posed = {name: np.empty((len(every), _SIZES[name]), np.float32) for name in MOVING_OUTPUTS}
+
+        def run(start: int, stop: int) -> None:
+            outputs = self._run(t, every[start:stop], steps)
+            for name, output in zip(MOVING_OUTPUTS, outputs, strict=True):
+                expected = posed[name][start:stop]
+                if output.shape != expected.shape:
+                    raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
+                expected[:] = output
+
+        run_parallel(run, [(i, min(i + self._chunk, len(every))) for i in range(0, len(every), self._chunk)])
+        return posed
+
+    def _pose_all(self, t: float, ids: npt.NDArray[np.int64] | None, steps: float | None) -> dict[str, FloatArray]:
+        """Poses by a graph of all Gaussians, one per row, and of more rows if it needs a multiple of some length."""
+        rows = slice(self.scene.moving_count) if ids is None else ids
+        outputs = zip(MOVING_OUTPUTS, self._run(t, np.arange(0), steps), strict=True)
+        return {name: output[rows] for name, output in outputs}
 
     def _checked_time(self, t: float) -> float:
         t0, t1 = self.scene.metadata.time_range
@@ -181,7 +193,7 @@ class DeformationSession:
         inputs = {"t": np.array([t], np.float32), "ids": ids}
         if self._steps is not None:
             inputs[OPTIONAL_INPUT] = np.array([self._steps if steps is None else steps], np.float32)
-        return self._call(self._session, MOVING_OUTPUTS, inputs)
+        return self._call(self._session, self._outputs, inputs)
 
     def _call(
         self, session: ort.InferenceSession, outputs: Sequence[str], inputs: dict[str, np.ndarray]

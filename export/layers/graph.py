@@ -29,10 +29,10 @@ class GraphBuilder:
         self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
-    def split(self, value: str, outputs: list[str], sizes: list[int]) -> list[str]:
-        """Split a matrix into groups of columns with these sizes."""
+    def split(self, value: str, outputs: list[str], sizes: list[int], axis: int = 1) -> list[str]:
+        """Split a matrix into groups of columns, or of rows, with these sizes."""
         lengths = self.constant(f"{value}.sizes", np.array(sizes, np.int64))
-        self.nodes.append(helper.make_node("Split", [value, lengths], outputs, name=f"{value}.split", axis=1))
+        self.nodes.append(helper.make_node("Split", [value, lengths], outputs, name=f"{value}.split", axis=axis))
         return outputs
 
     def model(

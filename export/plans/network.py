@@ -1,5 +1,6 @@
 """Plans `network`, all layers in float32 as the model computes them, and `prefix:k`, the first k of them."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from export.layers.graph import GraphBuilder
 from export.plans.base import Plan
 from export.plans.scene_graph import finished, new_graph, unit_quats
 from export.supports import Layout, SupportInputs, support_export_of
+from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT, MIN_SCALE
 
@@ -34,14 +36,18 @@ def _deform(graph: GraphBuilder, baked: Baked) -> None:
     steps = graph.constant("steps", np.array([len(baked.layers)], np.float32))
     attributes = moving.baked_attributes if rows.layout is None else rows.layout.attributes
     inputs = SupportInputs(baked.support, baked.layers, means, quats, time, steps, attributes)
-    parts = export.deltas(graph, inputs)
-    parts = {part: _modulated(graph, rows, part, moving.modulation.get(part), value) for part, value in parts.items()}
-    operator = ("Add", [means, parts["means"]]) if "means" in parts else ("Identity", [means])
-    graph.node(*operator, rows.output("means"))
-    _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space, rows.output("scales"))
-    raw_quats = graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats
-    unit_quats(graph, raw_quats, rows.output("quats"))
-    rows.select()
+    plain = not moving.modulation and baked.scene.metadata.delta_space == "raw"
+    poses = export.poses(graph, inputs, log_scales) if plain else None
+    if poses is None:
+        parts = export.deltas(graph, inputs)
+        parts = {part: _modulated(graph, rows, part, moving.modulation.get(part), v) for part, v in parts.items()}
+        poses = {name: rows.output(name) for name in MOVING_OUTPUTS}
+        operator = ("Add", [means, parts["means"]]) if "means" in parts else ("Identity", [means])
+        graph.node(*operator, poses["means"])
+        _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space, poses["scales"])
+        raw_quats = graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats
+        unit_quats(graph, raw_quats, poses["quats"])
+    rows.select(poses)
 
 
 class _Rows:
@@ -60,8 +66,8 @@ class _Rows:
         """The name of an output before the selection."""
         return name if self.layout is None else f"rows.{name}"
 
-    def select(self) -> None:
-        """Add the nodes that select the ids."""
+    def select(self, poses: Mapping[str, str]) -> None:
+        """Add the nodes that select the ids from the poses of a layout's rows."""
         if self.layout is None:
             return
         graph, row_of_id = self._graph, np.zeros(self._count, np.int32)
@@ -70,8 +76,8 @@ class _Rows:
         if not np.array_equal(row_of_id, np.arange(self._count)):
             rows = graph.node("Cast", [graph.constant("row_of_id", row_of_id)], "rows.of_id", to=TensorProto.INT64)
             ids = graph.node("Gather", [rows, "ids"], "rows.ids")
-        for name in ("means", "scales", "quats"):
-            graph.node("Gather", [self.output(name), ids], name)
+        for name, value in poses.items():
+            graph.node("Gather", [value, ids], name)
 
 
 def _modulated(graph: GraphBuilder, rows: _Rows, part: str, factors: np.ndarray | None, deltas: str) -> str:

@@ -48,3 +48,8 @@ class SupportExport:
         """Add the nodes of the chain and of the support. Returns the summed deltas of the rows by head, without heads
         that are always 0 (equations 7 to 9, before modulation)."""
         raise NotImplementedError
+
+    def poses(self, graph: GraphBuilder, inputs: SupportInputs, log_scales: str) -> dict[str, str] | None:
+        """Add the nodes of means, scales and quaternions of a layout's rows, deformed without modulation and with
+        deltas of logarithms of scales, [R, 3]; None to have them computed from `deltas`."""
+        return None

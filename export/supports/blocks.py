@@ -11,9 +11,11 @@ from export.supports.base import Layout
 BLOCK_SIZES = (64, 128, 256)
 BLOCK_NODES = 8
 """Nodes of a block are padded to a multiple of this."""
+BLOCK_COST = 1250
+"""Elements of a matrix of weights whose products take as long as those of a block beside them."""
 SORTING_GAIN = 0.9
-"""Rows are sorted if this makes the matrices of weights smaller than this times those in the order given, which needs
-no index from Gaussians to rows."""
+"""Rows are sorted if this makes the cost smaller than this times that of the order given, which needs no index from
+Gaussians to rows."""
 WEIGHT_ONE = 32767
 """A skinning weight of 1 as it is stored, in 16 bits: one of 4 weights is off by 1.5e-5 at most."""
 
@@ -22,13 +24,13 @@ class Blocks(NamedTuple):
     """B blocks of S rows that follow U nodes each."""
 
     nodes: np.ndarray  # int64 [B, U]
-    ids: np.ndarray  # int64 [B, F, S], indices into a row of `nodes`
-    weights: np.ndarray  # int16 [B, F, S], fractions of `WEIGHT_ONE`
+    ids: np.ndarray  # int64 [B, S, F], indices into a row of `nodes`
+    weights: np.ndarray  # int16 [B, S, F], fractions of `WEIGHT_ONE`
 
     @property
-    def size(self) -> int:
-        """Elements of all matrices of weights."""
-        return self.nodes.size * self.ids.shape[2]
+    def cost(self) -> int:
+        """Time of skinning, in elements of a matrix of weights."""
+        return self.nodes.size * self.ids.shape[1] + BLOCK_COST * len(self.nodes)
 
 
 def block_layout(means: np.ndarray, node_ids: np.ndarray, skinning_weights: np.ndarray) -> Layout:
@@ -41,18 +43,18 @@ def block_layout(means: np.ndarray, node_ids: np.ndarray, skinning_weights: np.n
         skinning_weights: [N, F]; rows sum to 1.
     """
     stored = _stored_weights(skinning_weights)
-    given, sorted_ = (_smallest(order, node_ids, stored) for order in (np.arange(len(means)), morton_order(means)))
-    rows, blocks = sorted_ if sorted_[1].size < SORTING_GAIN * given[1].size else given
+    given, sorted_ = (_cheapest(order, node_ids, stored) for order in (np.arange(len(means)), morton_order(means)))
+    rows, blocks = sorted_ if sorted_[1].cost < SORTING_GAIN * given[1].cost else given
     return Layout(rows, blocks._asdict())
 
 
-def _smallest(order: np.ndarray, node_ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, Blocks]:
-    """Padded rows and blocks of the size whose matrices are smallest."""
+def _cheapest(order: np.ndarray, node_ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, Blocks]:
+    """Padded rows and blocks of the size that costs least."""
     layouts = []
     for size in sorted({min(size, len(order)) for size in BLOCK_SIZES}):
         rows = np.append(order, np.repeat(order[-1:], -len(order) % size))
         layouts.append((rows, _blocks(node_ids[rows], weights[rows], size)))
-    return min(layouts, key=lambda layout: layout[1].size)
+    return min(layouts, key=lambda layout: layout[1].cost)
 
 
 def _blocks(node_ids: np.ndarray, weights: np.ndarray, size: int) -> Blocks:
@@ -60,8 +62,8 @@ def _blocks(node_ids: np.ndarray, weights: np.ndarray, size: int) -> Blocks:
     distinct = [np.unique(block, return_inverse=True) for block in members]
     width = -(-max(len(nodes) for nodes, _ in distinct) // BLOCK_NODES) * BLOCK_NODES
     nodes = np.stack([np.pad(nodes, (0, width - len(nodes)), mode="edge") for nodes, _ in distinct])
-    ids = np.stack([local.reshape(size, -1).T for _, local in distinct])
-    return Blocks(nodes, ids, weights.reshape(members.shape).transpose(0, 2, 1))
+    ids = np.stack([local.reshape(size, -1) for _, local in distinct])
+    return Blocks(nodes, ids, weights.reshape(members.shape))
 
 
 def _stored_weights(weights: np.ndarray) -> np.ndarray:

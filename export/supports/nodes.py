@@ -1,10 +1,9 @@
 """The support `nodes` as a graph: the chain at the nodes once a call, then linear blend skinning of all Gaussians.
 
-Gaussians come in B blocks of S rows (`export.supports.blocks`). Values of a block lie in columns, [B, C, S], so that
-operations on them are on long contiguous rows.
+Gaussians come in B blocks of S rows (`export.supports.blocks`), R = B · S in all.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import cast
 
 import numpy as np
@@ -15,13 +14,12 @@ from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder, to_numpy
 from export.supports.base import Layout, SupportExport, SupportInputs
 from export.supports.blocks import WEIGHT_ONE, block_layout
+from export.supports.skinning import Blend, columns_of, reshaped, skinned_deltas, skinned_poses
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.nodes import NodesSupport
-from msdgs_train.supports.skinning_kernels import MIN_STRETCH
 
-WIDTHS = {"means": 3, "scales": 3, "quats": 4}
-IDENTITY = np.array([1, 0, 0, 0], np.float32)
+IDENTITY, CONJUGATE = np.array([1, 0, 0, 0], np.float32), np.array([1, -1, -1, -1], np.float32)
 
 
 class NodesExport(SupportExport):
@@ -30,31 +28,24 @@ class NodesExport(SupportExport):
     heads_are_removable = False
 
     def bytes_per_gaussian(self, support: Support) -> int:
-        """A weight in 16 bits and an index in 8 bits for each node that a Gaussian follows."""
-        return 3 * cast(NodesSupport, support).config.followed
+        """An index in 8 bits and, but for the last, a weight in 16 bits for each node that a Gaussian follows."""
+        return 3 * cast(NodesSupport, support).config.followed - 2
 
     def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout:
         """Blocks of Gaussians that are near each other."""
         return block_layout(means, attributes["node_ids"], attributes["skinning_weights"])
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
+        """Motions of the nodes, blended for each Gaussian, minus its canonical pose."""
+        return skinned_deltas(graph, _blend(graph, inputs))
+
+    def poses(self, graph: GraphBuilder, inputs: SupportInputs, log_scales: str) -> dict[str, str]:
         """Motions of the nodes, blended for each Gaussian, applied to its canonical pose."""
-        blended = _blended(graph, inputs.attributes, _motions(graph, inputs))
-        names = ["skinning.x", "skinning.y", "skinning.z", "skinning.offsets", "skinning.rots"]
-        *columns, offsets, rots = graph.split(blended, names, [3, 3, 3, 3, 4])
-        blocks, _, rows = inputs.attributes["weights"].shape
-        means, quats = _columns(graph, inputs.means, blocks, rows, 3), _columns(graph, inputs.quats, blocks, rows, 4)
-        axes = _matrices(graph, "skinning.axes", inputs.quats)  # constant: computed when the file is opened
-        parts = {
-            "means": _moved(graph, columns, offsets, means),
-            "scales": _stretched(graph, columns, _columns(graph, axes, blocks, rows, 9)),
-            "quats": _rotated(graph, rots, quats),
-        }
-        return {part: _rows(graph, value, WIDTHS[part]) for part, value in parts.items()}
+        return skinned_poses(graph, _blend(graph, inputs), log_scales)
 
 
 def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
-    """[M, 16] `NodesSupport.motions`, but matrices column by column."""
+    """[M, 16] `NodesSupport.motions`."""
     support = cast(NodesSupport, inputs.support)
     positions = to_numpy(support.nodes)
     nodes = graph.constant("nodes", positions)
@@ -65,29 +56,47 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     tiled = graph.constant("nodes.tiled", np.tile(positions, 3))
     rotated = _row_sums(graph, "nodes.rotated", graph.node("Mul", [matrices, tiled], "nodes.products"))
     offsets = graph.node("Sub", [graph.node("Add", [nodes, parts["means"]], "nodes.moved"), rotated], "nodes.offsets")
-    by_columns = graph.constant("nodes.by_columns", np.arange(9).reshape(3, 3).T.reshape(9))
-    matrices = graph.node("Gather", [matrices, by_columns], "nodes.columns", axis=1)
     return graph.node("Concat", [matrices, offsets, rots], "nodes.motions", axis=1)
 
 
-def _blended(graph: GraphBuilder, attributes: Mapping[str, np.ndarray], motions: str) -> str:
-    """[B, 16, S] weighted means of the motions, [M, 16], of the nodes that each Gaussian follows."""
-    nodes, ids, weights = (attributes[name] for name in ("nodes", "ids", "weights"))
-    picked = graph.node("Gather", [motions, _stored_ids(graph, "skinning.nodes", nodes)], "skinning.picked")
-    picked = graph.node("Transpose", [picked], "skinning.motions", perm=[0, 2, 1])
-    own = graph.constant("skinning.own", np.arange(nodes.shape[1])[:, None])
+def _blend(graph: GraphBuilder, inputs: SupportInputs) -> Blend:
+    """Weighted means of the motions of the nodes that each Gaussian follows."""
+    nodes, ids, weights = (inputs.attributes[name] for name in ("nodes", "ids", "weights"))
+    count = ids.shape[0] * ids.shape[1]
+    followed = [_motions(graph, inputs), _stored_ids(graph, "skinning.nodes", nodes)]
+    followed = graph.node("Gather", followed, "skinning.followed")  # [B, U, 16]
+    # [B, S, 16]: half the time of motions in columns, [B, 16, S], where the second matrix is the large one
+    blended = graph.node("MatMul", [_weights(graph, ids, weights, nodes.shape[1]), followed], "skinning.blended")
+    names = ["skinning.matrices", "skinning.offsets", "skinning.rots"]
+    matrices, offsets, rots = graph.split(columns_of(graph, blended, 16, count), names, [9, 3, 4], axis=0)
+    # constant, so computed when the file is opened: the rows of the inverse rotation are the axes
+    inverse = graph.node("Mul", [inputs.quats, graph.constant("conjugate", CONJUGATE)], "skinning.inverse")
+    axes = _matrices(graph, "skinning.axes", inverse)
+    sizes = ((inputs.means, 3), (inputs.quats, 4), (axes, 9))
+    means, quats, axes = (columns_of(graph, value, width, count) for value, width in sizes)
+    return Blend(matrices, offsets, rots, means, quats, axes, count)
+
+
+def _weights(graph: GraphBuilder, ids: np.ndarray, weights: np.ndarray, width: int) -> str:
+    """[B, S, U] skinning weights of all nodes of a block. Constant: onnxruntime computes them when it opens the file.
+
+    The last weight of a Gaussian isn't stored: it is one minus the others.
+    """
+    own = graph.constant("skinning.own", np.arange(width))
     one = graph.constant("skinning.one", np.array([1 / WEIGHT_ONE], np.float32))
-    matrix = ""
-    for f in range(ids.shape[1]):  # constant: onnxruntime computes the matrices when it opens the file
-        name = f"skinning.node{f}"
-        followed = graph.node("Equal", [_stored_ids(graph, name, ids[:, f, None]), own], f"{name}.equal")
-        stored = graph.constant(f"{name}.stored_weight", weights[:, f, None])
-        weight = graph.node("Cast", [stored], f"{name}.number", to=TensorProto.FLOAT)
+    left, total = graph.constant("skinning.all", np.array([WEIGHT_ONE], np.float32)), ""
+    for f in range(ids.shape[2]):
+        name, weight = f"skinning.node{f}", left
+        if f + 1 < ids.shape[2]:
+            stored = graph.constant(f"{name}.stored_weight", weights[..., f, None])
+            weight = graph.node("Cast", [stored], f"{name}.number", to=TensorProto.FLOAT)
+            left = graph.node("Sub", [left, weight], f"{name}.left")
         weight = graph.node("Mul", [weight, one], f"{name}.weight")
+        followed = graph.node("Equal", [_stored_ids(graph, name, ids[..., f, None]), own], f"{name}.equal")
         place = graph.node("Cast", [followed], f"{name}.place", to=TensorProto.FLOAT)
         term = graph.node("Mul", [place, weight], f"{name}.matrix")
-        matrix = graph.node("Add", [matrix, term], f"{name}.sum") if matrix else term
-    return graph.node("MatMul", [picked, matrix], "skinning.blended")
+        total = graph.node("Add", [total, term], f"{name}.sum") if total else term
+    return total
 
 
 def _stored_ids(graph: GraphBuilder, name: str, ids: np.ndarray) -> str:
@@ -95,20 +104,6 @@ def _stored_ids(graph: GraphBuilder, name: str, ids: np.ndarray) -> str:
     small = np.uint8 if ids.max() < 1 << 8 else np.int16 if ids.max() < 1 << 15 else np.int32
     stored = graph.constant(f"{name}.stored", ids.astype(small))
     return graph.node("Cast", [stored], f"{name}.ids", to=TensorProto.INT64)
-
-
-def _columns(graph: GraphBuilder, rows: str, blocks: int, size: int, width: int) -> str:
-    """[B, C, S] of [B · S, C]."""
-    shape = graph.constant(f"{rows}.block_shape", np.array([blocks, size, width], np.int64))
-    block = graph.node("Reshape", [rows, shape], f"{rows}.blocks")
-    return graph.node("Transpose", [block], f"{rows}.columns", perm=[0, 2, 1])
-
-
-def _rows(graph: GraphBuilder, columns: str, width: int) -> str:
-    """[B · S, C] of [B, C, S]."""
-    flat = graph.constant(f"{columns}.flat_shape", np.array([-1, width], np.int64))
-    block = graph.node("Transpose", [columns], f"{columns}.blocks", perm=[0, 2, 1])
-    return graph.node("Reshape", [block, flat], f"{columns}.rows")
 
 
 def _stretching(graph: GraphBuilder, name: str, rotations: str, stretches: str) -> str:
@@ -123,12 +118,8 @@ def _stretching(graph: GraphBuilder, name: str, rotations: str, stretches: str) 
 
 def _products(graph: GraphBuilder, name: str, left: str, right: str) -> str:
     """[·, 9] products of 3 × 3 matrices, [·, 9] each."""
-    square, flat = (
-        graph.constant(f"{name}.{word}", np.array(shape, np.int64))
-        for word, shape in (("square", (-1, 3, 3)), ("flat", (-1, 9)))
-    )
-    squares = [graph.node("Reshape", [m, square], f"{name}.{k}") for k, m in (("left", left), ("right", right))]
-    return graph.node("Reshape", [graph.node("MatMul", squares, f"{name}.product"), flat], name)
+    squares = [reshaped(graph, m, (-1, 3, 3), f"{name}.{k}") for k, m in (("left", left), ("right", right))]
+    return reshaped(graph, graph.node("MatMul", squares, f"{name}.product"), (-1, 9), name)
 
 
 def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
@@ -160,64 +151,6 @@ def _row_sums(graph: GraphBuilder, name: str, products: str) -> str:
     """[·, 9] → [·, 3]: sums of three columns at a time."""
     threes = graph.constant(f"{name}.threes", np.kron(np.eye(3), np.ones((3, 1))).astype(np.float32))
     return graph.node("MatMul", [products, threes], name)
-
-
-def _linear(graph: GraphBuilder, name: str, factors: Sequence[str], vectors: Sequence[str]) -> str:
-    """[B, C, S] sum of vectors [B, C, S] times factors, [B, 1, S] each, or the other way round."""
-    terms = [graph.node("Mul", [f, v], f"{name}.{i}") for i, (f, v) in enumerate(zip(factors, vectors, strict=True))]
-    total = terms[0]
-    for i, term in enumerate(terms[1:], start=1):
-        total = graph.node("Add", [total, term], f"{name}.sum{i}")
-    return total
-
-
-def _moved(graph: GraphBuilder, columns: list[str], offsets: str, means: str) -> str:
-    """[B, 3, S] by how much means move."""
-    coordinates = graph.split(means, [f"{means}.{axis}" for axis in "xyz"], [1, 1, 1])
-    rotated = _linear(graph, "skinning.means", coordinates, columns)
-    moved = graph.node("Add", [rotated, offsets], "skinning.means.moved")
-    return graph.node("Sub", [moved, means], "skinning.means.delta")
-
-
-def _stretched(graph: GraphBuilder, columns: list[str], axes: str) -> str:
-    """[B, 3, S] logarithms of how much longer a Gaussian's axes, columns of its rotation [B, 9, S], become by its
-    matrix."""
-    ones, lengths = graph.constant("skinning.three_ones", np.ones((1, 3), np.float32)), list[str]()
-    entries = graph.split(axes, [f"{axes}.{k}" for k in range(9)], [1] * 9)
-    for axis in range(3):
-        name = f"skinning.axis{axis}"
-        moved = _linear(graph, name, entries[axis::3], columns)
-        lengths.append(
-            graph.node("MatMul", [ones, graph.node("Mul", [moved, moved], f"{name}.squares")], f"{name}.square")
-        )
-    squares = graph.node("Concat", lengths, "skinning.squares", axis=1)
-    least = graph.constant("skinning.least", np.array([MIN_STRETCH**2], np.float32))
-    half = graph.constant("skinning.half", np.array([0.5], np.float32))
-    logs = graph.node("Log", [graph.node("Max", [squares, least], "skinning.kept")], "skinning.logs")
-    return graph.node("Mul", [logs, half], "skinning.scales.delta")
-
-
-def _rotated(graph: GraphBuilder, rots: str, quats: str) -> str:
-    """[B, 4, S] by how much quaternions change when `rots`, made unit, rotate them."""
-    rows = (((0, 1), (1, 1), (2, 1), (3, 1)), ((1, -1), (0, 1), (3, -1), (2, 1)),
-            ((2, -1), (3, 1), (0, 1), (1, -1)), ((3, -1), (2, -1), (1, 1), (0, 1)))  # fmt: skip
-    ones = graph.constant("skinning.quats.ones", np.ones((1, 4), np.float32))
-    factors = graph.split(rots, [f"{rots}.{axis}" for axis in "wxyz"], [1, 1, 1, 1])
-    products = []
-    for axis, row in zip("wxyz", rows, strict=True):  # row i of the left factor's matrix: unit i times the quaternion
-        matrix = np.zeros((4, 4), np.float32)
-        for k, (source, sign) in enumerate(row):
-            matrix[k, source] = sign
-        name = f"skinning.quats.{axis}"
-        products.append(graph.node("MatMul", [graph.constant(f"{name}.unit", matrix), quats], f"{name}.product"))
-    rotated = _linear(graph, "skinning.quats", factors, products)
-    squares = graph.node("Mul", [rots, rots], "skinning.rots.squares")
-    norm = graph.node("Sqrt", [graph.node("MatMul", [ones, squares], "skinning.rots.sum")], "skinning.rots.norm")
-    least = graph.constant("skinning.rots.least", np.array([MIN_NORM], np.float32))
-    unit = graph.node(
-        "Div", [rotated, graph.node("Max", [norm, least], "skinning.rots.divisor")], "skinning.quats.unit"
-    )
-    return graph.node("Sub", [unit, quats], "skinning.quats.delta")
 
 
 def _unit(graph: GraphBuilder, name: str, quats: str) -> str:

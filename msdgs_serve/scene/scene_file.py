@@ -16,6 +16,7 @@ from msdgs_serve.scene.onnx import (
     Tensor,
     Value,
     infer,
+    names_needed,
     read_model,
     write_model,
 )
@@ -57,8 +58,10 @@ class SceneFile:
     moving_count: int
     steps: float | None  # the default input; None if the plan doesn't run layers
     poses_all: bool  # whether a call computes all Gaussians in any case
+    outputs: tuple[str, ...]  # those of `graph` with the values of MOVING_OUTPUTS
+    selected: bool  # whether rows of the outputs are those of the input `ids`; otherwise row i is of Gaussian i
     constants: Mapping[str, np.ndarray]  # those of CONSTANT_OUTPUTS that are stored directly
-    graph: bytes  # computes MOVING_OUTPUTS from the inputs of the contract, which have no defaults
+    graph: bytes  # computes `outputs` from the inputs of the contract, which have no defaults
     constant_graph: bytes | None  # computes the remaining CONSTANT_OUTPUTS, without inputs
     cost: SceneCost
 
@@ -98,13 +101,17 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
         if stored is not None:
             constants[name] = stored.array().copy()  # aligned, and doesn't keep the whole file in memory
     computed = [name for name in CONSTANT_OUTPUTS if name not in constants]
+    rows = _before_selection(model, values, moving_count) if poses_all else None
+    outputs = rows or MOVING_OUTPUTS
     return SceneFile(
         metadata,
         moving_count,
         steps,
         poses_all,
+        outputs,
+        rows is None,
         constants,
-        write_model(model, MOVING_OUTPUTS, inputs, values),
+        write_model(model, outputs, inputs, values),
         write_model(model, computed, {}, values) if computed else None,
         SceneCost(cost.memory_bytes, cost.operations * calls, calls, limits),
     )
@@ -114,6 +121,26 @@ def _poses_all(model: Model, inputs: Mapping[str, Value], moving_count: int) -> 
     """Whether all Gaussians take hardly more operations than one."""
     one, every = (infer(model, inputs, UNLIMITED, ids, 1, 0)[1].operations for ids in (1, moving_count))
     return every < PER_ID_FACTOR * one
+
+
+def _before_selection(model: Model, values: Mapping[str, Value], moving_count: int) -> tuple[str, ...] | None:
+    """The names of the poses of all Gaussians, row i of Gaussian i, from which the last nodes of a graph select the
+    ids. None if its last nodes do something else.
+
+    The selection takes 2.5 of 10.7 ms of a pose of 106,500 Gaussians on one thread, and is one of all in order mostly.
+    """
+    makers, rows = {node.outputs[0]: node for node in model.nodes}, []
+    for name in MOVING_OUTPUTS:
+        node = makers.get(name)
+        if node is None or node.operator != "Gather" or node.inputs[1] != "ids" or node.attributes.get("axis", 0):
+            return None
+        value = values[node.inputs[0]]
+        if not value.varies or value.shape[0].per_id or value.shape[0].fixed < moving_count:
+            return None
+        rows.append(node.inputs[0])
+    if len({*rows}) < len(rows) or "ids" in names_needed(model, rows):
+        return None
+    return tuple(rows)
 
 
 def _check_finite(tensor: Tensor) -> None:

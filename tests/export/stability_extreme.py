@@ -23,7 +23,7 @@ from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.base import SceneBounds
-from msdgs_train.layers.mlp import MLPConfig, PositionalEncoding, frequency_matrix
+from msdgs_train.layers.mlp import MLPConfig, frequency_matrix, positional_encoding
 from msdgs_train.layers.plane import PlaneConfig
 from tests.export.stability_rows import Change, Row, measured, refused, relative, worst_frame
 from tests.export.stability_rows import changed as any_changed
@@ -86,9 +86,9 @@ def traps() -> Iterator[Row]:
 
 def _encoding() -> Iterator[Row]:
     x = torch.linspace(-1.3, 1.3, 20_001, dtype=torch.double)[:, None].float()
-    exact = PositionalEncoding.apply(x.double(), frequency_matrix(1, 10).double())
-    single = PositionalEncoding.apply(x, frequency_matrix(1, 10))
-    half = PositionalEncoding.apply(x.half().float(), frequency_matrix(1, 10))
+    exact = positional_encoding(x.double(), frequency_matrix(1, 10).double())
+    single = positional_encoding(x, frequency_matrix(1, 10))
+    half = positional_encoding(x.half().float(), frequency_matrix(1, 10))
     yield measured("encoding at 2⁹", "sines in float32", float((single - exact).abs().max()), "encoding.float32")
     types = {t.data_type for t in onnx.load_from_string(_network(changed())).graph.initializer}
     half_types = len(types & {onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16})

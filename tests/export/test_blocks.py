@@ -11,7 +11,9 @@ from export.plans.registry import build
 from export.spatial_order import morton_order
 from export.supports.blocks import WEIGHT_ONE, block_layout
 from msdgs_serve.deformation import DeformationSession
-from tests.support.models import NODES, SCENE, random_model
+from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.spline import SplineLayer
+from tests.support.models import NODES, SCENE, SPLINE, random_model
 from tests.support.tolerances import tolerance
 
 
@@ -32,16 +34,16 @@ def test_each_row_has_the_nodes_and_weights_of_its_gaussian(count: int, nodes: i
     layout = block_layout(means, node_ids, weights)
     stored = layout.attributes
     assert set(layout.rows) == set(range(count))
-    blocks, _, size = stored["ids"].shape
+    blocks, size, _ = stored["ids"].shape
     dense = np.zeros((blocks * size, nodes))
     for block in range(blocks):
         for row in range(size):
-            of_row = stored["nodes"][block][stored["ids"][block, :, row]]
-            np.add.at(dense[block * size + row], of_row, stored["weights"][block, :, row] / WEIGHT_ONE)
+            of_row = stored["nodes"][block][stored["ids"][block, row]]
+            np.add.at(dense[block * size + row], of_row, stored["weights"][block, row] / WEIGHT_ONE)
     want = np.zeros((count, nodes))
     np.put_along_axis(want, node_ids, weights, axis=1)
     np.testing.assert_allclose(dense, want[layout.rows], atol=follows / WEIGHT_ONE)
-    np.testing.assert_array_equal(stored["weights"].sum(axis=1), WEIGHT_ONE)
+    np.testing.assert_array_equal(stored["weights"].sum(axis=2), WEIGHT_ONE)
 
 
 def test_morton_order_of_a_grid_visits_each_octant_at_once():
@@ -56,12 +58,17 @@ def test_morton_order_of_points_without_extent(means: np.ndarray):
     np.testing.assert_array_equal(morton_order(means), np.arange(len(means)))
 
 
+def session_of(model: DynamicGaussians) -> DeformationSession:
+    """The model's scene file, opened."""
+    contents = build("network", bake(model, SCENE, "0" * 64)).SerializeToString()
+    return DeformationSession("nodes.onnx", contents=contents)
+
+
 def test_a_scene_on_nodes_is_posed_in_one_call():
     """For any number of Gaussians, any ids and any number of layers."""
     count = 5000
     model = random_model(count, noise=0.02, support=replace(NODES, num_nodes=30), sh_degree=0)
-    contents = build("network", bake(model, SCENE, "0" * 64)).SerializeToString()
-    session = DeformationSession("nodes.onnx", contents=contents)
+    session = session_of(model)
     assert session.cost.calls == 1
     ids = np.random.default_rng(2).permutation(count)[:700]
     for steps, layers in ((None, None), (1.0, 1), (0.0, 0)):
@@ -69,3 +76,20 @@ def test_a_scene_on_nodes_is_posed_in_one_call():
             posed = model.pose(0.3, layers, ids=torch.from_numpy(ids))
         for got, want in zip(session.pose(0.3, ids, steps), (posed.means, posed.quats, posed.scales), strict=True):
             np.testing.assert_allclose(got, want.numpy(), rtol=0, atol=tolerance("export.nodes.relative"))
+    for some, every in zip(session.pose(0.3, ids), session.pose(0.3), strict=True):
+        np.testing.assert_array_equal(some, every[ids])
+
+
+@pytest.mark.parametrize("embedding_dim", [0, 8])
+def test_rotations_that_cancel_are_the_identity(embedding_dim: int):
+    """With and without modulation, as in training: such a blend has no direction."""
+    model = random_model(20, layers=(SPLINE,), support=NODES, embedding_dim=embedding_dim)
+    layer = model.deformation.layers[0]
+    assert isinstance(layer, SplineLayer)
+    with torch.no_grad():
+        layer.rots.zero_()
+        want = model.pose(0.3)
+    session = session_of(model)
+    for got, values in zip(session.pose(0.3), (want.means, want.quats, want.scales), strict=True):
+        np.testing.assert_allclose(got, values.numpy(), rtol=0, atol=tolerance("export.nodes.relative"))
+    np.testing.assert_allclose(session.pose(0.3)[1], np.tile([1, 0, 0, 0], (20, 1)), atol=1e-6)

@@ -50,7 +50,12 @@ def plain_encoding(x: np.ndarray, frequencies: int) -> np.ndarray:
 
 
 def plain_mlp(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
-    """Equations 7 and 10 with the time features repeated for every point: the columns of all heads."""
+    """Equations 7 and 10: the columns of all heads."""
+    return linear(layer.heads, plain_hidden(layer, means, t))
+
+
+def plain_hidden(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
+    """[N, width] the last hidden units, with the time features repeated for every point."""
     time = plain_encoding(np.array([[t]]), layer.time_frequency_matrix.shape[1])
     code = linear(layer.time_output, np.maximum(linear(layer.time_hidden, time), 0))
     encoded = plain_encoding(means, layer.xyz_frequency_matrix.shape[1] // 3)
@@ -59,7 +64,7 @@ def plain_mlp(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
     for i, module in enumerate(layer.trunk, start=1):
         read = np.concatenate([inputs, hidden], axis=1) if i == layer.skip else hidden
         hidden = np.maximum(linear(module, read), 0)
-    return linear(layer.heads, hidden)
+    return hidden
 
 
 def plain_features(planes: PlaneGrid, means: np.ndarray, t: float) -> np.ndarray:

@@ -37,6 +37,11 @@ def write_model(
     return b"".join(whole.parts)
 
 
+def names_needed(model: Model, outputs: Sequence[str]) -> set[str]:
+    """Return the names of all values that the outputs depend on, and their own."""
+    return _needed(model, outputs)[1]
+
+
 def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]:
     """Return the nodes, in order, and the names of values that the outputs depend on."""
     names, nodes = set(outputs), []

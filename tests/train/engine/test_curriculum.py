@@ -128,7 +128,7 @@ def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, name: s
     groups, seen = trainer.system.parameter_groups(), set()
     for _ in range(12):
         before = [(group.role, p, p.detach().clone()) for group in groups for p in group.params]
-        views = trainer._render_and_backward()
+        views = trainer._render_and_backward(trainer.system.parameter_groups())
         average_gradients(groups, views)
         trainer.optimizer.step()
         trainer.step_count += 1
@@ -152,7 +152,7 @@ def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: Scen
     (layer,) = splatting(trainer).model.deformation
     assert isinstance(layer, SplineLayer)
     curves = {"transls": layer.transls, "rots": layer.rots, "stretches": layer.stretches}
-    (view,) = views = trainer._render_and_backward()
+    (view,) = views = trainer._render_and_backward(trainer.system.parameter_groups())
     assert view.sample.update == "motion"
     read, _ = layer.knots_at(torch.tensor(view.sample.t))
     average_gradients(trainer.system.parameter_groups(), views)
@@ -180,14 +180,14 @@ def test_the_loss_depends_on_the_sample(scene: SceneData, monkeypatch: pytest.Mo
     monkeypatch.setattr(SplineLayer, "new_frame_rows", lambda _, times: larger.extend(times) or [])
     monkeypatch.setattr(system_module, "pooled_l1", lambda *images: pooled.append(images) or 0.0)
     monkeypatch.setattr(SplineLayer, "temporal_smoothness", lambda _, t: smooth.append(float(t)) or 0.0)
-    monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, chain, t: rigid.append(float(t)) or 0.0)
+    monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, motions: rigid.append(motions) or 0.0)
     trained(small_config(model=MOTION_BASES, steps=100, pooled_l1_weight=1.0, **PHASES), scene, 40)
     deformed = [sample for sample in drawn[20:] if sample.update != "static"]
     new, others = ([s.t for s in deformed if (s.update == "motion") == is_new] for is_new in (True, False))
     assert larger == new != []
     assert len(pooled) == len(new)
     assert smooth == pytest.approx(others)
-    assert rigid == pytest.approx([sample.t for sample in deformed])
+    assert len(rigid) == len(deformed)
 
 
 def test_phases_follow_each_other_and_cover_the_run() -> None:

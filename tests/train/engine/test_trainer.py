@@ -146,7 +146,9 @@ def test_images_of_a_step_share_it_evenly(data: Path) -> None:
         trainer = Trainer(config.updated(batch_size=batch_size, threads=threads), scene)
         found = []
         for _ in range(6 // batch_size):
-            average_gradients(trainer.system.parameter_groups(), trainer._render_and_backward())
+            average_gradients(
+                trainer.system.parameter_groups(), trainer._render_and_backward(trainer.system.parameter_groups())
+            )
             found.append([p.grad.clone() for p in splatting(trainer).model.parameters() if p.grad is not None])
         return found
 
@@ -160,7 +162,7 @@ def test_images_of_a_step_share_it_evenly(data: Path) -> None:
 
 def test_a_gradient_is_the_mean_over_the_images_that_update_the_parameter(data: Path) -> None:
     trainer = Trainer(small_config(batch_size=2, window_full_fraction=0.0), load_scene(data))
-    first, second = trainer._render_and_backward()
+    first, second = trainer._render_and_backward(trainer.system.parameter_groups())
     groups, means = trainer.system.parameter_groups(), splatting(trainer).model.gaussians.means
     average_gradients(groups, [first, second])
     assert means.grad is not None

@@ -1,0 +1,206 @@
+"""Size, error and time of exported models on control nodes, random and of the paper's size."""
+
+import math
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+from benchmarks.measuring import Times, machine, report_console, table
+from export.jobs.job import ExportJob
+from export.measure.poses import posed
+from export.measure.verify import TIMES, verify
+from export.plans.base import BASELINE
+from export.plans.registry import build
+from export.pruning.mask import PruningMask, bake_pruned, full_mask, pruned
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.baked import MOVING_OUTPUTS
+from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_train.engine.config import SMALL_LAYER
+from msdgs_train.evaluation.layer_strip import camera_of
+from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from msdgs_train.supports.nodes import NodesConfig
+from tests.support.models import SCENE, random_model
+
+ID_BYTES = 8
+"""Bytes that a moving Gaussian takes in the default of the input `ids`, under every plan."""
+OPENINGS = 3
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Sizes of the model and number of poses."""
+
+    count: int
+    layers: int
+    nodes: int
+    followed: int
+    noise: float
+    threads: tuple[int, ...]
+    repeats: int
+    size: int  # pixels, of the frames
+
+
+def main(
+    count: int = 106_500,
+    layers: int = 10,
+    widths: tuple[int, ...] = (96, 128),
+    nodes: int = 512,
+    followed: int = 4,
+    seeds: tuple[int, ...] = (0, 1),
+    noise: float = 0.05,
+    threads: tuple[int, ...] = (1, 2),
+    repeats: int = 100,
+    size: int = 256,
+    check: bool = False,
+) -> int:
+    """Export random models on control nodes as `export/to_onnx.py --plan network` does, unpruned, and print errors,
+    sizes and times.
+
+    python -m benchmarks.export.nodes --widths 96 128 --seeds 0 1
+
+    Errors are the largest at 50 times against the checkpoint in float64, as docs/contract.md defines `measured_error`,
+    and of the worst of 48 frames. Times are of `DeformationSession.pose` of all Gaussians.
+
+    Args:
+        count: Gaussians, all of which move.
+        layers: MLP layers, two hidden ones each.
+        widths: Width of the hidden layers; a model each.
+        nodes: Control nodes.
+        followed: Nodes that each Gaussian follows.
+        seeds: A model each.
+        noise: Standard deviation of the noise added to all parameters but means.
+        threads: Threads of onnxruntime.
+        repeats: Poses that are timed, at other times each.
+        size: Width of the frames in pixels.
+        check: Test this benchmark on a model of 2,000 Gaussians.
+    """
+    if check:
+        return self_test()
+    settings = Settings(count, layers, nodes, followed, noise, threads, repeats, size)
+    models = [(width, seed) for width in widths for seed in seeds]
+    rows = [measured(settings, *model) for model in track(models, "models", console=Console(stderr=True))]
+    console, names = report_console(), MOVING_OUTPUTS
+    errors = table(f"{count:,} Gaussians, {layers} layers, {nodes} nodes", "width, seed", *names, "worst frame, dB")
+    files = table("files", "width, seed", "MB", "bytes per Gaussian, static", "moving", "id", "opening, s")
+    times = table(
+        "ms per pose", "width, seed", *(f"{n} threads: {w}" for n in threads for w in ("median", "95 %", "CPU"))
+    )
+    for row in rows:
+        errors.add_row(row["name"], *(f"{row['errors'][name]:.1e}" for name in names), f"{row['psnr_worst']:.1f}")
+        numbers = row["bytes"] / 1e6, row["static"], row["static"] + row["moving"]
+        files.add_row(row["name"], *(f"{n:.1f}" for n in numbers), str(ID_BYTES), f"{row['opening']:.2f}")
+        times.add_row(row["name"], *(f"{value:.1f}" for each in row["times"].values() for value in each))
+    for each in (machine(), errors, files, times):
+        console.print(each)
+    return 0
+
+
+def measured(settings: Settings, width: int, seed: int) -> dict[str, Any]:
+    """The figures of one model."""
+    support = NodesConfig(num_nodes=settings.nodes, k_nearest=settings.followed)
+    chain = (replace(SMALL_LAYER, width=width),) * settings.layers
+    model = random_model(
+        settings.count, seed, settings.noise, layers=chain, support=support, embedding_dim=0, sh_degree=0
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint = Path(folder) / "model.pt"
+        save_model(checkpoint, model, _scene(settings.size), 1)
+        job = ExportJob(checkpoint, Path(folder), rules=())
+        candidate = job.candidate(BASELINE, None)
+        static, moving = bytes_per_gaussian(job, candidate.size)
+        return {
+            "name": f"{width}, {seed}",
+            "errors": verify(candidate.session, candidate.pruned.moving, times=TIMES, tolerance=math.inf),
+            "psnr_worst": job.error(candidate).psnr_worst,
+            "bytes": candidate.size,
+            "static": static,
+            "moving": moving,
+            "opening": _seconds_to_open(candidate.path),
+            "times": milliseconds(candidate.path, settings),
+        }
+
+
+def bytes_per_gaussian(job: ExportJob, size: int) -> tuple[float, float]:
+    """Bytes of a static Gaussian, and how many more a moving one takes. `size` is that of the file in which all move;
+    it is compared with files in which every second Gaussian is static or left out."""
+    whole, count = full_mask(job.model), len(job.model.gaussians)
+    canonical, first = posed(job.model, 0.0, deform=False), np.arange(count) % 2 == 0
+
+    def size_of(mask: PruningMask) -> int:
+        baked = bake_pruned(pruned(job.model, mask, canonical, []), job.info, job.sha256)
+        return build(BASELINE, baked).ByteSize()
+
+    half_static, half = size_of(whole.without(moves=first)), size_of(whole.without(kept=first))
+    changed = count - int(first.sum())
+    return (half_static - half) / changed, (size - half_static) / changed
+
+
+def milliseconds(path: Path, settings: Settings) -> dict[int, tuple[float, float, float]]:
+    """Median and 95 % quantile of the time of a pose, and median of its processor time, by number of threads."""
+    sessions = {threads: _opened(path, threads) for threads in settings.threads}
+    wall, processor = Times(), Times(time.process_time)
+    for t in np.linspace(0, 1, settings.repeats):
+        for threads, session in sessions.items():
+            processor.time(str(threads), wall.time, str(threads), session.pose, float(t))
+    found = {}
+    for threads in settings.threads:
+        of_pose, of_processor = (1e3 * np.array(each.seconds[str(threads)]) for each in (wall, processor))
+        found[threads] = (
+            float(np.median(of_pose)),
+            float(np.quantile(of_pose, 0.95)),
+            float(np.median(of_processor)),
+        )
+    return found
+
+
+def _opened(path: Path, threads: int) -> DeformationSession:
+    """A session with this number of threads."""
+    before = os.environ.get(THREADS_VARIABLE)
+    os.environ[THREADS_VARIABLE] = str(threads)
+    try:
+        return DeformationSession(path)
+    finally:
+        del os.environ[THREADS_VARIABLE]
+        if before is not None:
+            os.environ[THREADS_VARIABLE] = before
+
+
+def _seconds_to_open(path: Path) -> float:
+    times = Times()
+    for _ in range(OPENINGS):
+        times.time("open", DeformationSession, path)
+    return times.minimum("open") / 1e3
+
+
+def _scene(width: int) -> SceneInfo:
+    """The cameras of the tests' scene with images of this width."""
+    cameras = []
+    for entry in SCENE.cameras:
+        camera = camera_of(entry, width)
+        cameras.append(entry | {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")})
+    return replace(SCENE, cameras=cameras)
+
+
+def self_test() -> int:
+    """The export of a small model is exact, and each Gaussian adds the expected number of bytes to its file."""
+    settings = Settings(count=2_000, layers=2, nodes=20, followed=4, noise=0.05, threads=(1, 2), repeats=3, size=48)
+    found = measured(settings, 32, 0)
+    assert max(found["errors"][name] for name in MOVING_OUTPUTS) < 1e-4
+    assert found["psnr_worst"] > 60
+    static = 4 * (3 + 4 + 3 + 1 + 3)  # mean, quaternion, scale, opacity, color
+    assert abs(found["static"] - static) < 1
+    assert ID_BYTES <= found["moving"] <= ID_BYTES + 12
+    return main(count=200, layers=1, widths=(16,), nodes=8, seeds=(0,), repeats=2, size=32)
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))
