@@ -1,4 +1,4 @@
-"""Which images come, and what they update: passes, the time window, and the three kinds of samples."""
+"""The order of images and the parameters that they update: passes, the time window, kinds of samples."""
 
 from collections import Counter
 from copy import deepcopy
@@ -59,7 +59,7 @@ def test_first_and_last_all_images_update_everything(scene: SceneData) -> None:
 def test_windows_grow_from_the_middle_one_after_the_other(
     scene: SceneData, starts: tuple[float, ...], batch_size: int
 ) -> None:
-    """Each in an equal part of the steps 200 to 600; what updates motion lies at the border."""
+    """Each takes an equal part of the steps 200 to 600; motion-only samples are at the border."""
     edges = np.linspace(200, 600, len(starts) + 1)
     numbers = range(600 * batch_size)
     drawn = samples(scene, numbers, window_start_widths=starts, batch_size=batch_size)
@@ -103,7 +103,7 @@ def test_samples_of_one_step_differ(scene: SceneData) -> None:
     assert [sample.update for sample in drawn] == ["static", "motion", "all", "motion"]
 
 
-def test_the_second_window_draws_all_of_its_images_alike(scene: SceneData) -> None:
+def test_the_second_window_draws_its_images_uniformly(scene: SceneData) -> None:
     drawn = Counter(sample.frame.name for sample in samples(scene, range(1101, 1800), **TWO_WINDOWS))
     times = [drawn[frame.name] for frame in scene.splits["train"] if distance(scene, frame.t) <= 0.3]
     assert max(times) - min(times) <= 2
@@ -172,8 +172,8 @@ def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: Scen
         )
 
 
-def test_what_is_asked_for_follows_the_sample(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of new frames larger steps and pooled images; motion must be smooth at the others, and rigid at all of them."""
+def test_the_loss_depends_on_the_sample(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """New frames have larger steps and pooled L1; temporal smoothness is for the others, local rigidity for all."""
     drawn, larger, pooled, smooth, rigid = [], [], [], [], []
     next_sample = WindowCurriculum.next
     monkeypatch.setattr(WindowCurriculum, "next", lambda *args: drawn.append(next_sample(*args)) or drawn[-1])

@@ -1,4 +1,4 @@
-"""The deformation layers against the paper's sizes and a plain float64 reading of its equations."""
+"""The deformation layers against the paper's sizes and a plain float64 implementation of its equations."""
 
 from typing import Any
 
@@ -116,7 +116,7 @@ def last_features(layer: MLPLayer, places: torch.Tensor, t: float) -> torch.Tens
 @pytest.mark.parametrize(
     "sizes", [{}, {"depth": 8}, {"width": 96, "depth": 2, "time_width": 64}, {"width": 64, "depth": 3}]
 )
-def test_some_last_unit_answers_everywhere(sizes: dict[str, Any]):
+def test_some_last_unit_is_active_everywhere(sizes: dict[str, Any]):
     places = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 2.6 - 1.3
     torch.manual_seed(0)
     layer = MLPLayer(MLPConfig(**sizes))
@@ -126,7 +126,7 @@ def test_some_last_unit_answers_everywhere(sizes: dict[str, Any]):
 
 
 def mean_cosines(layer: MLPLayer) -> tuple[float, float]:
-    """Between the last features of one place at times 0.1 apart, and of places one unit apart at one time."""
+    """Mean cosine similarity of the last features at times 0.1 apart, and at positions one unit apart."""
     places = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
     here = last_features(layer, places, 0.5)
     later = last_features(layer, places, 0.6)

@@ -1,4 +1,4 @@
-"""Spline layers: curves, where they begin, how they extrapolate beyond the time window, and temporal smoothness."""
+"""Spline layers: curves, initialization, extrapolation beyond the time window, and temporal smoothness."""
 
 from dataclasses import replace
 
