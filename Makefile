@@ -14,7 +14,7 @@ CLUSTER := .venv-cluster
 VIEWER := .venv-viewer
 HTTP_TESTS := tests/service tests/frames/test_video.py --ignore-glob='*/test_viewer*'
 BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.avx512 service.scaling \
-	training.training_step training.known_motion export.imported_formats export.paper_sized \
+	training.training_step training.known_motion training.k_steps export.imported_formats export.paper_sized \
 	export.nodes
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package

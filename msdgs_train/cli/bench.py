@@ -2,16 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from msdgs_train.cli.compare import comparison_progress
 from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console
-from msdgs_train.comparison.matrix import Budget, Run, read_systems
-
-if TYPE_CHECKING:
-    from msdgs_train.comparison.pools import RunEnd
+from msdgs_train.comparison.matrix import Budget, read_systems
 
 
 @dataclass(frozen=True)
@@ -49,36 +46,16 @@ class Bench:
     """What --minutes count: time that passes, or CPU time of all threads, on a machine that does other work too."""
 
     def execute(self) -> int:
-        from msdgs_train.comparison.bench import (
-            append_row,
-            key_of,
-            key_of_row,
-            make_bench_runs,
-            measure,
-            read_rows,
-            read_scenes,
-        )
+        from msdgs_train.comparison.bench import make_bench_runs, read_scenes, rows_of, runs_left, train_and_measure
         from msdgs_train.comparison.bench_report import write_bench
-        from msdgs_train.comparison.pools import processes
-        from msdgs_train.comparison.runner import train_all
 
         minutes, csv = self.minutes or (30.0 if self.whole else 5.0), self.csv or self.out / "bench.csv"
         budget = Budget(steps=None, minutes=minutes, threads=self.threads, time=self.time)
-        scenes = {scene.name: scene for scene in read_scenes(self.data, short=not self.whole, names=self.scenes)}
-        systems = read_systems(self.systems, budget)
-        runs = make_bench_runs(systems, list(scenes.values()), self.seeds, self.out)
-        done = set(map(key_of_row, read_rows(csv)))
-        left = [run for run in runs if key_of(run) not in done]
-        with comparison_progress(len(left)) as on_end:
-
-            def finish(run: Run, end: "RunEnd") -> None:
-                on_end(run, end)
-                if end.status in ("finished", "was finished"):
-                    append_row(csv, measure(run, scenes[run.scene]))
-
-            complete = train_all(left, processes(self.jobs), finish)
-        wanted = {key_of(run) for run in runs}
-        rows = [row for row in read_rows(csv) if key_of_row(row) in wanted]
+        scenes = read_scenes(self.data, short=not self.whole, names=self.scenes)
+        runs = make_bench_runs(read_systems(self.systems, budget), scenes, self.seeds, self.out)
+        with comparison_progress(len(runs_left(runs, csv))) as on_end:
+            complete = train_and_measure(runs, scenes, csv, self.jobs, on_end)
+        rows = rows_of(runs, csv)
         if rows:
             paths = write_bench(self.out, rows)
             console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, markup=False, highlight=False)

@@ -11,14 +11,15 @@ import json
 import os
 import platform
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run, require_unique
-from msdgs_train.comparison.runner import final_metrics
+from msdgs_train.comparison.pools import RunEnd, processes
+from msdgs_train.comparison.runner import final_metrics, train_all
 from msdgs_train.datasets.common.files import write_text
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import read_metrics
@@ -118,6 +119,36 @@ def append_row(path: Path, row: Row) -> None:
     writer.writerows([*read_rows(path), row])
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, text.getvalue())
+
+
+def train_and_measure(
+    runs: Sequence[Run],
+    scenes: Sequence[BenchScene],
+    csv_file: Path,
+    jobs: int,
+    on_end: Callable[[Run, RunEnd], None],
+) -> bool:
+    """Train the runs that have no row in the file, and add their rows; returns False if Ctrl-C has stopped it."""
+    by_name = {scene.name: scene for scene in scenes}
+
+    def finish(run: Run, end: RunEnd) -> None:
+        on_end(run, end)
+        if end.status in ("finished", "was finished"):
+            append_row(csv_file, measure(run, by_name[run.scene]))
+
+    return train_all(runs_left(runs, csv_file), processes(jobs), finish)
+
+
+def runs_left(runs: Sequence[Run], csv_file: Path) -> list[Run]:
+    """The runs that have no row in the file."""
+    done = set(map(key_of_row, read_rows(csv_file)))
+    return [run for run in runs if key_of(run) not in done]
+
+
+def rows_of(runs: Sequence[Run], csv_file: Path) -> list[Row]:
+    """The rows of these runs in the file."""
+    wanted = set(map(key_of, runs))
+    return [row for row in read_rows(csv_file) if key_of_row(row) in wanted]
 
 
 def measure(run: Run, scene: BenchScene) -> Row:

@@ -1,0 +1,178 @@
+"""Whether K deformation layers pay: chains on control nodes beside one layer of as many parameters, for equal time."""
+
+import dataclasses
+import io
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from benchmarks.measuring import machine, report_console, table
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.cli.compare import comparison_progress
+from msdgs_train.comparison.bench import Row, make_bench_runs, read_scenes, rows_of, runs_left, train_and_measure
+from msdgs_train.comparison.bench_report import paired_gain
+from msdgs_train.comparison.matrix import Budget
+from msdgs_train.comparison.report import mean_and_deviation, save_figure
+from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
+from msdgs_train.layers.base import PAPER_HEADS
+from msdgs_train.layers.mlp import MLPConfig, MLPLayer
+from msdgs_train.systems.registry import DEFAULT, preset
+
+NUM_LAYERS = (1, 2, 4, 10)
+SCENES = ("toybench_200", "toybench_slow_200", "lego_200")
+CHAIN, WIDE = "K layers", "1 layer of as many parameters"
+UNWEIGHTED, MODULATED = "K layers, w = 1", "K layers, modulated"
+FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED)
+
+
+def main(
+    data: Path = Path("data"),
+    out: Path = Path("out/k_steps"),
+    csv: Path | None = None,
+    scenes: tuple[str, ...] = SCENES,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    minutes: float = 2.0,
+    jobs: int = 1,
+    check: bool = False,
+) -> int:
+    """Train K = 1, 2, 4 and 10 layers, and one layer of as many parameters as each, with and without step weights and
+    modulation; print a table and draw PSNR on test images against K.
+
+    python -m benchmarks.training.k_steps --data data --csv docs/data/k_steps.csv
+
+    Each run has one thread and the same CPU time. Runs that have a row in the file are not trained again.
+
+    Args:
+        data: The folder that holds the datasets of `msdgs-train bench`.
+        out: The folder of runs, table and figure.
+        csv: The file with a row per finished run; OUT/k_steps.csv if not given.
+        scenes: Scenes of `msdgs-train bench`.
+        seeds: One run per seed.
+        minutes: CPU time of each run.
+        jobs: Runs in parallel, no more than the machine has cores.
+        check: Test this benchmark: widths give equal parameters, and figure and table show what a file holds.
+    """
+    if check:
+        return self_test()
+    csv = csv or out / "k_steps.csv"
+    try:
+        found = read_scenes(data, short=False, names=scenes)
+        budget = Budget(steps=None, minutes=minutes, time="cpu").settings()
+        runs = make_bench_runs({name: c.updated(**budget) for name, c in systems().items()}, found, seeds, out)
+        with comparison_progress(len(runs_left(runs, csv))) as on_end:
+            complete = train_and_measure(runs, found, csv, jobs, on_end)
+    except InvalidInput as error:
+        report_console().print(f"error: {error}", style="red", markup=False)
+        return 1
+    rows = rows_of(runs, csv)
+    report(rows, out, report_console())
+    return 0 if complete and len(rows) == len(runs) else 1
+
+
+def systems() -> dict[str, TrainConfig]:
+    """The default system with other layers, by the names that `name_of` gives."""
+    base = preset(DEFAULT)
+    chains = {k: base.updated(layers=(SMALL_LAYER,) * k) for k in NUM_LAYERS}
+    made = {name_of(CHAIN, k): config for k, config in chains.items()}
+    made |= {name_of(WIDE, k): base.updated(layers=(wide_layer(k),)) for k in NUM_LAYERS[1:]}
+    made |= {name_of(UNWEIGHTED, k): config.updated(weights=False) for k, config in chains.items()}
+    made |= {name_of(MODULATED, k): config.updated(embedding_dim=32) for k, config in chains.items()}
+    return made
+
+
+def name_of(family: str, num_layers: int) -> str:
+    """The name of a system."""
+    return f"{family}, K = {num_layers}"
+
+
+def wide_layer(num_layers: int) -> MLPConfig:
+    """A layer as `SMALL_LAYER`, of the width that comes closest to the parameters of so many of them."""
+    wanted = num_layers * parameters(SMALL_LAYER)
+    candidates = [dataclasses.replace(SMALL_LAYER, width=width) for width in range(8, 1024, 4)]
+    return min(candidates, key=lambda layer: abs(parameters(layer) - wanted))
+
+
+def parameters(layer: MLPConfig) -> int:
+    """Trainable numbers of a layer."""
+    return sum(parameter.numel() for parameter in MLPLayer(layer, PAPER_HEADS).parameters())
+
+
+def report(rows: Sequence[Row], out: Path, console: Console) -> None:
+    """Print a table per scene, and draw the figure."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    for scene in scenes:
+        made = table(f"PSNR on test images of {scene}, dB", "K", *FAMILIES, f"{CHAIN} - {WIDE} (95 % over images)")
+        for k in NUM_LAYERS:
+            values = [psnrs(rows, scene, name_of(family, k)) for family in FAMILIES]
+            cells = [mean_and_deviation(found, 2) if found else "–" for found in values]
+            made.add_row(str(k), *cells, _gain(rows, scene, k))
+        console.print(made)
+    console.print(machine())
+    out.mkdir(parents=True, exist_ok=True)
+    save_figure(draw(rows, scenes), out / "k_steps.png")
+    console.print(f"wrote {out / 'k_steps.png'}")
+
+
+def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
+    """A panel per scene, a line per family: mean PSNR against K, with bars from the worst seed to the best."""
+    figure = Figure(figsize=(1.5 + 3.6 * len(scenes), 4.2), layout="constrained")
+    panels = figure.subplots(1, len(scenes), squeeze=False)[0]
+    for axes, scene in zip(panels, scenes, strict=True):
+        for family in FAMILIES:
+            found = {k: psnrs(rows, scene, name_of(family, k)) for k in NUM_LAYERS}
+            known = {k: np.array(values) for k, values in found.items() if values}
+            mean, low, high = np.array([(v.mean(), v.min(), v.max()) for v in known.values()]).reshape(-1, 3).T
+            bars = [mean - low, high - mean]
+            axes.errorbar(list(known), mean, bars, marker="o", ms=4, capsize=3, label=family)
+        axes.set(title=scene, xscale="log", xticks=NUM_LAYERS, xticklabels=NUM_LAYERS, xlabel="K")
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("PSNR on test images, dB")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize="small")
+    return figure
+
+
+def psnrs(rows: Sequence[Row], scene: str, system: str) -> list[float]:
+    """PSNR on test images, one per seed."""
+    return [float(row["test_psnr"]) for row in rows if (row["scene"], row["system"]) == (scene, system)]
+
+
+def _gain(rows: Sequence[Row], scene: str, k: int) -> str:
+    """Of K layers over one of as many parameters, with its interval over images, each the mean over the seeds."""
+    images = [
+        [np.array(row["test_images"].split(), float) for row in rows if (row["scene"], row["system"]) == (scene, name)]
+        for name in (name_of(CHAIN, k), name_of(WIDE, k))
+    ]
+    if not all(images):
+        return ""
+    mean, low, high = paired_gain([np.mean(images[0], axis=0) - np.mean(images[1], axis=0)])
+    return f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"
+
+
+def self_test() -> int:
+    """Equal parameters within 2 %, and a figure and a table of two scenes that lack some runs."""
+    for k in NUM_LAYERS[1:]:
+        ratio = parameters(wide_layer(k)) / (k * parameters(SMALL_LAYER))
+        assert abs(ratio - 1) < 0.02, (k, ratio)
+    rows = [
+        {"scene": scene, "system": name, "test_psnr": f"{30 - index}", "test_images": f"{29 - index} {31 - index}"}
+        for scene in SCENES[:2]
+        for index, name in enumerate(list(systems())[:6])
+    ]
+    console = Console(file=io.StringIO(), record=True, width=200)
+    with tempfile.TemporaryDirectory() as folder:
+        report(rows, Path(folder), console)
+        assert (Path(folder) / "k_steps.png").stat().st_size > 1000
+    assert "+3.00 (+3.00 to +3.00)" in console.export_text()
+    print("ok: equal parameters, a table and a figure")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))
