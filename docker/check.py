@@ -1,11 +1,11 @@
-"""Build the image, run it as a careful operator would, and lose a replica under load.
+"""Check the image and the composition: build, run with few rights, kill a replica under load.
 
-    python docker/check.py                                    with images from the usual registry
-    BASE_IMAGE=… PROXY_IMAGE=… python docker/check.py         with images that are there already
+    python docker/check.py                                    with images from the default registry
+    BASE_IMAGE=… PROXY_IMAGE=… python docker/check.py         with other images, such as local ones
 
-Read from the environment: BASE_IMAGE, PIP_INDEX_URL, MSDGS_IMAGE, PROXY_IMAGE, as compose.yaml does; CA_FILE,
-certificates for the build; BUILD_NETWORK, `host` where containers have no other; DOCKER, the command.
-Exit status 77 and the reason where there is no daemon; all containers, the network and the volumes are removed again.
+Environment variables: BASE_IMAGE, PIP_INDEX_URL, MSDGS_IMAGE, PROXY_IMAGE as in compose.yaml; CA_FILE, certificates for
+the build; BUILD_NETWORK, `host` if containers have no other; DOCKER, the command.
+Without a daemon it prints the reason and the exit status is 77. Containers, network and volumes are removed at the end.
 """
 
 import itertools
@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))  # for files that the tests make
+sys.path.insert(0, str(ROOT))  # to import `tests`
 SKIPPED = 77
 DOCKER = os.environ.get("DOCKER", "docker")
 IMAGE = os.environ.get("MSDGS_IMAGE", "msdgs:check")
@@ -35,15 +35,15 @@ PROXY_IMAGE = os.environ.get("PROXY_IMAGE", "nginx:1.28-alpine")
 PROJECT = "msdgs-check"
 REPLICAS = 3
 LOAD = 120
-"""Frames asked for while a replica is killed."""
+"""Frames that are requested while a replica is killed."""
 CLIENTS = 4
 KEYS = {"read": "reader-0123456789", "write": "writer-0123456789"}
 CAN_READ, CAN_WRITE = ({"X-API-Key": KEYS[scope]} for scope in ("read", "write"))
 MAX_MEGABYTES = 600
 MAX_MEMORY = 1e9
-"""Bytes that a replica may take, hostile uploads included."""
-PATIENCE = 120.0
-"""Seconds until a service must be ready, on a machine that is busy with other things."""
+"""Maximum memory of a replica in bytes, hostile uploads included."""
+MAX_START_SECONDS = 120.0
+"""Maximum seconds until a service is ready, also on a busy machine."""
 HARDENED = [
     "--read-only", "--tmpfs", "/tmp:noexec,nosuid,nodev,size=256m", "--cap-drop", "ALL",
     "--security-opt", "no-new-privileges", "--memory", "4g", "--memory-swap", "4g", "--pids-limit", "512",
@@ -54,8 +54,8 @@ class Skipped(Exception):
     """Nothing can be checked here."""
 
 
-class Answer:
-    """Of an HTTP request."""
+class Response:
+    """The response to an HTTP request."""
 
     def __init__(self, status: int, headers: Mapping[str, str], body: bytes) -> None:
         self.status = status
@@ -64,7 +64,7 @@ class Answer:
 
 
 def main() -> int:
-    """All checks in a row; the first that fails ends it."""
+    """Run all checks; the first failure ends the program."""
     try:
         available()
     except Skipped as reason:
@@ -89,7 +89,7 @@ def main() -> int:
 
 
 def available() -> None:
-    """Raises `Skipped` without a daemon, without compose, or without images to build from."""
+    """Raise `Skipped` without a Docker daemon, compose or base images."""
     if shutil.which(DOCKER) is None:
         raise Skipped(f"there is no {DOCKER} command")
     if output(DOCKER, "info", check=False).returncode != 0:
@@ -99,11 +99,11 @@ def available() -> None:
     for image in (BASE_IMAGE, PROXY_IMAGE):
         known = output(DOCKER, "image", "inspect", image, check=False).returncode == 0
         if not known and output(DOCKER, "pull", "--quiet", image, check=False).returncode != 0:
-            raise Skipped(f"image {image} can't be had")
+            raise Skipped(f"image {image} is not available")
 
 
 def build() -> None:
-    """The serve target."""
+    """Build the target `serve`."""
     command = [DOCKER, "build", "-f", "docker/Dockerfile", "--target", "serve", "-t", IMAGE]
     command += ["--build-arg", f"BASE_IMAGE={BASE_IMAGE}"]
     if "PIP_INDEX_URL" in os.environ:
@@ -118,7 +118,7 @@ def build() -> None:
 
 
 def check_contents() -> None:
-    """Small, not root, no torch."""
+    """The image is small, has no torch and doesn't run as root."""
     facts = json.loads(output(DOCKER, "image", "inspect", IMAGE).stdout)[0]
     megabytes = facts["Size"] / 1e6
     print(f"Image: {megabytes:.0f} MB")
@@ -130,19 +130,19 @@ def check_contents() -> None:
 
 
 def check_cold_start() -> None:
-    """From `docker run` to the bytes of a frame, with a read-only root and no capabilities; nothing is compiled."""
+    """Time from `docker run` to the first frame, with a read-only root and no capabilities; nothing is compiled."""
     port = free_port()
     where = ["--network", "host", "-e", "MSDGS_HOST=127.0.0.1", "-e", f"MSDGS_PORT={port}"]
     started = time.perf_counter()
     container = output(DOCKER, "run", "--detach", *HARDENED, *where, IMAGE).stdout.strip()
     try:
         running = time.perf_counter()
-        answer = wait_for(lambda: frame(f"http://127.0.0.1:{port}", 0.5, size=400))
+        response = wait_for(lambda: frame(f"http://127.0.0.1:{port}", 0.5, size=400))
         ended = time.perf_counter()
         print(
             f"First frame {ended - running:.1f} s after the container ran ({ended - started:.1f} s with its creation)"
         )
-        expect(answer.body[:8] == b"\x89PNG\r\n\x1a\n", "a frame is a PNG")
+        expect(response.body[:8] == b"\x89PNG\r\n\x1a\n", "a frame is a PNG")
         count = "find {} -name '*.nbc' | wc -l"
         stored = sh(container, count.format("/opt/msdgs/lib/python3*/site-packages/msdgs_serve"))
         copied = sh(container, count.format("/tmp"))
@@ -155,7 +155,7 @@ def check_cold_start() -> None:
         stopping = time.perf_counter()
         output(DOCKER, "stop", container)
         code = output(DOCKER, "inspect", "--format", "{{.State.ExitCode}}", container).stdout.strip()
-        expect(code == "0", f"it stops by itself when asked to, after {time.perf_counter() - stopping:.1f} s")
+        expect(code == "0", f"it stops on SIGTERM, after {time.perf_counter() - stopping:.1f} s")
     finally:
         output(DOCKER, "rm", "--force", container, check=False)
 
@@ -167,17 +167,17 @@ def check_rights(container: str, *writable: str) -> None:
     expect(output(DOCKER, "exec", container, "touch", "/opt/x", check=False).returncode != 0, "the root is read-only")
     for folder in writable:
         ended = sh(container, f"cp /bin/true {folder}/copied && {folder}/copied; echo $?; rm {folder}/copied")
-        expect(ended == "126", f"nothing can be run from {folder}, where it may write")
+        expect(ended == "126", f"nothing can be executed in {folder}, which is writable")
     expect(sh(container, "id -u") != "0", "its user isn't root")
     status = dict(line.split(":\t", 1) for line in sh(container, "cat /proc/1/status").splitlines())
     expect(status["Seccomp"] == "2", "Docker's seccomp profile holds")
     expect(int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0, "it has no capabilities and can't get any")
-    expect(status["NoNewPrivs"] == "1", "it can't get other rights")
+    expect(status["NoNewPrivs"] == "1", "it can't gain privileges")
 
 
 @contextmanager
 def composition(replicas: int, **settings: str) -> Iterator[str]:
-    """`up` with replicas, then `down`; the address of the proxy."""
+    """Start the composition with some replicas; yield the address of its proxy."""
     port = free_port()
     chosen = {"MSDGS_IMAGE": IMAGE, "PROXY_IMAGE": PROXY_IMAGE, "PORT": f"127.0.0.1:{port}", **settings}
     environment = {**os.environ, **chosen}
@@ -189,7 +189,7 @@ def composition(replicas: int, **settings: str) -> Iterator[str]:
         wait_for(lambda: get(f"{url}/ready"))
         for name in containers("render"):
             wait_for(
-                lambda name=name: Answer(
+                lambda name=name: Response(
                     503 if sh(name, "python /opt/msdgs/ready.py; echo $?") != "0" else 200, {}, b""
                 )
             )
@@ -199,24 +199,26 @@ def composition(replicas: int, **settings: str) -> Iterator[str]:
 
 
 def check_cache(url: str) -> None:
-    """A frame is drawn once, kept a second, then held against the scene by its ETag."""
+    """A frame is rendered once, cached for a second, then revalidated by its ETag."""
     first = frame(url, 0.25)
     second = frame(url, 0.25)
     expect((first.headers["x-cache"], second.headers["x-cache"]) == ("MISS", "HIT"), "a frame is taken from the cache")
-    expect(first.body == second.body and first.headers["etag"] == second.headers["etag"], "it is the same")
-    expect("server-timing" in first.headers and "server-timing" not in second.headers, "only drawn frames have times")
+    expect(first.body == second.body and first.headers["etag"] == second.headers["etag"], "it has the same bytes")
+    expect(
+        "server-timing" in first.headers and "server-timing" not in second.headers, "only rendered frames have times"
+    )
     known = frame(url, 0.25, headers={"If-None-Match": first.headers["etag"]})
-    expect((known.status, known.body) == (304, b""), "who has it gets a 304")
+    expect((known.status, known.body) == (304, b""), "a matching ETag gets a 304")
     time.sleep(2.2)  # nginx counts whole seconds: one that lasts 1 s may be fresh for 2
-    expect(frame(url, 0.25).headers["x-cache"] == "REVALIDATED", "an older one is held against the scene, not redrawn")
+    expect(frame(url, 0.25).headers["x-cache"] == "REVALIDATED", "an expired frame is revalidated, not rendered again")
     keyed = frame(url, 0.25, headers={"X-API-Key": "some"})
-    expect(keyed.headers["x-cache"] == "BYPASS", "frames for a key are not taken from the cache")
-    expect(get(f"{url}/metrics").status == 404, "metrics are not for everybody")
-    expect(get(f"{url}/").status == 200, "the page is there")
+    expect(keyed.headers["x-cache"] == "BYPASS", "requests with a key bypass the cache")
+    expect(get(f"{url}/metrics").status == 404, "metrics are not public")
+    expect(get(f"{url}/").status == 200, "the viewer is served")
 
 
 def check_affinity(url: str) -> None:
-    """Frames of one time go to one replica, by link and by call; all replicas have work."""
+    """GET and POST requests for one time go to one replica; all replicas are used."""
     marked = "affinity"
     times = [number / 32 for number in range(32)]
     for t in times:
@@ -258,23 +260,26 @@ def check_kill(url: str) -> None:
 
 
 def check_uploads(url: str) -> None:
-    """A scene is added, drawn and deleted by who may do so, and a damaged one refused."""
+    """A scene is added, rendered and deleted with a key that permits it; a damaged file is refused."""
     (container,) = containers("render")
     check_rights(container, "/tmp", "/uploads")
     whole = (ROOT / "examples" / "toybench.onnx").read_bytes()
     expect(frame(url, 0.5).status == 401, "frames need a key")
     before = frame(url, 0.5, headers=CAN_READ).body
-    expect(upload(url, whole, CAN_READ) == 403, "a key to read uploads nothing")
-    expect(upload(url, whole[: len(whole) // 2]) == 422, "half a file is refused")
-    expect(upload(url, whole) == 201, "a whole one is served after a trial")
-    expect(frame(url, 0.5, headers=CAN_READ, scene="sent").body == before, "it looks as the same scene of the image")
+    expect(upload(url, whole, CAN_READ) == 403, "a key with the scope `read` can't upload")
+    expect(upload(url, whole[: len(whole) // 2]) == 422, "a truncated file is refused")
+    expect(upload(url, whole) == 201, "a valid file is accepted")
+    expect(
+        frame(url, 0.5, headers=CAN_READ, scene="sent").body == before,
+        "its frames equal those of the scene in the image",
+    )
     deleted = ask(urllib.request.Request(f"{url}/scenes/sent", headers=CAN_WRITE, method="DELETE"))
     expect(deleted.status == 204, "it can be deleted")
-    expect(frame(url, 0.5, headers=CAN_READ).body == before, "the other scene has the same bytes as before")
+    expect(frame(url, 0.5, headers=CAN_READ).body == before, "frames of the other scene are unchanged")
 
 
 def check_hostile_uploads(url: str) -> None:
-    """Files that ask for memory, time or another file are refused while a scene is drawn, and nothing of them stays."""
+    """Files that take memory or time, or read other files, are refused while a scene is rendered; none is left."""
     try:
         import onnx
 
@@ -291,16 +296,16 @@ def check_hostile_uploads(url: str) -> None:
     with ThreadPoolExecutor(1) as pool:
         for attack in ATTACKS:
             contents = attack.on(onnx.load_from_string(sound), Path("/opt/msdgs/ready.py"))
-            answer = pool.submit(upload, url, contents)
-            while not answer.done():
+            response = pool.submit(upload, url, contents)
+            while not response.done():
                 frames.append(frame(url, 0.5, headers=CAN_READ).body)
-            statuses.append(answer.result())
+            statuses.append(response.result())
     frames.append(frame(url, 0.5, headers=CAN_READ).body)
     expect(statuses == [422] * len(ATTACKS), f"{statuses.count(422)} of {len(ATTACKS)} hostile files are refused")
-    expect(set(frames) == {before}, f"{len(frames)} frames during and after it have the same bytes as before")
-    expect(sh(container, "find /tmp /uploads") == left, "no file of theirs is left")
+    expect(set(frames) == {before}, f"{len(frames)} frames during and after the uploads are unchanged")
+    expect(sh(container, "find /tmp /uploads") == left, "no file is left")
     peak = sh(container, "cat /sys/fs/cgroup/memory.peak || cat /sys/fs/cgroup/memory/memory.max_usage_in_bytes")
-    expect(int(peak) < MAX_MEMORY, f"the container never had more than {int(peak) / 1e6:.0f} MB of memory")
+    expect(int(peak) < MAX_MEMORY, f"peak memory of the container: {int(peak) / 1e6:.0f} MB")
 
 
 def frame(
@@ -311,73 +316,73 @@ def frame(
     size: int = 64,
     azimuth: int = 30,
     headers: dict[str, str] | None = None,
-) -> Answer:
-    """A frame by link."""
+) -> Response:
+    """Request a frame by GET."""
     link = f"{url}/render?scene={scene}&azimuth={azimuth}&elevation=20&t={t}&width={size}&height={size}"
     return get(link, headers)
 
 
 def upload(url: str, contents: bytes, headers: dict[str, str] = CAN_WRITE) -> int:
-    """Status of the answer to a scene file named `sent`."""
+    """Upload a scene as `sent`; returns the status."""
     return ask(urllib.request.Request(f"{url}/scenes?name=sent", contents, headers, method="POST")).status
 
 
-def post(url: str, t: float, azimuth: int, request_id: str) -> Answer:
-    """A frame by call."""
+def post(url: str, t: float, azimuth: int, request_id: str) -> Response:
+    """Request a frame by POST."""
     camera = {"type": "orbit", "azimuth": azimuth, "elevation": 20}
     body = {"scene": "toybench", "camera": camera, "t": t, "width": 64, "height": 64}
     headers = {"Content-Type": "application/json", "X-Request-ID": request_id}
     return ask(urllib.request.Request(f"{url}/render", json.dumps(body).encode(), headers))
 
 
-def get(url: str, headers: dict[str, str] | None = None) -> Answer:
-    """Return status and body of a GET; status 0 without an answer."""
+def get(url: str, headers: dict[str, str] | None = None) -> Response:
+    """Return status and body of a GET; status 0 without a response."""
     return ask(urllib.request.Request(url, headers=headers or {}))
 
 
-def ask(request: urllib.request.Request) -> Answer:
-    """Return status and body of a request; status 0 without an answer."""
+def ask(request: urllib.request.Request) -> Response:
+    """Return status and body of a request; status 0 without a response."""
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
         with direct.open(request, timeout=60) as response:
-            return Answer(response.status, dict(response.headers.items()), response.read())
+            return Response(response.status, dict(response.headers.items()), response.read())
     except urllib.error.HTTPError as error:
-        return Answer(error.code, dict(error.headers.items()), error.read())
+        return Response(error.code, dict(error.headers.items()), error.read())
     except OSError:
-        return Answer(0, {}, b"")
+        return Response(0, {}, b"")
 
 
-def wait_for(attempt: Callable[[], Answer]) -> Answer:
-    """The first answer of status 200."""
-    deadline = time.monotonic() + PATIENCE
+def wait_for(attempt: Callable[[], Response]) -> Response:
+    """Return the first response with status 200."""
+    deadline = time.monotonic() + MAX_START_SECONDS
     while time.monotonic() < deadline:
-        answer = attempt()
-        if answer.status == 200:
-            return answer
+        response = attempt()
+        if response.status == 200:
+            return response
         time.sleep(0.05)
-    sys.exit(f"FAILED: not ready after {PATIENCE:.0f} s")
+    sys.exit(f"FAILED: not ready after {MAX_START_SECONDS:.0f} s")
 
 
 def containers(service: str) -> list[str]:
-    """Ids of a service's containers."""
+    """Return the ids of a service's containers."""
     labels = {"com.docker.compose.project": PROJECT, "com.docker.compose.service": service}
     filters = [part for name, value in labels.items() for part in ("--filter", f"label={name}={value}")]
     return output(DOCKER, "ps", "--quiet", *filters).stdout.split()
 
 
 def log() -> list[dict[str, str]]:
-    """The proxy's log of requests."""
+    """Return the proxy's access log."""
     lines = output(DOCKER, "logs", containers("proxy")[0]).stdout.splitlines()
     return [json.loads(line) for line in lines if line.startswith("{")]
 
 
 def sh(container: str, script: str) -> str:
-    """What a shell in a container prints."""
+    """Run a script in a container; returns its output."""
     return output(DOCKER, "exec", container, "sh", "-c", script, check=False).stdout.strip()
 
 
 def output(*command: str, check: bool = True) -> "subprocess.CompletedProcess[str]":
-    """Run a command quietly."""
+    """Run a command and capture its output."""
     return subprocess.run(command, check=check, capture_output=True, text=True)
 
 
@@ -388,11 +393,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def expect(holds: bool, what: str) -> None:
-    """Say it, or end with it."""
+def expect(holds: bool, claim: str) -> None:
+    """Print a claim that holds; exit if it doesn't."""
     if not holds:
-        sys.exit(f"FAILED: {what}")
-    print(f"ok: {what}")
+        sys.exit(f"FAILED: {claim}")
+    print(f"ok: {claim}")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,6 @@ Track = Callable[[str, int], Callable[[], object]]
 """Called with the name of a task and its number of steps; returns a function to call after each step."""
 
 
-def no_progress(what: str, steps: int) -> Callable[[], object]:
+def no_progress(name: str, steps: int) -> Callable[[], object]:
     """Ignore progress."""
     return lambda: None

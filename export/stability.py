@@ -1,4 +1,4 @@
-"""`python export/stability.py model.pt`: whether float32, or less, shows what the model would show in float64."""
+"""`python export/stability.py model.pt`: the error of float32 and lower precision against float64."""
 
 import sys
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""A function called in a process of its own, with limits of memory, time and what it writes.
+"""Call a function in a subprocess with limits on memory, time and output.
 
-Native code that reads the files of others may crash, hang or take all memory. This costs that process, not its caller.
+Native code that reads untrusted files may crash, hang or exhaust memory; this ends the subprocess, not its caller.
 """
 
 import contextlib
@@ -20,29 +20,34 @@ OPEN_FILES = 64
 
 
 class ProcessLimits(NamedTuple):
-    """Of one call."""
+    """Limits of one call."""
 
-    memory: int  # bytes of data, those of the interpreter and of libraries among them
-    written: int  # bytes of each file that it writes, its answer among them
+    memory: int  # bytes of data, interpreter and libraries included
+    written: int  # bytes per written file, the answer included
     seconds: float
 
 
 class ProcessFailed(Exception):
-    """The process ended without an answer; says how."""
+    """The process ended without an answer; the message names the cause."""
 
 
 def call_guarded(function: Callable[..., None], *arguments: Any, limits: ProcessLimits, answer: BinaryIO) -> None:
-    """Call a module's `function` with the file for its answer and these arguments, which JSON can hold.
+    """Call a module's `function` with a file for its answer and arguments that JSON can hold.
 
-    `answer` is an open file of the system, rewound at the end. Raises `ProcessFailed` where the function raises, too.
+    `answer` is an open file with a descriptor, rewound at the end. Raises `ProcessFailed`, also if the function raises.
     """
     call = {"module": function.__module__, "name": function.__name__, "arguments": arguments, "limits": limits}
     command = [sys.executable, "-P", "-m", "msdgs_serve.guarded", json.dumps(call)]
     environment = {**os.environ, THREADS_VARIABLE: "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    nowhere = subprocess.DEVNULL
     try:
         done = subprocess.run(
-            command, stdin=nowhere, stdout=answer, stderr=nowhere, timeout=limits.seconds, check=False, env=environment
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=answer,
+            stderr=subprocess.DEVNULL,
+            timeout=limits.seconds,
+            check=False,
+            env=environment,
         )
     except subprocess.TimeoutExpired:
         raise ProcessFailed(f"isn't read within {limits.seconds:g} s") from None
@@ -55,17 +60,17 @@ def call_guarded(function: Callable[..., None], *arguments: Any, limits: Process
 
 
 def main(text: str) -> None:
-    """Make the call, in the process."""
+    """Make the call in the subprocess."""
     call = json.loads(text)
     _limit(ProcessLimits(*call["limits"]))
     with os.fdopen(os.dup(1), "wb") as answer:
-        os.dup2(2, 1)  # what libraries print is no part of it
+        os.dup2(2, 1)  # output of libraries is not part of the answer
         getattr(importlib.import_module(call["module"]), call["name"])(answer, *call["arguments"])
 
 
 def _limit(limits: ProcessLimits) -> None:
     os.nice(NICENESS)
-    with contextlib.suppress(OSError):  # where Linux runs out of memory, this is the process to end
+    with contextlib.suppress(OSError):  # if Linux runs out of memory, it ends this process first
         Path("/proc/self/oom_score_adj").write_text("1000")
     values = {
         resource.RLIMIT_CPU: int(limits.seconds) + 1,
@@ -73,11 +78,11 @@ def _limit(limits: ProcessLimits) -> None:
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: OPEN_FILES,
     }
-    if sys.platform == "linux":  # elsewhere the system doesn't keep to it
+    if sys.platform == "linux":  # other systems don't enforce it
         values[resource.RLIMIT_DATA] = limits.memory
     for which, value in values.items():
-        _, most = resource.getrlimit(which)
-        value = value if most == resource.RLIM_INFINITY else min(value, most)
+        _, hard = resource.getrlimit(which)
+        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
         resource.setrlimit(which, (value, value))
 
 

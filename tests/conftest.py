@@ -22,7 +22,7 @@ hypothesis.settings.load_profile("any machine")
 
 @pytest.fixture(autouse=True)
 def tiny_numbers_stay():
-    """A test that makes its process flush denormals would change every test that comes after it on its worker."""
+    """A process that flushes denormals would change the results of all later tests on this worker."""
     yield
     assert np.float32(1e-38) * np.float32(1e-2) > 0
 
@@ -48,7 +48,7 @@ def file(tmp_path: Path) -> bytes:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_sessionfinish(session: pytest.Session) -> Iterator[None]:
-    """At the very end: what was not tested. In CI a skip that is not on the list is a failure."""
+    """Report skipped tests at the end. In CI a skip that isn't in `ALLOWED_SKIPS` is a failure."""
     yield
     terminal = session.config.pluginmanager.get_plugin("terminalreporter")
     if terminal is None or hasattr(session.config, "workerinput"):

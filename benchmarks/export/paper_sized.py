@@ -125,8 +125,8 @@ class Training:
         scales = target[:, LOG_SCALES].exp()
         spread = (scales.amax(1, keepdim=True) - scales.amin(1, keepdim=True)) * 2
         sign = torch.where((pose.quats.detach() * target[:, QUATS]).sum(1, keepdim=True) < 0, -1.0, 1.0)
-        turned = (sign * pose.quats - target[:, QUATS]) * spread
-        return torch.cat([pose.means - target[:, MEANS], pose.scales - scales, turned], dim=1) / self.pixel
+        quats = (sign * pose.quats - target[:, QUATS]) * spread
+        return torch.cat([pose.means - target[:, MEANS], pose.scales - scales, quats], dim=1) / self.pixel
 
     def _batch(self) -> Tensor:
         moving = round(MOVING_FRACTION * GAUSSIANS_PER_TIME) if len(self._moving) else 0

@@ -18,7 +18,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import MsdgsError
 
 WRITTEN = (".ply", ".spz")
-TURN = ["-r", "180,0,0"]
+ROTATION = ["-r", "180,0,0"]
 """Version 3 doesn't convert the axes of an SPZ file to those of a PLY; version 2 did."""
 
 
@@ -37,16 +37,18 @@ def main(scene: Annotated[Path, tyro.conf.Positional], package: str = "@playcanv
     console.print(machine(), markup=False)
     try:
         session = DeformationSession(scene)
-        proof = RoundTrip(session)
+        round_trip = RoundTrip(session)
         t0, _ = session.scene.metadata.time_range
         with tempfile.TemporaryDirectory() as folder:
             for suffix in WRITTEN:
                 ours, theirs = Path(folder) / f"ours{suffix}", Path(folder) / f"theirs{suffix}.ply"
                 convert(ConvertOptions(scene, ours, t0), Console(quiet=True))
-                turn = TURN if suffix == ".spz" else []
-                subprocess.run(["npx", "--yes", package, "-w", ours, *turn, theirs], check=True, capture_output=True)
+                rotation = ROTATION if suffix == ".spz" else []
+                subprocess.run(
+                    ["npx", "--yes", package, "-w", ours, *rotation, theirs], check=True, capture_output=True
+                )
                 read = read_splats(theirs)
-                psnr = proof.psnr(read.gaussians, t0)
+                psnr = round_trip.psnr(read.gaussians, t0)
                 console.print(f"{suffix}: {len(read):,} Gaussians, {psnr:.1f} dB against the scene", markup=False)
                 require(psnr, None, LOSSY, theirs.name)
     except subprocess.CalledProcessError as error:

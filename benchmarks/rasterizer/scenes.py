@@ -55,7 +55,7 @@ def write_splat(file: Path, gaussians: Gaussians) -> None:
 
 
 def object_scene(count: int, seed: int = 0) -> Gaussians:
-    """A bumpy shell of flat Gaussians, most of them either opaque or faint, and a tenth floating around it; float32."""
+    """A bumpy shell of flat Gaussians, mostly opaque or nearly transparent, a tenth floating around it; float32."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -64,8 +64,8 @@ def object_scene(count: int, seed: int = 0) -> Gaussians:
     radii[floaters] = 1.3 * np.cbrt(rng.random(np.count_nonzero(floaters)))
     scales = np.exp(rng.normal(np.log(2 * median_scale(count)), 0.5, (count, 3)))
     scales[np.arange(count), rng.integers(0, 3, count)] *= 0.15
-    faint = rng.random(count) < 0.35
-    opacities = np.where(faint, rng.beta(1.2, 8, count), rng.beta(8, 1.2, count))
+    is_transparent = rng.random(count) < 0.35
+    opacities = np.where(is_transparent, rng.beta(1.2, 8, count), rng.beta(8, 1.2, count))
     sh = rng.normal(0, 0.04, (count, (SH_DEGREE + 1) ** 2, 3))
     sh[:, 0] = 1.2 * np.sin(4 * directions + [0, 1, 2]) + rng.normal(0, 0.15, (count, 3))
     quats = rng.normal(size=(count, 4))
@@ -79,9 +79,9 @@ def median_scale(count: int) -> float:
     return float(np.exp(np.interp(np.log(count), counts, scales)))
 
 
-def object_camera(width: int, height: int, turn: float = 0.6) -> Camera:
-    """A camera at distance 4, `turn` radians around the object and a little above it, `CAMERA_ANGLE_X` wide."""
-    eye = DISTANCE * np.array([np.sin(turn) * np.cos(0.4), -np.sin(0.4), -np.cos(turn) * np.cos(0.4)])
+def object_camera(width: int, height: int, azimuth: float = 0.6) -> Camera:
+    """A camera at distance 4, `azimuth` radians around the object and a little above it, `CAMERA_ANGLE_X` wide."""
+    eye = DISTANCE * np.array([np.sin(azimuth) * np.cos(0.4), -np.sin(0.4), -np.cos(azimuth) * np.cos(0.4)])
     focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)
     pose = Camera.from_look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), width, height, 40.0).camera_to_world
     return Camera(focal, focal, width / 2, height / 2, width, height, pose)

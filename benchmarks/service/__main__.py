@@ -85,8 +85,8 @@ def load(settings: Settings) -> Iterator[Row]:
     bad = {status: count for status, count in tally.statuses.items() if status not in (200, 503)}
     title = f"{CLIENTS} clients, mixed requests, {settings.seconds:.0f} s"
     yield Row(f"{title}: 5xx other than 503", "none", str(bad or "none"), not bad)
-    ratio = tally.frames_a_second / alone
-    rates = f"{tally.frames_a_second:.1f} of {alone:.1f} frames/s: {ratio:.0%}"
+    ratio = tally.frames_per_second / alone
+    rates = f"{tally.frames_per_second:.1f} of {alone:.1f} frames/s: {ratio:.0%}"
     measured = f"{rates}; clients take {client:.0%} of a core"
     yield Row("throughput relative to renderer and encoder alone", ">= 90 %", measured, ratio >= 0.9)
     wrong = sum(count for (wanted, found), count in tally.bodies.items() if expected[wanted] != found)
@@ -111,19 +111,19 @@ def too_much(settings: Settings) -> Iterator[Row]:
     requests = images(1000, FIRST)
     seconds = settings.overload_seconds / OVERLOAD_TURNS
     with service(settings.folder) as running:
-        peaks, tallies, health = [saturate(running, requests, 8, 5).frames_a_second], list[Tally](), list[Health]()
+        peaks, tallies, health = [saturate(running, requests, 8, 5).frames_per_second], list[Tally](), list[Health]()
         paced = at_rate(running, requests, CLIENTS, 15, PACE * peaks[0])
         for _ in range(OVERLOAD_TURNS):
             tally, looked = overload(running, requests, 64, seconds, OVERLOAD * peaks[-1])
             tallies.append(tally)
             health.append(looked)
-            peaks.append(saturate(running, requests, 8, 5).frames_a_second)
+            peaks.append(saturate(running, requests, 8, 5).frames_per_second)
     yield Row("8 clients, 400×400 JPEG", "", f"{', '.join(f'{peak:.0f}' for peak in peaks)} frames/s", None)
     ratio = paced.milliseconds(0.99) / paced.milliseconds(0.5)
     measured = f"{ratio:.1f} ({paced.milliseconds(0.5):.0f} and {paced.milliseconds(0.99):.0f} ms)"
     yield Row(f"at {PACE:.0%} of that: p99 / p50", "< 3", measured, ratio < 3)
     title = f"{OVERLOAD}× overload, {OVERLOAD_TURNS} × {seconds:.0f} s"
-    late = np.concatenate([np.array(tally.seconds) * tally.frames_a_second / PLACES for tally in tallies])
+    late = np.concatenate([np.array(tally.seconds) * tally.frames_per_second / PLACES for tally in tallies])
     p99 = float(np.quantile(late, 0.99))
     measured = f"{p99:.2f} ({', '.join(f'{tally.milliseconds(0.99):.0f}' for tally in tallies)} ms)"
     yield Row(f"{title}: p99 of accepted requests / bound of the queue", "<= 2", measured, p99 <= 2)
@@ -176,7 +176,7 @@ def main(scene: Path = SCENE, only: tuple[Part, ...] = (), minutes: float = 0.7,
             print(f"{name}: {(PARTS[name].__doc__ or '').splitlines()[0]}", flush=True)
             for row in PARTS[name](settings):
                 rows.append(row)
-                print(f"  {row.what}: {row.measured} (bound: {row.bound})", flush=True)
+                print(f"  {row.name}: {row.measured} (bound: {row.bound})", flush=True)
     return 0 if print_rows(rows) else 1
 
 

@@ -16,7 +16,7 @@ SCENE = Path(__file__).resolve().parents[2] / "examples" / "toybench.onnx"
 class Row(NamedTuple):
     """One service level."""
 
-    what: str
+    name: str
     bound: str
     measured: str
     met: bool | None  # None: no bound
@@ -36,15 +36,15 @@ def print_rows(rows: Iterable[Row]) -> bool:
     """Print the table; returns whether all bounds are met."""
     table, all_met = Table("service level", "bound", "measured", "met", title=time.strftime("%Y-%m-%d")), True
     for row in rows:
-        table.add_row(row.what, row.bound, row.measured, {True: "yes", False: "NO", None: ""}[row.met])
+        table.add_row(row.name, row.bound, row.measured, {True: "yes", False: "NO", None: ""}[row.met])
         all_met &= row.met is not False
     Console(width=max(Console().width, 120)).print(table)
     return all_met
 
 
-def memory_row(what: str, samples: Sequence[int]) -> Row:
+def memory_row(name: str, samples: Sequence[int]) -> Row:
     """Whether memory grows: bytes, sampled at regular intervals, in the last fifth of the time and in the second."""
     fifth = max(1, len(samples) // 5)
     second, last = float(np.median(samples[fifth : 2 * fifth])), float(np.median(samples[-fifth:]))
     measured = f"{last / second - 1:+.1%} ({second / 2**20:.0f} to {last / 2**20:.0f} MiB)"
-    return Row(f"{what}, the last fifth of the time against the second", "within 5 %", measured, last / second <= 1.05)
+    return Row(f"{name}, the last fifth of the time against the second", "within 5 %", measured, last / second <= 1.05)

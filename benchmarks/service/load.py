@@ -34,7 +34,7 @@ class Tally:
     lasted: float = 0.0
 
     @property
-    def frames_a_second(self) -> float:
+    def frames_per_second(self) -> float:
         return self.statuses[200] / self.lasted
 
     def milliseconds(self, part: float) -> float:

@@ -184,8 +184,10 @@ def check() -> int:
     alone = simulate(trace, Fleet(1, poses=SCENES * TIMES), one, clients=1)
     assert (alone.hits, alone.refused) == (2000 - distinct, 0)
     assert abs(alone.seconds - 0.01 * (2000 + distinct)) < 1e-6
-    affinity, turns = (simulate(trace, Fleet(3, r, poses=40), one, clients=6) for r in ("affinity", "round robin"))
-    assert affinity.hit_rate > turns.hit_rate
+    affinity, round_robin = (
+        simulate(trace, Fleet(3, r, poses=40), one, clients=6) for r in ("affinity", "round robin")
+    )
+    assert affinity.hit_rate > round_robin.hit_rate
     flooded = simulate(trace, Fleet(1, poses=40), one, rate=500)
     assert flooded.refused > 500
     assert flooded.latencies.max() <= 17 * 0.02 + 1e-9

@@ -9,7 +9,7 @@ import numpy as np
 
 Routing = Literal["affinity", "round robin", "bounded"]
 
-TRIES = 3  # replicas that the proxy asks, as docker/nginx/nginx.conf says
+TRIES = 3  # replicas that the proxy tries, as in docker/nginx/nginx.conf
 BOUND = 1.25  # `bounded`: a replica has at most this many times the mean number of requests
 RETRY_SECONDS = 1.0  # that a refused client waits
 

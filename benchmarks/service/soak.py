@@ -30,10 +30,10 @@ from benchmarks.service.requests import Offline, Wanted, digest, images, mixed
 from tests.support.scene_files import write_scene
 
 CLIENTS, NEIGHBORS = 16, 8
-CATALOGUE, BATCH, BATCH_BESIDE, FILM = 48, 12, 200, 8
+CATALOGUE, BATCH, BATCH_BESIDE, VIDEO_FRAMES = 48, 12, 200, 8
 COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 MAX_WAIT = 5.0
-ALIKE = 1.0  # mean difference of two films of the same frames, of 255
+MAX_VIDEO_DIFFERENCE = 1.0  # mean difference of two videos of the same frames, of 255
 SAMPLE_SECONDS = 1.0
 HOSTILE_BODIES = (
     b'{"camera": ' + b"[" * 50_000,
@@ -94,8 +94,8 @@ def shares(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
     p99 = {path: 1000 * float(np.quantile(took, 0.99)) for path, took in times.items()}
     ratio = p99["/render/batch"] / p99["/render"]
     measured = f"{ratio:.2f}: {p99['/render/batch']:.0f} and {p99['/render']:.0f} ms, of {[*map(len, times.values())]}"
-    what = f"a frame's p99 beside {NEIGHBORS} clients of batches, relative to {NEIGHBORS} clients of frames"
-    yield Row(what, "<= 3", measured, ratio <= 3)
+    name = f"a frame's p99 beside {NEIGHBORS} clients of batches, relative to {NEIGHBORS} clients of frames"
+    yield Row(name, "<= 3", measured, ratio <= 3)
 
 
 def _beside(running: list[Running], seconds: float, frame: Any, path: str, body: Any) -> list[float]:
@@ -139,7 +139,7 @@ class Soak:
         drawn = Offline(work)
         self._small = [(small._replace(scene=path.stem), digest(drawn.draw(small._replace(scene=path.stem))))
                        for path in self._files]  # fmt: skip
-        self._films: dict[int, np.ndarray] = {}  # by first frame: the film as it was first received
+        self._videos: dict[int, np.ndarray] = {}  # by first frame: the video as it was first received
         self._bad = [_external(self._files[0]), self._files[0].read_bytes()[:200], b"no scene", b""]
         self._lock = threading.Lock()
 
@@ -147,7 +147,7 @@ class Soak:
         """Random actions of one client until the time is over."""
         chance, client = random.Random(number), Client(number, self.port)
         actions: list[tuple[Callable[[Client, random.Random], None], int]] = [
-            (self._frame, 20), (self._batch, 3), (self._film, 1), (self._upload, 2), (self._damaged, 2),
+            (self._frame, 20), (self._batch, 3), (self._video, 1), (self._upload, 2), (self._damaged, 2),
             (self._hostile, 2), (self._leave, 1),
         ]  # fmt: skip
         while time.monotonic() < self._ends:
@@ -162,10 +162,10 @@ class Soak:
         with self._lock:
             self.statuses += client.statuses
 
-    def _expect(self, holds: bool, what: str) -> None:
+    def _expect(self, holds: bool, problem: str) -> None:
         if not holds:
             with self._lock:
-                self.wrong.append(what)
+                self.wrong.append(problem)
 
     def _frame(self, client: Client, chance: random.Random) -> None:
         wanted = chance.choice(self._wanted)
@@ -179,21 +179,23 @@ class Soak:
         found = {line["index"]: digest(base64.b64decode(line.get("data", ""))) for line in lines}
         self._expect(found == {n: self._expected[each] for n, each in enumerate(several)}, "a batch")
 
-    def _film(self, client: Client, chance: random.Random) -> None:
+    def _video(self, client: Client, chance: random.Random) -> None:
         start = chance.randrange(4)
-        frames = [{"camera": {"type": "orbit", "azimuth": 9 * (start + n), "elevation": 20}, "t": n / FILM}
-                  for n in range(FILM)]  # fmt: skip
+        frames = [{"camera": {"type": "orbit", "azimuth": 9 * (start + n), "elevation": 20}, "t": n / VIDEO_FRAMES}
+                  for n in range(VIDEO_FRAMES)]  # fmt: skip
         body = {"scene": "first", "frames": frames, "width": 160, "height": 120}
         answer = client.post("/render/video", body)
         shown = np.zeros(0)
         if answer.status == 200:
-            with av.open(io.BytesIO(answer.body), "r") as film:
-                shown = np.stack([frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]).astype(float)
+            with av.open(io.BytesIO(answer.body), "r") as video:
+                shown = np.stack([frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]).astype(float)
         with self._lock:
-            first = self._films.setdefault(start, shown)
+            first = self._videos.setdefault(start, shown)
         # x264 doesn't always write the same bytes
-        alike = shown.shape == (FILM, 120, 160, 3) and float(np.abs(shown - first).mean()) < ALIKE
-        self._expect(alike, f"a film of {len(shown)} frames, {answer.status}")
+        is_same = (
+            shown.shape == (VIDEO_FRAMES, 120, 160, 3) and float(np.abs(shown - first).mean()) < MAX_VIDEO_DIFFERENCE
+        )
+        self._expect(is_same, f"a video of {len(shown)} frames, {answer.status}")
 
     def _upload(self, client: Client, chance: random.Random) -> None:
         """A scene is added on one service, drawn and deleted on either, and then missing on both."""
@@ -302,7 +304,7 @@ def main(
 
     `shares`: single frames beside clients of batches and beside clients of single frames.
 
-    `soak`: frames, batches, films, uploads, damaged and hostile files, on two services that share a folder behind
+    `soak`: frames, batches, videos, uploads, damaged and hostile files, on two services that share a folder behind
     nginx with the settings of docker/.
 
     python -m benchmarks.service.soak shares
@@ -312,7 +314,7 @@ def main(
     Each client has a key of its own. Use an idle machine.
 
     Args:
-        part: What to measure.
+        part: The measurement.
         scene: A scene file whose time range is [0, 1].
         minutes: By default 30 for `soak` and 0.5 for each half of `shares`.
     """

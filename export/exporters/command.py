@@ -56,7 +56,7 @@ def convert(options: ConvertOptions, console: Console) -> None:
     console.print(f"{out}: {written} against the scene", markup=False)
     eps2d = session.scene.metadata.eps2d
     if eps2d != GSPLAT.eps2d:
-        drawn = "softer" if eps2d < GSPLAT.eps2d else "harder"
+        drawn = "blurrier" if eps2d < GSPLAT.eps2d else "sharper"
         console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
 
 

@@ -60,8 +60,8 @@ def visionary_of(file: Path) -> Callable[[float], Gaussians]:
     return shown
 
 
-def require(psnr: float, asked_for: float | None, default: float, what: str) -> None:
-    """Raise `ConversionFailed` if `psnr` is below the dB that are asked for, or else a default."""
+def require(psnr: float, asked_for: float | None, default: float, name: str) -> None:
+    """Raise `ConversionFailed` if `psnr` is below the requested minimum, by default that of the format."""
     minimum = default if asked_for is None else asked_for
     if not psnr >= minimum:
-        raise ConversionFailed(f"{what} has {psnr:.1f} dB against the scene, and {minimum:g} dB were asked for")
+        raise ConversionFailed(f"{name} has {psnr:.1f} dB against the scene, and {minimum:g} dB were asked for")

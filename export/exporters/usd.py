@@ -11,7 +11,7 @@ from export.importers.splats.base import as_float32
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 
-FRAMES_A_SECOND = 24
+FRAMES_PER_SECOND = 24
 PRIM = "/Splats"
 """Also the default prim."""
 
@@ -49,7 +49,7 @@ def write_usd(
             prim.GetAttribute(f"{harmonics}Coefficients").Set(vt.Vec3fArray.FromNumpy(as_float32(sh).reshape(-1, 3)))
         on_frame()
     if len(times) > 1:
-        stage.SetTimeCodesPerSecond(FRAMES_A_SECOND)
+        stage.SetTimeCodesPerSecond(FRAMES_PER_SECOND)
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(len(times) - 1)
     stage.Export(str(file))

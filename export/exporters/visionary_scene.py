@@ -19,10 +19,10 @@ def visionary_scene(model: str, metadata: SceneMetadata) -> dict[str, Any]:
     Rotations are Euler angles in radians, intrinsic, in the order XYZ. The keys are those of Visionary's example.
     """
     view = framing(metadata)
-    turn = Rotation.align_vectors([[0.0, 1.0, 0.0]], view.up[None])[0]
+    rotation = Rotation.align_vectors([[0.0, 1.0, 0.0]], view.up[None])[0]
     transform = {
-        "position": (-turn.apply(view.target)).tolist(),
-        "rotationEulerRad": np.asarray(turn.as_euler("XYZ")).tolist(),
+        "position": (-rotation.apply(view.target)).tolist(),
+        "rotationEulerRad": np.asarray(rotation.as_euler("XYZ")).tolist(),
         "scale": [1.0, 1.0, 1.0],
     }
     asset = {"name": model, "type": "onnx", "path": model, "dynamic": True, "transform": transform}

@@ -14,6 +14,6 @@ class ImportFailed(MsdgsError):
         self.problem = problem
 
 
-def cut_off(file: str | Path, what: str, needed: int, found: int) -> ImportFailed:
+def cut_off(file: str | Path, part: str, needed: int, found: int) -> ImportFailed:
     """A file that is shorter than its header states."""
-    return ImportFailed(file, f"is cut off: {what} needs {needed:,} bytes, there are {found:,}")
+    return ImportFailed(file, f"is cut off: {part} needs {needed:,} bytes, there are {found:,}")

@@ -1,4 +1,4 @@
-"""Readers whose files are unpacked by native code, such as that of WebP, zstd or torch, in a process of their own."""
+"""Readers that use native code, such as WebP, zstd or torch, run in a subprocess."""
 
 import importlib
 import json
@@ -15,14 +15,13 @@ from msdgs_serve.guarded import ProcessFailed, ProcessLimits, call_guarded
 Arrays = Mapping[str, np.ndarray]
 
 MEMORY, MEMORY_PER_BYTE = 2 << 30, 1 << 10
-"""Bytes that the process may have: its own, torch among them, and for each byte of the file, which may be packed by
-deflate."""
+"""Memory limit of the subprocess in bytes: its own, with torch, and per byte of the file, which may be compressed."""
 
 SECONDS, SECONDS_PER_BYTE = 120.0, 1e-5
 
 
 def read_guarded(read: Callable[..., Arrays], path: Path, *options: str) -> dict[str, np.ndarray]:
-    """What a module's function `read` makes of a file or folder: arrays of numbers or text. Raises `ImportFailed`."""
+    """The arrays that a module's function `read` returns for a file or folder. Raises `ImportFailed`."""
     files = [each for each in path.iterdir() if each.is_file()] if path.is_dir() else [path]
     size = sum(file.stat().st_size for file in files)
     memory = MEMORY + MEMORY_PER_BYTE * size
@@ -42,7 +41,7 @@ def read_guarded(read: Callable[..., Arrays], path: Path, *options: str) -> dict
 
 
 def write_arrays(answer: BinaryIO, module: str, name: str, path: str, *options: str) -> None:
-    """In the process: an .npz of a header, with the names or what is wrong with the file, and the arrays."""
+    """In the subprocess: write an .npz of the arrays and a header, which has their names or the problem of the file."""
     arrays: Arrays = {}
     problem = None
     try:

@@ -79,10 +79,10 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
 def _tracker(console: Console, progress: Progress) -> Track:
     started = time.monotonic()
 
-    def track(what: str, steps: int) -> Callable[[], object]:
+    def track(name: str, steps: int) -> Callable[[], object]:
         if steps and not console.is_terminal:  # no progress bars in a log
-            console.print(f"{time.monotonic() - started:5.0f} s  {what} …", markup=False)
-        task = progress.add_task(what, total=steps)
+            console.print(f"{time.monotonic() - started:5.0f} s  {name} …", markup=False)
+        task = progress.add_task(name, total=steps)
         return lambda: progress.advance(task)
 
     return track

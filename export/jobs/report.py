@@ -47,9 +47,9 @@ LEGEND = """\
 - **memory**: peak while loading the file and drawing a frame, above that of the idle process.
 - **worst frame**, **mean**: PSNR in dB against frames of the exact network, deformation and rasterizer in float64.
 - **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
-  a Gaussian, in scene units and in pixels, faint and hidden ones included.
+  a Gaussian, in scene units and in pixels, transparent and hidden ones included.
 - **held-out**: mean PSNR in dB against held-out images.
-- Points with other rasterizer options show what these would gain. A file can't select them, so none is chosen.
+- Points with other rasterizer options show their effect. A file can't select them, so none is chosen.
 """
 
 

@@ -45,7 +45,7 @@ TIMED_VIEWS = 3
 
 DEFAULT_RASTERIZER = "default"
 RASTERIZERS = {"alpha ≥ 2/255": {"alpha_min": 2 / 255}, "ends at 1 %": {"transmittance_min": 1e-2}}
-"""Other rasterizer options, tried on the chosen point to show what they would gain."""
+"""Other rasterizer options, tried on the chosen point to show their effect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,9 +195,9 @@ class Sweep:
         self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst))
         return self.estimates[-1]
 
-    def _estimate_all(self, what: str, candidates: Sequence[tuple]) -> None:
+    def _estimate_all(self, name: str, candidates: Sequence[tuple]) -> None:
         """Estimate candidates, given as the arguments of `_estimate`."""
-        on_estimate = self.job.progress(f"candidates: {what}", len(candidates))
+        on_estimate = self.job.progress(f"candidates: {name}", len(candidates))
         for candidate in candidates:
             self._estimate(*candidate)
             on_estimate()
@@ -247,11 +247,13 @@ class Sweep:
         return [(c.plan, c.pruning_db, degree) for c in chosen for degree in range(c.sh_degree)]
 
     def _undominated(self, db_margin: float = DB_MARGIN) -> list[QuickEstimate]:
-        def beaten(estimate: QuickEstimate) -> bool:
+        def dominated(estimate: QuickEstimate) -> bool:
             margins = {"time_margin": TIME_MARGIN if db_margin else 1.0, "db_margin": db_margin}
             return any(other.dominates(estimate, **margins) for other in self.estimates)
 
-        return [estimate for estimate in self.estimates if estimate.worst_db >= MIN_USEFUL_DB and not beaten(estimate)]
+        return [
+            estimate for estimate in self.estimates if estimate.worst_db >= MIN_USEFUL_DB and not dominated(estimate)
+        ]
 
     def _measured(self) -> SweepResult:
         if not self.estimates:

@@ -42,8 +42,8 @@ def _spline(graph: GraphBuilder, name: str, layer: SplineLayer, time: str) -> st
     """[nodes, 13] translations 3, stretches 6, quaternions 4 of any length, at `time`, [1, 1]."""
     knots, count = layer.config.num_knots, layer.transls.shape[1]
 
-    def scalar(what: str, value: float) -> str:
-        return graph.constant(f"{name}.{what}", np.array(value, np.float32))
+    def scalar(suffix: str, value: float) -> str:
+        return graph.constant(f"{name}.{suffix}", np.array(value, np.float32))
 
     since = graph.node("Sub", [time, graph.constant(f"{name}.first_time", to_numpy(layer.first_time))], f"{name}.since")
     place = graph.node("Mul", [since, graph.constant(f"{name}.knots", to_numpy(layer.knots_per_time))], f"{name}.place")

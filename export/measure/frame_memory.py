@@ -1,4 +1,4 @@
-"""Memory of one frame of a scene file, measured in a process that loads only what serving needs.
+"""Memory of one frame of a scene file, measured in a process that loads only the service's modules.
 
 `frame_memory` runs this module as that process, which reads a request on standard input and prints a list of bytes.
 """

@@ -17,7 +17,7 @@ from msdgs_train.gaussians.model_file import SceneInfo
 
 NEAR = GSPLAT.near_plane
 MIN_OPACITY = GSPLAT.alpha_min
-"""Fainter Gaussians are not drawn at all."""
+"""Gaussians of lower opacity are not drawn at all."""
 
 
 class FrameDifference(NamedTuple):

@@ -51,14 +51,14 @@ def time_frames(
     """Time a frame of each candidate at each of the views, `repeats` times; the first frames don't count."""
     firsts = [time_frame(candidate, views[0], background) for candidate in candidates]
     possible = [int(1e3 * SECONDS_PER_CANDIDATE / (first[2] * len(views))) for first in firsts]
-    turns = [max(MIN_REPEATS, min(repeats, count)) for count in possible]
+    counts = [max(MIN_REPEATS, min(repeats, count)) for count in possible]
     runs: list[list[list[TimingRun]]] = [[] for _ in candidates]
     collecting = gc.isenabled()
     gc.disable()
     try:
-        for turn in range(repeats):
-            for candidate, count, found in zip(candidates, turns, runs, strict=True):
-                if turn < count:
+        for repeat in range(repeats):
+            for candidate, count, found in zip(candidates, counts, runs, strict=True):
+                if repeat < count:
                     found.append([time_frame(candidate, view, background) for view in views])
             on_repeat()
     finally:
@@ -83,6 +83,6 @@ def time_frame(
 
 
 def _frame_time(runs: np.ndarray) -> FrameTime:
-    """The summary of [turns, views, 3] times of deformation, rasterization and both."""
+    """The summary of [repeats, views, 3] times of deformation, rasterization and both."""
     minima, medians = (each.mean(axis=0).tolist() for each in (runs.min(axis=0), np.median(runs, axis=0)))
     return FrameTime(*(Milliseconds(*pair) for pair in zip(minima, medians, strict=True)))

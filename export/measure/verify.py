@@ -33,7 +33,7 @@ MAX_VIOLATIONS = 1e-3
 
 
 class VerificationFailed(MsdgsError):
-    """A written scene file doesn't compute what its model does."""
+    """A written scene file differs from its model."""
 
 
 def verify(

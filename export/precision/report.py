@@ -95,7 +95,7 @@ class StabilityReport:
             return f"unstable in float32: {'; '.join(self.unstable)}. Use {_remedy()}"
         if not self.layers or not self.gaussians:
             return "stable: nothing moves"
-        return "stable: float32 shows what float64 shows, any plan may be used"
+        return "stable: float32 agrees with float64, any plan may be used"
 
     def refusal(self, plan: str) -> str | None:
         """Why `plan` must not be used for this model, with the remedy; None if it may."""
@@ -132,7 +132,7 @@ def limits_met(model: DynamicGaussians, scales: list[np.ndarray]) -> dict[str, i
     for name, factors in model.modulation(g.embeddings).present().items() if model.modulation is not None else ():
         bounded = factors.log().abs() >= MAX_LOG_FACTOR * AT_LIMIT
         found[f"modulation of {name} at e^±{MAX_LOG_FACTOR:g}"] = bounded.any(dim=1).sum()
-    return {what: int(count) for what, count in found.items() if count}
+    return {limit: int(count) for limit, count in found.items() if count}
 
 
 def _remedy() -> str:

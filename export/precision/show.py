@@ -61,8 +61,8 @@ def print_report(report: StabilityReport, console: Console) -> None:
         )
     if report.worst is not None:
         console.print(_worst_sentence(report.worst), markup=False)
-    for what, count in report.limits.items():
-        console.print(f"{what}: {count:,} of the Gaussians", markup=False)
+    for limit, count in report.limits.items():
+        console.print(f"{limit}: {count:,} of the Gaussians", markup=False)
     console.print(report.verdict, style="bold green" if report.stable else "bold red", markup=False)
 
 

@@ -25,7 +25,7 @@ def prune(
     """Apply `rules` while the worst selection frame stays at `min_db` dB or more. Returns the mask and the entries of
     `left_out` in its scene file.
 
-    Each rule may spend its fraction of the squared error that this allows, and what the rules before it have saved.
+    Each rule may spend its fraction of the squared error that this allows, and the rest of earlier rules' budgets.
     """
     mask, left_out = full_mask(statistics.model), []
     for name in (name for name in RULES if name in rules):

@@ -16,7 +16,7 @@ MAX_MEAN_MOTION = 1.0
 """Pixels. Parts of the network that move the visible Gaussians by more than this on average aren't tried."""
 
 VISIBLE_MOTION = 2.0
-"""Pixels. Gaussians that move further keep their motion even if they are faint: in other views they may not be."""
+"""Pixels. Gaussians that move further keep their motion even if it is barely visible: in other views it may be more."""
 
 MAX_OPERATIONS = 2e13
 """Operations for trials without some of the layers, some minutes of two cores; layers not tried by then are kept. All

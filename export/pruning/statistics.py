@@ -104,7 +104,7 @@ class PruningStatistics:
             frame = render(drawn, view.camera, self.background, self.model.rasterizer)
             worst = min(worst, compare(frame, self._frames[i]).psnr)
             if worst < min_db:
-                self._order.remove(i)  # probably the worst one next time too
+                self._order.remove(i)  # probably the worst one in the next call too
                 self._order.insert(0, i)
                 break
         return worst
@@ -116,8 +116,8 @@ class PruningStatistics:
         furthest = np.zeros(len(poses.static), np.float32)
         for at in map(poses.at, poses.times):
             moved = np.linalg.norm(at.means - poses.static.means, axis=1)
-            turned = np.linalg.norm(half_axes(at) - mean_axes, axis=1).max(axis=1, initial=0)
-            np.maximum(furthest, moved + turned, out=furthest)
+            rotated = np.linalg.norm(half_axes(at) - mean_axes, axis=1).max(axis=1, initial=0)
+            np.maximum(furthest, moved + rotated, out=furthest)
         return furthest * self.pixels_per_unit(poses.static.means)
 
     def change(self, network: NetworkMask, smaller: NetworkMask) -> float:
@@ -131,8 +131,8 @@ class PruningStatistics:
             before = rows(poses.at(t), ids, self.model.config.sh_degree)
             after = posed(model, t, ids)
             moved = np.linalg.norm(after.means - before.means, axis=1)
-            turned = np.linalg.norm(half_axes(after) - half_axes(before), axis=1).max(axis=1, initial=0)
-            pixels = (moved + turned) * self.pixels_per_unit(before.means) * self.peaks[ids]
+            rotated = np.linalg.norm(half_axes(after) - half_axes(before), axis=1).max(axis=1, initial=0)
+            pixels = (moved + rotated) * self.pixels_per_unit(before.means) * self.peaks[ids]
             change = max(change, float(pixels.sum() / max(self.peaks[ids].sum(), 1e-12)))
         return change
 

@@ -14,7 +14,7 @@ class Layout(NamedTuple):
     """The rows of a graph that poses all Gaussians in one order and then selects those that are asked for."""
 
     rows: np.ndarray  # [R] int64, the Gaussian of each row; every Gaussian has one at least
-    attributes: Mapping[str, np.ndarray]  # what the support stores of the rows
+    attributes: Mapping[str, np.ndarray]  # values that the support stores per row
 
 
 class SupportInputs(NamedTuple):

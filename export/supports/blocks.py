@@ -68,7 +68,7 @@ def _blocks(node_ids: np.ndarray, weights: np.ndarray, size: int) -> Blocks:
 
 
 def _stored_weights(weights: np.ndarray) -> np.ndarray:
-    """int16 [N, F] whose rows sum to `WEIGHT_ONE`: the largest weight takes what rounding leaves."""
+    """int16 [N, F] whose rows sum to `WEIGHT_ONE`: the largest weight absorbs the rounding."""
     stored = np.round(weights.astype(np.float64) * WEIGHT_ONE).astype(np.int64)
     largest = stored.argmax(axis=1)
     stored[np.arange(len(stored)), largest] += WEIGHT_ONE - stored.sum(axis=1)

@@ -151,8 +151,8 @@ class Trajectories:
         between = self.distances(ids, _cubic_between(samples[:, ::2]) - samples[:, 1::2])
         got = _cubic_at(samples, self._probe_parts)
         probes = self._probes[ids]
-        turned = np.einsum("mtc,mtc->mt", got[..., QUATS], probes[..., QUATS]) < 0
-        probes[..., QUATS] *= np.where(turned, -1, 1)[..., None].astype(probes.dtype)
+        flipped = np.einsum("mtc,mtc->mt", got[..., QUATS], probes[..., QUATS]) < 0
+        probes[..., QUATS] *= np.where(flipped, -1, 1)[..., None].astype(probes.dtype)
         return np.maximum(between, self.distances(ids, got - probes))
 
     def _probed(self, baked: Baked) -> tuple[ExactPoses | SinglePoses, Samples]:
@@ -174,8 +174,8 @@ class Trajectories:
             single = sampler.at(t, self._ids)
         except SceneFileInvalid:
             return False
-        turned = np.where(np.einsum("mc,mc->m", single[:, QUATS], exact[:, QUATS]) < 0, -1, 1)
-        single[:, QUATS] *= turned[:, None]
+        signs = np.where(np.einsum("mc,mc->m", single[:, QUATS], exact[:, QUATS]) < 0, -1, 1)
+        single[:, QUATS] *= signs[:, None]
         weights = _rotation_weights(exact[:, None], self.pixel)
         off = distances(single[:, None] - exact[:, None], weights)
         return bool((off <= FLOAT32_ENOUGH * self.pixel).all())
@@ -191,9 +191,9 @@ class Trajectories:
 def distances(differences: np.ndarray, rotation_weights: np.ndarray) -> npt.NDArray[np.float64]:
     """[M] the largest of differences from poses, [M, T, 10], as `Trajectories.distances` has it."""
     squares = np.square(differences)
-    turns = squares[..., QUATS].sum(-1).max(-1) * rotation_weights**2
+    rotations = squares[..., QUATS].sum(-1).max(-1) * rotation_weights**2
     moves = squares[..., MEANS].sum(-1).max(-1)
-    return np.sqrt(np.maximum(np.maximum(moves, turns), squares[..., SCALES].max((-1, -2))))
+    return np.sqrt(np.maximum(np.maximum(moves, rotations), squares[..., SCALES].max((-1, -2))))
 
 
 def layers_digest(baked: Baked) -> bytes:
@@ -208,8 +208,8 @@ def layers_digest(baked: Baked) -> bytes:
 def give_one_sign(samples: Samples) -> None:
     """Choose signs of quaternions along time so that each is closer to the one before: q and −q are one rotation."""
     quats = samples[..., QUATS]
-    turned = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
-    quats[:, 1:] *= np.cumprod(turned, axis=1)[..., None].astype(samples.dtype)
+    signs = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
+    quats[:, 1:] *= np.cumprod(signs, axis=1)[..., None].astype(samples.dtype)
 
 
 def _rotation_weights(samples: Samples, pixel: float) -> npt.NDArray[np.float64]:

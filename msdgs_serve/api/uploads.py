@@ -76,7 +76,7 @@ class Uploads:
         limits = self._settings
         upload.bytes += size
         if upload.bytes > limits.max_scene_megabytes * MIB:
-            detail = f"A scene file must be at limit {limits.max_scene_megabytes} MiB."
+            detail = f"A scene file must be at most {limits.max_scene_megabytes} MiB."
             raise RequestRejected(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "large_body", detail, field="body")
         if shutil.disk_usage(self._folder).free < limits.min_free_megabytes * MIB + size:
             raise _storage_full("disk_full", f"The service keeps {limits.min_free_megabytes} MiB of its disk free.")

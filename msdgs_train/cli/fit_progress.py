@@ -92,7 +92,7 @@ class FitProgress(Observer):
 
 
 def print_result(result: RunResult, data: Path, run: Path) -> None:
-    """Print how a run has ended, its metrics and models, and the command that continues it."""
+    """Print the run's status, metrics and models, and the command that continues it."""
     console.print(f"{result.status} at step {result.step:,}, {result.gaussians:,} Gaussians, {result.seconds:.0f} s")
     for split, metrics in result.metrics.items():
         console.print(f"{split:>5}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")

@@ -111,19 +111,18 @@ class MCMCStrategy:
 
 
 def compute_relocation(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Return opacity and scale factor of each of `shares` equal Gaussians that together look as one; float64.
+    """Return opacity and scale factor of each of `shares` equal Gaussians that together look like one; float64.
 
     Args:
         opacities: [N] of the one, in (0, 1).
         shares: [N] int, 1 or more.
 
     Returns:
-        Opacities [N], 1 − (1 − o)^(1/n), with which they let as much through at their centre as the one; and [N] by
-        what their scales are to be multiplied, so that their alpha, summed along a line through the centre, is the
-        same too: o / Σ_k C(n, k+1) (−1)^k o_n^(k+1) / √(k+1), the double sum of the paper's equation 9 with its
-        inner sum of binomials done.
+        Opacities [N], 1 − (1 − o)^(1/n), with the transmittance of the one at its center; and factors of the scales,
+        [N], which keep the sum of alpha along a line through the center: o / Σ_k C(n, k+1) (−1)^k o_n^(k+1) / √(k+1),
+        the double sum of the paper's equation 9 with its inner sum of binomials done.
     """
-    opacities = opacities.clamp(max=MAX_OPACITY)  # the sum loses its digits where all of its terms are large
+    opacities = opacities.clamp(max=MAX_OPACITY)  # the sum cancels if its terms are large
     shares = shares.clamp(1, MAX_COPIES).double()
     new = -torch.expm1(torch.log1p(-opacities) / shares)
     terms = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64)

@@ -156,7 +156,7 @@ def _group_of(name: str) -> str:
 
 
 RESUMABLE_CHANGES = frozenset({"steps", "threads", "minutes", "log_every", "eval_every", "checkpoint_every"})
-"""Settings that may change when a run is resumed. All others have shaped what is trained already."""
+"""Settings that may change when a run is resumed. All others have affected the model already."""
 
 
 def check_resumable(stored: TrainConfig, wanted: TrainConfig) -> None:

@@ -1,18 +1,18 @@
 """The order of the images, and the parameters that each of them updates.
 
-First all images train a static scene. Then what moves is tracked from the middle of the scene's time outwards, in a
-window that grows image by image, once or more. While it grows for the first time, of four samples
+First all images train a static scene. Then motion is tracked from the middle of the scene's time in a window that
+grows in both directions, once or more. While it grows for the first time, of four samples
 
-- one is drawn from all images of the window alike, and updates everything;
+- one is drawn uniformly from all images of the window, and updates everything;
 - two are drawn from the newest ones, at its border, and update motion alone: canonical Gaussians that learned from so
   few images as often would overfit them and lose their textures;
-- one is drawn from those outside, and updates what is static alone, where static parts are visible: otherwise the few
+- one is drawn from those outside, and updates static parts alone, where they are visible: otherwise the few
   images in the middle of time would be explained by any geometry that their few cameras can't tell from the true one.
 
 When it grows again, motion is nearly right: all images of the window update everything.
 """
 
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,22 +34,6 @@ class TrainingSample(NamedTuple):
     frame: Frame
     t: float  # of the Gaussians: the image's, or the nearest within the window
     update: Update  # which parameters learn from it
-
-
-class Curriculum(Protocol):
-    """The order of the images of a run."""
-
-    def next(self, number: int, step: int, generator: torch.Generator) -> TrainingSample:
-        """The sample of this number, in this step of the schedule, both counted from 0."""
-        ...
-
-    def state(self) -> Tensor:
-        """The state besides the generator, for `load_state`."""
-        ...
-
-    def load_state(self, state: Tensor) -> None:
-        """Continue from a state; an empty one starts a new pass."""
-        ...
 
 
 class WindowCurriculum:

@@ -11,10 +11,10 @@ class CurriculumConfig(Checked):
     """The images of each phase of a run."""
 
     static_fraction: float = 0.1
-    """The first fraction of the run trains on all images without deformation, until what is static is in place
+    """The first fraction of the run trains on all images without deformation, until static parts have converged
     (warm_up of Deformable-3D-Gaussians, the coarse stage of 4DGaussians)."""
     static_window_fraction: float = 0.025
-    """The next fraction is still without deformation, on the first time window, in which what moves takes shape."""
+    """The next fraction is still without deformation, on the first time window, in which moving objects take shape."""
     window_start_widths: tuple[float, ...] = (0.03,)
     """Half width at which the time window, centered in the scene's time, begins to grow, as a fraction of that time.
     With more than one, it shrinks to the next and grows again, in as many steps; from then on all images of the window
@@ -24,7 +24,7 @@ class CurriculumConfig(Checked):
     new_frames_motion_only: bool = True
     """While the window first grows, half of the steps, on newly admitted images, train motion alone."""
     outside_frames_static_only: bool = True
-    """While it first grows, a quarter of the steps, on images outside, train what is static alone."""
+    """While it first grows, a quarter of the steps, on images outside, train static parts alone."""
 
     def __post_init__(self) -> None:
         self.require_fractions("static_fraction", "static_window_fraction", "window_full_fraction")

@@ -1,7 +1,7 @@
 """The training of one model in memory: take a step, evaluate, save and restore a checkpoint."""
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates, ste
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.evaluation.metrics import ImageMetrics, image_metrics, psnr_from_mse
 from msdgs_train.gaussians import safe_load
+from msdgs_train.layers.parameters import ParamGroup
 from msdgs_train.systems.base import System, Target
 from msdgs_train.systems.registry import system_of
 
@@ -86,13 +87,13 @@ class Trainer:
         self.system.before_step(self.optimizer, self.reached)
         groups = self.system.parameter_groups()
         set_learning_rates(self.optimizer, groups, self.schedule, self.step_count, self.lr_factor)
-        views = self._render_and_backward()
+        views = self._render_and_backward(groups)
         average_gradients(groups, views)
         loss = sum(view.loss for view in views) / len(views)
         self.reached = range(self.step_count + 1, self.step_count + advance + 1)
         self.step_count += advance
         self.optimizer_steps += 1
-        is_finite = self._is_finite(loss)
+        is_finite = self._is_finite(loss, [p.grad for g in groups for p in g.params if p.grad is not None])
         if is_finite:
             # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
             clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], MAX_GRADIENT_NORM)
@@ -180,7 +181,7 @@ class Trainer:
     def _generators(self) -> list[torch.Generator]:
         return [self._generator, *self.system.generators()]
 
-    def _render_and_backward(self) -> list[ViewGradients]:
+    def _render_and_backward(self, groups: Sequence[ParamGroup]) -> list[ViewGradients]:
         """Render the next batch and differentiate the loss of each image, in parallel."""
         size = self.config.run.batch_size
         first = self.optimizer_steps * size
@@ -189,8 +190,8 @@ class Trainer:
             for number in range(first, first + size)
         ]
         if size == 1:
-            return [self._differentiate(*drawn[0])]
-        return list(self._workers.map(lambda view: self._differentiate(*view), drawn))
+            return [self._differentiate(groups, *drawn[0])]
+        return list(self._workers.map(lambda view: self._differentiate(groups, *view), drawn))
 
     @functools.cached_property
     def _workers(self) -> ThreadPoolExecutor:
@@ -198,18 +199,17 @@ class Trainer:
         return ThreadPoolExecutor(self.config.run.threads, "image", torch.set_num_threads, (1,))
 
     @sharing_cores()
-    def _differentiate(self, sample: TrainingSample, background: Tensor) -> ViewGradients:
+    def _differentiate(self, groups: Sequence[ParamGroup], sample: TrainingSample, background: Tensor) -> ViewGradients:
         target = Target.over(self._images.rgba(sample.frame), background)
         view = self.system.loss(sample, target, background, self.step_count)
-        return differentiate(self.system.parameter_groups(), sample, view, target.rgb)
+        return differentiate(groups, sample, view, target.rgb)
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":
             return torch.rand(3, generator=self._generator)
         return torch.tensor(self.config.data.evaluation_background)
 
-    def _is_finite(self, loss: float) -> bool:
-        gradients = [p.grad for p in self.system.model.parameters() if p.grad is not None]
+    def _is_finite(self, loss: float, gradients: list[Tensor]) -> bool:
         if bool(torch.isfinite(loss + get_total_norm(gradients, foreach=True))):
             self._skipped_in_a_row = 0
             return True

@@ -87,7 +87,9 @@ class ModelConfig:
             raise InvalidInput("model.scale_space", f"one of {list(get_args(ScaleSpace))}", self.scale_space)
         if self.layers and self.support.moves_nodes:
             if self.scale_space != "log":
-                raise InvalidInput("model.scale_space", "log with nodes, whose stretches are factors", self.scale_space)
+                raise InvalidInput(
+                    "model.scale_space", "log with nodes, whose scale deltas are factors", self.scale_space
+                )
             for name in ("opacity_head", "sh_head"):
                 if getattr(self, name):
                     raise InvalidInput(f"model.{name}", "off with nodes, which move Gaussians only", True)

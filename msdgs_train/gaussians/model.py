@@ -1,6 +1,6 @@
 """The whole model: canonical Gaussians, a support, its chain of layers, and the modulation of their deltas."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -55,20 +55,25 @@ class DynamicGaussians(nn.Module):
         deform: bool = True,
         sh_degree: int | None = None,
         ids: Tensor | None = None,
+        motions: Any = None,
     ) -> PosedGaussians:
         """The Gaussians at time `t`.
 
         `num_layers` stops after that many layers, `deform=False` gives the canonical Gaussians without running any,
-        `sh_degree` omits the SH bands above it, and `ids`, int64 [M], poses only these Gaussians.
+        `sh_degree` omits the SH bands above it, `ids`, int64 [M], poses only these Gaussians, and `motions` are those
+        of the support at `t`, if they are known.
         """
         g = self.gaussians.rows(ids)
-        degree = self.config.sh_degree if sh_degree is None else sh_degree
-        sh = torch.cat([g.sh_dc, g.sh_rest[:, : sh_coefficients(degree) - 1]], dim=1)
+        rest = sh_coefficients(self.config.sh_degree if sh_degree is None else sh_degree) - 1
+        sh = torch.cat([g.sh_dc, g.sh_rest if rest == g.sh_rest.shape[1] else g.sh_rest[:, :rest]], dim=1)
         means, quats, raw_opacities = g.means, unit_or_identity(g.raw_quats), g.raw_opacities
         if not (deform and len(self.deformation) and num_layers != 0):
             return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)
-        time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
-        deltas = self.support(self.deformation, self.canonical_points(g), time, num_layers)
+        points = CanonicalPoints(means, quats, g.attributes)
+        if motions is None:
+            time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
+            motions = self.support.motions(self.deformation, points, time, num_layers)
+        deltas = self.support.follow(points, motions)
         deltas = self._modulated(deltas, g.attributes)
         if deltas.opacities is not None:
             raw_opacities = raw_opacities + deltas.opacities

@@ -58,6 +58,3 @@ class DeformationLayer(nn.Module):
         """Floating-point operations per point; by default a product and a sum per weight of a Linear."""
         linears = [module for module in self.modules() if isinstance(module, nn.Linear)]
         return 2 * sum(linear.weight.numel() for linear in linears)
-
-    def extra_repr(self) -> str:
-        return f"{sum(p.numel() for p in self.parameters()):,} parameters"

@@ -2,7 +2,7 @@
 
 A gradient at one time changes only nearby knots, while an MLP shares its weights over all positions and times. On
 control nodes these are Shape of Motion's motion bases (Wang et al. 2024) on splines, with a stretch: a soft body needs
-few of them, where rigid ones must be many.
+fewer of them than of rigid ones.
 """
 
 from collections.abc import Iterable
@@ -112,10 +112,10 @@ class SplineLayer(DeformationLayer):
         """
         knots = self.config.num_knots
         known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
-        for last, outwards in ((known[0], -1), (known[-1], 1)):
-            rot, inner = (unit(self.rots[k]) for k in (last, last - outwards))
+        for last, direction in ((known[0], -1), (known[-1], 1)):
+            rot, inner = (unit(self.rots[k]) for k in (last, last - direction))
             step = multiply(rot, inner * rot.new_tensor([1.0, -1.0, -1.0, -1.0]))
-            for k in range(last + outwards, knots + 3 if outwards > 0 else -1, outwards):
+            for k in range(last + direction, knots + 3 if direction > 0 else -1, direction):
                 if abs(k - last) <= 3:  # knots that times within the window read
                     rot = unit(multiply(step, rot))
                 self.transls[k], self.rots[k], self.stretches[k] = self.transls[last], rot, self.stretches[last]

@@ -18,8 +18,8 @@ class LossConfig(Checked):
     gradient at displacements larger than the object."""
 
     empty_weight: float = 0.0
-    """Weight of alpha where the image is transparent: what has the background's color there would be fog in views of
-    other cameras."""
+    """Weight of alpha where the image is transparent: without it, Gaussians of the background's color appear there as
+    fog in other views."""
 
     def __post_init__(self) -> None:
         self.require_fractions("ssim_lambda", "mse_fraction")

@@ -63,6 +63,16 @@ class Support(nn.Module):
         self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None
     ) -> Deltas:
         """Deltas of the Gaussians at time `t`, a scalar tensor, after the first `num_layers` of the chain, or all."""
+        return self.follow(gaussians, self.motions(chain, gaussians, t, num_layers))
+
+    def motions(
+        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None = None
+    ) -> Any:
+        """The motions of the points at time `t`, which `follow` and `regularizers` read."""
+        raise NotImplementedError
+
+    def follow(self, gaussians: CanonicalPoints, motions: Any) -> Deltas:
+        """Deltas of the Gaussians, given the motions of the points."""
         raise NotImplementedError
 
     def points(self, gaussians: CanonicalPoints) -> Tensor:
@@ -72,8 +82,8 @@ class Support(nn.Module):
     def on_deform_start(self, gaussians: "CanonicalGaussians", surgery: "RowSurgery") -> None:
         """Called before the first step with deformation."""
 
-    def regularizers(self, chain: MultiStepDeformation, t: Tensor) -> dict[str, Tensor]:
-        """Weighted terms of the loss at time `t`, by name."""
+    def regularizers(self, motions: Any) -> dict[str, Tensor]:
+        """Weighted terms of the loss at the time of the motions, by name."""
         return {}
 
     def baked(self, attributes: dict[str, Tensor]) -> dict[str, Any]:

@@ -35,8 +35,8 @@ class GaussiansSupport(Support):
         super().__init__()
         self.config = config
 
-    def forward(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None
+    def motions(
+        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None = None
     ) -> Deltas:
         means = self.points(gaussians)
         if torch.is_grad_enabled() or len(means) <= CHUNK:
@@ -44,6 +44,9 @@ class GaussiansSupport(Support):
         parts = [chain(chunk, t, num_layers) for chunk in means.split(CHUNK)]
         columns = [[column for column in columns if column is not None] for columns in zip(*parts, strict=True)]
         return Deltas(*(torch.cat(column) if column else None for column in columns))  # pyright: ignore
+
+    def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
+        return motions
 
     def points(self, gaussians: CanonicalPoints) -> Tensor:
         return gaussians.means.detach() if self.config.detach_deform_input else gaussians.means

@@ -89,18 +89,17 @@ class NodesSupport(Support):
         neighbors = min(ARAP_NEIGHBORS, config.num_nodes - 1)
         self.register_buffer("neighbors", torch.zeros(config.num_nodes, neighbors, dtype=torch.int64))
 
-    def forward(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None
-    ) -> Deltas:
+    def follow(self, gaussians: CanonicalPoints, motions: Tensor) -> Deltas:
         weights = skinning_weights(gaussians.attributes["skinning_logits"])
-        ids = gaussians.attributes["node_ids"]
-        columns = skin(gaussians.means, gaussians.quats, weights, ids, self.motions(chain, t, num_layers))
+        columns = skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions)
         return Deltas(*columns.split((3, 3, 4), dim=1))
 
     def points(self, gaussians: CanonicalPoints) -> Tensor:
         return self.nodes
 
-    def motions(self, chain: MultiStepDeformation, t: Tensor, num_layers: int | None = None) -> Tensor:
+    def motions(
+        self, chain: MultiStepDeformation, gaussians: CanonicalPoints | None, t: Tensor, num_layers: int | None = None
+    ) -> Tensor:
         """[M, 16] matrices, offsets and quaternions of the nodes at time `t`: x → matrix x + offset."""
         deltas = chain(self.nodes, t, num_layers)
         rots = unit(deltas.quats + deltas.quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
@@ -137,13 +136,13 @@ class NodesSupport(Support):
         nearest = logits.topk(self.config.followed, dim=1)
         return (nearest.values - nearest.values[:, :1]).clamp_min(MIN_INITIAL_LOGIT), nearest.indices
 
-    def regularizers(self, chain: MultiStepDeformation, t: Tensor) -> dict[str, Tensor]:
-        return {"arap": self.config.arap_weight * self.local_rigidity(chain, t)}
+    def regularizers(self, motions: Tensor) -> dict[str, Tensor]:
+        return {"arap": self.config.arap_weight * self.local_rigidity(motions)}
 
-    def local_rigidity(self, chain: MultiStepDeformation, t: Tensor) -> Tensor:
+    def local_rigidity(self, motions: Tensor) -> Tensor:
         """Mean over pairs of neighbors: distance between one as moved by itself and as moved by the other, relative to
         their canonical distance."""
-        matrices, offsets, _ = self.motions(chain, t).split((9, 3, 4), dim=1)
+        matrices, offsets, _ = motions.split((9, 3, 4), dim=1)
         near = self.neighbors
         own = torch.einsum("bij,bj->bi", matrices.view(-1, 3, 3), self.nodes) + offsets
         moved = torch.einsum("bij,bkj->bki", matrices.view(-1, 3, 3), self.nodes[near]) + offsets[:, None]

@@ -1,4 +1,4 @@
-"""The interface of a system: a model, how it is rendered, and what it does before and after each step."""
+"""The interface of a system: a model, how it is rendered, and hooks before and after each step."""
 
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -36,7 +36,7 @@ class ViewLoss(NamedTuple):
     loss: Tensor  # scalar
     rgb: Tensor  # [H, W, 3]
     clamped_scales: int = 0  # Gaussians a scale of which was clamped
-    screen: Any = None  # what `after_step` wants to know of the backward pass
+    screen: Any = None  # results of the backward pass for `after_step`
 
 
 class System(Protocol):

@@ -21,7 +21,7 @@ ON_NODES = TrainConfig().updated(
     means_lr_final=5e-5,
     mse_fraction=0.8,
 )
-"""What the systems on control nodes have in common."""
+"""Settings that the systems on control nodes share."""
 
 register_system(
     DEFAULT,

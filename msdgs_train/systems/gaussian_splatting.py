@@ -82,13 +82,14 @@ class GaussianSplatting:
                 layer.on_window(before, after)
 
     def loss(self, sample: TrainingSample, target: Target, background: Tensor, step: int) -> ViewLoss:
-        posed, c = self._pose(self.model, sample.t, step), self.config.loss
+        motions, c = self._motions(sample.t, step), self.config.loss
+        posed = self._pose(self.model, sample.t, step, motions)
         rgb, alpha, info = rasterize(*posed, sample.frame.camera, background, self._options(step + 1))
         if sample.update == "static":
             loss = masked_l1(rgb, target.rgb, 1 - c.ssim_lambda)
         else:
             loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
-            loss = loss + self._regularizers(posed, sample, step)
+            loss = loss + self._regularizers(posed, motions, sample, step)
         if sample.update == "motion" and c.pooled_l1_weight:
             loss = loss + c.pooled_l1_weight * pooled_l1(rgb, target.rgb)
         if c.empty_weight:
@@ -151,15 +152,23 @@ class GaussianSplatting:
         """Options of the rasterizer in a step, counted from 1."""
         return GSPLAT._replace(eps2d=self.schedule.eps2d(step))
 
-    def _pose(self, model: DynamicGaussians, t: float, step: int) -> PosedGaussians:
-        return model.pose(t, deform=self.schedule.deforms(step), sh_degree=self.schedule.sh_degree(step))
+    def _pose(self, model: DynamicGaussians, t: float, step: int, motions: Any = None) -> PosedGaussians:
+        degree, deform = self.schedule.sh_degree(step), self.schedule.deforms(step)
+        return model.pose(t, deform=deform, sh_degree=degree, motions=motions)
 
-    def _regularizers(self, posed: PosedGaussians, sample: TrainingSample, step: int) -> Tensor | float:
+    def _motions(self, t: float, step: int) -> Any:
+        """Those of the support, once for the pose and the regularizers."""
+        if not (self.schedule.deforms(step) and len(self.model.deformation)):
+            return None
+        points = self.model.canonical_points()
+        return self.model.support.motions(self.model.deformation, points, points.means.new_tensor(t))
+
+    def _regularizers(self, posed: PosedGaussians, motions: Any, sample: TrainingSample, step: int) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
         terms = list(self.density.regularizers(posed).values())
-        if self.schedule.deforms(step):
-            time = torch.tensor(sample.t, dtype=posed.means.dtype)
-            terms += self.model.support.regularizers(self.model.deformation, time).values()
+        if motions is not None:
+            time = posed.means.new_tensor(sample.t)
+            terms += self.model.support.regularizers(motions).values()
             for layer in self.model.deformation:
                 terms += layer.regularizers(time, is_new_frame=sample.update == "motion").values()
         total: Tensor | float = 0.0

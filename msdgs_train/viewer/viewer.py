@@ -1,7 +1,7 @@
 """A browser viewer of a model from any view at any time, drawn by this project's rasterizer.
 
 viser provides the page, its camera and its controls; renderings are the background images of its empty scene. One
-thread polls the state of every browser and draws what has changed: small images during changes, then a large one.
+thread polls the state of every browser and draws changed views: small images during changes, then a large one.
 """
 
 import contextlib
@@ -53,7 +53,7 @@ class Wanted(NamedTuple):
 class _Browser:
     wanted: Wanted | None = None
     changed: float = 0.0  # time of the last change of `wanted`
-    drawn: tuple[Wanted, Snapshot, bool] | None = None  # what was drawn last; True for the large image
+    drawn: tuple[Wanted, Snapshot, bool] | None = None  # the last drawn view; True for the large image
 
 
 class Viewer:

@@ -23,7 +23,7 @@ from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.base import SceneBounds
-from msdgs_train.layers.mlp import MLPConfig, PositionalEncoding, frequency_matrix
+from msdgs_train.layers.mlp import MLPConfig, frequency_matrix, positional_encoding
 from msdgs_train.layers.plane import PlaneConfig
 from tests.export.stability_rows import Change, Row, measured, refused, relative, worst_frame
 from tests.export.stability_rows import changed as any_changed
@@ -32,7 +32,7 @@ from tests.support.models import CAMERA, MLP, SCENE, export_scene
 COUNT = 60
 changed = partial(any_changed, count=COUNT, layers=(replace(MLP, xyz_frequencies=6),))
 UNSEEN = (0.0, 0.137, 0.419, 0.733, 0.951, 1.0)
-"""Parts of the time range, between which the assessment looks at others."""
+"""Fractions of the time range; the assessment uses other times."""
 
 MOVES, SCALES = "pose from the scene file", "scales from the file, relative"
 
@@ -86,9 +86,9 @@ def traps() -> Iterator[Row]:
 
 def _encoding() -> Iterator[Row]:
     x = torch.linspace(-1.3, 1.3, 20_001, dtype=torch.double)[:, None].float()
-    exact = PositionalEncoding.apply(x.double(), frequency_matrix(1, 10).double())
-    single = PositionalEncoding.apply(x, frequency_matrix(1, 10))
-    half = PositionalEncoding.apply(x.half().float(), frequency_matrix(1, 10))
+    exact = positional_encoding(x.double(), frequency_matrix(1, 10).double())
+    single = positional_encoding(x, frequency_matrix(1, 10))
+    half = positional_encoding(x.half().float(), frequency_matrix(1, 10))
     yield measured("encoding at 2⁹", "sines in float32", float((single - exact).abs().max()), "encoding.float32")
     types = {t.data_type for t in onnx.load_from_string(_network(changed())).graph.initializer}
     half_types = len(types & {onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16})
@@ -113,7 +113,7 @@ def _head_bias(columns: slice, value: float) -> Change:
 
 
 def a_million() -> Iterator[Row]:
-    """A million moving Gaussians, few of which are compared."""
+    """A million moving Gaussians, a few of which are compared."""
     small = MLPConfig(width=4, depth=1, xyz_frequencies=1, time_width=4, time_features=2)
     model = changed(_many, count=2, layers=(small,), embedding_dim=0)
     with tempfile.TemporaryDirectory() as folder:
@@ -145,7 +145,7 @@ def extents() -> Iterator[Row]:
                 yield refused(case, lambda m=model, s=scene: exported(m, s), reason)
                 continue
             unstable = session.scene.metadata.measured_error["unstable"]["count"]
-            if unstable:  # no float32 file could keep the poses, so frames decide
+            if unstable:  # no float32 file can hold these poses, so frames are compared
                 times = np.interp(UNSEEN, (0, 1), scene.time_range).tolist()
                 seen, psnr = worst_frame(model, session.gaussians, times, scene)
                 quantity = f"frames of the scene file, {unstable} of {COUNT} Gaussians unstable, {seen} in them"

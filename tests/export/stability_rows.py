@@ -1,7 +1,7 @@
-"""Rows of the stability suite: a made case, what was measured, its bound in the tolerances, and whether it held.
+"""Rows of the stability suite: a constructed case, the measured error, its bound, and whether the bound holds.
 
-A case either holds its bound, or is refused with a message that says why. Anything else fails: a bound broken, another
-exception than the package's own, a refusal that doesn't name its reason, NaN.
+A case either keeps its bound, or is refused with a message that names the reason. Anything else fails: an exceeded
+bound, an exception of another package, a refusal without the reason, NaN.
 """
 
 import math
@@ -38,7 +38,7 @@ class Row(NamedTuple):
 
 
 def measured(case: str, quantity: str, error: float, bound: str) -> Row:
-    """Whether an error keeps the row `bound` of the tolerances; of one in dB, which must not be lower."""
+    """Whether an error is within the row `bound` of the tolerances; a value in dB must not be lower."""
     limit = tolerance(bound)
     decibels = bound.endswith("_db")
     held = math.isfinite(error) and (error >= limit if decibels else error <= limit)
@@ -56,13 +56,13 @@ def refused(case: str, action: Callable[[], object], *reasons: str, quantity: st
         return Row(
             case, quantity, "–", "a refusal", f"{REFUSED}: {shortened(message)}" if named else f"{FAILS}: {message}"
         )
-    except Exception as error:  # what must not happen is a row, too
+    except Exception as error:  # an unexpected success is a failed row
         return Row(case, quantity, "–", "a refusal", f"{FAILS}: {type(error).__name__} {error}")
     return Row(case, quantity, "–", "a refusal", f"{FAILS}: was accepted")
 
 
 def shortened(message: str, length: int = 110) -> str:
-    """The message without the folder of a file, cut at a word."""
+    """The message without the folder of a file, shortened."""
     message = " ".join(word.rsplit("/", 1)[-1] if word.startswith("/") else word for word in message.split())
     return message if len(message) <= length else message[:length].rsplit(" ", 1)[0] + " …"
 

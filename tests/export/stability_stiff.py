@@ -1,4 +1,4 @@
-"""Made models whose layers amplify round-off: a little, a lot, and beyond what any number can hold."""
+"""Constructed models whose layers amplify round-off: a little, a lot, and beyond the range of floats."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,11 +19,11 @@ from tests.support.tolerances import tolerance
 
 TIMES = 3
 UNSEEN_TIMES = (0.137, 0.4321, 0.777)
-"""None of them is one that `assess` looks at."""
+"""None of them is one of the times of `assess`."""
 
 
 def steps_times(factor: float) -> Change:
-    """All that a layer's last Linear says, `factor` times as large: steps, their Jacobian, and the weight's logit."""
+    """Scale a layer's last Linear by `factor`: steps, their Jacobian, and the weight's logit."""
 
     def change(model: DynamicGaussians) -> None:
         for name, parameter in model.deformation.named_parameters():
@@ -34,7 +34,7 @@ def steps_times(factor: float) -> Change:
 
 
 def all_times(factor: float) -> Change:
-    """Every weight matrix, `factor` times as large."""
+    """Scale every weight matrix by `factor`."""
 
     def change(model: DynamicGaussians) -> None:
         for name, parameter in model.deformation.named_parameters():
@@ -45,7 +45,7 @@ def all_times(factor: float) -> Change:
 
 
 def rougher(factor: float) -> Change:
-    """The upper octaves, 32 to 512, `factor` times as strong, steps as large as before: stiff in the word's sense."""
+    """Scale the upper octaves, 32 to 512, by `factor`, with steps as large as before: a stiff field."""
 
     def change(model: DynamicGaussians) -> None:
         before = _displacement(model)
@@ -63,7 +63,7 @@ def _displacement(model: DynamicGaussians) -> float:
 
 
 def saturated(logit: float) -> Change:
-    """The weight's logit so far out that its sigmoid is 0 or 1 to the last bit."""
+    """Set the weight's logit so that its sigmoid is exactly 0 or 1 in float32."""
 
     def change(model: DynamicGaussians) -> None:
         for layer in model.deformation.layers:
@@ -73,7 +73,7 @@ def saturated(logit: float) -> Change:
 
 
 def layers(count: int, kind: str = "mlp") -> dict[str, Any]:
-    """Many layers are small ones: their number is what matters here."""
+    """Many layers are small ones: only their number matters here."""
     small = {"mlp": replace(MLP, depth=1), "plane": replace(PLANE, resolution=6, time_resolution=6)}
     return {"layers": ((small if count > 4 else SMALL_LAYERS)[kind],) * count}
 
@@ -102,7 +102,7 @@ CASES: dict[str, Callable[[], DynamicGaussians]] = {
 
 
 def rows_of(case: str) -> list[Row]:
-    """What is predicted must cover what is measured, and what is accepted must be exact in images not looked at."""
+    """Predictions bound measured errors, and accepted models are exact in frames that weren't assessed."""
     model = CASES[case]()
     report = assess(model, SCENE, times=TIMES if len(model.deformation) < 16 else 2)
     name = f"{case}: amplified × {report.worst_amplification:.2g}"
@@ -118,7 +118,7 @@ def rows_of(case: str) -> list[Row]:
 
 
 def _predicted(name: str, report: StabilityReport) -> list[Row]:
-    """Where little round-off is predicted, there must be no more; where much is, a chain isn't linear any more."""
+    """The predicted round-off is an upper bound as long as it is small enough for the chain to be linear."""
     s = report.samples
     small = s.predicted < tolerance("stability.first_order")
     ratios = s.distance[small] / np.maximum(s.predicted[small], 1e-300)
@@ -138,7 +138,7 @@ def jacobian_rows() -> Iterator[Row]:
                 ends = [(means + s * axis) + model.deformation(means + s * axis, t).means for s in (1, -1)]
                 columns.append((ends[0] - ends[1]) / (2 * step))
         norms = torch.linalg.matrix_norm(torch.stack(columns, dim=2), ord=2).numpy()
-        smooth = np.median(np.abs(found.after[-1] - norms) / norms)  # kinks of ReLU and of grids lie in a few steps
+        smooth = np.median(np.abs(found.after[-1] - norms) / norms)  # a few steps cross kinks of ReLU or of grids
         yield measured(
             f"K = 3, {layer.kind}", "‖J₃J₂J₁‖ against differences, median", float(smooth), "stability.jacobian"
         )

@@ -21,7 +21,7 @@ def all_rows() -> Iterator[Row]:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the table; the status is 1 where a row fails."""
+    """Print the table; the exit status is 1 if a row fails."""
     if set(arguments) - {"--write"}:
         print(__doc__)
         return 2

@@ -65,7 +65,7 @@ def session_of(model: DynamicGaussians) -> DeformationSession:
 
 
 def test_a_scene_on_nodes_is_posed_in_one_call():
-    """However many Gaussians there are; any of them, after any number of layers."""
+    """For any number of Gaussians, any ids and any number of layers."""
     count = 5000
     model = random_model(count, noise=0.02, support=replace(NODES, num_nodes=30), sh_degree=0)
     session = session_of(model)

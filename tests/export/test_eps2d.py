@@ -42,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("narrow")
     model = random_model(count=60, eps2d=EPS2D)
     with torch.no_grad():
-        model.gaussians.log_scales.sub_(1.5)  # under a pixel, where it is eps2d that is seen
+        model.gaussians.log_scales.sub_(1.5)  # below a pixel, where eps2d dominates
         model.gaussians.raw_opacities.add_(2.0)
     export_scene(saved(folder, model), folder / "scene.onnx")
     return folder
@@ -99,7 +99,7 @@ def test_exact_frames_of_an_export(
     assert np.square(drawn - expected).mean() < 1e-5
 
 
-def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
+def test_a_file_without_eps2d_has_the_default(folder: Path, tmp_path: Path):
     contents = onnx.load(folder / "scene.onnx")
     kept = {entry.key: entry.value for entry in contents.metadata_props if entry.key != "eps2d"}
     del contents.metadata_props[:]
@@ -108,7 +108,7 @@ def test_a_file_from_before_has_that_of_the_field(folder: Path, tmp_path: Path):
     assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.eps2d == GSPLAT.eps2d
 
 
-def test_training_may_begin_with_more(tmp_path: Path):
+def test_training_may_start_with_a_larger_eps2d(tmp_path: Path):
     """Saved models have the eps2d of their training step, also after a checkpoint is loaded."""
     sizes = replace(MOTION_BASES, eps2d=EPS2D)
     config = training_config(model=sizes, window_full_fraction=0.5, eps2d_init=0.4)
@@ -131,12 +131,12 @@ def test_training_may_begin_with_more(tmp_path: Path):
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
-def test_a_start_that_cannot_be_is_named(value: float):
+def test_an_invalid_initial_eps2d_is_refused(value: float):
     with pytest.raises(InvalidInput, match=r"config\.eps2d_init"):
         training_config(eps2d_init=value)
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf"), "0.3", True])
-def test_one_that_cannot_be_is_named(value: object):
+def test_an_invalid_eps2d_is_refused(value: object):
     with pytest.raises(InvalidInput, match=r"model\.eps2d"):
         small_config(eps2d=value)

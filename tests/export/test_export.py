@@ -229,7 +229,7 @@ def test_a_scale_that_would_overflow_or_vanish_is_cut(tmp_path: Path, layers: in
     ("script", "arguments"),
     [("to_onnx", ["nowhere.pt"]), ("stability", ["nowhere.pt"]), ("convert", ["nowhere.onnx", "a.ply"])],
 )
-def test_the_scripts_run_from_any_folder_and_teach(tmp_path: Path, script: str, arguments: list[str]):
+def test_the_scripts_run_from_any_folder_and_their_help_has_examples(tmp_path: Path, script: str, arguments: list[str]):
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(ROOT / "export" / f"{script}.py"), *arguments]
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)

@@ -49,7 +49,7 @@ def run(scene: Path, out: Path, t: float | None = None, frames: int = 30, min_ps
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_ply_of_one_moment_is_that_moment(tmp_path: Path, degree: int):
+def test_a_ply_holds_one_time(tmp_path: Path, degree: int):
     scene = scene_file(tmp_path, sh_degree=degree)
     run(scene, tmp_path / "a.ply", t=0.4)
     expected, got = DeformationSession(scene).gaussians(0.4), read_splats(tmp_path / "a.ply").gaussians
@@ -98,7 +98,7 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
         if entry.key == "antialiasing":
             entry.value = f'"{antialiasing}"'
     onnx.save(contents, scene)
-    run(scene, tmp_path / "a.spz")  # which compares images, and refuses under 45 dB
+    run(scene, tmp_path / "a.spz")  # compares images, and refuses less than 45 dB
     read = read_splats(tmp_path / "a.spz")
     assert read.antialiasing == antialiasing
     expected = DeformationSession(scene).gaussians(0.0)
@@ -107,7 +107,7 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
     assert turned.max() < tolerance("spz_rotation")
 
 
-@pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it softer"), (0.3, ""), (0.5, "draw it harder")])
+@pytest.mark.parametrize(("eps2d", "said"), [(0.1, "draw it blurrier"), (0.3, ""), (0.5, "draw it sharper")])
 def test_differences_of_other_renderers_are_printed(tmp_path: Path, eps2d: float, said: str):
     printed = StringIO()
     scene = scene_file(tmp_path, eps2d=eps2d)
@@ -117,7 +117,7 @@ def test_differences_of_other_renderers_are_printed(tmp_path: Path, eps2d: float
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
-def test_gltf_is_that_moment(tmp_path: Path, degree: int):
+def test_gltf_holds_one_time(tmp_path: Path, degree: int):
     scene = scene_file(tmp_path, sh_degree=degree)
     run(scene, tmp_path / "a.glb", t=0.4)
     assert_same(read_gltf(tmp_path / "a.glb"), DeformationSession(scene).gaussians(0.4))
@@ -155,7 +155,7 @@ def test_usd_has_a_sample_a_frame(tmp_path: Path, ending: str):
     for frame in range(5):
         assert_same(shown(frame), session.gaussians(frame / 4))
     first = session.gaussians(0.0)
-    turned = prim.GetAttribute("orientations").Get(0)[0]  # by half a turn about x, with OpenCV's y pointing down
+    turned = prim.GetAttribute("orientations").Get(0)[0]  # rotated by 180° about x, as OpenCV's y points down
     assert turned.GetReal() == pytest.approx(float(first.quats[0, 0]))
     assert turned.GetImaginary()[1] == pytest.approx(-float(first.quats[0, 2]))
     run(scene, tmp_path / f"still.{ending}", t=0.4)
@@ -208,7 +208,7 @@ def test_visionary_scene_stands_upright_about_what_its_cameras_look_at(tmp_path:
 
 @pytest.mark.parametrize("plan", ["network", "lowrank:8", "keyframes:7"])
 def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
-    """Its rules: opset 17 alone, no functions or control flow, finite constants of these types, empty padding."""
+    """Visionary needs opset 17 only, no functions or control flow, finite constants of these types, empty padding."""
     model = visionary_model(scene_file(tmp_path, plan))
     outputs, rows = {each.name: each.type.tensor_type for each in model.graph.output}, 512
     shapes = {name: [each.dim_value for each in kind.shape.dim] for name, kind in outputs.items()}

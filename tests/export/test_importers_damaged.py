@@ -1,6 +1,6 @@
 """Damaged files of every imported kind are refused or rendered finite, in bounded time and memory.
 
-`MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` tests so many larger files of each kind.
+`MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` tests 5,000 larger files of each kind.
 """
 
 import os
@@ -38,10 +38,10 @@ COUNT = 300 if DAMAGED < 1000 else 1_000
 """Gaussians in a file."""
 
 PALETTE = 64
-"""Sets of harmonics in a SOG."""
+"""Entries of the SH palette of a SOG."""
 
 ENDS = 1024
-"""Bytes at each end of a file, where headers and tables are; half of the damage is done there."""
+"""Bytes at each end of a file, which hold headers and tables; half of the damage is there."""
 
 
 class Kind(NamedTuple):

@@ -1,4 +1,4 @@
-"""Files that native code unpacks are read in a process of its own: what happens there costs that process alone."""
+"""Files that native code reads are read in a subprocess: crashes, hangs and memory errors end only that process."""
 
 import ctypes
 import gzip
@@ -59,11 +59,11 @@ def print_and_return(path: Path) -> dict[str, np.ndarray]:
         pytest.param(
             take_memory,
             r"a.sog: is damaged: it crashes the process that reads it \(1\), within a limit of 2,048 MiB",
-            marks=pytest.mark.skipif(sys.platform != "linux", reason="other systems don't keep to a limit of memory"),
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="other systems don't enforce a memory limit"),
         ),
     ],
 )
-def test_what_goes_wrong_in_the_process_is_named(
+def test_errors_of_the_subprocess_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], dict[str, np.ndarray]], problem: str
 ):
     if read is hang:

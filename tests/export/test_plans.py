@@ -96,9 +96,7 @@ def test_a_plan_that_this_model_cannot_have_says_what_it_can():
 
 @pytest.mark.parametrize("kind", FORMATS)
 @pytest.mark.parametrize("plan", FITTED)
-def test_fitted_plans_are_as_close_as_they_promise_at_times_that_they_have_not_seen(
-    tmp_path: Path, kind: str, plan: str
-):
+def test_fitted_plans_keep_their_error_bound_between_samples(tmp_path: Path, kind: str, plan: str):
     model, baked, trajectories = made(kind)
     session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
     assert session.scene.metadata.plan == plan
@@ -203,7 +201,7 @@ def test_one_gaussian(tmp_path: Path, plan: str):
     assert verify(session, model, times=9)["displacement"] < (1 if plan == "int8" else trajectories.pixel)
 
 
-def test_a_time_range_of_one_moment(tmp_path: Path):
+def test_a_time_range_of_one_time(tmp_path: Path):
     model = random_model(8, **FORMATS["mlp"])
     baked = bake(model, replace(SCENE, time_range=(0.25, 0.25)), "0" * 64)
     for plan in ("lowrank:2", "keyframes:4"):

@@ -1,4 +1,4 @@
-"""What fitted plans are fitted to: samples as dense as the motion needs, and a motion too fast for them is found."""
+"""Sampling for fitted plans: as dense as the motion needs; too fast motion is detected."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -50,7 +50,7 @@ def sampled(monkeypatch: pytest.MonkeyPatch) -> Callable[[Motion], tuple[Baked, 
 
 
 def of_first(motion: Callable[[float], float], others: float = 0.0) -> Motion:
-    """The first Gaussian moves along x; the others `others` as much."""
+    """The first Gaussian moves along x; the others by the fraction `others` of that."""
     return lambda t: np.array([[motion(t) * (1 if i == 0 else others), 0, 0] for i in range(COUNT)])
 
 
@@ -68,7 +68,7 @@ def test_a_fast_motion_that_a_coarse_sampling_misses_is_caught(sampled, tmp_path
     (tmp_path / "scene.onnx").write_bytes(build(plan, baked, trajectories).SerializeToString())
     session = DeformationSession(tmp_path / "scene.onnx")
     off = max(abs(session.pose(t, [0])[0][0, 0] - FAST[name](t)) for t in np.linspace(0, 1, 401))
-    # either its own poses follow it, or the file says that it doesn't
+    # either its own poses follow the motion, or the metadata count it as too fast
     fitted = session.scene.metadata.measured_error["fitted"]
     stated = fitted["error_too_fast"] if 0 in trajectories.unresolved else fitted["error"]
     assert off <= tolerance("between_samples.factor") * (stated + tolerance("stored_pose") * trajectories.pixel)
@@ -87,7 +87,7 @@ def test_amplitudes_far_apart_keep_the_same_error(sampled, tmp_path: Path, plan:
     session = DeformationSession(tmp_path / "scene.onnx")
     for t in np.linspace(0.013, 0.987, 9):
         off = np.linalg.norm(session.pose(t)[0] - motion(float(np.float32(t))), axis=1)
-        resolution = tolerance("float32.relative") * sizes  # of the file's own numbers and its time
+        resolution = tolerance("float32.relative") * sizes  # for float32 poses and times
         assert (off <= 0.05 * trajectories.pixel * tolerance("between_samples.factor") + 10 * resolution).all()
 
 

@@ -48,7 +48,7 @@ def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: Sc
     return worst
 
 
-def test_everything_that_the_made_scene_does_not_need_is_left_out_and_said(tmp_path: Path):
+def test_everything_without_effect_is_pruned_and_listed(tmp_path: Path):
     job = job_of(tmp_path, with_hidden_one(moving_object()))
     candidate = job.candidate("network", 50.0)
     scene, means = candidate.session.scene, job.model.gaussians.means[candidate.pruned.ids]
@@ -77,11 +77,11 @@ KEPT: dict[str, Callable[[BakedScene], bool]] = {
     "layers": lambda scene: len(scene.metadata.layers) == 2,
     "sh": lambda scene: scene.metadata.sh_degree == 1,
 }
-"""What a scene shows of a rule that was switched off."""
+"""The part of a scene that each rule would remove."""
 
 
 @pytest.mark.parametrize("rule", [*RULES, None])
-def test_a_rule_that_is_switched_off_leaves_things_in(tmp_path: Path, rule: str | None):
+def test_a_rule_that_is_switched_off_removes_nothing(tmp_path: Path, rule: str | None):
     off = [rule] if rule else list(RULES)
     others = [name for name in RULES if name not in off]
     scene = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0).session.scene
@@ -99,12 +99,12 @@ def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("pruning_db", [30.0, 45.0, 60.0])
-def test_the_error_allowed_is_kept_in_frames_of_our_own(tmp_path: Path, pruning_db: float):
+def test_the_error_bound_holds_in_other_frames(tmp_path: Path, pruning_db: float):
     model = random_model(400, sh_degree=1, noise=0.02)
     job = job_of(tmp_path, model)
     candidate = job.candidate("network", pruning_db)
     assert job.error(candidate).psnr_worst >= pruning_db
-    # at other times a frame may be worse, though not by much
+    # at other times a frame may be slightly worse
     assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("pruning.other_times_db")
 
 
@@ -142,7 +142,7 @@ def test_a_change_of_one_gaussian_is_measured(tmp_path: Path):
     assert 0 < error.position_pixels <= moved * CAMERA["fx"] / depth
 
 
-def test_times_that_decide_are_not_the_times_that_are_measured():
+def test_selection_times_are_not_evaluation_times():
     cameras = cameras_of(SCENE)
     deciding = {view.t for view in selection_views(cameras, (0.0, 1.0), 33)}
     measured = {view.t for view in evaluation_views(cameras, (0.0, 1.0), 16, 3)}
@@ -154,7 +154,7 @@ def test_times_that_decide_are_not_the_times_that_are_measured():
 def test_cameras_are_added_where_too_few_are_stored(count: int):
     cameras = cameras_of(SceneInfo(cameras=SCENE.cameras[:count], bounds=SCENE.bounds))
     assert len(cameras) > count
-    for _, camera in cameras[count:]:  # they see the scene's middle in theirs
+    for _, camera in cameras[count:]:  # the scene's middle is in the middle of their images
         in_camera = camera.world_to_camera @ [0, 0, 0, 1]
         assert in_camera[2] > 0
         assert np.abs(in_camera[:2]).max() < tolerance("pixel")

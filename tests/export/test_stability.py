@@ -29,7 +29,7 @@ def assert_none_fails(rows: list[Row]):
 
 
 @pytest.mark.parametrize("case", stability_stiff.CASES)
-def test_a_stiff_model_is_exact_enough_or_refused(case: str):
+def test_an_ill_conditioned_model_is_accurate_or_refused(case: str):
     assert_none_fails(stability_stiff.rows_of(case))
 
 
@@ -169,7 +169,7 @@ def test_the_command_flags_a_model_that_overflows(tmp_path: Path, capsys: pytest
     ("settings", "message"),
     [({"times": 1}, "`times`"), ({"min_psnr": -1.0}, "`min_psnr`"), ({"min_psnr": float("nan")}, "`min_psnr`")],
 )
-def test_the_command_refuses_settings_that_make_no_sense(
+def test_the_command_refuses_invalid_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, float], message: str
 ):
     assert main(saved(tmp_path, random_model(5)), **settings) == 1  # type: ignore[arg-type]

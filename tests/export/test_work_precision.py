@@ -25,7 +25,7 @@ from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that it sweeps once
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that the sweep runs once
 
 POINT_FIELDS = {
     "front": bool,
@@ -60,13 +60,13 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_p
     ahead = front(points)
     assert ahead
     for i, a in enumerate(points):
-        beaten = any(
+        dominated = any(
             b.milliseconds <= a.milliseconds
             and b.error.psnr_worst >= a.error.psnr_worst
             and (b.milliseconds, b.error.psnr_worst) != (a.milliseconds, a.error.psnr_worst)
             for b in points
         )
-        assert not (beaten and i in ahead)
+        assert not (dominated and i in ahead)
     best = choose(points, min_psnr)
     within = [p for p in points if p.error.psnr_worst >= min_psnr]
     assert (best is None) == (not within)
@@ -149,7 +149,7 @@ def test_the_report_has_its_fields(swept: tuple[ExportJob, SweepResult], tmp_pat
         assert p["moving"] + p["static"] <= GROUND + OBJECT
     page = paths[1].read_text()
     assert page.count("★ |") == 1
-    chosen = next(p for p in read["points"] if p["chosen"])  # times decide: all of such small files are fast
+    chosen = next(p for p in read["points"] if p["chosen"])  # times of such small files are nearly equal
     assert ("motion of Gaussians that never move visibly" in page) == (chosen["static"] > 0)
     assert all(len(row) == len(COLUMNS) for row in rows(contents))
     with Image.open(paths[2]) as image:
@@ -215,7 +215,7 @@ def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.Capt
     shown = capsys.readouterr().err
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene
-    # which of such small files is the fastest is a matter of chance
+    # the fastest of such small files is random
     still = scene.moving_count < len(moving_object().gaussians)
     assert ("left out: motion of Gaussians that never move visibly" in shown) == still
     assert scene.metadata.sh_degree == 1 or scene.metadata.left_out[-1]["rule"] == "sh_degree"

@@ -78,7 +78,7 @@ def test_a_camera_without_a_scene_is_named(folder: Path, name: object):
         read_scene_names(folder / "views.json")
 
 
-def test_without_ray_it_says_how_to_get_it(
+def test_without_ray_the_message_names_the_package(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setitem(sys.modules, "ray", None)

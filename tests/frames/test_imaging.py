@@ -1,4 +1,4 @@
-"""Encoders: what comes back from a decoder is what went in, to the precision that the format has."""
+"""Encoders: decoded images equal the original to the format's precision."""
 
 import os
 
@@ -119,7 +119,7 @@ def test_images_that_a_format_cannot_hold_are_refused_by_name(arguments, field):
     assert error.value.field == field
 
 
-def test_a_writer_that_fails_says_so(monkeypatch: pytest.MonkeyPatch):
+def test_an_error_of_the_writer_is_raised(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(oiio.ImageOutput, "create", lambda _: None)
     with pytest.raises(EncodingFailed, match="png"):
         encode(make_image(), "png")
@@ -133,7 +133,7 @@ def test_channels_of_different_sizes_are_refused():
 
 
 def test_srgb_transfer_against_known_values_and_back():
-    # IEC 61966-2-1: mid grey 0.5 encoded is 0.21404 linear; the two pieces meet
+    # IEC 61966-2-1: mid grey 0.5 encoded is 0.21404 linear; the function is continuous
     known = srgb_to_linear(np.array([0.0, 0.04045, 0.5, 1.0]))
     np.testing.assert_allclose(known, [0, 0.0031308, 0.2140411, 1], atol=1e-7)
     values = np.linspace(0, 4, 1001)

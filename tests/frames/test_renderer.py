@@ -14,7 +14,7 @@ from msdgs_serve.scene import Gaussians, InvalidInput
 from msdgs_serve.scene.baked import BakedScene
 from tests.support.scene_files import level_camera, metadata, write_scene
 
-FAINT = GSPLAT._replace(alpha_max=0.5)
+CAPPED = GSPLAT._replace(alpha_max=0.5)
 POSE_BYTES = 2 * 10 * 4  # two Gaussians: means, quats, scales
 
 
@@ -24,7 +24,7 @@ def session(scene: Path) -> DeformationSession:
 
 
 class CountingSession(DeformationSession):
-    """A scene that records the times at which it is posed, and that can wait or fail."""
+    """A scene that records the times at which it is posed; it can be made to wait or fail."""
 
     def __init__(self, gaussians: Gaussians, scene: BakedScene) -> None:
         self.scene = scene
@@ -52,7 +52,7 @@ def test_options_and_the_scene_choose_the_rasterizer(session: DeformationSession
     mip = DeformationSession(write_scene(tmp_path / "mip.onnx", antialiasing="mip"))
     plain = rasterize(session.gaussians(0.5), camera, background=background).rgb
     for drawn, options, rasterizer in (
-        (session, RenderOptions(rasterizer=FAINT), FAINT),
+        (session, RenderOptions(rasterizer=CAPPED), CAPPED),
         (mip, RenderOptions(), GSPLAT._replace(mip=True)),
     ):
         image = Renderer().render(drawn, camera, 0.5, options)
@@ -80,9 +80,9 @@ def test_simultaneous_requests_share_one_computation(counting: CountingSession):
     assert counting.times == [0.5]
 
 
-def test_the_pose_asked_for_longest_ago_is_forgotten_first(counting: CountingSession):
+def test_the_least_recently_used_pose_is_evicted_first(counting: CountingSession):
     renderer = Renderer(cache_bytes=2 * POSE_BYTES)
-    for t in (0.0, 0.1, 0.0, 0.2, 0.0, 0.1):  # 0.2 drives out 0.1
+    for t in (0.0, 0.1, 0.0, 0.2, 0.0, 0.1):  # 0.2 evicts 0.1
         renderer.posed(counting, t)
     assert counting.times == [0.0, 0.1, 0.2, 0.1]
 
@@ -106,7 +106,7 @@ def test_a_failed_computation_fails_all_requests_and_is_repeated(counting: Count
     assert len(renderer.posed(counting, 0.5)) == 2
 
 
-def test_a_cache_of_less_than_nothing_is_refused():
+def test_a_negative_capacity_is_refused():
     with pytest.raises(InvalidInput) as error:
         Renderer(cache_bytes=-1)
     assert error.value.field == "cache_bytes"

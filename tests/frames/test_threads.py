@@ -1,4 +1,4 @@
-"""Work that several threads take parts of, and that ends where its job is cancelled."""
+"""Work shared by several threads, which ends if its job is cancelled."""
 
 import threading
 
@@ -26,7 +26,7 @@ def test_a_part_that_another_thread_has_is_waited_for(two_threads: None):
     def work() -> bool:
         if threading.get_ident() == caller:
             assert begun.wait(60)
-            return False  # the other thread is not done
+            return False  # the other thread hasn't finished
         begun.set()
         threading.Event().wait(0.1)
         ended.append(True)
@@ -50,7 +50,7 @@ def test_errors_of_other_threads_are_raised(two_threads: None):
         run_together(work, ())
 
 
-def test_threads_without_work_are_not_awaited(two_threads: None):
+def test_idle_threads_are_not_waited_for(two_threads: None):
     caller, begun, go_on = threading.get_ident(), threading.Event(), threading.Event()
 
     def work() -> bool:
@@ -74,7 +74,7 @@ def test_one_thread_works_alone(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("threads", ["1", "3"])
 def test_parts_on_the_pool_end_with_it(threads: str, monkeypatch: pytest.MonkeyPatch):
-    """The part that runs ends by itself, those after it don't begin."""
+    """The running part is finished, later ones are not started."""
     monkeypatch.setenv(THREADS_VARIABLE, threads)
     job, begun = RenderJob(), []
 
@@ -85,7 +85,7 @@ def test_parts_on_the_pool_end_with_it(threads: str, monkeypatch: pytest.MonkeyP
     with pytest.raises(RenderCancelled), job.stage("draw"):
         run_parallel(part, [(number,) for number in range(100)])
     assert 1 <= len(begun) < 10
-    run_parallel(part, [(0,)])  # outside of the stage nothing is checked
+    run_parallel(part, [(0,)])  # no check outside of the stage
 
 
 def test_a_large_frame_can_be_given_up_between_its_rounds():
@@ -94,7 +94,7 @@ def test_a_large_frame_can_be_given_up_between_its_rounds():
     caller, checks = threading.get_ident(), [0]
 
     def check() -> None:
-        """Counts the caller's own: how many helpers begin before all is done is up to chance."""
+        """Counts the caller's own call: the number of helpers that start in time is random."""
         checks[0] += threading.get_ident() == caller
 
     with checking(check):

@@ -1,4 +1,4 @@
-"""Camera paths, films over HTTP, and `msdgs-render`."""
+"""Camera paths, videos over HTTP, and `msdgs-render`."""
 
 import io
 import json
@@ -35,8 +35,8 @@ def nerfstudio(count: int = 3, **changes: Any) -> dict[str, Any]:
     return {**path, "render_width": SIZE, "render_height": SIZE, **changes}
 
 
-def frames_of(film: bytes) -> tuple[list[np.ndarray], float]:
-    with av.open(io.BytesIO(film), "r") as container:
+def frames_of(video: bytes) -> tuple[list[np.ndarray], float]:
+    with av.open(io.BytesIO(video), "r") as container:
         rate = container.streams.video[0].average_rate
         assert rate is not None
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], float(rate)
@@ -80,7 +80,7 @@ def test_nerfstudios_path_is_read():
     ],
     ids=str,
 )
-def test_a_path_that_is_wrong_is_told_where(client: httpx.Client, changes: dict[str, Any], field: str):
+def test_an_invalid_path_is_refused_by_key(client: httpx.Client, changes: dict[str, Any], field: str):
     document = nerfstudio(**changes)
     with pytest.raises(InvalidInput) as error:
         read_nerfstudio(document, (0.0, 1.0))
@@ -92,7 +92,7 @@ def test_a_path_that_is_wrong_is_told_where(client: httpx.Client, changes: dict[
 
 
 @pytest.mark.parametrize("video_format", ["mp4", "webm"])
-def test_a_film_shows_the_frames(client: httpx.Client, video_format: str):
+def test_a_video_shows_the_frames(client: httpx.Client, video_format: str):
     times = [0.0, 0.25, 0.5, 0.75, 1.0]
     body = {"frames": [{"camera": ORBIT, "t": t} for t in times], "width": SIZE, "height": SIZE, "fps": 5.0}
     response = client.post("/render/video", json={**body, "format": video_format})
@@ -109,7 +109,7 @@ def test_a_film_shows_the_frames(client: httpx.Client, video_format: str):
 
 def test_an_animated_webp_shows_the_frames(tmp_path: Path):
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
-    path = tmp_path / "film.webp"
+    path = tmp_path / "video.webp"
     with path.open("wb") as file:
         assert write_video((np.full((SIZE, SIZE, 3), color, np.uint8) for color in colors), 5.0, "webp", file) == 3
     file = oiio.ImageInput.open(str(path))
@@ -149,7 +149,7 @@ def run(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-def test_images_of_a_turn(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_images_of_an_orbit(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "frames"
     assert run(scene, out, "--frames", 3, "--width", 20, "--height", 10) == 0
     files = sorted(out.glob("frame_*.png"))
@@ -161,7 +161,7 @@ def test_images_of_a_turn(scene: Path, tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    film, drawn = tmp_path / "turn.mp4", []
+    video, drawn = tmp_path / "orbit.mp4", []
 
     def encode_two(image: Image, *arguments: Any) -> bytes:
         if len(drawn) == 2:
@@ -169,19 +169,19 @@ def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pyt
         drawn.append(image.t)
         return encode(image, *arguments)
 
-    command = (scene, film, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
+    command = (scene, video, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
     monkeypatch.setattr(blocks, "encode", encode_two)
     assert run(*command) == INTERRUPTED
-    assert not film.exists()
+    assert not video.exists()
     monkeypatch.setattr(blocks, "encode", lambda image, *more: drawn.append(image.t) or encode(image, *more))
     assert run(*command) == 0
     assert drawn == [0.0, 0.25, 0.5, 0.75, 1.0]
-    frames, rate = frames_of(film.read_bytes())
+    frames, rate = frames_of(video.read_bytes())
     assert (len(frames), rate) == (5, 10)
-    assert [path.name for path in tmp_path.iterdir()] == ["turn.mp4"]
+    assert [path.name for path in tmp_path.iterdir()] == ["orbit.mp4"]
 
 
-def test_a_path_of_nerfstudio_on_disk(scene: Path, tmp_path: Path):
+def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
     (tmp_path / "path.json").write_text(json.dumps(nerfstudio()))
     assert run(scene, tmp_path / "out", "--path", tmp_path / "path.json", "--format", "exr") == 0
     pixels, spec = decode((tmp_path / "out" / "frame_00002.exr").read_bytes(), "exr")
@@ -195,14 +195,14 @@ def test_a_path_of_nerfstudio_on_disk(scene: Path, tmp_path: Path):
         (["scene", "out", "--path", "missing.json"], "missing.json"),
         (["scene", "out", "--frames", "0"], "--frames"),
         (["scene", "out", "--width", "10"], "--height"),
-        (["scene", "film.gif"], "mp4, webm, webp"),
-        (["scene", "film.mp4", "--transparent"], "--transparent"),
+        (["scene", "video.gif"], "mp4, webm, webp"),
+        (["scene", "video.mp4", "--transparent"], "--transparent"),
         (["scene", "taken"], "an empty folder"),
         (["missing.onnx", "out"], "missing.onnx"),
         (["scene", "out", "--quality", "80"], "quality"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_errors_are_one_line(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     arguments: list[str], message: str,
 ):  # fmt: skip

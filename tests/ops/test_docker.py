@@ -1,4 +1,4 @@
-"""Images and composition: what can be seen without a daemon, and with one the whole check of docker/check.py."""
+"""Images and composition: static checks, and with a Docker daemon docker/check.py."""
 
 import contextlib
 import json
@@ -57,12 +57,12 @@ def test_everything_that_the_package_asks_for_is_locked(name: str, extras: tuple
     assert names - pins(DOCKER / "requirements" / f"{name}.txt").keys() <= {"torch"}, "docker/lock.sh renews them"
 
 
-def test_what_serves_has_no_torch():
+def test_the_serve_image_has_no_torch():
     assert not {"torch", "onnx", "scipy", "matplotlib"} & pins(DOCKER / "requirements" / "serve.txt").keys()
-    assert "torch" not in pins(DOCKER / "requirements" / "train.txt"), "it comes from an index of its own"
+    assert "torch" not in pins(DOCKER / "requirements" / "train.txt"), "it comes from another index"
 
 
-def test_what_images_copy_is_sent_to_the_build():
+def test_copied_files_are_in_the_build_context():
     sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     copied = re.findall(
         r"^COPY (?!--from)(?:--chown=\S+ )?(.+) \S+$", (DOCKER / "Dockerfile").read_text(), re.MULTILINE
@@ -101,14 +101,14 @@ def test_prometheus_has_a_key_where_keys_are_asked_for():
     assert len((DOCKER / default[1]).read_text().strip()) < MIN_KEY_LENGTH, "the default must not be a valid key"
 
 
-def test_the_proxy_says_whom_it_asks_for_and_is_believed():
+def test_the_service_trusts_the_address_from_the_proxy():
     assert "proxy_set_header X-Forwarded-For $remote_addr;" in (DOCKER / "nginx" / "nginx.conf").read_text()
     render = SERVICES["render"]
     assert render["environment"]["MSDGS_PROXIES"] == "*"
-    assert "ports" not in render, "or everybody would be believed"
+    assert "ports" not in render, "every client would be trusted"
 
 
-def test_the_service_is_told_nothing_that_it_doesn_t_know():
+def test_all_settings_of_the_service_exist():
     known = {f"MSDGS_{name.upper()}" for name in Settings.model_fields}
     assert SERVICES["render"]["environment"].keys() <= known
     in_image = re.findall(r"MSDGS_\w+", (DOCKER / "Dockerfile").read_text())
@@ -145,7 +145,7 @@ def test_prometheus_answers_every_query_of_the_dashboard(tmp_path: Path):
 
 @contextlib.contextmanager
 def prometheus(folder: Path, target: str) -> Iterator[Callable[[str], list[Any]]]:
-    """The composition's, which looks at `target` every second instead; a function that asks it."""
+    """Run Prometheus with the composition's settings, scraping `target` every second; yields a query function."""
     settings = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yaml").read_text())
     settings["global"]["scrape_interval"] = "1s"
     (job,) = settings["scrape_configs"]
@@ -160,7 +160,7 @@ def prometheus(folder: Path, target: str) -> Iterator[Callable[[str], list[Any]]
     command = ["prometheus", *options, f"--web.listen-address={address}"]
 
     def answer(query: str) -> list[Any]:
-        with contextlib.suppress(httpx.TransportError):  # it isn't up yet
+        with contextlib.suppress(httpx.TransportError):  # not listening yet
             found = httpx.get(f"http://{address}/api/v1/query", params={"query": query})
             return found.json()["data"]["result"] if found.status_code == 200 else []
         return []

@@ -1,4 +1,4 @@
-"""Links of the docs lead somewhere, every image and table is shown, and the pages stay short."""
+"""Links of the docs are valid, every image and table is used, and the pages are short."""
 
 import re
 from pathlib import Path

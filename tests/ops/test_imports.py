@@ -39,7 +39,11 @@ def test_import_contracts_hold() -> None:
     ("code", "needed", "unwanted"),
     [
         ("import msdgs_serve", "msdgs_serve", HEAVY),
-        (IMPORT_ALL.format(skip="msdgs_serve.client"), "fastapi", NOT_FOR_SERVING),  # httpx loads rich where it is
+        (
+            IMPORT_ALL.format(skip="msdgs_serve.client"),
+            "fastapi",
+            NOT_FOR_SERVING,
+        ),  # httpx loads rich if it is installed
         (IMPORT_ALL.format(skip="msdgs_serve.api"), "numba", HTTP),
         ("import sys; sys.path.insert(0, 'examples'); import demo", "serving", HEAVY | HTTP | NOT_FOR_SERVING),
     ],

@@ -1,4 +1,4 @@
-"""The manifest for Kubernetes: it is valid, and says of the service what is true of it."""
+"""The manifest for Kubernetes is valid and consistent with the service."""
 
 from typing import Any
 

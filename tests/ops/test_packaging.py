@@ -1,4 +1,4 @@
-"""`pip install .` alone is enough to serve a scene outside of the checkout, and installs nothing of training."""
+"""`pip install .` alone suffices to serve a scene outside of the checkout, and installs nothing for training."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from tests.support.processes import ROOT
 PACKAGES = {"msdgs_serve", "msdgs_train"}
 SCENE = ROOT / "examples" / "toybench.onnx"
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("packaging")]  # one worker, so that it installs once
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("packaging")]  # one worker, so that pip runs once
 
 DESCRIBE = """
 import importlib.metadata as m, importlib.util, json
@@ -28,7 +28,7 @@ print(json.dumps({"files": files, "distributions": names, "where": importlib.uti
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fresh environment with the package from this checkout, built and installed, and nothing else asked for."""
+    """A fresh environment with only the package of this checkout and its dependencies."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=True)
     pins = str(ROOT / "constraints.txt")
@@ -48,13 +48,13 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def described(environment: Path) -> dict:
-    """What the environment holds."""
+    """The installed files and distributions."""
     command = [environment / "bin" / "python", "-c", DESCRIBE]
     return json.loads(subprocess.check_output(command, cwd=environment, env=clean_environment()))
 
 
 def clean_environment() -> dict[str, str]:
-    """The environment without what would let the checkout or this environment be seen."""
+    """Environment variables without those that point to the checkout or to this environment."""
     return {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
 
 

@@ -1,4 +1,4 @@
-"""Work on a Ray cluster of this machine: the same bytes as drawn here, and what a worker that dies costs."""
+"""Work on a Ray cluster of this machine: the same bytes as without it, and recovery from lost workers."""
 
 import filecmp
 import time
@@ -24,9 +24,9 @@ CORES = 2
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster() -> Iterator[Any]:
-    """Found by `auto`; one node to begin with, small, with an object store to match."""
+    """A small cluster of one node, which `auto` finds."""
     patch = pytest.MonkeyPatch()
-    patch.setenv("RAY_AUTH_MODE", "disabled")  # nothing but this machine reaches it
+    patch.setenv("RAY_AUTH_MODE", "disabled")  # reachable from this machine only
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's own
         import ray  # pyright: ignore[reportMissingImports]
@@ -87,11 +87,11 @@ def test_a_worker_that_dies_costs_its_task_alone(tmp_path: Path):
     assert (tmp_path / "died").exists()
 
 
-def test_work_that_always_kills_its_worker_ends():
+def test_a_task_that_always_kills_its_worker_is_given_up():
     with ray_cluster("auto") as cores, pytest.raises(WorkLost, match=f"{MAX_LOSSES} times"):
         list(run_tasks(RayTasks(always_dies), [1], cores))
 
 
-def test_errors_of_ours_come_back_as_such():
+def test_domain_errors_are_raised_by_the_caller():
     with ray_cluster("auto") as cores, pytest.raises(MsdgsError, match="`number` must be another, got 1"):
         list(run_tasks(RayTasks(refuses), [1], cores))

@@ -1,4 +1,4 @@
-"""What a run of the tests says of those that it skipped."""
+"""The report on skipped tests."""
 
 from tests.support.skips import ALLOWED_SKIPS, LACKS, not_tested, unexpected
 
@@ -9,7 +9,7 @@ def test_only_listed_reasons_are_expected():
     assert unexpected([lack.reason for lack in LACKS]) == sorted(lack.reason for lack in LACKS)
 
 
-def test_one_line_says_what_was_not_tested_and_what_brings_it():
+def test_one_line_names_untested_parts_and_the_command_to_install_them():
     assert not_tested(list(ALLOWED_SKIPS)) == ""
     line = not_tested([lack.reason for lack in (*LACKS, LACKS[0])])
     assert "the page in a browser (2), " in line

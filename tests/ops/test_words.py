@@ -10,7 +10,7 @@ RETIRED = {
     "sow|sown|sowing": "reseed",
     "stillness": "static",
     "settling": "static time window",
-    "lessons?|taught": "training sample, update",
+    "taught": "updated",
     "foretold": "predicted",
     "healed": "outliers replaced",
     "companions": "copies",
@@ -28,8 +28,13 @@ RETIRED = {
     "lanes_memory|lane_types|LanesType|parts?_of_lanes": "vector_memory, vector_types, VectorType, part_count",
     "serve[./]watch|stopped watch|rasterizer[./]ahead": "render_job, precompile",
     "(?:most|least)_(?!common)\\w+|at_most": "max_*, min_*",
-    "[a-z]+_a_(?:byte|pair|part|round|turn)": "*_per_*",
+    "[a-z]+_a_(?:byte|pair|part|round|turn|row|pixel|second)": "*_per_*",
     "anew|nobody|whoever": "again, no one, the one that",
+    "pictures?|films?": "image, video",
+    "truths?|judge[ds]?|lessons?": "target, evaluate, training sample",
+    "hammer|giants?": "stress, huge splats",
+    "wander(?:s|ing)?|faint(?:er|est)?": "noise injection, low opacity",
+    "laps?|unsteady|unkind|dear": "timing run, unstable, fault injection, expensive",
 }
 """Regular expressions of whole words, and what is said instead."""
 

@@ -1,9 +1,9 @@
-"""Run the kernels' tests without the compiler and tell which of their lines ran.
+"""Run the kernels' tests without the compiler and measure line coverage.
 
 python -m tests.rasterizer.kernel_coverage
 
-Kernels are plain Python then, on NumPy arrays of 16. What builds LLVM code needs the compiler and isn't counted. The
-status is 1 where a test fails or fewer lines ran than tests/support/tolerances.py asks for.
+Kernels are then plain Python on NumPy arrays of 16. Code that builds LLVM needs the compiler and isn't counted. The
+exit status is 1 if a test fails or coverage is below the bound in tests/support/tolerances.py.
 """
 
 import os
@@ -23,7 +23,7 @@ NAMES = (
     "operations or memory or powers or behind or opacity or 6-1-53 or 12-15-53 or harmonics or none_and or camera "
     "or 40-21-20"
 )
-"""Of the tests, those that are small enough for plain Python."""
+"""The tests that are small enough for plain Python."""
 
 BUILDS_CODE = ("def .*builder: Any", "@lower_builtin", "@type_callable", "@register_model")
 
@@ -37,7 +37,7 @@ def kernel_files() -> list[Path]:
 
 
 def main() -> int:
-    """Start again with the compiler off, as it can't be switched off later."""
+    """Restart with the compiler off: it can't be switched off later."""
     if os.environ.get("NUMBA_DISABLE_JIT") != "1":
         environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
         return subprocess.call([sys.executable, "-m", "tests.rasterizer.kernel_coverage"], cwd=ROOT, env=environment)
@@ -48,7 +48,7 @@ def main() -> int:
         for pattern in BUILDS_CODE:
             coverage.exclude(pattern)
         with coverage.collect():
-            # NumPy warns of what compiled code passes over in silence: infinity where nothing is seen
+            # NumPy warns of infinities in empty pixels, compiled code doesn't
             options = ["-n", "0", "-q", "-p", "no:cacheprovider", "-W", "ignore::RuntimeWarning", "-k", NAMES]
             status = pytest.main([*options, *(str(Path(__file__).with_name(name)) for name in FILES)])
         percent = coverage.report(show_missing=True)

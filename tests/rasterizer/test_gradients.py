@@ -138,7 +138,7 @@ def test_pixels_at_a_threshold_jump_by_no_more_than_stated():
     moved = parameters._replace(scales=parameters.scales * (1 + step))
     rgb, alpha = draw(parameters, camera)
     change = [after - before for after, before in zip(draw(moved, camera), (rgb, alpha), strict=True)]
-    tangent = torch.autograd.functional.jvp(  # by reverse mode twice over the plain renderer, pixel by pixel
+    tangent = torch.autograd.functional.jvp(  # by reverse mode twice through the plain renderer, pixel by pixel
         lambda scales: draw_plainly(parameters._replace(scales=scales), camera),
         parameters.scales,
         step * parameters.scales.detach(),
@@ -259,7 +259,7 @@ def test_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("changed", ["image", "means"])
 def test_a_change_in_place_before_the_backward_pass_is_noticed(changed: str):
-    """As for torch's own functions: the gradient would be that of neither value."""
+    """As for torch's own functions, since the gradient would be wrong for both values."""
     parameters, camera, _ = small_scene(59)
     rgb, _ = draw(parameters, camera)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Cached machine code: compiled again if a source changes or a file is damaged, complete before the first request."""
+"""Cached machine code: recompiled if a source changes or a file is damaged, complete before the first request."""
 
 import ast
 import json
@@ -25,7 +25,7 @@ def double(x):
 CALL = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from room.caller import double
+from package.caller import double
 print(double(21.0), len(double.stats.cache_misses))
 """
 
@@ -33,8 +33,8 @@ print(double(21.0), len(double.stats.cache_misses))
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kernels")
-    (folder / "room").mkdir()
-    (folder / "room" / "caller.py").write_text(KERNEL)
+    (folder / "package").mkdir()
+    (folder / "package" / "caller.py").write_text(KERNEL)
     return folder
 
 
@@ -98,13 +98,13 @@ def test_a_copy_of_compiled_kernels_is_used(tmp_path: Path):
     """As in a container with a read-only root: compiled at build, copied at start."""
     package = tmp_path / "msdgs_serve"
     shutil.copytree(ROOT / "msdgs_serve", package, ignore=shutil.ignore_patterns("__pycache__"))
-    (package / "room.py").write_text(KERNEL)
+    (package / "added.py").write_text(KERNEL)
     run = f"""
 import sys
 sys.path.insert(0, {str(tmp_path)!r})
 import msdgs_serve
 assert msdgs_serve.__file__.startswith({str(tmp_path)!r})
-from msdgs_serve.room import double
+from msdgs_serve.added import double
 double(21.0)
 print(len(double.stats.cache_misses))
 """
@@ -119,18 +119,18 @@ print(len(double.stats.cache_misses))
 
 
 def files_of(folder: Path, stamp: str = "now") -> CheckedFiles:
-    return CheckedFiles(str(folder), "room.kernel", stamp)
+    return CheckedFiles(str(folder), "added.kernel", stamp)
 
 
 def test_code_that_two_processes_store_at_once_is_not_mixed_up(tmp_path: Path):
     """Both processes read the index before the other stored its code; no type may get the other's code."""
     files_of(tmp_path).save("float32", "code for float32")
-    index = (tmp_path / "room.kernel.nbi").read_bytes()
-    (tmp_path / "room.kernel.nbi").unlink()
+    index = (tmp_path / "added.kernel.nbi").read_bytes()
+    (tmp_path / "added.kernel.nbi").unlink()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CheckedFiles, "_remove", lambda *_: None)  # as if the other's file weren't there yet
+        patch.setattr(CheckedFiles, "_remove", lambda *_: None)  # the other process hasn't written its file yet
         files_of(tmp_path).save("float64", "code for float64")
-    (tmp_path / "room.kernel.nbi").write_bytes(index)
+    (tmp_path / "added.kernel.nbi").write_bytes(index)
     assert files_of(tmp_path).load("float32") == "code for float32"
     assert files_of(tmp_path).load("float64") is None
     files_of(tmp_path).save("float64", "code for float64")
@@ -149,23 +149,23 @@ CALLER_OF_OTHERS = """
 import numpy as np
 from msdgs_serve.rasterizer.harmonics import harmonics_above_0
 from msdgs_serve.rasterizer.jit import kernel
-from room.constants import FACTOR
+from package.constants import FACTOR
 
 @kernel
 def double(x):
     return FACTOR * harmonics_above_0(0.0, -1.0, 0.0)[0] * x
 """
 
-EDITS = {  # what a kernel of `room` is compiled from, beside its own file
+EDITS = {  # sources of a kernel in `package` besides its own file
     "kernel": ("msdgs_serve/rasterizer/harmonics.py", "        -SH_C1 * y,", "        -2 * SH_C1 * y,"),
     "constant": ("msdgs_serve/scene/spherical_harmonics.py", "SH_C1 = 0.48", "SH_C1 = 3 * 0.48"),
-    "neighbour": ("room/constants.py", "1.0", "5.0"),
+    "neighbour": ("package/constants.py", "1.0", "5.0"),
 }
 
 
 def test_machine_code_follows_every_source(tmp_path: Path):
     shutil.copytree(ROOT / "msdgs_serve", tmp_path / "msdgs_serve", ignore=shutil.ignore_patterns("__pycache__"))
-    room = tmp_path / "room"
+    room = tmp_path / "package"
     room.mkdir()
     (room / "caller.py").write_text(CALLER_OF_OTHERS)
     (room / "constants.py").write_text("FACTOR = 1.0\n")
@@ -250,7 +250,7 @@ def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
 
 
 def test_kernels_run_without_the_compiler() -> None:
-    """Their tests also pass with the kernels as plain Python, and cover nearly all of their lines."""
+    """The kernels' tests also pass without the compiler, and cover nearly all lines."""
     run_python("import sys; from tests.rasterizer.kernel_coverage import main; sys.exit(main())")
 
 

@@ -1,4 +1,4 @@
-"""Projection, covariance and colors against gsplat's own plain torch reference: code that no one here wrote."""
+"""Projection, covariance and colors against gsplat's torch reference."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ SCENES = ["random", *sorted(ADVERSARIAL)]
 def scene(name: str, dtype: type) -> tuple[Gaussians, Camera]:
     gaussians, camera = random_scene(11, 300) if name == "random" else ADVERSARIAL[name]()
     gaussians = as_dtype(gaussians, np.float64)
-    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)  # as gsplat will do
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)  # as gsplat does
     return as_dtype(replace(gaussians, quats=quats), dtype), camera
 
 
@@ -40,7 +40,7 @@ def conics(splats: columns.Splats) -> np.ndarray:
 
 
 def assert_conics(splats: columns.Splats, inverse: np.ndarray, row: str):
-    """Relative to the diagonal of the inverse covariance: for xy the most that a covariance allows."""
+    """Compare relative to the diagonal of the inverse covariance, for xy to its upper bound √(xx yy)."""
     drawn = splats.extents[:, 0] > 0
     size = np.sqrt(inverse[drawn][:, [0, 0, 2]] * inverse[drawn][:, [0, 2, 2]])
     assert_close((conics(splats)[drawn] - inverse[drawn]) / size + 1, np.ones_like(size), row)
@@ -59,7 +59,7 @@ def test_projection(name: str, dtype: type):
         got.records[drawn][:, [columns.RED, columns.GREEN, columns.BLUE]], want.colors.numpy()[drawn], f"color.{row}"
     )
     pixels = want.means2d.numpy()[drawn]
-    size = np.maximum(np.abs(pixels), max(camera.width, camera.height))  # float32 has so many digits after the point
+    size = np.maximum(np.abs(pixels), max(camera.width, camera.height))  # float32's resolution of pixel coordinates
     assert_close(
         (got.records[drawn][:, [columns.X, columns.Y]] - pixels) / size + 1,
         np.ones_like(pixels),
@@ -69,14 +69,14 @@ def test_projection(name: str, dtype: type):
 
 
 def of_model(model: str, camera: Camera) -> Camera:
-    """The same image, more or less, by a camera of another model."""
+    """A camera of another model with about the same image."""
     scale = 0.25 if model == "orthographic" else 1.0
     return replace(camera, model=model, fx=scale * camera.fx, fy=scale * camera.fy)
 
 
 @pytest.mark.parametrize("model", ["orthographic", "fisheye"])
 def test_other_cameras(model: str):
-    """Colors aside: gsplat takes an orthographic camera's lines of sight for those of a pinhole."""
+    """Without colors: gsplat takes an orthographic camera's viewing directions for those of a pinhole."""
     gaussians, camera = scene("random", np.float64)
     camera = of_model(model, camera)
     got, want = project(gaussians, camera, GSPLAT), gsplat_projection(gaussians, camera)

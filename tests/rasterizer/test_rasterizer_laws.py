@@ -40,7 +40,7 @@ def assert_identical(got: Rendering, want: Rendering):
 
 
 def clear_pixels(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Return at which pixels rounding can't change a decision."""
+    """Return the pixels at which rounding can't change a decision."""
     return reference.render(gaussians, camera, BACKGROUND).slack == 0
 
 
@@ -79,18 +79,18 @@ def test_further_channels_change_no_other_channel(dtype: type):
         np.testing.assert_array_equal(more.alpha, plain.alpha)
 
 
-def rotated(gaussians: Gaussians, camera: Camera, turn: np.ndarray) -> tuple[Gaussians, Camera]:
+def rotated(gaussians: Gaussians, camera: Camera, rotation: np.ndarray) -> tuple[Gaussians, Camera]:
     """Move world and camera rigidly; harmonics are rotated by a fit."""
     directions = np.random.default_rng(0).normal(size=(100, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    before, after = (reference.sh_basis(d, 3) for d in (directions @ turn, directions))
-    harmonics = np.linalg.lstsq(after, before, rcond=None)[0]  # value at turn @ d is the old one at d
-    shift = np.array([0.7, -0.3, 0.4])
+    before, after = (reference.sh_basis(d, 3) for d in (directions @ rotation, directions))
+    harmonics = np.linalg.lstsq(after, before, rcond=None)[0]  # value at rotation @ d is the old one at d
+    translation = np.array([0.7, -0.3, 0.4])
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, shift
+    pose[:3, :3], pose[:3, 3] = rotation, translation
     moved = Gaussians(
-        means=gaussians.means @ turn.T + shift,
-        quats=from_matrix(turn @ to_matrix(gaussians.quats)),
+        means=gaussians.means @ rotation.T + translation,
+        quats=from_matrix(rotation @ to_matrix(gaussians.quats)),
         scales=gaussians.scales,
         opacities=gaussians.opacities,
         sh=np.einsum("jk,nkc->njc", harmonics, gaussians.sh),
@@ -117,7 +117,7 @@ def test_sign_of_quaternions_does_not_matter(dtype: type):
 @pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
 @DTYPES
 def test_opaque_front_hides_all(dtype: type, options):
-    """Two giants of opacity 1: the first leaves 1 - alpha_max, the second would use that up, so nothing follows."""
+    """Two huge splats of opacity 1: the first leaves 1 - alpha_max; the second would end the pixel and isn't drawn."""
     behind, camera = gaussians_of([[0, 0, 4], [0.2, 0, 5], [-0.3, 0.2, 6]], scales=0.5, dtype=dtype), front_camera()
     front = gaussians_of([[0, 0, 2], [0, 0, 2.5]], scales=1e4, opacities=1.0, rgb=[0.1, 0.7, 0.3], dtype=dtype)
     options = options._replace(transmittance_min=(1 - options.alpha_max) ** 2 * 2)
@@ -131,7 +131,7 @@ def test_opaque_front_hides_all(dtype: type, options):
 @DTYPES
 @SEEDS
 def test_background_shows_through_what_is_left(seed: int, dtype: type):
-    """rgb(background) = rgb(black) + (1 - alpha) background; alpha and depth don't know of it."""
+    """rgb(background) = rgb(black) + (1 - alpha) background; alpha and depth don't depend on it."""
     gaussians, camera = scene(seed, dtype)
     over, black = draw(gaussians, camera, background=BACKGROUND), draw(gaussians, camera)
     assert_close(over.rgb, black.rgb + (1 - black.alpha)[..., None] * BACKGROUND, f"rgb.{np.dtype(dtype).name}")
@@ -169,19 +169,19 @@ def test_crops_show_the_same_pixels(dtype: type):
 
 @SEEDS
 def test_mirrored_image(seed: int):
-    """The world seen in a mirror at x = 0, by a camera on the axis, is the image turned left to right."""
+    """The world seen in a mirror at x = 0, by a camera on the axis, is the image flipped left to right."""
     gaussians, _ = scene(seed, np.float64)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     gaussians = replace(gaussians, means=gaussians.means + np.array([0, 0, 4]), quats=quats, sh=gaussians.sh[:, :1])
     mirrored = replace(gaussians, means=gaussians.means * [-1, 1, 1], quats=quats * [1, 1, -1, -1])
     image, camera = draw(gaussians, front_camera()), front_camera()
-    turned = draw(mirrored, camera)
-    assert_same(Rendering(*(channel[:, ::-1] for channel in turned)), image)
+    flipped = draw(mirrored, camera)
+    assert_same(Rendering(*(channel[:, ::-1] for channel in flipped)), image)
 
 
 @DTYPES
 def test_invisible_gaussians_change_no_byte(dtype: type):
-    """Opacity 0, under the threshold, behind the eye, beside the image."""
+    """Opacity 0 or below the threshold, behind the camera, outside of the image."""
     gaussians, camera = scene(20, dtype)
     forward, right = camera.camera_to_world[:3, 2], camera.camera_to_world[:3, 0]
     middle = camera.position + 2 * forward
@@ -194,7 +194,7 @@ def test_invisible_gaussians_change_no_byte(dtype: type):
 @DTYPES
 @pytest.mark.parametrize("channels", [1, 3, 5])
 def test_extra_channels_are_drawn_as_colors_are(channels: int, dtype: type):
-    """Each channel as the red of the same Gaussians, over black; depth is what the camera's axis says."""
+    """Each channel as the red of the same Gaussians, over black; depth is measured along the camera's axis."""
     gaussians, camera = scene(20, dtype)
     extra = np.random.default_rng(0).uniform(-1, 1, size=(len(gaussians), channels)).astype(dtype)
     got = draw(gaussians, camera, background=BACKGROUND, extra=extra)
@@ -219,7 +219,7 @@ def test_extra_channels_that_cannot_be(bad: np.ndarray):
 
 @DTYPES
 def test_median_depth_is_where_half_of_the_light_is_gone(dtype: type):
-    """Against a loop over the Gaussians, front to back, at pixels where no rounding decides."""
+    """Against a loop over the Gaussians, front to back, at pixels that are not at a threshold."""
     gaussians, camera = scene(20, dtype)
     got = draw(gaussians, camera, background=BACKGROUND, median_depth=True)
     plain = draw(gaussians, camera, background=BACKGROUND)

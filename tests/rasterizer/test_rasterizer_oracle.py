@@ -22,7 +22,7 @@ EXACT_DEPTHS = {"equal_depths"}
 
 
 def assert_same_image(got: Rendering, want: Reference, row: str, min_clean: float = 0.5):
-    """Compare tightly where no decision is in doubt; elsewhere allow the effect of the decision as well."""
+    """Compare tightly except at thresholds, where the effect of the decision is allowed as well."""
     clean = want.slack == 0
     assert clean.mean() >= min_clean, "the comparison would be empty"
     for name in ("rgb", "alpha"):
@@ -30,7 +30,7 @@ def assert_same_image(got: Rendering, want: Reference, row: str, min_clean: floa
         assert np.isfinite(channel).all(), name
         scale = want.color_range if name == "rgb" else 1.0
         error = np.abs(channel - expected).reshape(*clean.shape, -1).max(axis=-1)
-        assert error[clean].max(initial=0) <= tolerance(f"{name}.{row}"), f"{name}, pixels without doubt"
+        assert error[clean].max(initial=0) <= tolerance(f"{name}.{row}"), f"{name}, pixels away from thresholds"
         excess = error - want.slack * max(scale, 1.0)
         assert excess.max(initial=0) <= tolerance(f"{name}.{row}"), f"{name}, pixels at a threshold"
     assert_same_depth(got, want, row)
@@ -81,7 +81,7 @@ def test_adversarial_scenes(name: str):
 
 @pytest.mark.slow
 def test_largest_image():
-    """A few splats, small, large and at the far corner, are at their places in 8192 × 8192 pixels."""
+    """A few splats, small, large and at the far corner, are correct in 8192 × 8192 pixels."""
     side = 8192
     camera = front_camera(side, side, focal=6000.0)
     means = np.array([[0, 0, 3], [-1.2, 1.3, 2], [0.5, -1.0, 2.2], [1.36, 1.36, 2]])

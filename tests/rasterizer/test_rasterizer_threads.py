@@ -1,4 +1,4 @@
-"""Same bytes from any number of threads; compiled once, for every process and every layout of arrays."""
+"""Same bytes from any number of threads; compiled once for all processes and array layouts."""
 
 import sys
 from dataclasses import replace
@@ -74,7 +74,7 @@ def test_no_layout_of_arrays_is_compiled_separately(layout, dtype: type):
 
 
 def test_cameras_of_any_number_type_are_compiled_for_once():
-    """JSON brings integers, NumPy brings its own scalars."""
+    """Fields may be integers from JSON or NumPy scalars."""
     gaussians, camera = random_scene(43, 20)
     square = replace(camera, fx=50.0, fy=50.0, cx=26.0, cy=18.0)
     expected = bytes_of(draw(gaussians, square))

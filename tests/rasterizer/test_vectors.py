@@ -1,4 +1,4 @@
-"""SIMD vector operations: the compiled ones against NumPy's, which are their definition."""
+"""SIMD vector operations: compiled against NumPy's, which are their definition."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +17,7 @@ DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float3
 
 
 def plain(compiled: Callable) -> Callable:
-    """The same function without the compiler, which may be off altogether."""
+    """The same function without the compiler, which may be switched off."""
     return getattr(compiled, "py_func", compiled)
 
 
@@ -92,7 +92,7 @@ def rows_and_columns(
 
 @DTYPES
 def test_memory(dtype: type):
-    """Loads stop at the end of an array, stores leave what is beside them."""
+    """Loads stop at the end of an array, stores don't write outside of their range."""
     matrix = np.arange(160, dtype=dtype).reshape(10, 16)
     points = np.arange(54, dtype=dtype).reshape(18, 3)
     got = [np.full((9, 16), -1, dtype), np.full(40, -1, dtype), np.full(60, -1, dtype)]

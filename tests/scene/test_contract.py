@@ -192,7 +192,7 @@ def test_a_constant_that_is_not_finite_is_named(tmp_path: Path, name: str, conte
 )
 def test_shapes_that_disagree_are_refused(tmp_path: Path, name: str, change: Callable[[np.ndarray], np.ndarray]):
     error = refusal(tmp_path / "scene.onnx", lambda model: replace_constant(model, name, change), STATIC_BYTES)
-    # a wrong number of static means makes all the others wrong, and these are looked at first
+    # a wrong number of static means makes the other arrays wrong, which are checked first
     assert error.field == name or (name == "static_means" and error.field in CONSTANT_OUTPUTS)
 
 

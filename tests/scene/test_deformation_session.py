@@ -56,7 +56,7 @@ def test_moving_gaussians_come_first_then_static_ones(tmp_path: Path):
 def test_ids_come_back_in_their_order(session: DeformationSession, ids: list[int]):
     for some, every in zip(session.pose(0.5, ids), session.pose(0.5), strict=True):
         assert some.shape == every[ids].shape
-        # rows of a product may be added in another order in a chunk of another length
+        # the order of sums in a product may depend on the length of the chunk
         assert np.abs(some - every[ids]).max(initial=0) <= tolerance("export.relative")
 
 
@@ -93,7 +93,7 @@ OUTSIDE = (-0.001, 2.001, float("nan"), float("inf"))
         *(({"ids": ids}, "ids") for ids in ([-1], [1000], [0.5], [[1]], ["a"], 3)),
     ],
 )
-def test_what_the_scene_has_not_is_refused(session: DeformationSession, asked: dict[str, Any], message: str):
+def test_invalid_times_ids_and_steps_are_refused(session: DeformationSession, asked: dict[str, Any], message: str):
     with pytest.raises(InvalidInput, match=message):
         session.pose(**{"t": 0.5, **asked})
     if "ids" not in asked:
@@ -144,7 +144,7 @@ def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
         )
     path = written(tmp_path / "scene.onnx", model)
     session = DeformationSession(path)
-    session.pose(0.5, range(2 * 2048))  # compiles, and fills what is kept
+    session.pose(0.5, range(2 * 2048))  # compiles kernels and fills caches
     _, grown_mb = measured(lambda: session.pose(0.5))
     activation_mb = count * width * 4 / 2**20
     outputs_mb = count * 10 * 4 / 2**20

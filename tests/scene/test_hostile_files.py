@@ -98,7 +98,7 @@ WIRE_TRICKS = {
 
 
 @pytest.mark.parametrize("what", WIRE_TRICKS)
-def test_each_value_has_one_spelling(sound: onnx.ModelProto, what: str):
+def test_each_value_has_one_encoding(sound: onnx.ModelProto, what: str):
     with pytest.raises(ModelInvalid):
         read_model(WIRE_TRICKS[what](sound))
 

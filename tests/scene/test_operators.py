@@ -41,7 +41,7 @@ def test_the_graph_that_is_written_again_computes_the_same_bits(name: str):
 
 
 def emitted() -> dict[str, dict[str, set[Any]]]:
-    """Return the operators of all sound scenes and their attributes."""
+    """Return the operators of all valid scenes and their attributes."""
     found: dict[str, dict[str, set[Any]]] = {}
     for contents in SCENES.values():
         for node in onnx.load_from_string(contents).graph.node:

@@ -68,9 +68,9 @@ def test_orbit_keeps_distance_and_elevation(up: list[float]):
     target, direction = np.array([0.3, -0.2, 0.5]), np.array(up) / np.linalg.norm(up)
     for azimuth in (0.0, 90.0, 215.0):
         pose = orbit(target, 4.0, azimuth, 30.0, np.array(up))
-        outwards = pose[:3, 3] - target
-        assert_close(np.linalg.norm(outwards), 4, "rotation")
-        assert_close(outwards @ direction, 4 * math.sin(math.radians(30)), "rotation")
+        offset = pose[:3, 3] - target
+        assert_close(np.linalg.norm(offset), 4, "rotation")
+        assert_close(offset @ direction, 4 * math.sin(math.radians(30)), "rotation")
         camera = Camera.from_fov(pose, 64, 64, 40.0)
         assert_close(pixel_of(camera, target), [32, 32], "pixel")
         assert pixel_of(camera, target + 0.1 * direction)[1] < 32
@@ -79,8 +79,8 @@ def test_orbit_keeps_distance_and_elevation(up: list[float]):
 def test_orbit_by_azimuth_is_a_rotation_around_up():
     up, origin = np.array([0.0, 0, 1]), np.zeros(3)
     start, quarter = (orbit(origin, 2.0, azimuth, 20.0, up) for azimuth in (10.0, 100.0))
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert_close(quarter[:3], turn @ start[:3], "rotation")
+    rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert_close(quarter[:3], rotation @ start[:3], "rotation")
 
 
 def test_resized_camera_sees_the_same_in_proportion():
@@ -170,30 +170,30 @@ def test_a_resized_camera_keeps_its_model():
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 24, 8, 6)
 
 
-PIVOT = np.array([0.5, -0.25, 0.75])  # on the grid that targets are rounded to
+CENTER = np.array([0.5, -0.25, 0.75])  # a multiple of the rounding of targets
 FAR_OUT = ((-1.0, -1.0, -1.0), (1.0, 9.0, 7.0))
 
 
 def seen_by(*poses: np.ndarray) -> SceneMetadata:
-    """A scene with cameras of these poses, [4, 4], and bounds whose middle is beside what they look at."""
+    """A scene with cameras of these poses, [4, 4], which don't look at the center of its bounds."""
     cameras = tuple(SceneCamera(str(i), 0.0, Camera.from_fov(pose, 64, 48, 40.0)) for i, pose in enumerate(poses))
     return metadata(cameras=cameras, bounds=FAR_OUT)
 
 
 def test_the_target_is_what_the_cameras_look_at():
-    seen = framing(seen_by(*(orbit(PIVOT, 4.0, azimuth, 20, UP) for azimuth in (0, 70, 200))))
-    assert_close(seen.target, PIVOT, "rotation")
+    seen = framing(seen_by(*(orbit(CENTER, 4.0, azimuth, 20, UP) for azimuth in (0, 70, 200))))
+    assert_close(seen.target, CENTER, "rotation")
     assert_close(seen.distance, 4.0, "rotation")
 
 
 @pytest.mark.parametrize("sideways", [0.0, 0.3])
 def test_cameras_side_by_side_leave_the_middle_of_the_bounds(sideways: float):
-    ahead = orbit(PIVOT, 4.0, 0, 20, UP)
+    ahead = orbit(CENTER, 4.0, 0, 20, UP)
     beside = ahead.copy()
     beside[:3, 3] += sideways * ahead[:3, 0]
     assert_close(framing(seen_by(ahead, beside)).target, [0, 4, 3], "rotation")
 
 
 def test_cameras_that_look_away_from_each_other_leave_the_middle_of_the_bounds():
-    poses = [orbit(PIVOT, 0.1, azimuth, 20, UP) @ np.diag([-1.0, 1.0, -1.0, 1.0]) for azimuth in (0, 70, 200)]
+    poses = [orbit(CENTER, 0.1, azimuth, 20, UP) @ np.diag([-1.0, 1.0, -1.0, 1.0]) for azimuth in (0, 70, 200)]
     assert_close(framing(seen_by(*poses)).target, [0, 4, 3], "rotation")

@@ -1,7 +1,7 @@
-"""Scene files of every plan and layer kind, changed at the level of the format: refused with a reason or drawn finite,
+"""Scene files of every plan and layer kind, mutated as protobuf: refused with a reason or rendered finite,
 in bounded memory, without opening a file.
 
-`MSDGS_HOSTILE=5000 pytest -n 0 -s tests/scene/test_structured_fuzz.py` tests so many files instead of 300.
+`MSDGS_HOSTILE=5000 pytest -n 0 -s tests/scene/test_structured_fuzz.py` tests 5,000 files instead of 300.
 """
 
 import os
@@ -33,7 +33,7 @@ def test_sound_files_are_drawn():
     )
 
 
-def test_a_seed_is_a_file():
+def test_a_seed_determines_the_file():
     assert hostile_file(7) == hostile_file(7)
     assert len({hostile_file(seed) for seed in range(200)}) > 180
 
@@ -45,7 +45,7 @@ def test_mutated_files_are_refused_or_drawn_in_bounded_memory():
     counted, megabytes = measured(lambda: outcomes(range(FILES)))
     drawn = counted.pop(DRAWN)
     print(f"\n{FILES:,} files, {drawn:,} drawn, the others refused for {len(counted):,} reasons; {megabytes:.0f} MB")
-    assert 0.02 * FILES < drawn < 0.6 * FILES  # the changes neither always break a file nor mostly do nothing
+    assert 0.02 * FILES < drawn < 0.6 * FILES  # mutations neither always break a file nor mostly have no effect
     assert megabytes < LIMITS.memory_bytes / 2**20 + MEMORY_MEGABYTES
 
 

@@ -96,7 +96,7 @@ def test_a_camera_of_the_scene_by_index_or_name(client: httpx.Client):
         render(client, camera={"type": "matrix", **intrinsics}, width=64, height=48), by_index
     )
     short = render(client, camera={"type": "orbit", "azimuth": 90, "elevation": 20}, width=None, height=None)
-    assert np.abs(short.astype(int) - by_index).max() <= 1, "omitted fields come from the scene"
+    assert np.abs(short.astype(int) - by_index).max() <= 1, "omitted fields have the scene's values"
     for given, shape in (({"width": 128}, (96, 128, 3)), ({"height": 12}, (12, 16, 3))):
         size = {"width": None, "height": None, **given}
         assert render(client, camera={"type": "scene", "index": 0}, **size).shape == shape
@@ -167,7 +167,7 @@ def test_a_scene_that_breaks_is_reported_and_goes_on(tmp_path: Path):
         ]
 
 
-def test_a_scene_broken_from_the_start_is_unavailable_without_saying_where_it_lies(tmp_path: Path):
+def test_a_scene_broken_from_the_start_is_unavailable_without_revealing_its_path(tmp_path: Path):
     (tmp_path / "broken.onnx").write_bytes(b"no scene")
     with serving(tmp_path) as client:
         for response in (client.post("/render", json=FRAME), client.get("/scenes/broken")):

@@ -206,7 +206,7 @@ def test_a_thousand_long_keys_give_a_short_answer(client: httpx.Client):
     assert 1 <= len(fields) < 400
 
 
-def test_a_form_is_told_to_be_json(client: httpx.Client):
+def test_a_form_is_refused_as_not_json(client: httpx.Client):
     response = client.post("/render", data={"t": "1"})
     check_problem(response, 422)
     assert "application/json" in response.json()["detail"]
@@ -255,7 +255,7 @@ def test_invalid_batches(client: httpx.Client, frames: Any):
 
 
 @in_this_process
-def test_a_failure_of_the_server_says_nothing_of_its_inside(
+def test_a_failure_of_the_server_reveals_nothing_of_its_inside(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     def fail(*_: object) -> bytes:
@@ -267,5 +267,5 @@ def test_a_failure_of_the_server_says_nothing_of_its_inside(
     batch = client.post("/render/batch", json={"frames": [FRAME]})
     assert json.loads(batch.content)["status"] == 500
     assert "secret" not in response.text + batch.text
-    assert client.get("/live").status_code == 200, "the connection lives on"
+    assert client.get("/live").status_code == 200, "the connection is still usable"
     assert any(record.exc_info and "secret" in str(record.exc_info[1]) for record in caplog.records)

@@ -49,7 +49,7 @@ def test_every_frame_equals_that_of_a_single_request(client: httpx.Client):
         assert base64.b64decode(line["data"]) == alone.content
 
 
-def test_a_frame_that_is_wrong_leaves_the_others(client: httpx.Client):
+def test_an_invalid_frame_does_not_affect_the_others(client: httpx.Client):
     bad: list[Any] = [
         {**FRAME, "scene": "red", "t": 7},
         {**FRAME, "scene": "green"},

@@ -27,7 +27,7 @@ REFUSED = 'msdgs_problems_total{kind="overloaded"}', 'msdgs_requests_total{metho
 
 @contextmanager
 def full(queue: WorkQueue, places: int) -> Iterator[None]:
-    """Take places of the queue by calls that do nothing."""
+    """Occupy places in the queue by calls that do nothing."""
     with ExitStack() as calls:
         for number in range(places):
             calls.enter_context(queue.admitted(str(number)))
@@ -109,9 +109,9 @@ def test_the_answer_is_that_of_the_application(tmp_path: Path, caplog: pytest.Lo
                 assert headers.keys() == answers[0][1].keys()
                 assert all(value == answers[0][1][name] for name, value in headers.items() if name not in CHANGES)
             assert len({headers["x-request-id"] for _, headers, _ in answers}) == 3
-            assert sent(connection, CALL)[0] == 422, "there is room, and no camera"
+            assert sent(connection, CALL)[0] == 422, "there is a place, but the camera is missing"
         counted = client.get("/metrics").text.splitlines()
         assert [line.split()[-1] for name in REFUSED for line in counted if line.startswith(name)] == ["4.0", "4.0"]
     lines = [vars(record)["facts"] for record in caplog.records if vars(record)["facts"]["status"] == 503]
-    alike = [{name: fact for name, fact in line.items() if name != "milliseconds"} for line in lines]
-    assert alike == alike[:1] * 4
+    facts = [{name: fact for name, fact in line.items() if name != "milliseconds"} for line in lines]
+    assert facts == facts[:1] * 4

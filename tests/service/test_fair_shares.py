@@ -1,4 +1,4 @@
-"""How many places in the queue each client has, when they are free again, and whose work is done next."""
+"""Places in the queue by client, when they are released, and the order of work."""
 
 import asyncio
 import contextvars
@@ -85,7 +85,7 @@ def test_a_client_has_as_many_places_as_it_leaves(queue: WorkQueue):
         assert places(queue, calls, "four") == 4
 
 
-def test_batches_and_films_have_half_of_all_places(queue: WorkQueue):
+def test_batches_and_videos_have_half_of_all_places(queue: WorkQueue):
     with ExitStack() as calls:
         assert [places(queue, calls, client, streamed=True) for client in ("one", "two", "three")] == [4, 0, 0]
         assert places(queue, calls, "two") == 2
@@ -107,7 +107,7 @@ def test_parts_keep_their_place_until_the_call_and_its_work_have_ended(queue: Wo
         last.cancel()
         assert queue.running == 1
         with ExitStack() as calls:
-            assert places(queue, calls, "one") == 3, "one of four is taken as long as the thread is"
+            assert places(queue, calls, "one") == 3, "one of four places is taken until the thread is free"
         go_on.set()
 
     asyncio.run(call())
@@ -124,7 +124,7 @@ def test_the_place_of_a_call_is_free_after_its_work_and_later_work_is_never_refu
     async def call() -> None:
         with queue.admitted("one"), ExitStack() as calls:
             await queue.run(lambda: None, RenderJob())
-            while queue.waiting:  # the future is done a moment before its callbacks have run
+            while queue.waiting:  # callbacks run shortly after the future is done
                 await asyncio.sleep(0.001)
             fill(queue, calls)
             await queue.run(lambda: None, RenderJob())
@@ -167,7 +167,7 @@ def times(count: int) -> list[float]:
     return [number / count for number in range(count)]
 
 
-def film(service: Service) -> AsyncGenerator[bytes]:
+def streamed_video(service: Service) -> AsyncGenerator[bytes]:
     frames = [{"camera": ORBIT, "t": t} for t in times(MANY)]
     body = VideoRequest.model_validate({"frames": frames, "width": 32, "height": 32})
     return video._stream_video(service, body, *video._path(service, body))
@@ -177,7 +177,7 @@ def lines(service: Service) -> AsyncGenerator[Any]:
     return batch._items(service, [{**FRAME, "t": t} for t in times(MANY)], multipart=False)
 
 
-@pytest.mark.parametrize("made", [film, lines])
+@pytest.mark.parametrize("made", [streamed_video, lines])
 def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images: list[weakref.ref[Image]], made: Any):
     """A video or batch has one frame in memory, and renders none before the previous one is sent."""
 
@@ -193,7 +193,7 @@ def test_frames_are_drawn_as_they_are_sent_and_not_kept(service: Service, images
     assert len(images) == MANY
 
 
-def test_a_film_fails_in_time_to_say_so_or_is_cut_off(scene: Path):
+def test_a_video_fails_before_its_first_byte_or_is_cut_off(scene: Path):
     renderer = Renderer()
     original, broken = renderer.render, list[float]()
 

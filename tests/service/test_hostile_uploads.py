@@ -88,7 +88,7 @@ def test_a_poisoned_file_is_listed_as_broken_and_nothing_else_changes(tmp_path: 
         assert POISON[what][0] in bad["reason"]
         assert bad["reason"].isprintable()
         assert (fine["name"], fine["problem"], fine["reason"]) == ("good", False, None)
-        (tmp_path / "late.onnx").write_bytes(contents)  # what comes later is looked at by the reload
+        (tmp_path / "late.onnx").write_bytes(contents)  # reloading checks later files
         write_scene(good, static_color=(0, 0, 1))
         eventually(lambda: frame(client) != before)
 
@@ -115,9 +115,9 @@ def test_a_file_that_takes_too_long_is_refused(tmp_path: Path):
 
 
 @in_this_process
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems don't keep to a limit of memory")
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems don't enforce a memory limit")
 def test_a_file_that_ends_its_process_is_refused_at_upload(folder: Path, file: bytes, monkeypatch: pytest.MonkeyPatch):
-    dying = GraphLimits(memory_bytes=-(1 << 29))  # leaves that process no memory at all
+    dying = GraphLimits(memory_bytes=-(1 << 29))  # leaves no memory to the subprocess
     with serving(folder, uploads=True) as client:
         monkeypatch.setattr(Settings, "graph_limits", dying)
         answer = client.post("/scenes", params={"name": "walk"}, content=file)

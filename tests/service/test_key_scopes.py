@@ -1,4 +1,4 @@
-"""What a key opens, what is open without one, and which files of keys are read."""
+"""Calls that need a scope, calls that need no key, and valid files of keys."""
 
 import asyncio
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, check_problem, serving
 
 KEYS = {scope: f"{scope}-0123456789abcdef" for scope in SCOPES}
-# one call for each scope that changes nothing where it is let through
+# one call for each scope that has no effect if it is permitted
 CALLS = [("POST", "/render", "read"), ("DELETE", "/scenes/nothing", "write"), ("GET", "/metrics", "operate")]
 
 
@@ -90,7 +90,7 @@ def test_uploads_need_the_scope_write(client: httpx.Client, file: bytes):
         assert client.delete("/scenes/walk", headers={"X-API-Key": KEYS[scope]}).status_code == status
 
 
-def test_every_call_of_the_document_says_which_scope_it_needs(client: httpx.Client):
+def test_every_call_of_the_document_names_its_scope(client: httpx.Client):
     document = client.get("/openapi.json", headers={"X-API-Key": KEYS["read"]}).json()
     for path, calls in document["paths"].items():
         for method, call in calls.items():
@@ -118,7 +118,7 @@ def test_a_key_may_have_several_scopes(tmp_path: Path):
         ("\n# nothing\n", "0 keys"),
     ],
 )
-def test_a_file_that_says_no_scopes_is_refused_with_the_line_that_it_needs(tmp_path: Path, text: str, message: str):
+def test_a_file_without_scopes_is_refused_with_an_example(tmp_path: Path, text: str, message: str):
     (tmp_path / "keys").write_text(text)
     with pytest.raises(InvalidInput, match=message) as error:
         read_keys(tmp_path / "keys")
@@ -132,7 +132,7 @@ def test_key_files_must_be_text(tmp_path: Path):
             read_keys(path)
 
 
-def test_a_variable_that_is_empty_is_as_if_it_were_not_there(monkeypatch: pytest.MonkeyPatch):
+def test_an_empty_variable_counts_as_unset(monkeypatch: pytest.MonkeyPatch):
     """docker/compose.yaml sets it even if there are no keys."""
     monkeypatch.setenv("MSDGS_API_KEYS_FILE", "")
     assert Settings().api_keys_file is None

@@ -26,7 +26,7 @@ def place(camera: Camera, point: list[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("t", "dt"), [(0.1, 0.2), (0.9, -0.3), (0.0, 1.0)])
-def test_the_ball_goes_where_its_centre_goes(scene: Path, t: float, dt: float):
+def test_motion_of_the_ball_is_that_of_its_center(scene: Path, t: float, dt: float):
     camera = Camera.from_fov(orbit(np.zeros(3), 5.0, 40, 10, UP), SIZE, SIZE, 40.0)
     session = DeformationSession(scene)
     image = Renderer().render(session, camera, t, RenderOptions(motion_dt=dt))

@@ -1,4 +1,4 @@
-"""How responses are written to connections."""
+"""Writing of responses to connections."""
 
 import asyncio
 from collections.abc import AsyncIterator

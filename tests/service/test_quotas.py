@@ -1,4 +1,4 @@
-"""Quotas of uploads, in all and by key, and the space that they leave on the disk."""
+"""Quotas of uploads, in all and by key, and free disk space."""
 
 import errno
 import shutil
@@ -42,7 +42,7 @@ def left(folder: Path) -> set[str]:
 def test_so_many_scenes_in_all(folder: Path, file: bytes):
     with serving(folder, uploads=True, max_scenes=2) as client:
         assert [add(client, file, name) for name in ("a", "b", "c")] == [201, 201, 507]
-        assert add(client, file, "a", replace=True) == 201, "what is replaced is not counted"
+        assert add(client, file, "a", replace=True) == 201, "a replaced scene is not counted"
         assert delete(client, "b") == 204
         assert add(client, file, "c") == 201
     assert left(folder) == {"a.onnx", "c.onnx"}
@@ -67,7 +67,7 @@ def test_so_many_scenes_of_a_key_also_after_a_new_start(folder: Path, file: byte
         assert add(client, file, "c", TWO) == 201
         assert delete(client, "a") == 204
         assert add(client, file, "d") == 201
-        assert add(client, file, "d", TWO, replace=True) == 201, "who replaces a scene has it from then on"
+        assert add(client, file, "d", TWO, replace=True) == 201, "replacing a scene makes the key its owner"
         assert add(client, file, "e") == 201
     assert ONE not in "".join(path.read_text() for path in folder.glob(".*.owner"))
 
@@ -116,7 +116,7 @@ def test_a_full_disk_is_a_507(folder: Path, file: bytes, monkeypatch: pytest.Mon
     servers: list[Server] = []
 
     def full(*_: object, **__: object) -> None:
-        raise OSError(number, "no room")
+        raise OSError(number, "no space")
 
     with serving(folder, uploads=True, server=servers) as client:
         store = servers[0].service.store

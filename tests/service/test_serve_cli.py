@@ -48,7 +48,7 @@ def read_until(process: subprocess.Popen[str], pattern: str) -> str:
     raise AssertionError(f"it ended: {printed}{process.stderr.read()}")
 
 
-def test_it_says_where_it_listens_and_what_to_paste_and_stops_at_ctrl_c(process: subprocess.Popen[str]):
+def test_it_prints_its_address_and_an_example_and_stops_at_ctrl_c(process: subprocess.Popen[str]):
     printed = read_until(process, r"-d '")
     match = re.search(r"Listening on (http://127\.0\.0\.1:\d+)", printed)
     assert match
@@ -84,7 +84,7 @@ def test_help_shows_examples_and_options(capsys: pytest.CaptureFixture[str]):
         (["balls.onnx", "--host", "256.1.1.1"], "can't listen on 256.1.1.1"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_errors_are_one_line(
     scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ):
     monkeypatch.chdir(scene.parent)
@@ -108,7 +108,7 @@ def test_a_start_that_fails_ends_the_program(
     assert "could not start" in capsys.readouterr().err
 
 
-def test_a_port_in_use_is_said_before_anything_is_loaded(scene: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_port_in_use_is_reported_before_anything_is_loaded(scene: Path, capsys: pytest.CaptureFixture[str]):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main([str(scene), "--port", str(port)]) == 2

@@ -130,7 +130,7 @@ def test_get_equals_post(client: httpx.Client):
         ("elevation=90", "elevation"),
     ],
 )
-def test_a_link_that_is_wrong_is_told_where(client: httpx.Client, query: str, field: str):
+def test_an_invalid_query_is_refused_by_parameter(client: httpx.Client, query: str, field: str):
     check_problem(client.get(f"/render?{query}"), 422, field)
 
 
@@ -166,8 +166,8 @@ def test_depth_as_an_image_is_lighter_the_nearer(client: httpx.Client):
         assert np.abs(grey - want).max() <= 1
 
 
-def test_gaussians_a_pixel_are_counted(client: httpx.Client):
-    """As numbers and as an image; tests/rasterizer/test_rasterizer_oracle.py counts them one by one."""
+def test_gaussians_per_pixel_are_counted(client: httpx.Client):
+    """As numbers and as an image; tests/rasterizer/test_rasterizer_oracle.py verifies the numbers."""
     counts = array(client, channels=["gaussians"])[..., 0]
     assert counts.max() >= 1
     np.testing.assert_array_equal(counts, counts.round())
@@ -181,7 +181,7 @@ def test_gaussians_a_pixel_are_counted(client: httpx.Client):
     np.testing.assert_allclose(blurred, sum(array(client, channels=["gaussians"], t=t) for t in (0.55, 0.65)) / 2)
 
 
-def test_motion_blur_is_the_mean_of_moments_in_linear_light(client: httpx.Client):
+def test_motion_blur_is_the_mean_of_frames_in_linear_light(client: httpx.Client):
     shutter, times = {"open": -0.2, "close": 0.2, "samples": 4}, (0.35, 0.45, 0.55, 0.65)
     blurred = array(client, shutter=shutter)
     alpha = np.mean([array(client, t=t)[..., 3] for t in times], axis=0)
@@ -194,7 +194,7 @@ def test_motion_blur_is_the_mean_of_moments_in_linear_light(client: httpx.Client
     assert np.isfinite(over).all()
 
 
-def test_an_exr_file_knows_its_camera_and_its_time(client: httpx.Client):
+def test_an_exr_file_has_its_camera_and_its_time(client: httpx.Client):
     camera = client.get("/scenes/balls").json()["cameras"][0]
     body = {"camera": {"type": "scene", "index": 0}, "t": 0.25, "format": "exr"}
     pixels, spec = decode(client.post("/render", json=body).content, "exr")
@@ -221,7 +221,7 @@ def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixtur
         client.get("/scenes/nothing")
 
         def told() -> list[logging.LogRecord]:
-            """A line is logged after its response, so that of an earlier request may come later."""
+            """A line is logged after its response, so lines of earlier requests may be late."""
             return [record for record in caplog.records if "/scenes/nothing" in record.getMessage()]
 
         eventually(lambda: bool(told()))

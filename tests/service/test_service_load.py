@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 
 class SlowPoses(PoseCache):
-    """A cache that keeps no poses; once `slow` is set, each pose waits for `go_on`.
+    """A cache that stores no poses; once `slow` is set, each pose waits for `go_on`.
 
     From pose number `last` on, each then waits until its request is cancelled.
     """
@@ -99,9 +99,9 @@ def test_requests_beyond_the_queue_are_rejected_with_retry_after(scene: Path, po
         for _ in range(3):
             check_refused(client.post("/render", json=FRAME))
         assert client.post("/render/batch", json={"frames": [FRAME]}).status_code == 503
-        assert client.post("/render", json={**FRAME, "width": 0}).status_code == 503, "a body is not even looked at"
+        assert client.post("/render", json={**FRAME, "width": 0}).status_code == 503, "the body is not read"
         have = client.post("/render", json=FRAME, headers={"If-None-Match": "*"})
-        assert have.status_code == 304, "what the client has costs no place"
+        assert have.status_code == 304, "a cached frame needs no place"
         for path in ("/live", "/ready", "/scenes/balls"):
             assert client.get(path).status_code == 200
         poses.go_on.set()
@@ -115,9 +115,9 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
         response = client.post("/render", json=FRAME)
         assert time.monotonic() - started >= 0.3
         check_problem(response, 504)
-        assert server.service.queue.running == 1, "the place is taken as long as the thread is"
+        assert server.service.queue.running == 1, "the place is taken until the thread is free"
         waiting = client.post("/render", json=FRAME)
-        assert waiting.status_code == 504, "the time in line counts"
+        assert waiting.status_code == 504, "waiting counts"
         poses.slow = False
         poses.go_on.set()
         eventually(lambda: server.service.queue.running == 0)
@@ -148,7 +148,7 @@ def test_work_for_a_client_that_is_gone_ends(scene: Path, poses: SlowPoses, path
         assert poses.begun < samples
 
 
-def test_a_client_that_leaves_the_line_is_never_drawn_for(scene: Path, poses: SlowPoses):
+def test_a_client_that_leaves_the_queue_is_dropped(scene: Path, poses: SlowPoses):
     with serving_slowly(scene, poses, concurrent_renders=1) as (client, server), ThreadPoolExecutor(1) as pool:
         queue = server.service.queue
         first = pool.submit(client.post, "/render", json=FRAME)

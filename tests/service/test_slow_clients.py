@@ -61,7 +61,7 @@ def rest_of(connection: socket.socket) -> bytes:
     ids=["nothing", "headers", "body"],
 )
 def test_slow_senders_are_closed_and_others_are_served(client: httpx.Client, first: bytes, drip: bytes):
-    assert client.post("/render", json=FRAME).status_code == 200, "kernels are compiled before seconds count"
+    assert client.post("/render", json=FRAME).status_code == 200, "kernels are compiled before the time limit applies"
     with contextlib.ExitStack() as sockets:
         silent, dripping = (
             [sockets.enter_context(begun(client, first)) for _ in range(SOCKETS // 2)] for _ in range(2)
@@ -69,7 +69,7 @@ def test_slow_senders_are_closed_and_others_are_served(client: httpx.Client, fir
         deadline = time.monotonic() + MAX_SECONDS
         while drip and (dripping := [connection for connection in dripping if takes(connection, drip)]):
             assert client.post("/render", json=FRAME).status_code == 200
-            assert time.monotonic() < deadline, "a drip makes it wait for ever"
+            assert time.monotonic() < deadline, "single bytes keep it waiting forever"
             time.sleep(SECONDS / 10)
         for connection in silent:
             answer = rest_of(connection)
@@ -94,7 +94,7 @@ def test_a_reader_that_stands_still_is_closed(client: httpx.Client, server: list
     before = len(server[0].server_state.connections)
     connection = connect(client)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    link = "/render?format=npy&width=1500&height=1000"  # 30 MB, more than any socket holds
+    link = "/render?format=npy&width=1500&height=1000"  # 30 MB, more than socket buffers hold
     connection.sendall(f"GET {link} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
     assert connection.recv(100).startswith(b"HTTP/1.1 200")
     eventually(lambda: len(server[0].server_state.connections) <= before)

@@ -117,7 +117,7 @@ def test_a_file_that_stops_coming_leaves_nothing(folder: Path, limits: dict[str,
         eventually(lambda: files(folder) == [])
 
 
-def test_where_it_is_not_allowed_nothing_is_added_or_deleted(folder: Path, file: bytes):
+def test_without_uploads_nothing_is_added_or_deleted(folder: Path, file: bytes):
     write_scene(folder / "walk.onnx")
     with serving(folder) as client:
         for response in (add(client, file, "jump"), client.delete("/scenes/walk")):

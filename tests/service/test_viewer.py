@@ -1,4 +1,4 @@
-"""The page at /, in a browser: it loads, drags, plays, changes view, and says when the service goes away."""
+"""The page at /, in a browser: loading, dragging, playing, channels, and the message if the service goes away."""
 
 import itertools
 import json
@@ -108,7 +108,7 @@ def test_it_shows_the_scene_as_the_service_draws_it(opened: Page, client: httpx.
     assert opened.locator("#facts").inner_text().startswith("Gaussians")
 
 
-def test_dragging_turns_and_ends_in_full_quality(opened: Page):
+def test_dragging_orbits_and_ends_in_full_quality(opened: Page):
     before, asked = image(opened), bodies(opened)
     opened.mouse.move(200, 200)
     forget(opened)
@@ -152,10 +152,10 @@ def test_wheel_keys_and_shift_drag_move_the_camera(opened: Page):
     panned = camera_after(shift_drag)
     assert panned["target"] != nearer["target"]
     assert panned["distance"] == nearer["distance"]
-    turned = camera_after(lambda: opened.keyboard.press("ArrowLeft"))
-    assert turned["azimuth"] != panned["azimuth"]
+    rotated = camera_after(lambda: opened.keyboard.press("ArrowLeft"))
+    assert rotated["azimuth"] != panned["azimuth"]
     flown = camera_after(lambda: opened.keyboard.press("w", delay=100))
-    assert flown["target"] != turned["target"]
+    assert flown["target"] != rotated["target"]
     assert camera_after(lambda: opened.keyboard.press("r"))["target"] == [0, 0, 0]
 
 
@@ -218,7 +218,7 @@ def test_depth_count_and_motion(opened: Page):
         assert np.abs(image(opened).astype(int) - before).max() > 50
     opened.locator("#time").fill("1")
     opened.wait_for_function("() => location.hash.includes('t=1&')")
-    assert asked[-1]["t"] + asked[-1]["dt"] == 1, "motion at the end of time leads beyond it"
+    assert asked[-1]["t"] + asked[-1]["dt"] == 1, "motion needs a later time, which the end doesn't have"
 
 
 def test_the_slider_of_layers(opened: Page):
@@ -293,7 +293,7 @@ def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Cli
             assert decode(content, image_format)[0].shape == (*image(page).shape[:2], channels)
 
 
-def test_it_says_that_the_service_is_away_and_comes_back(page: Page, scenes: Path):
+def test_it_reports_an_unavailable_service_and_recovers(page: Page, scenes: Path):
     with serving(scenes) as client:
         port = client.base_url.port
         open_page(page, client)

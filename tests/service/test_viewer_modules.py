@@ -1,4 +1,4 @@
-"""The page's modules by themselves: the camera is the service's, and frames are as large as there is time for."""
+"""The page's modules: the camera equals the service's, and frame sizes follow the frame time."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,7 +39,7 @@ def test_the_camera_is_the_services_own(modules: Page, up: tuple[float, float, f
     assert np.abs(columns - wanted[:3]).max() < tolerance("rotation")
 
 
-def test_a_pose_that_is_taken_over_stays_where_it_is(modules: Page):
+def test_a_pose_from_the_scene_is_kept(modules: Page):
     stored = metadata().cameras[1]
     script = """async ([view, stored]) => {
         const { Camera } = await import("/viewer/camera.js");
@@ -52,8 +52,8 @@ def test_a_pose_that_is_taken_over_stays_where_it_is(modules: Page):
     assert np.abs(columns - stored.camera.camera_to_world[:3]).max() < tolerance("rotation")
 
 
-@pytest.mark.parametrize(("pose", "nanoseconds_a_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
-def test_moving_frames_come_15_times_a_second(modules: Page, pose: float, nanoseconds_a_pixel: float):
+@pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
+def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nanoseconds_per_pixel: float):
     script = """async ([pose, aPixel]) => {
         const { Pace } = await import("/viewer/pace.js");
         const pace = new Pace();
@@ -65,8 +65,8 @@ def test_moving_frames_come_15_times_a_second(modules: Page, pose: float, nanose
           pace.measured(width * height, pose + drawing, drawing);
         }
         return taken; }"""
-    taken = modules.evaluate(script, [pose, nanoseconds_a_pixel * 1e-9])
+    taken = modules.evaluate(script, [pose, nanoseconds_per_pixel * 1e-9])
     pixels, seconds = taken[-1]
     assert seconds < 1 / 15
-    affordable = (1 / 15 - pose) / (nanoseconds_a_pixel * 1e-9)
-    assert pixels > 0.5 * min(affordable, 1600 * 1200), "fewer pixels than there is time for"
+    affordable = (1 / 15 - pose) / (nanoseconds_per_pixel * 1e-9)
+    assert pixels > 0.5 * min(affordable, 1600 * 1200), "fewer pixels than affordable"

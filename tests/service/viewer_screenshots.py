@@ -11,7 +11,7 @@ SCENE = Path("examples/toybench.onnx")
 DESKTOP = {"viewport": {"width": 1280, "height": 800}}
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 AT = "t=0.6&at=30,20,3.4,0,0,0"
-SHOTS = (
+SCREENSHOTS = (
     ("color_light", DESKTOP, "light", "rgb"),
     ("layers_light", DESKTOP, "light", "rgb&steps=1"),
     ("depth_dark", DESKTOP, "dark", "depth"),
@@ -23,9 +23,9 @@ THUMBNAIL = "() => document.querySelector('#scenes canvas').getContext('2d').get
 
 
 def main(folder: Path) -> None:
-    """Write one JPEG for each of `SHOTS`."""
+    """Write one JPEG for each of `SCREENSHOTS`."""
     with serving(SCENE) as client, chromium() as browser:
-        for name, device, scheme, view in SHOTS:
+        for name, device, scheme, view in SCREENSHOTS:
             options: Any = {**device, "color_scheme": scheme}
             with browser.new_context(**options) as context:
                 page = context.new_page()

@@ -1,4 +1,4 @@
-"""Runs of Deformable-3D-Gaussians and 4DGaussians with small random networks, which are written here in a few lines."""
+"""Runs of Deformable-3D-Gaussians and 4DGaussians with small random networks, reimplemented in a few lines."""
 
 import itertools
 import json
@@ -25,7 +25,7 @@ BOX = [[1.1, 0.9, 1.4], [-0.8, -1.3, -0.9]]
 
 
 def _random_layers(state: State, prefix: str = "") -> tuple[Callable[..., None], torch.Generator]:
-    """Return a function that adds a linear layer of some size to a state, and its source of numbers."""
+    """Return a function that adds a random linear layer to a state, and its generator."""
     generator = torch.Generator().manual_seed(0)
 
     def add(name: str, inputs: int, outputs: int, size: float = 1.0) -> None:
@@ -136,11 +136,11 @@ def write_fourdgs(folder: Path, state: State, switches: str = SWITCHES, lengths:
     torch.save(torch.zeros(COUNT, 3), cloud / "deformation_accum.pth")
     config = "{'resolution': [8, 8, 8, 12]}"
     (folder / "cfg_args").write_text(f"Namespace(sh_degree=3, kplanes_config={config}, {switches})")
-    (folder / "cameras.json").write_text(json.dumps([stored_camera(turn) for turn in range(4)]))
+    (folder / "cameras.json").write_text(json.dumps([stored_camera(index) for index in range(4)]))
     return folder
 
 
-def stored_camera(turn: int) -> dict[str, object]:
-    pose = orbit(np.zeros(3), 4.0, 90 * turn, 10, np.array([0.0, -1.0, 0.0]))
+def stored_camera(index: int) -> dict[str, object]:
+    pose = orbit(np.zeros(3), 4.0, 90 * index, 10, np.array([0.0, -1.0, 0.0]))
     size = {"width": 96, "height": 96, "fx": 96.0, "fy": 96.0}
-    return {"img_name": f"{turn}", "rotation": pose[:3, :3].tolist(), "position": pose[:3, 3].tolist(), **size}
+    return {"img_name": f"{index}", "rotation": pose[:3, :3].tolist(), "position": pose[:3, 3].tolist(), **size}

@@ -1,4 +1,4 @@
-"""Mutated scene files by seed, opened, posed and rendered. As a program: opens the file MARKER, then tests COUNT files.
+"""Mutated scene files by seed, opened, posed and rendered. As a program it opens MARKER, then tests COUNT files.
 
 `python -m tests.support.fuzz_scenes COUNT MARKER`
 """
@@ -66,7 +66,7 @@ def outcomes(seeds: range) -> Counter[str]:
 
 
 def main(count: str, marker: str) -> None:
-    """Render the sound files, open the marker, then test the mutated files."""
+    """Render the valid files, open the marker, then test the mutated files."""
     for contents in sound_scenes().values():
         assert outcome(contents) == DRAWN
     Path(marker).read_bytes()

@@ -1,4 +1,4 @@
-"""Hostile scene files, each made from a sound one, and the message of its refusal."""
+"""Hostile scene files, each made from a valid one, and the expected message."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +15,7 @@ MANY = 1_500_000_000
 
 
 class Attack(NamedTuple):
-    """A hostile change of a scene file; `on` makes it from a sound model and the path of a secret file."""
+    """A hostile change of a scene file; `on` makes it from a valid model and the path of a secret file."""
 
     name: str
     message: str
@@ -89,7 +89,7 @@ def truncated_location(model: onnx.ModelProto, secret: Path) -> bytes:
 
 
 def location_alone(model: onnx.ModelProto, secret: Path) -> bytes:
-    """The same number in an otherwise sound file."""
+    """The same number in an otherwise valid file."""
     base = without_base(model).SerializeToString() + field(14, 2**32 + 1)
     return with_graph(model, model.graph.SerializeToString() + field(5, base))
 
@@ -138,7 +138,7 @@ def six_gigabytes(call: str) -> Attack:
     return Attack(f"six gigabytes by {operator}", f"the operator {operator}", beside_the_scene(nodes))
 
 
-# the loop runs 10¹⁵ times around t = 0.5, and not at all at both ends of the time range
+# the loop runs 10¹⁵ times around t = 0.5, but not at the ends of the time range
 LOOP = """
 <float[1] eight = {8}, float[1] huge = {1e15}, int64[0] none = {}, bool go = {1}> {
     rest = Sub(one, t)

@@ -1,4 +1,4 @@
-"""Decoding of encoded images, and what tests compare them by."""
+"""Decoding of encoded images, and metrics to compare them."""
 
 import io
 import tempfile
@@ -11,7 +11,7 @@ from msdgs_serve.imaging.formats import ImageFormat
 
 
 def decode(body: bytes, image_format: ImageFormat) -> tuple[np.ndarray, oiio.ImageSpec]:
-    """Pixels as stored (straight alpha stays straight) and the header; for `npy` that of nothing."""
+    """Pixels as stored (straight alpha stays straight) and the header, empty for `npy`."""
     if image_format == "npy":
         return np.load(io.BytesIO(body), allow_pickle=False), oiio.ImageSpec()
     config = oiio.ImageSpec()

@@ -1,4 +1,4 @@
-"""Small models: random ones, in which nothing is zero by its initialisation, a moving object, and the way to a file."""
+"""Small models: random ones without zeros, a moving object, and their export."""
 
 import hashlib
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.nodes import NodesConfig, NodesSupport
 
 torch.set_num_threads(1)
-"""The tests themselves run side by side, and OpenMP threads that wait for a core spin."""
+"""Tests run in parallel, and waiting OpenMP threads spin."""
 
 CAMERA = {
     "fx": 50.0,
@@ -59,7 +59,7 @@ def small_config(**changes: Any) -> ModelConfig:
 
 
 def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config: Any) -> DynamicGaussians:
-    """A model whose Gaussians and networks all differ from their start by normal noise."""
+    """A model with normal noise added to all initial parameters."""
     settings = small_config(**config)
     gaussians = CanonicalGaussians.random_in_cube(count, 1.3, settings.sh_degree, seed, settings.attributes())
     with torch.random.fork_rng(), torch.no_grad():
@@ -74,7 +74,7 @@ def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config:
 
 
 def _place_nodes(support: NodesSupport, gaussians: CanonicalGaussians) -> None:
-    """Nodes among the Gaussians, each of which follows the nearest; at random if there are no Gaussians."""
+    """Place nodes among the Gaussians, or at random if there are none; Gaussians follow the nearest."""
     if len(gaussians) == 0:
         support.nodes.normal_()
         return
@@ -84,14 +84,14 @@ def _place_nodes(support: NodesSupport, gaussians: CanonicalGaussians) -> None:
 
 
 GROUND, OBJECT = 200, 40  # Gaussians of the moving object's scene, the ground's first
-RISE = 0.3  # scene units that the object moves by per unit of time, about
+RISE = 0.3  # approximate speed of the object, scene units per unit of time
 
 
 def moving_object(seed: int = 0, moves: bool = True, **config: Any) -> DynamicGaussians:
-    """Still ground at x < 0.3, and an object at x > 0.9 that rises; without `moves`, no layer moves anything.
+    """Static ground at x < 0.3, and an object at x > 0.9 that rises; without `moves`, no layer moves anything.
 
-    Besides what it needs the model has a second layer that does nothing, SH bands of zeros, modulation that is 1, and
-    heads of scales and rotations that are zero.
+    It also has parts without effect: a second layer, SH bands of zeros, modulation of 1, and heads of scales and
+    rotations that are zero.
     """
     settings = small_config(**({"layers": (replace(MLP, depth=1),) * 2, "sh_degree": 1} | config))
     generator = torch.Generator().manual_seed(seed)
@@ -114,7 +114,7 @@ def moving_object(seed: int = 0, moves: bool = True, **config: Any) -> DynamicGa
 
 
 def rise(layer: torch.nn.Module) -> None:
-    """Make a layer of zeros answer at x > 0.8 alone, and move upwards in proportion to the time."""
+    """Make a layer of zeros move points at x > 0.8 upwards in proportion to the time."""
     assert isinstance(layer, MLPLayer)
     layer.time_hidden.weight[0, 0] = 1
     layer.time_output.weight[0, 0] = 1  # the first feature of time is the time
@@ -146,7 +146,7 @@ def export_scene(
 ) -> Exported:
     """Bake `checkpoint`, write it beside `output`, compare that file with the model, and only then move it there.
 
-    Whatever goes wrong before, `output` stays as it was. Raises `CheckpointInvalid`, `ModelNotExportable`,
+    An error leaves `output` unchanged. Raises `CheckpointInvalid`, `ModelNotExportable`,
     `PlanUnsafe`, `VerificationFailed`, or `SceneFileInvalid` where the written file breaks its contract.
     """
     loaded = load_model(checkpoint)

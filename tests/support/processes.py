@@ -49,7 +49,7 @@ def program(module: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def wait_for(holds: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait until it does."""
+    """Wait until a port is listened on."""
     deadline = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < deadline, "waited in vain"
@@ -82,7 +82,7 @@ def chromium(*arguments: str) -> Iterator[Browser]:
     if program is None:
         pytest.skip("no Chromium on this machine; `apt-get install chromium libatomic1`, or name one in MSDGS_CHROMIUM")
     with sync_playwright() as playwright:
-        # it runs as root in containers, and shows nothing but our own page
+        # it runs as root in containers, and opens only our own page
         browser = playwright.chromium.launch(
             executable_path=program, args=["--no-sandbox", "--disable-gpu", *arguments]
         )

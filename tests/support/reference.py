@@ -1,11 +1,11 @@
-"""A slow, obvious float64 renderer: one loop over the Gaussians, front to back, nothing left out, no tiles.
+"""A slow, obvious float64 renderer: one loop over the Gaussians, front to back, without culling or tiles.
 
-It shares no code with the package: rotations, harmonics, projection and blending are written here again, from the
-paper (equations 1 and 2) and the constants in `RasterizerOptions`.
+It shares no code with the package: rotations, harmonics, projection and blending follow the paper (equations 1 and 2)
+and the constants in `RasterizerOptions`.
 
-Where float32 may fairly decide otherwise (is alpha above `alpha_min`? has the transmittance run out? which of two
-splats of almost the same depth is in front?) the image jumps. Such pixels are found here, and `slack` says by how
-much the jump can change the weights of a pixel.
+The image is discontinuous at thresholds, where float32 may decide differently: alpha at `alpha_min`, the end of the
+transmittance, the order of almost equal depths. Such pixels are detected, and `slack` bounds the change of the weights
+of a pixel.
 """
 
 import math
@@ -18,11 +18,11 @@ from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, Gaussians
 
 ALPHA_BAND = 1e-3
-"""Relative distance to a threshold under which float32 may fall on its other side: sigma, about 5.5 at the threshold,
-carries an error of a pixel coordinate (3e-5 px) times its slope (6 / px), about 2e-4."""
+"""Relative distance to a threshold within which float32 may be on its other side: sigma, about 5.5 at the threshold,
+has an error of a pixel coordinate (3e-5 px) times its slope (6 / px), about 2e-4."""
 
 DEPTH_BAND = 2e-6
-"""Relative distance of two depths under which float32 may swap them: some roundings of 6e-8, times |position| / z."""
+"""Relative distance of two depths within which float32 may swap them: some roundings of 6e-8, times |position| / z."""
 
 
 class Reference(NamedTuple):
@@ -50,7 +50,7 @@ def render(
     options: RasterizerOptions = GSPLAT,
     depth_band: float = DEPTH_BAND,
 ) -> Reference:
-    """Equation 2 at every pixel. Set `depth_band` to 0 where depths are exact, to have ties judged too."""
+    """Equation 2 at every pixel. Set `depth_band` to 0 where depths are exact, to decide ties as well."""
     background = np.asarray(background, float)
     colors = view_colors(gaussians, camera)
     projected = [project(gaussians, k, camera, colors[k], options) for k in range(len(gaussians))]
@@ -135,7 +135,7 @@ def view_colors(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def quaternion_matrix(quat: np.ndarray) -> np.ndarray:
-    """[3, 3] by Rodrigues' formula: turn by 2 acos(w) around (x, y, z)."""
+    """[3, 3] by Rodrigues' formula: rotation by 2 acos(w) around (x, y, z)."""
     w, v = quat[0], quat[1:]
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross

@@ -1,4 +1,4 @@
-"""Slow, obvious readings of the deformation in NumPy and float64: layers, chains, and linear blend skinning."""
+"""A slow, obvious deformation in NumPy and float64: layers, chains, and linear blend skinning."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -19,7 +19,7 @@ MIN_STRETCH = 0.05
 
 
 class PlainDeltas(NamedTuple):
-    """Deltas of N points, and in a step its weight."""
+    """Deltas of N points, and the weight of a step."""
 
     means: np.ndarray  # [N, 3]
     scales: np.ndarray  # [N, 3], or [N, 6] of a stretch tensor
@@ -50,7 +50,12 @@ def plain_encoding(x: np.ndarray, frequencies: int) -> np.ndarray:
 
 
 def plain_mlp(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
-    """Equations 7 and 10 with the time features repeated for every point: the columns of all heads."""
+    """Equations 7 and 10: the columns of all heads."""
+    return linear(layer.heads, plain_hidden(layer, means, t))
+
+
+def plain_hidden(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
+    """[N, width] the last hidden units, with the time features repeated for every point."""
     time = plain_encoding(np.array([[t]]), layer.time_frequency_matrix.shape[1])
     code = linear(layer.time_output, np.maximum(linear(layer.time_hidden, time), 0))
     encoded = plain_encoding(means, layer.xyz_frequency_matrix.shape[1] // 3)
@@ -59,7 +64,7 @@ def plain_mlp(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
     for i, module in enumerate(layer.trunk, start=1):
         read = np.concatenate([inputs, hidden], axis=1) if i == layer.skip else hidden
         hidden = np.maximum(linear(module, read), 0)
-    return linear(layer.heads, hidden)
+    return hidden
 
 
 def plain_features(planes: PlaneGrid, means: np.ndarray, t: float) -> np.ndarray:
@@ -163,8 +168,8 @@ def _skinned(model: DynamicGaussians, support: NodesSupport, canonical: PlainPos
     for n, (mean, scale, quat) in enumerate(zip(*canonical, strict=True)):
         weights = np.exp(logits[n] - logits[n].max())
         followed = [motions[k] for k in ids[n]]
-        matrix, offset, turn = (np.average(parts, axis=0, weights=weights) for parts in zip(*followed, strict=True))
+        matrix, offset, rot = (np.average(parts, axis=0, weights=weights) for parts in zip(*followed, strict=True))
         means[n] = matrix @ mean + offset
         scales[n] = scale * np.maximum(np.linalg.norm(matrix @ rotation(quat).as_matrix(), axis=0), MIN_STRETCH)
-        quats[n] = product(turn / np.linalg.norm(turn), quat)
+        quats[n] = product(rot / np.linalg.norm(rot), quat)
     return PlainPose(means, scales, quats)

@@ -19,7 +19,7 @@ class Projection(NamedTuple):
     means2d: Tensor  # [N, 2] pixels
     depths: Tensor  # [N]
     conics: Tensor  # [N, 3] xx, xy, yy of the inverse covariance
-    compensations: Tensor  # [N] by which `mip` dims the opacities
+    compensations: Tensor  # [N] factors of the opacities by `mip`
     colors: Tensor  # [N, 3] harmonics plus 0.5, not below 0
 
 

@@ -20,7 +20,7 @@ SH_DC = 0.28209479177387814
 
 
 def metadata(**changes: Any) -> SceneMetadata:
-    """Of a scene in the cube [-1, 1]³, seen by two cameras of 64 × 48 pixels, z up; t from 0 to 1."""
+    """Metadata of a scene in the cube [-1, 1]³ with two cameras of 64 × 48 pixels, z up; t from 0 to 1."""
     cameras = tuple(
         SceneCamera(f"view_{azimuth}", 0.0, Camera.from_fov(orbit(np.zeros(3), 5.0, azimuth, 20, UP), 64, 48, 40.0))
         for azimuth in (0, 90)
@@ -45,7 +45,7 @@ def metadata(**changes: Any) -> SceneMetadata:
 
 
 def level_camera(size: int = 64) -> Camera:
-    """A square camera 5 units from the origin and at its height, which it looks at."""
+    """A square camera 5 units from the origin, at its height, looking at it."""
     return Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), size, size, 40.0)
 
 

@@ -1,5 +1,5 @@
-"""Sound scene files changed at random at the level of the format: nodes, attributes, shapes, names, versions, metadata,
-and how protobuf writes them. The same seed gives the same file."""
+"""Random mutations of valid scene files: nodes, attributes, shapes, names, versions, metadata, and the encoding of
+protobuf. The same seed gives the same file."""
 
 import json
 from collections import defaultdict
@@ -21,7 +21,7 @@ Rng = np.random.Generator
 Mutation = Callable[[onnx.ModelProto, Rng], object]
 
 CANARY = Path("/tmp/msdgs-canary")
-"""Where external tensors point to: it must never be opened."""
+"""The file that external tensors refer to; it must never be opened."""
 
 OPERATORS = (
     "Add", "Cast", "Clip", "Concat", "Cos", "DequantizeLinear", "Div", "Equal", "Exp", "Floor", "Gather", "Gemm",
@@ -31,7 +31,7 @@ OPERATORS = (
     "NonZero", "OneHot", "Pad", "RandomNormal", "Range", "Resize", "Scan", "Shape", "Slice", "StringNormalizer", "Tile",
     "TopK", "Transpose", "", "add", "Bogus",
 )  # fmt: skip
-ALIKE = (
+SAME_INPUTS = (
     ("Add", "Sub", "Mul", "Div", "Max", "Min", "Pow"),
     ("Cos", "Exp", "Floor", "Identity", "Log", "Relu", "Sigmoid", "Sin", "Sqrt"),
     ("Less", "Equal"),
@@ -134,7 +134,7 @@ def _change_elements(elements: Any, field: FieldDescriptor, model: onnx.ModelPro
 def swap_operator(model: onnx.ModelProto, rng: Rng) -> None:
     """Replace an operator by one that takes the same inputs."""
     node = pick(rng, model.graph.node)
-    for operators in ALIKE:
+    for operators in SAME_INPUTS:
         if node.op_type in operators:
             node.op_type = pick(rng, operators)
 
@@ -197,17 +197,17 @@ SUBTLE: tuple[Mutation, ...] = (change_values, change_values, rewire, swap_opera
 """Half of the changes: more of these files are valid and reach onnxruntime."""
 
 WIRE = 0.3
-"""Share of the files whose encoding is changed."""
+"""Fraction of the files whose encoding is changed."""
 
 
 def mutated(sound: bytes, rng: Rng) -> bytes:
-    """Return a sound file with one to three changes."""
+    """Return a valid file with one to three changes."""
     model = onnx.load_from_string(sound)
     only_wire = rng.random() < WIRE / 2
     for _ in range(0 if only_wire else int(rng.choice([1, 2, 3], p=[0.7, 0.2, 0.1]))):
         try:
             pick(rng, SUBTLE if rng.random() < 0.5 else MUTATIONS)(model, rng)
         except (ValueError, TypeError):
-            continue  # nothing is left that this could change, or the field can't hold the value
+            continue  # nothing to change, or the field can't hold the value
     contents = model.SerializeToString()
     return changed_wire(contents, rng) if only_wire or rng.random() < WIRE / 2 else contents

@@ -12,7 +12,7 @@ from msdgs_serve.scene.camera import look_at
 Scene = tuple[Gaussians, Camera]
 
 draw = functools.partial(rasterize, depth=True)
-"""All that is drawn without naming a further channel."""
+"""The channels that are drawn by default."""
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 IDENTITY_ROTATION = (1.0, 0.0, 0.0, 0.0)
@@ -50,7 +50,7 @@ def random_camera(rng: np.random.Generator, width: int, height: int) -> Camera:
 
 
 def random_scene(seed: int, count: int, width: int = 53, height: int = 37, *, sh_degree: int = 3) -> Scene:
-    """float32, as the service has it. The default size is no multiple of any tile."""
+    """float32, as in the service. The default size is no multiple of the tile's."""
     rng = np.random.default_rng(seed)
     return as_dtype(random_gaussians(rng, count, sh_degree=sh_degree), np.float32), random_camera(rng, width, height)
 
@@ -84,7 +84,7 @@ def gaussians_of(
     quats: object = IDENTITY_ROTATION,
     dtype: type = np.float32,
 ) -> Gaussians:
-    """Gaussians of degree 0 from lists; colors are told apart by index unless `rgb` says otherwise."""
+    """Gaussians of degree 0 from lists; colors differ by index unless `rgb` is given."""
     means = np.asarray(means, float).reshape(-1, 3)
     count = len(means)
     if rgb is None:
@@ -119,7 +119,7 @@ def behind_camera() -> Scene:
 
 
 def near_plane() -> Scene:
-    """Large splats whose centres lie just before, on and behind the near plane, so that their bodies cross it."""
+    """Large splats with centers just before, on and behind the near plane, which they all cross."""
     z = np.array([0.005, 0.01, np.nextafter(np.float32(0.01), np.float32(1)), 0.011, 0.02, 0.1])
     means = np.column_stack([np.linspace(-0.002, 0.002, 6), np.linspace(0.002, -0.002, 6), z])
     return gaussians_of(means, scales=0.5, opacities=0.3), front_camera()
@@ -133,7 +133,7 @@ def off_axis_89() -> Scene:
 
 
 def inside_splat() -> Scene:
-    """The eye inside several large splats, with small ones beyond."""
+    """The eye is inside of several large splats, with small ones behind."""
     means = [[0, 0, 0.05], [0.1, 0, 0.3], [0, -0.2, 0.5], [0, 0, -0.2], [0.3, 0.3, 2]]
     return gaussians_of(means, scales=[0.8, 1.0, 1.5, 2.0, 0.1], opacities=[0.3, 0.4, 0.4, 0.9, 0.9]), front_camera()
 
@@ -147,8 +147,8 @@ def needles() -> Scene:
     return gaussians_of(means, scales=scales, quats=unit_quats(rng, count)), front_camera()
 
 
-def giants() -> Scene:
-    """Each covers the whole image, some a thousand times."""
+def huge() -> Scene:
+    """Each covers the whole image, some are a thousand times as large."""
     means = np.column_stack([np.linspace(-1, 1, 6), np.linspace(1, -1, 6), np.linspace(2, 8, 6)])
     return gaussians_of(means, scales=[1, 3, 10, 30, 100, 1000], opacities=0.2), front_camera()
 
@@ -169,7 +169,7 @@ def opacity_extremes() -> Scene:
 
 
 def crowd() -> Scene:
-    """A thousand splats behind one another on one pixel, faint enough that hundreds are blended."""
+    """A thousand splats behind one another on one pixel, so transparent that hundreds are blended."""
     depths = np.linspace(2, 6, 1000)
     rng = np.random.default_rng(5)
     opacities = rng.uniform(0.004, 0.02, 1000)
@@ -178,7 +178,7 @@ def crowd() -> Scene:
 
 
 def needles_of_a_million() -> Scene:
-    """Aspect 1e6 : 1, in all directions; some far longer than the image, some thinner than float32 sees."""
+    """Aspect 1e6 : 1, in all directions; some far longer than the image, some thinner than float32 resolves."""
     rng = np.random.default_rng(8)
     count = 33
     means = np.column_stack([rng.uniform(-1, 1, size=(count, 2)), rng.uniform(2, 4, count)])
@@ -187,18 +187,18 @@ def needles_of_a_million() -> Scene:
     return gaussians_of(means, scales=scales, quats=unit_quats(rng, count)), front_camera()
 
 
-def giants_without_end() -> Scene:
+def unbounded_splats() -> Scene:
     """Over the whole frame, round and flat, up to e²⁰ scene units, with small ones before and behind them."""
     rng = np.random.default_rng(9)
     log_scales = np.linspace(0, 20, 21)
     scales = np.exp(np.column_stack([log_scales, log_scales, np.where(np.arange(21) % 2, log_scales, -3)]))
     means = np.column_stack([rng.uniform(-1, 1, size=(21, 2)), np.linspace(2, 8, 21)])
-    giants = gaussians_of(means, scales=scales, opacities=0.15, quats=unit_quats(rng, 21))
-    return joined(giants, gaussians_of(means[::2] * [0.5, 0.5, 1] - [0, 0, 0.1], scales=0.1)), front_camera()
+    huge = gaussians_of(means, scales=scales, opacities=0.15, quats=unit_quats(rng, 21))
+    return joined(huge, gaussians_of(means[::2] * [0.5, 0.5, 1] - [0, 0, 0.1], scales=0.1)), front_camera()
 
 
 def ten_thousand_on_a_pixel() -> Scene:
-    """One pixel's list is as long as the scene, most of it behind where the light has run out."""
+    """One pixel's list is as long as the scene; most of it is behind the end of the transmittance."""
     depths = np.linspace(2, 6, 10_000)
     means = np.column_stack([0.01 * depths, 0.01 * depths, depths])
     opacities = np.random.default_rng(10).uniform(0.004, 0.02, 10_000)
@@ -212,7 +212,7 @@ def at_the_camera() -> Scene:
 
 
 def through_the_near_plane() -> Scene:
-    """Discs and needles that lie along the axis: their bodies reach from behind the eye to far before it."""
+    """Discs and needles along the axis, which extend from behind the eye to far in front of it."""
     rng = np.random.default_rng(11)
     means = np.column_stack([rng.uniform(-0.3, 0.3, size=(17, 2)), np.geomspace(0.0101, 1.0, 17)])
     return gaussians_of(means, scales=[[0.02, 0.05, 2.0]] * 17, opacities=0.4), front_camera()
@@ -233,8 +233,8 @@ def oblong_pixels() -> Scene:
 ADVERSARIAL: dict[str, Callable[[], Scene]] = {
     scene.__name__: scene
     for scene in (
-        equal_depths, behind_camera, near_plane, off_axis_89, inside_splat, needles, giants, subpixel, opacity_extremes,
-        crowd, needles_of_a_million, giants_without_end, ten_thousand_on_a_pixel, at_the_camera, through_the_near_plane,
+        equal_depths, behind_camera, near_plane, off_axis_89, inside_splat, needles, huge, subpixel, opacity_extremes,
+        crowd, needles_of_a_million, unbounded_splats, ten_thousand_on_a_pixel, at_the_camera, through_the_near_plane,
         principal_point_outside, oblong_pixels,
     )
 }  # fmt: skip

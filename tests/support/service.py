@@ -25,7 +25,7 @@ from tests.support.service_on_ray import serving_on_ray
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
 FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 MAX_SECONDS = 60.0
-"""Seconds that a test waits, whatever else the machine does."""
+"""Maximum seconds that a test waits, also on a busy machine."""
 
 WATCH_SECONDS = 0.05
 SERVICE_VARIABLE = "MSDGS_TEST_SERVICE"
@@ -38,11 +38,11 @@ own_connection = pytest.mark.skipif(ON_RAY, reason="slow connections end at the 
 def serving(
     *scenes: Path, renderer: Renderer | None = None, server: list[Server] | None = None, **settings: Any
 ) -> Iterator[httpx.Client]:
-    """A client of a service over these scenes, which ends on leaving. The server is added to `server`."""
+    """A client of a service with these scenes, which stops at the end of the block. The server is added to `server`."""
     chosen = Settings(scenes=list(scenes), **{"watch_seconds": WATCH_SECONDS, "port": 0, **settings})
     if ON_RAY:
         if renderer is not None or server is not None or chosen.port:
-            pytest.skip("reaches into the process of the service, or says its port: not on Ray Serve")
+            pytest.skip("reaches into the process of the service, or needs its port: not on Ray Serve")
         with serving_on_ray(chosen) as client:
             yield client
         return
@@ -84,7 +84,7 @@ def eventually(condition: Callable[[], object]) -> None:
 
 
 def check_problem(response: httpx.Response, status: int | None = None, field: str | None = None) -> None:
-    """Check that an answer has the one shape of all errors; and, if given, its status and the first field it names."""
+    """Check that a response has the shape of all errors and, if given, the status and the first field."""
     assert status in (None, response.status_code), response.text[:500]
     assert response.headers["content-type"] == "application/problem+json"
     assert len(response.content) <= MAX_BODY_BYTES

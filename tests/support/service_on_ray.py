@@ -17,7 +17,7 @@ from msdgs_serve.scene import InvalidInput
 from tests.support.processes import ROOT, free_port
 
 OBJECT_STORE_BYTES = 100 << 20
-CORES = 64  # as Ray counts them: several services are up at once
+CORES = 64  # Ray's number of cores: several services run at once
 _numbers = itertools.count()
 
 
@@ -44,7 +44,9 @@ def _cluster() -> int:
 
     port = free_port()
     os.environ["PYTHONPATH"] = str(ROOT)
-    os.environ.setdefault("RAY_agent_register_timeout_ms", "300000")  # Ray gives up early where others compute
+    os.environ.setdefault(
+        "RAY_agent_register_timeout_ms", "300000"
+    )  # Ray's default time limit is short for a busy machine
     os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")
     ray.init(
         address="local", include_dashboard=False, num_cpus=CORES, object_store_memory=OBJECT_STORE_BYTES,
@@ -56,7 +58,7 @@ def _cluster() -> int:
 
 
 def dies_once(folder: Path, number: int) -> int:
-    """Its worker, the first time that the marked item is worked on."""
+    """End the worker process the first time that the marked item is processed."""
     marker = folder / "died"
     if number == 3 and not marker.exists():
         marker.touch()

@@ -1,25 +1,25 @@
-"""What a test may lack: where that is meant to be so, and what brings the rest.
+"""Reasons for which tests may be skipped, and commands that install what they need.
 
-In CI (`CI` or `MSDGS_CI` is set) a run fails if it skips a test for a reason that isn't in `ALLOWED_SKIPS`. Others end
-in a line that says what was not tested, and the command that would bring it.
+In CI (`CI` or `MSDGS_CI` is set) a run fails if it skips a test for a reason that isn't in `ALLOWED_SKIPS`. Other runs
+end with a line that lists the untested parts and the command that installs what they need.
 """
 
 from typing import NamedTuple
 
 ALLOWED_SKIPS = {
-    "needs Ray": "350 MB that conflict with nothing and serve few: `make test-cluster`",
-    "viser isn't installed": "it wants older versions of what all else is tested with: `make test-viewer`",
-    "skipped: no Docker daemon": "a container has none; who builds the image runs docker/check.py",
-    "skipped: there is no docker command": "a container has none, as above",
-    "MSDGS_SPLATS names no folder": "files of other programs, which are not ours to pass on",
+    "needs Ray": "350 MB: `make test-cluster`",
+    "viser isn't installed": "needs older versions of other packages: `make test-viewer`",
+    "skipped: no Docker daemon": "containers have none; docker/check.py is run for releases",
+    "skipped: there is no docker command": "containers have none, as above",
+    "MSDGS_SPLATS names no folder": "files of other programs, which can't be redistributed",
     "reaches into the process of the service": "on Ray Serve it is another process (MSDGS_TEST_SERVICE=ray)",
     "slow connections end at the proxy": "on Ray Serve (MSDGS_TEST_SERVICE=ray)",
 }
-"""Reasons, by how they begin, and why the test doesn't run everywhere."""
+"""Beginnings of reasons, and why the test doesn't run everywhere."""
 
 
 class Lack(NamedTuple):
-    """What a reason begins with, what is not tested for it, and a package of Debian's or else of Python's."""
+    """The beginning of a reason, the untested part, and the Debian or Python package that it needs."""
 
     reason: str
     untested: str
@@ -36,12 +36,12 @@ LACKS = (
 
 
 def unexpected(reasons: list[str]) -> list[str]:
-    """Those of the reasons that tests were skipped for that `ALLOWED_SKIPS` doesn't name, each once."""
+    """The reasons of skipped tests that `ALLOWED_SKIPS` doesn't have, each once."""
     return sorted({reason for reason in reasons if not reason.startswith(tuple(ALLOWED_SKIPS))})
 
 
 def not_tested(reasons: list[str]) -> str:
-    """One line of what these skips left out and the command that brings it; empty if nothing did."""
+    """One line with the untested parts and the command that installs what they need; empty if there are none."""
     counts = {lack: sum(reason.startswith(lack.reason) for reason in reasons) for lack in LACKS}
     lacking = [lack for lack, count in counts.items() if count]
     if not lacking:

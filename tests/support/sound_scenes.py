@@ -1,4 +1,4 @@
-"""Sound scene files of every plan and every kind of layer, small."""
+"""Small valid scene files of every plan and kind of layer."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -37,7 +37,7 @@ def _exported() -> Iterator[tuple[str, bytes]]:
     for name, config in MODELS.items():
         baked = bake(random_model(COUNT, **config), SCENE, "0" * 64)
         for plan in PLANS if config["layers"] else PLANS[:1]:
-            if plan != "int8" or "mlp" in config["layers"]:  # of others no product is of width × width
+            if plan != "int8" or "mlp" in config["layers"]:  # other layers have no product of width × width
                 yield f"{name} {plan}", build(plan, baked).SerializeToString()
 
 

@@ -61,7 +61,7 @@ def ply_bytes(columns: dict[str, np.ndarray], form: str = "binary_little_endian"
 
 
 def compressed_ply_bytes(g: Gaussians) -> bytes:
-    """SuperSplat's: one chunk a 256 Gaussians, bytes of -4 to 4 for harmonics beyond degree 0."""
+    """SuperSplat's: a chunk per 256 Gaussians, bytes of -4 to 4 for SH above degree 0."""
     chunks, packed = [], []
     for start in range(0, len(g), 256):
         part = slice(start, start + 256)
@@ -80,7 +80,7 @@ def compressed_ply_bytes(g: Gaussians) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
     lines += [f"property float {name}" for name in names] + [f"element vertex {len(g)}"]
     lines += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
-    rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)  # a channel's come together
+    rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)  # sorted by channel
     if rest.size:
         lines += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
     header = "\n".join([*lines, "end_header", ""]).encode()
@@ -93,7 +93,7 @@ def _colors(g: Gaussians) -> np.ndarray:
 
 
 def _three_smallest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The place [N] of the largest component, and the others [N, 3] where it is positive."""
+    """The index [N] of the largest component, and the others [N, 3], with signs for which it is positive."""
     largest = np.abs(quats).argmax(axis=1)
     return largest, np.array([np.delete(q * np.sign(q[k]), k) for q, k in zip(quats, largest, strict=True)])
 

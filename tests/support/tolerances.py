@@ -1,6 +1,6 @@
-"""Every numeric tolerance of the tests: one row a quantity, with the reason for its size.
+"""All numeric tolerances of the tests: one row per quantity, with the reason for its size.
 
-A test says `assert_close(got, want, "rotation")` or `tolerance("rgb.float32")`; it never writes a number of its own.
+A test calls `assert_close(got, want, "rotation")` or `tolerance("rgb.float32")` and contains no number of its own.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ TABLE = (
     # rasterizer against the float64 oracle, pixels where no decision is in doubt; colors are of size 1
     Row("rgb.float32", 5e-6, "hundreds of blended splats, each alpha off by a few 1e-6 from the rounding of sigma"),
     Row("alpha.float32", 5e-6, "as rgb"),
-    Row("depth.float32.relative", 3e-5, "a quotient of two such sums, both small at the faint edge of a splat"),
+    Row("depth.float32.relative", 3e-5, "a quotient of two such sums, both small at the transparent edge of a splat"),
     Row("rgb.float32_8192", 5e-4, "a mean near pixel 8192 is rounded to 2e-4 px in float32; slopes are up to 1 / px"),
     Row("alpha.float32_8192", 5e-4, "as rgb"),
     Row("depth.float32_8192.relative", 3e-5, "as in smaller images: a splat's depth doesn't depend on its place"),
@@ -61,13 +61,13 @@ TABLE = (
     Row("gradient.second_order", 1e-5, "what a linear step of 2e-4 leaves out: its square times curvatures up to 100"),
     Row("oracle_db", 70.0, "whole image, threshold pixels included: one step in 1 of 5,000 at every pixel"),
     Row("motion_vector", 2e-3, "pixels; a displacement of 30, stored and blended in float32, over a sum of weights"),
-    Row("hammer.growth", 61.0, "MiB that 16 threads keep; a frame lost each time would be gigabytes"),
+    Row("stress.growth", 61.0, "MiB that 16 threads keep; a frame lost each time would be gigabytes"),
     Row("kernel_coverage", 95.0, "per cent of the kernels' lines; what is left needs the compiler"),
     # losses
     Row("ssim.float32", 1e-5, "variances are differences of blurred squares; torch blurs in another order"),
     Row("ssim.float64", 1e-12, "as ssim.float32"),
     Row("psnr.relative", 1e-6, "torchmetrics adds in float32"),
-    Row("flip.relative", 1e-5, "the same program; in the rendering it is given, the last bits may differ"),
+    Row("flip.relative", 1e-5, "the same program; the last bits of its input may differ"),
     Row("loss_gradient", 1e-7, "central differences with steps of 1e-7 and 1e-6 of a loss of size 1"),
     # the deformation network
     Row("skinning_gradient", 2e-7, "central differences with a step of 1e-6: 1e-13 / 1e-6; relative if above 1"),
@@ -85,7 +85,7 @@ TABLE = (
     ),
     Row("stored_pose", 0.02, "of a pixel; 16 bits over a motion of hundreds of pixels, and float32 arithmetic"),
     Row("fitted_beside_others", 1e-6, "float32 positions of size 1; how products round depends on how many there are"),
-    Row("between_samples.factor", 2.0, "times a promise made at samples: between them a cubic is off by as much again"),
+    Row("between_samples.factor", 2.0, "times a bound at samples: between them a cubic's error may double"),
     Row("int8.relative", 0.2, "of the largest motion; 8 bits are 0.4 % of a range, and layers multiply it"),
     Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),
     Row("cubic_between", 1e-5, "fourth derivative 1,296 · h⁴ · 3/128 with h = 1/64, more at the ends"),
@@ -94,23 +94,25 @@ TABLE = (
     Row("served_frame", 1e-3, "of a float pixel; onnxruntime's exponentials and products are not torch's to the bit"),
     Row("served_frame.8bit", 0.756, "of 255; as served_frame, and half a step of 8 bits"),
     # stability: made cases, docs/stability.md
-    Row(
-        "stability.accepted_db", 50.0, "what the export promises by default; a model let through must keep it anywhere"
-    ),
+    Row("stability.accepted_db", 50.0, "the export's default bound, which accepted models must keep"),
     Row(
         "stability.predicted",
         2.0,
         "a first-order bound, each layer's error measured once; roundings of the sum of deltas come on top",
     ),
-    Row("stability.spectral_norm.relative", 1e-12, "a root of a cubic in float64, of matrices whose entries are alike"),
-    Row("stability.none", 0.0, "a count of what must not be there"),
+    Row(
+        "stability.spectral_norm.relative",
+        1e-12,
+        "a root of a cubic in float64, of matrices with entries of similar size",
+    ),
+    Row("stability.none", 0.0, "a count of pixels that must be 0"),
     Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
     Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
     Row("export.float32_db", 90.0, "worst frame, float32 against float64: at a few pixels a splat is at its cut-off"),
     Row("pruning.other_times_db", 2.0, "a quarter more error at times other than the selection times of pruning"),
     # files of other programs
     Row("splat_values", 3e-6, "float32 logarithms and logits of size 10, back through exp"),
-    Row("splat_file_db", 60.0, "stored as float32: what is called lossless"),
+    Row("splat_file_db", 60.0, "stored as float32: lossless"),
     Row("quantised_splat_file_db", 45.0, "bytes of color and opacity, 8 to 16 bits of everything else: lossy"),
     Row("stored_frame", 1e-4, "16 bits over a motion of half the scene, relative to the scene"),
     Row("spz_position", 3e-4, "scene units; 12 fractional bits"),
@@ -122,16 +124,20 @@ TABLE = (
     ),
     Row("damaged_file.megabytes", 8.0, "beside twice the sound file's: what the allocator keeps from call to call"),
     Row("import.network", 1e-5, "a network of 8 layers in float32, its sums in another order"),
-    Row("import.mean_over_time", 2e-3, "a mean over 41 times against one over 401 of what bends at 12 nodes of time"),
+    Row(
+        "import.mean_over_time",
+        2e-3,
+        "a mean over 41 times against one over 401 of a piecewise linear function of 12 nodes",
+    ),
     Row("visionary.relative", 2e-5, "products of float32 rotations and scales, relative to the largest covariance"),
     # datasets
     Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
     Row("composite_of_8bit", 1.001 / 255, "half a step of color and half a step of alpha, each rounded once"),
     Row("video_color", 4.0, "of 255, even colors: YCbCr has 219 steps for 255, and is rounded on both ways"),
-    Row("video_picture.mean", 1.0, "of 255, waves: as video_color, on average; FFmpeg's fast way is 1.4 to 2 off"),
+    Row("video_image.mean", 1.0, "of 255, waves: as video_color, on average; FFmpeg's fast way is 1.4 to 2 off"),
     Row("ray_hit", 1e-3, "scene units; a ray stops 2e-4 before a surface, earlier in a bent one or along a wall"),
     Row("material_point", 1e-6, "scene units; trajectories are written with 7 digits"),
-    Row("picture_offset", 0.1, "pixels; estimated from colors at 96×96, where half a pixel would be a wrong centre"),
+    Row("image_offset", 0.1, "pixels; estimated from colors at 96×96, where half a pixel would be a wrong centre"),
     Row("dot_centroid", 0.05, "pixels; a dot of 2 pixels in 8 bits, stretched unevenly over its width by the lens"),
     Row(
         "silent_places",

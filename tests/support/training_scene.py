@@ -66,7 +66,7 @@ def small_config(**changes: Any) -> TrainConfig:
 
 
 def parameter_groups(gaussians: CanonicalGaussians) -> list[ParamGroup]:
-    """A group of its own for each attribute, all with one rate."""
+    """One group per attribute, all with one rate."""
     return [ParamGroup(name, [p], constant(1e-3), "static") for name, p in gaussians.named_parameters()]
 
 
@@ -100,7 +100,7 @@ def _narrow(layer: LayerConfig) -> LayerConfig:
 
 
 def shrunk(config: TrainConfig) -> TrainConfig:
-    """The same system on few Gaussians and in few steps, narrow, with most of its steps after the static phase."""
+    """The same system with few Gaussians, few steps and narrow layers; most steps are after the static phase."""
     support = config.model.support
     model = dataclasses.replace(
         config.model,
@@ -115,7 +115,7 @@ def shrunk(config: TrainConfig) -> TrainConfig:
 
 
 def splatting(trainer: Trainer) -> GaussianSplatting:
-    """The system of a trainer, which is one of Gaussians."""
+    """The system of a trainer, as `GaussianSplatting`."""
     assert isinstance(trainer.system, GaussianSplatting)
     return trainer.system
 
@@ -152,7 +152,7 @@ def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def state_of(run: Path) -> dict[str, Any]:
-    """All that is in its checkpoint but the seconds, by place."""
+    """All values of its checkpoint but the seconds, by path."""
     state = _flat(torch.load(run / "checkpoint.pt", weights_only=True))
     return {name: value for name, value in state.items() if name != "/seconds"}
 

@@ -1,4 +1,4 @@
-"""What the tests of training share."""
+"""Shared settings of the tests of training."""
 
 from pathlib import Path
 
@@ -16,5 +16,5 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of a tiny run."""
+    """Skip plots, which take longer than the rest of a tiny run."""
     monkeypatch.setattr(run_module, "draw_curve", lambda run: None)

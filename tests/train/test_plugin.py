@@ -38,7 +38,7 @@ pytestmark = pytest.mark.slow
 
 
 def run(module: str, *arguments: object, code: int = 0) -> str:
-    """What a command prints, in a process of its own that knows of no plugin but those it is given."""
+    """The output of a command in a subprocess with only the given plugins."""
     environment = {name: value for name, value in os.environ.items() if name != "MSDGS_PLUGINS"}
     done = subprocess.run(
         [sys.executable, "-m", module, *map(str, arguments)],
@@ -95,7 +95,7 @@ def test_its_layers_stand_beside_others_on_the_command_line(data: Path, tmp_path
     assert [layer["kind"] for layer in stored] == ["spline", "fourier", "mlp"]
 
 
-def test_without_the_plugin_it_is_named_what_is_missing(data: Path, trained: Path, tmp_path: Path) -> None:
+def test_without_the_plugin_the_missing_part_is_named(data: Path, trained: Path, tmp_path: Path) -> None:
     fit = ["fit", data, tmp_path / "run"]
     assert "--plugin MODULE, got sparse-fourier" in run("msdgs_train", *fit, "--preset", "sparse-fourier", code=2)
     assert "--plugin MODULE, got fourier" in run("msdgs_train", *fit, "--layers", "fourier", code=2)
@@ -129,7 +129,7 @@ def test_it_is_exported_and_served(trained: Path, exported: Path) -> None:
 
 
 def test_the_page_shows_it(trained: Path, exported: Path) -> None:
-    """In a browser, through a camera of the scene: as the service renders it, and as the model does."""
+    """The page's image from a camera of the scene equals those of the service and of the model."""
     with serving(exported) as client, chromium() as browser, browser.new_page() as page:
         asked = bodies(page)
         page.goto(f"{client.base_url}/#scene=plugin&t=0.37&camera=0")
@@ -145,7 +145,7 @@ def test_the_page_shows_it(trained: Path, exported: Path) -> None:
 
 
 def test_the_documented_code_is_the_example() -> None:
-    """All of it, in the order layer, export, system; the other tests of this file run it."""
+    """All code in the order layer, export, system; the other tests of this file run it."""
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)\n```", page, re.DOTALL)
     layer, export, system = blocks

@@ -14,7 +14,7 @@ from msdgs_train.gaussians.model_file import SceneInfo
 
 @dataclass(frozen=True)
 class Loss:
-    """Something of all Gaussians of a run that a scene file can't hold, and the PSNR that this costs."""
+    """A property of a run's Gaussians that a scene file can't hold, and the PSNR that this costs."""
 
     rule: str
     what: str

@@ -36,13 +36,13 @@ class Splats:
         return len(self.gaussians)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """All that is in it, by name, as `from_arrays` takes it."""
+        """The fields by name, for `from_arrays`."""
         own = {name: np.array(value) for name, value in vars(self).items() if name != "gaussians" and value is not None}
         return {**vars(self.gaussians), **own}
 
     @staticmethod
     def from_arrays(arrays: dict[str, np.ndarray]) -> "Splats":
-        """Splats that another process has read. Raises `InvalidInput` for arrays that are none."""
+        """The splats of `to_arrays`, read in another process. Raises `InvalidInput` for invalid arrays."""
         names = [field.name for field in fields(Gaussians)]
         gaussians = Gaussians(*(arrays[name] for name in names)).validate()
         return Splats(gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), arrays.get("quat_lengths"))

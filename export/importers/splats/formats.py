@@ -19,7 +19,7 @@ from export.importers.splats.spz import read_spz
 READERS: dict[str, Callable[[Path], Splats]] = {
     "ply": read_ply,
     "spz": read_spz,
-    "spz:unturned": partial(read_spz, turned=False),
+    "spz:unturned": partial(read_spz, converted=False),
     "sog": read_sog,
     "splat": read_splat,
     "ksplat": read_ksplat,
@@ -27,7 +27,7 @@ READERS: dict[str, Callable[[Path], Splats]] = {
 """Readers by name of the format."""
 
 UNPACKED = {"spz", "spz:unturned", "sog", "ksplat"}
-"""Those that native code unpacks, in a process of its own; the others are numbers as they are."""
+"""Formats that native code decompresses, in a subprocess; the others are read by NumPy."""
 
 
 def splat_format(path: Path) -> str | None:
@@ -66,5 +66,5 @@ def read_splats(path: Path, file_format: str | None = None) -> Splats:
 
 
 def read_arrays(path: Path, file_format: str) -> dict[str, np.ndarray]:
-    """What a reader returns, as arrays. Raises `ImportFailed`."""
+    """The result of a reader as arrays. Raises `ImportFailed`."""
     return READERS[file_format](path).to_arrays()

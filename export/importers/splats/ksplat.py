@@ -12,7 +12,7 @@ from export.importers.splats.ply import read_ply
 def read_ksplat(file: Path) -> Splats:
     """The Gaussians of a `.ksplat` file of any compression level.
 
-    Raises `ImportFailed` for one that is damaged, and where gaussforge isn't installed.
+    Raises `ImportFailed` for a damaged file, or if gaussforge isn't installed.
     """
     if importlib.util.find_spec("gaussforge") is None:
         raise ImportFailed(file, "needs gaussforge to be read: pip install '.[ksplat]'")

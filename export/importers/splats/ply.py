@@ -41,7 +41,7 @@ def read_ply(file: Path) -> Splats:
 class _Element(NamedTuple):
     name: str
     count: int
-    bytes_a_row: int
+    bytes_per_row: int
     columns: int
 
 
@@ -56,7 +56,7 @@ def _check_sizes(file: Path) -> None:
     binary = any(re.match(r"format\s+binary", line) for line in lines)
     body = file.stat().st_size - end.end()
     for element in _elements(file, lines):
-        needed = element.count * (element.bytes_a_row if binary else MIN_TEXT_BYTES * element.columns) - (not binary)
+        needed = element.count * (element.bytes_per_row if binary else MIN_TEXT_BYTES * element.columns) - (not binary)
         if needed > body:
             raise cut_off(file, f"{element.count:,} rows of `{element.name}`", needed, body)
         body -= needed
@@ -74,7 +74,7 @@ def _elements(file: Path, lines: list[str]) -> list[_Element]:
             if not elements or len(words) != 3 or words[1] not in _SIZES:
                 raise ImportFailed(file, f"has a property that no splat has: {line[:80]!r}")
             last = elements[-1]
-            elements[-1] = last._replace(bytes_a_row=last.bytes_a_row + _SIZES[words[1]], columns=last.columns + 1)
+            elements[-1] = last._replace(bytes_per_row=last.bytes_per_row + _SIZES[words[1]], columns=last.columns + 1)
     for element in elements:
         if element.count and not element.columns:
             raise ImportFailed(file, f"has {element.count:,} rows of `{element.name}` without properties")
@@ -183,6 +183,6 @@ class _Columns:
 
     def _column(self, name: str) -> np.ndarray:
         if not self.has(name):
-            what = "a cloud of points without Gaussians" if not self.has("opacity") else "not a whole splat"
-            raise ImportFailed(self._file, f"`{self._element.name}` has no property `{name}`; it is {what}")
+            content = "a cloud of points without Gaussians" if not self.has("opacity") else "not a whole splat"
+            raise ImportFailed(self._file, f"`{self._element.name}` has no property `{name}`; it is {content}")
         return np.asarray(self._element.data[name])

@@ -43,8 +43,8 @@ class Header(NamedTuple):
         return [self.count * each for each in (9, 1, 3, 3, rotation, rest)]
 
 
-def read_spz(file: Path, *, turned: bool = True) -> Splats:
-    """Read an SPZ file, with its axes converted to those of a PLY if `turned`.
+def read_spz(file: Path, *, converted: bool = True) -> Splats:
+    """Read an SPZ file, with its axes converted to those of a PLY if `converted`.
 
     Raises `ImportFailed` for other versions, SH above degree 3 and cut-off files.
     """
@@ -56,7 +56,7 @@ def read_spz(file: Path, *, turned: bool = True) -> Splats:
     else:
         raise ImportFailed(file, "isn't an SPZ file: it begins neither as gzip nor with NGSP")
     parts = _streams(file, header, contents) if header.version == 4 else _parts(file, header, body)
-    return _decoded(file, header, parts, turned)
+    return _decoded(file, header, parts, converted)
 
 
 def _header(file: Path, start: bytes) -> Header:
@@ -142,7 +142,7 @@ def _zstd(file: Path, number: int, packed: bytes, size: int) -> bytes:
     return bytes(found)
 
 
-def _decoded(file: Path, header: Header, parts: list[bytes], turned: bool) -> Splats:
+def _decoded(file: Path, header: Header, parts: list[bytes], converted: bool) -> Splats:
     positions, opacities, colors, scales, rotations, rest = (np.frombuffer(part, np.uint8) for part in parts)
     n = header.count
     low, middle, high = positions.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
@@ -150,7 +150,7 @@ def _decoded(file: Path, header: Header, parts: list[bytes], turned: bool) -> Sp
     dc = (colors.reshape(n, 1, 3) / 255 - 0.5) / COLOR_SCALE
     sh = np.concatenate([dc, (rest.reshape(n, -1, 3).astype(np.float64) - 128) / 128], axis=1)
     means, quats = fixed / 2**header.fractional_bits, _quats(header, rotations)
-    if turned:
+    if converted:
         means, quats, sh = from_right_up_back(means, quats, sh)
     return splats(
         file,

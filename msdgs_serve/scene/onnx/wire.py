@@ -30,8 +30,8 @@ class Kind(Enum):
 
     INTEGER = "int64"
     ENUM = "number from 0 to 2³¹ − 1"
-    NAME = "printable text of at max_count 200 bytes"
-    TEXT = "UTF-8 text of at max_count 1 MiB"
+    NAME = "printable text of at most 200 bytes"
+    TEXT = "UTF-8 text of at most 1 MiB"
     BYTES = "bytes"
     SKIPPED = "skipped"  # of any wire type; never passed on
     REJECTED = "rejected"

@@ -1,4 +1,4 @@
-"""A small data set of each layout, written from cameras that are known, as its format says that they are stored."""
+"""Small datasets of each layout, written from known cameras in the conventions of the format."""
 
 import json
 import math
@@ -30,7 +30,7 @@ LENSES = {
 
 
 class Pose(NamedTuple):
-    """A camera in the world: its turn as a unit quaternion wxyz, from OpenCV camera axes, and its position [3]."""
+    """A camera: its rotation as a unit quaternion wxyz, camera to world in OpenCV axes, and its position [3]."""
 
     q: np.ndarray
     position: np.ndarray
@@ -57,14 +57,14 @@ def flat(color: Any, lens: Lens, reduction: int = 1) -> np.ndarray:
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """With its folders; an image that is there stays."""
+    """Write an image and create its folder; an existing image is kept."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         write_png(path, image)
 
 
 def points_of(scene: SceneData) -> tuple[list[list[float]], np.ndarray]:
-    """Sparse points and their colors, both of which there must be."""
+    """The sparse points and their colors, which must exist."""
     assert scene.points is not None
     assert scene.point_colors is not None
     return scene.points.tolist(), scene.point_colors
@@ -151,7 +151,7 @@ def write_neu3d(
     count: int = 2,
     below: str = "",
 ) -> Path:
-    """Cameras as folders of images."""
+    """Write cameras as folders of images."""
     np.save(folder / "poses_bounds.npy", poses_bounds(len(names), lens))
     for camera, name in enumerate(names):
         for index in range(count):
@@ -163,7 +163,7 @@ def write_neu3d(
 def write_neu3d_videos(
     folder: Path, lens: Lens = SMALL, reduction: int = 1, counts: tuple[int, ...] = (7, 7, 7)
 ) -> Path:
-    """Cameras as videos of so many frames each."""
+    """Write cameras as videos of so many frames each."""
     np.save(folder / "poses_bounds.npy", poses_bounds(len(counts), lens))
     for camera, count in enumerate(counts):
         images = [flat(neu3d_color(camera, index), lens, reduction) for index in range(count)]
@@ -172,7 +172,7 @@ def write_neu3d_videos(
 
 
 def write_video(path: Path, images: list[np.ndarray], colorspace: str | None = None, **options: str) -> None:
-    """Without loss but for chroma at half the size; later frames are stored before earlier ones, as usual."""
+    """Write a video, lossless except for chroma at half the size, with B-frames."""
     with av.open(str(path), "w", options=options) as container:
         stream: Any = container.add_stream("libx264", rate=30, options={"crf": "0"})
         stream.height, stream.width, _ = images[0].shape
@@ -187,14 +187,14 @@ def write_video(path: Path, images: list[np.ndarray], colorspace: str | None = N
         container.mux(stream.encode())
 
 
-# HyperNeRF: nerfies' cameras, world to camera, in a world that `scene.json` moves and scales
+# HyperNeRF: nerfies' cameras, world to camera; `scene.json` translates and scales the world
 
 HYPERNERF_IDS = ["000000", "000001", "000002", "000003"]
 HYPERNERF_SCENE = {"scale": 0.25, "center": [0.5, -1.0, 2.0], "near": 0.1, "far": 3.0}
 
 
 def hypernerf_json(lens: Lens = LENSES["pinhole"]) -> dict[str, Any]:
-    """What each file says. The capture alternates between two cameras, as vrig scenes do."""
+    """The contents of each file. The capture alternates between two cameras, as vrig scenes do."""
     ids = HYPERNERF_IDS
     numbers = {
         id_: {"time_id": 5 * k, "warp_id": 99, "appearance_id": 0, "camera_id": k % 2} for k, id_ in enumerate(ids)
@@ -222,7 +222,7 @@ def hypernerf_json(lens: Lens = LENSES["pinhole"]) -> dict[str, Any]:
 def write_hypernerf(
     folder: Path, lens: Lens = LENSES["pinhole"], *copies: int, files: dict[str, Any] | None = None
 ) -> Path:
-    """Images in copies that are reduced by each of `copies`; one shows its number."""
+    """Write images downscaled by each of `copies`; an image shows its number."""
     for name, content in (files or hypernerf_json(lens)).items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(json.dumps(content))
@@ -247,7 +247,7 @@ COLMAP_NAMES = ("a_0.png", "a_1.png", "a_2.png")
 
 
 class ColmapModel(NamedTuple):
-    """What is in the three files: a camera 7, an image for each name, and two points."""
+    """The contents of the three files: camera 7, an image for each name, and two points."""
 
     lens: Lens
     names: tuple[str, ...]
@@ -270,12 +270,12 @@ def write_colmap(
     place: str = "0",
     poses: list[tuple[float, ...]] | None = None,
 ) -> Path:
-    """The second image has seen nothing."""
+    """Write a sparse model and its images; the second image has no observations."""
     sparse = folder / "sparse" / place
     sparse.mkdir(parents=True, exist_ok=True)
     known = [pose(index) for index in range(len(names))]
-    turned = [(0.98 * each.q * [1, -1, -1, -1], -each.rotation.T @ each.position) for each in known]
-    model = ColmapModel(lens, names, poses or [(*q, *t) for q, t in turned])
+    inverses = [(0.98 * each.q * [1, -1, -1, -1], -each.rotation.T @ each.position) for each in known]
+    model = ColmapModel(lens, names, poses or [(*q, *t) for q, t in inverses])
     {"bin": write_colmap_binary, "txt": write_colmap_text}[ending](sparse, model)
     for name in names:
         write_image(folder / "images" / name, flat(0, lens, reduction))
@@ -311,7 +311,7 @@ def write_colmap_text(sparse: Path, model: ColmapModel) -> None:
 
 
 class Layout(NamedTuple):
-    """A way to write a data set: with a lens, and images that are so many times smaller than its files say."""
+    """A writer of datasets, with a lens and with images that are smaller than stated by a factor."""
 
     write: Callable[[Path, Lens, int], Path]
     lens: Lens

@@ -1,4 +1,4 @@
-"""What a lens does to points, by the formulas as OpenCV's documentation prints them, and images of dots."""
+"""Lens distortion of points by the formulas of OpenCV's documentation, and images of dots."""
 
 import math
 from typing import NamedTuple
@@ -52,7 +52,7 @@ class Lens(NamedTuple):
 
 
 def frame_pixels(frame: Frame, points: np.ndarray) -> np.ndarray:
-    """[N, 2] where a frame's image, as stored, shows [N, 3] points of the world; `size` not reduced."""
+    """[N, 2] pixels of [N, 3] world points in the stored image of a frame that isn't downscaled."""
     camera, local = frame.camera, points @ frame.camera.world_to_camera[:3, :3].T
     x, y, z = (local + frame.camera.world_to_camera[:3, 3]).T
     x, y = x / z, y / z
@@ -73,7 +73,7 @@ def image_of_dots(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def centroids(rgba: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """[N, 2] of the light in a window around each of [N, 2] pixels."""
+    """[N, 2] centroids of the brightness in a window around each of [N, 2] pixels."""
     found = []
     for u, v in near:
         left, top = int(u) - WINDOW, int(v) - WINDOW

@@ -1,4 +1,4 @@
-"""What is wrong with a data set is said by the name of the file, the field, what was expected, and what came."""
+"""Errors of datasets name the file, the field, the expected and the given value."""
 
 import json
 import math
@@ -37,7 +37,7 @@ MATRIX = np.array(layouts.opengl_matrix(layouts.pose(1)))
 
 
 def put(value: Any, *path: Any) -> Change:
-    """Of JSON or an array: another value at that place, or none."""
+    """A change of JSON or of an array: another value at some path, or none."""
 
     def change(content: Any) -> Any:
         at = content
@@ -182,7 +182,7 @@ WRONG = [
 
 
 def changed(folder: Path, file: str, change: Change) -> Path:
-    """A data set of the layout that `file` begins with, and that file of it changed."""
+    """A dataset of the layout that `file` begins with, with this file changed."""
     layout, _, name = file.partition("/")
     WRITE[layout](folder)
     path = folder / "sparse" / "0" / name if layout == "colmap" else folder / name
@@ -198,7 +198,7 @@ def changed(folder: Path, file: str, change: Change) -> Path:
 @pytest.mark.parametrize(
     ("file", "change", "field", "problem"), WRONG, ids=[f"{row[0]}-{row[2]}-{row[3][:30]}" for row in WRONG]
 )
-def test_what_is_wrong_is_named(tmp_path: Path, file: str, change: Change, field: str, problem: str):
+def test_invalid_values_are_named(tmp_path: Path, file: str, change: Change, field: str, problem: str):
     path = changed(tmp_path, file, change)
     with pytest.raises(DatasetInvalid) as caught:
         load_scene(tmp_path)
@@ -294,7 +294,7 @@ SPOILED: list[tuple[str, Edit, str]] = [
 
 
 @pytest.mark.parametrize(("layout", "edit", "message"), SPOILED, ids=[f"{row[0]}-{row[2][:30]}" for row in SPOILED])
-def test_what_is_missing_or_of_another_kind_is_named(tmp_path: Path, layout: str, edit: Edit, message: str):
+def test_missing_files_and_invalid_types_are_named(tmp_path: Path, layout: str, edit: Edit, message: str):
     edit(WRITE[layout](tmp_path))
     with pytest.raises(DatasetInvalid, match=message):
         load_scene(tmp_path)
@@ -311,8 +311,8 @@ def test_folders_that_are_no_dataset(tmp_path: Path):
 
 
 @pytest.mark.parametrize("layout", sorted(WRITE.keys() - {"neu3d-videos"}))
-def test_an_image_that_is_none_or_cut_off_is_refused(tmp_path: Path, layout: str):
-    """Where its header says nothing, before training; where its pixels are lacking, when they are read."""
+def test_an_invalid_or_truncated_image_is_refused(tmp_path: Path, layout: str):
+    """An invalid header is found before training, missing pixels when they are read."""
     folder = WRITE[layout](tmp_path)
     path = load_scene(folder).splits["train"][0].image_path
     noise = np.random.default_rng(0).integers(0, 256, size=(240, 320, 3), dtype=np.uint8)

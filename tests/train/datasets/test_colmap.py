@@ -44,7 +44,7 @@ def test_names_without_a_time_are_named(tmp_path: Path):
         load_scene(folder)
 
 
-def test_without_points_the_cameras_say_how_large_the_scene_is(tmp_path: Path):
+def test_without_points_the_cameras_determine_the_scene_size(tmp_path: Path):
     folder = write_colmap(tmp_path, names=("0.png",), ending="txt")
     (folder / "sparse" / "0" / "points3D.txt").write_text("# none\n")
     scene = load_scene(folder)
@@ -74,7 +74,7 @@ def test_a_binary_file_that_is_cut_off_is_refused_wherever_the_cut_is(tmp_path: 
     ],
     ids=["nan", "inf", "zero"],
 )
-def test_poses_that_are_none_are_refused(tmp_path: Path, ending: str, pose: tuple[float, ...], message: str):
+def test_invalid_poses_are_refused(tmp_path: Path, ending: str, pose: tuple[float, ...], message: str):
     folder = write_colmap(tmp_path, names=("0.png",), ending=ending, poses=[pose])
     with pytest.raises(DatasetInvalid, match=rf"images\.{ending}: `images\[0\.png\]\.{message}"):
         load_scene(folder)

@@ -1,4 +1,4 @@
-"""Alpha and size: what images become when they are read, reduced and laid over a background."""
+"""Images: reading, downscaling and compositing over a background."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def image(seed: int, width: int, height: int) -> np.ndarray:
 
 
 def area_mean_by_loops(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Each new pixel, by going through all old ones that it overlaps; [height, width, 4] float64."""
+    """The area mean by loops over all overlapping pixels; [height, width, 4] float64."""
     old_height, old_width, _ = rgba.shape
     result = np.zeros((height, width, 4))
     for i in range(height):
@@ -48,7 +48,7 @@ def test_the_same_size_changes_nothing():
 
 
 def test_reducing_and_compositing_commute():
-    """As light does: straight colors averaged without their alpha would give a dark rim."""
+    """Averaging straight colors without their alpha would give a dark rim."""
     rgba = image(3, 40, 20)
     background = (0.9, 0.3, 0.1)
     first_laid = composite(rgba, background).reshape(10, 2, 20, 2, 3).mean(axis=(1, 3))

@@ -1,4 +1,4 @@
-"""What holds of every layout: where its cameras look, how images are reduced and straightened, and how large it is."""
+"""Laws of every layout: camera axes, downscaling, undistortion and scene size."""
 
 import re
 from collections.abc import Callable
@@ -43,7 +43,7 @@ def is_pinhole(lens: Lens) -> bool:
 @of_all
 @pytest.mark.parametrize("reduction", [1, 2], ids=["whole", "half"])
 def test_points_land_where_the_published_formula_puts_them(tmp_path: Path, layout: Layout, reduction: int):
-    """Also on copies of half the size that the files speak of."""
+    """Also for copies of half the stated size."""
     lens, frames = layout.lens, frames_of(load_scene(layout.write(tmp_path, layout.lens, reduction)))
     assert len(frames) >= 2
     for frame in frames:
@@ -56,7 +56,7 @@ def test_points_land_where_the_published_formula_puts_them(tmp_path: Path, layou
 @of_images
 @pytest.mark.parametrize("size", [None, 160])
 def test_dots_lie_at_their_pinhole_projections_after_loading(tmp_path: Path, layout: Layout, size: int | None):
-    """A flipped axis, rows taken for columns, or a lens that is left in or taken out twice, would move them."""
+    """A flipped axis, a transposed rotation, or distortion that is kept or removed twice would move them."""
     lens, folder = layout.lens, layout.write(tmp_path, layout.lens, 1)
     dots = image_of_dots(lens.pixels(lens.grid()), lens.width, lens.height)
     write_png(load_scene(folder).splits["train"][0].image_path, dots)
@@ -115,12 +115,12 @@ def test_a_scene_without_times_or_of_one_time_is_static(tmp_path: Path, write: C
 
 
 def cameras_around(target: tuple[float, float, float]) -> list[Camera]:
-    """On a ring, 4 from the target, at which all of them look."""
+    """Cameras on a ring of radius 4 that look at the target."""
     poses = [orbit(np.array(target), 4.0, azimuth, 37.0, np.array([0.0, 0.0, 1.0])) for azimuth in range(0, 360, 30)]
     return [Camera.from_fov(pose, 20, 10, 40.0) for pose in poses]
 
 
-def test_few_points_that_are_far_off_count_for_nothing():
+def test_a_few_outlying_points_have_no_effect():
     points = np.random.default_rng(0).uniform(-1, 1, size=(1000, 3))
     clean = scene_half_size(points, cameras_around((0, 0, 0)))
     points[:5] *= 1e6
@@ -133,7 +133,7 @@ def test_without_points_it_is_the_distance_to_where_all_cameras_look():
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_parallel_axes_meet_nowhere(count: int):
+def test_parallel_axes_have_no_intersection(count: int):
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = 2.0 * np.arange(count)
     extent = scene_half_size(None, [Camera.from_fov(pose, 20, 10, 40.0) for pose in poses])

@@ -10,7 +10,7 @@ from msdgs_train.datasets import load_scene
 from tests.train.datasets.layouts import HYPERNERF_IDS, HYPERNERF_SCENE, LENSES, hypernerf_json, write_hypernerf
 
 
-def test_the_key_of_nerfies_is_understood(tmp_path: Path):
+def test_the_key_of_nerfies_is_read(tmp_path: Path):
     files = hypernerf_json(LENSES["barrel"])
     for id_ in HYPERNERF_IDS:
         files[f"camera/{id_}.json"]["tangential"] = files[f"camera/{id_}.json"].pop("tangential_distortion")
@@ -32,7 +32,7 @@ def test_splits_times_and_pixels(tmp_path: Path):
     assert (scene.splits["test"][0].load_rgba()[..., :3] == 1).all()
 
 
-def test_warp_ids_serve_where_there_are_no_time_ids(tmp_path: Path):
+def test_warp_ids_are_used_without_time_ids(tmp_path: Path):
     files = hypernerf_json()
     files["metadata.json"] = {id_: {"warp_id": 3 * k + 3, "camera_id": 0} for k, id_ in enumerate(HYPERNERF_IDS)}
     scene = load_scene(write_hypernerf(tmp_path, files=files))

@@ -23,7 +23,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def image(camera: int, index: int) -> np.ndarray:
-    """What a camera's frame shows, of the size that videos here have."""
+    """The image of a camera's frame, of the size of these videos."""
     return layouts.flat(layouts.neu3d_color(camera, index), SMALL)
 
 
@@ -66,7 +66,7 @@ def test_a_camera_may_be_left_out_and_numbers_need_no_zeros(tmp_path: Path):
 
 
 def waves(width: int, height: int) -> np.ndarray:
-    """Color changes downwards only: where chroma lies across is another matter in H.264 than in FFmpeg's encoding."""
+    """Color changes vertically only, since H.264 and FFmpeg's encoder differ in the horizontal position of chroma."""
     y, x = np.mgrid[0:height, 0:width]
     grey = 128 + 40 * np.sin(x / 9) * np.cos(y / 7)
     return np.stack([grey + 40 * np.sin(y / 6), grey, grey + 40 * np.cos(y / 5)], axis=-1).astype(np.uint8)
@@ -81,7 +81,7 @@ def test_size_reduces_a_video_as_it_does_images(tmp_path: Path, size: int):
     for frame, drawn in zip(load_scene(tmp_path, size).splits["train"], drawings, strict=True):
         rgba = np.dstack([drawn, np.full((120, 160), 255, np.uint8)])
         want = resize_area(rgba, size, round(size * 0.75))[..., :3].astype(float)
-        assert np.abs(frame.load_rgba()[..., :3] - want).mean() < tolerance("video_picture.mean")
+        assert np.abs(frame.load_rgba()[..., :3] - want).mean() < tolerance("video_image.mean")
 
 
 def test_the_color_matrix_is_the_one_that_the_video_names(tmp_path: Path):
@@ -119,7 +119,7 @@ def test_a_cache_that_cant_be_written_is_named(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_video_that_is_cut_off_is_refused_and_leaves_nothing(tmp_path: Path, cache: Path):
-    """The header comes first and says how many frames there should be."""
+    """The header at the start of the file has the number of frames."""
     np.save(tmp_path / "poses_bounds.npy", poses_bounds(2))
     noise = np.random.default_rng(0).integers(0, 256, size=(COUNT, 96, 128, 3), dtype=np.uint8)
     for name in ("cam00", "cam01"):

@@ -1,4 +1,4 @@
-"""The synthetic scene: its images show what its known motion says, and its folder is whole or not there."""
+"""The synthetic scene: its images agree with its known motion, and its folder is complete or missing."""
 
 import json
 from dataclasses import replace
@@ -97,7 +97,7 @@ def share_that_fits(errors: list[np.ndarray]) -> float:
 
 @pytest.mark.slow
 def test_images_show_material_points_where_the_motion_puts_them(scene: SceneData):
-    """Those that do not fit lie at the edge of a thing. Wrong axes or the wrong time fit half as well, by chance."""
+    """Points that don't fit are at edges of objects. With wrong axes or times half as many fit, by chance."""
     frames = [*scene.splits["train"], *scene.splits["test"]]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     assert share_that_fits([color_errors(frame) for frame in frames]) > 0.75
@@ -113,19 +113,19 @@ def test_images_show_material_points_where_the_motion_puts_them(scene: SceneData
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1])
-def test_images_are_not_shifted_by_part_of_a_pixel(scene: SceneData, axis: int):
+def test_images_have_no_subpixel_offset(scene: SceneData, axis: int):
     shifts = np.linspace(-1, 1, 5)
     errors = [
         np.concatenate([color_errors(frame, shift=tuple(shift * np.eye(2)[axis])) for frame in scene.splits["train"]])
         for shift in shifts
     ]
     square, slope, _ = np.polyfit(shifts, np.mean(errors, axis=1), 2)
-    assert abs(-slope / (2 * square)) < tolerance("picture_offset")
+    assert abs(-slope / (2 * square)) < tolerance("image_offset")
 
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_every_material_point_stops_the_ray_to_it(scene: SceneData, name: str):
-    """The rays go through the inverse of the motion, the points through the motion itself."""
+    """Rays use the inverse of the motion, points the motion itself."""
     local = surface_points(name, 200)
     for frame in scene.splits["train"]:
         lengths, hits = distances_along_rays(frame, world_positions(name, local, frame.t))
@@ -133,7 +133,7 @@ def test_every_material_point_stops_the_ray_to_it(scene: SceneData, name: str):
         assert (np.abs(hits - lengths) < tolerance("ray_hit")).sum() > 20
 
 
-def test_several_things_move_and_two_stand_still():
+def test_several_objects_move_and_two_are_static():
     for name in OBJECTS:
         local = surface_points(name, 20)
         paths = np.stack([world_positions(name, local, t) for t in TIMES])
@@ -143,7 +143,7 @@ def test_several_things_move_and_two_stand_still():
 
 @pytest.mark.parametrize("name", MOVING)
 def test_motion_is_continuous(name: str):
-    """No jumps: steps of half the length are half as far, at contact with the ground too."""
+    """Halving the time step halves the displacement, also at contact with the ground."""
     local = surface_points(name, 20)
     farthest = [
         np.linalg.norm(np.diff([world_positions(name, local, t) for t in np.linspace(0, 1, n)], axis=0), axis=-1).max()
@@ -178,7 +178,7 @@ def test_the_ball_touches_the_ground_and_does_not_enter_it():
     assert lowest.max() > 0.4
 
 
-def test_things_do_not_pass_through_each_other():
+def test_objects_do_not_intersect():
     for t in TIMES:
         motion = motion_at(t)
         for name, other in combinations(MOVING, 2):
@@ -192,7 +192,7 @@ def test_things_do_not_pass_through_each_other():
             assert gaps.min() > 0, (name, other, t)
 
 
-def test_everything_lies_in_the_cube_that_training_begins_with(scene: SceneData):
+def test_everything_is_in_the_initial_cube_of_training(scene: SceneData):
     for name in OBJECTS:
         for t in TIMES:
             assert np.abs(world_positions(name, surface_points(name, 100), t)).max() < scene.scene_half_size
@@ -284,7 +284,7 @@ def test_an_empty_folder_is_filled_but_foreign_folders_and_files_are_not_replace
 
 
 @pytest.mark.parametrize("numbers", [{"size": 0}, {"size": 5000}, {"train_frames": 0}, {"test_frames": -1}])
-def test_numbers_that_make_no_dataset(tmp_path: Path, numbers: dict[str, Any]):
+def test_invalid_numbers_are_refused(tmp_path: Path, numbers: dict[str, Any]):
     with pytest.raises(InvalidInput) as caught:
         generate(tmp_path / "a", **numbers)
     assert caught.value.field in numbers

@@ -26,7 +26,7 @@ from tests.train.datasets.layouts import (
 
 
 def camera_with(folder: Path, frame: dict[str, float], **shared: float) -> Camera:
-    """Of the second frame, where the file says `shared` for all and the frame something of its own."""
+    """The camera of the second frame, given values for all frames, `shared`, and for this one."""
     content = {**dnerf_json(), **shared}
     content["frames"][1].update(frame)
     return load_scene(write_dnerf(folder, splits={"train": content})).splits["train"][1].camera
@@ -76,7 +76,7 @@ def test_intrinsics_of_a_frame_come_before_those_of_the_file_and_these_before_th
 
 
 def test_float_images_are_refused(tmp_path: Path):
-    """Their values would be scene-linear, and splats blend in the display's space."""
+    """They would be scene-linear, but splats are blended in display space."""
     content = dnerf_json(times=(0.0,))
     path = write_dnerf(tmp_path, splits={"train": content}) / "train" / "r_0.exr"
     writer = oiio.ImageOutput.create(str(path))
@@ -85,7 +85,7 @@ def test_float_images_are_refused(tmp_path: Path):
     writer.write_image(np.zeros((10, 20, 4), np.float32))
     writer.close()
     content["frames"][0]["file_path"] = "train/r_0.exr"
-    write_png(tmp_path / "train" / "r_0.exr.png", flat(0, CENTERED))  # the name as it is comes first
+    write_png(tmp_path / "train" / "r_0.exr.png", flat(0, CENTERED))  # the exact name is tried first
     with pytest.raises(DatasetInvalid, match="4 channels of float; 1 to 4 of 8 or 16 bits are supported"):
         load_scene(write_dnerf(tmp_path, splits={"train": content}))
 
@@ -102,7 +102,7 @@ def test_color_behind_transparent_pixels_does_not_bleed_into_undistorted_ones(tm
     assert (seen[:, :3] == [0, 0, 250]).all()
 
 
-def test_the_angle_serves_where_there_is_no_focal_length(tmp_path: Path):
+def test_the_angle_is_used_without_a_focal_length(tmp_path: Path):
     content = {"camera_angle_x": 0.8, "frames": nerfstudio_json(1)["frames"]}
     camera = load_scene(write_nerfstudio(tmp_path, content=content)).splits["train"][0].camera
     focal = 160 / math.tan(0.4)
@@ -132,7 +132,7 @@ def test_lists_of_file_names_make_the_splits(tmp_path: Path):
 def test_times_are_kept_even_outside_0_and_1(tmp_path: Path):
     content = nerfstudio_json(3)
     for frame, time in zip(content["frames"], [12.5, -3, 40], strict=True):
-        frame |= {"time": time, "mask_path": "masks/none.png"}  # masks are passed over
+        frame |= {"time": time, "mask_path": "masks/none.png"}  # masks are ignored
     scene = load_scene(write_nerfstudio(tmp_path, content=content))
     assert [frame.t for frame in scene.splits["test"] + scene.splits["train"]] == [12.5, -3.0, 40.0]
     assert scene.time_range == (-3.0, 40.0)

@@ -1,4 +1,4 @@
-"""The average of the last steps: of which steps, and that it is evaluated, shown, saved and resumed."""
+"""The average of the last steps: its weights, and that it is evaluated, shown, saved and resumed."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def _parameters(model: torch.nn.Module) -> list[np.ndarray]:
 
 
 def test_it_is_that_of_the_steps_after_density_control(data: Path) -> None:
-    """All of them weigh the same until there are that many, then older ones ever less."""
+    """Weights are equal for the first steps and decay exponentially after that."""
     trainer, seen = Trainer(CONFIG, load_scene(data)), []
     for step in range(1, STEPS + 1):
         trainer.step()
@@ -114,7 +114,7 @@ def test_with_fewer_steps_it_is_of_those_that_were_done_since(data: Path, tmp_pa
 
 
 @pytest.mark.parametrize("last", ["static", "windows", "density control"])
-def test_it_begins_when_gaussians_and_motions_stay_what_they_are(last: str) -> None:
+def test_it_starts_after_density_control_and_the_time_window(last: str) -> None:
     ends = {"static": 0.25, "windows": 0.25, "density control": 0.25, last: 0.5}
     config = CONFIG.updated(
         static_fraction=ends["static"],

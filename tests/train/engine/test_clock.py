@@ -18,7 +18,7 @@ STEPS, LIMIT, HELD_OUT, IMAGES = 16_000, 300.0, 40, 2
 @pytest.mark.parametrize("steps", [STEPS, 500])
 @pytest.mark.parametrize("evaluation", [0.0, 0.3])
 def test_it_spends_the_time_evenly_whatever_a_step_costs(steps: int, evaluation: float) -> None:
-    """Steps become eight times as slow while the schedule goes on, and every 500th is followed by an evaluation."""
+    """Steps become eight times slower during the schedule, and every 500th is followed by an evaluation."""
     clock, position, seconds, halfway = Clock(steps, LIMIT, HELD_OUT, 0), 1, 20.0, None
     for number in range(1, 10**6):
         cost = 0.01 if position < steps / 3 else 0.08
@@ -52,7 +52,7 @@ def test_a_run_that_has_no_time_left_ends_its_schedule(data: Path, tmp_path: Pat
 
 
 def test_steps_that_the_clock_passes_over_take_effect_once(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The start of the deformation and density control are at none of the steps that are taken."""
+    """The steps taken skip those at which the deformation and density control start."""
     placed: list[int] = []
     place = NodesSupport.on_deform_start
     monkeypatch.setattr(NodesSupport, "on_deform_start", lambda *given: placed.append(1) or place(*given))

@@ -1,4 +1,4 @@
-"""Which images come, and what they update: passes, the time window, and the three kinds of samples."""
+"""The order of images and the parameters that they update: passes, the time window, kinds of samples."""
 
 from collections import Counter
 from copy import deepcopy
@@ -59,7 +59,7 @@ def test_first_and_last_all_images_update_everything(scene: SceneData) -> None:
 def test_windows_grow_from_the_middle_one_after_the_other(
     scene: SceneData, starts: tuple[float, ...], batch_size: int
 ) -> None:
-    """Each in an equal part of the steps 200 to 600; what updates motion lies at the border."""
+    """Each takes an equal part of the steps 200 to 600; motion-only samples are at the border."""
     edges = np.linspace(200, 600, len(starts) + 1)
     numbers = range(600 * batch_size)
     drawn = samples(scene, numbers, window_start_widths=starts, batch_size=batch_size)
@@ -103,7 +103,7 @@ def test_samples_of_one_step_differ(scene: SceneData) -> None:
     assert [sample.update for sample in drawn] == ["static", "motion", "all", "motion"]
 
 
-def test_the_second_window_draws_all_of_its_images_alike(scene: SceneData) -> None:
+def test_the_second_window_draws_its_images_uniformly(scene: SceneData) -> None:
     drawn = Counter(sample.frame.name for sample in samples(scene, range(1101, 1800), **TWO_WINDOWS))
     times = [drawn[frame.name] for frame in scene.splits["train"] if distance(scene, frame.t) <= 0.3]
     assert max(times) - min(times) <= 2
@@ -128,7 +128,7 @@ def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, name: s
     groups, seen = trainer.system.parameter_groups(), set()
     for _ in range(12):
         before = [(group.role, p, p.detach().clone()) for group in groups for p in group.params]
-        views = trainer._render_and_backward()
+        views = trainer._render_and_backward(trainer.system.parameter_groups())
         average_gradients(groups, views)
         trainer.optimizer.step()
         trainer.step_count += 1
@@ -152,7 +152,7 @@ def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: Scen
     (layer,) = splatting(trainer).model.deformation
     assert isinstance(layer, SplineLayer)
     curves = {"transls": layer.transls, "rots": layer.rots, "stretches": layer.stretches}
-    (view,) = views = trainer._render_and_backward()
+    (view,) = views = trainer._render_and_backward(trainer.system.parameter_groups())
     assert view.sample.update == "motion"
     read, _ = layer.knots_at(torch.tensor(view.sample.t))
     average_gradients(trainer.system.parameter_groups(), views)
@@ -172,22 +172,22 @@ def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: Scen
         )
 
 
-def test_what_is_asked_for_follows_the_sample(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of new frames larger steps and pooled images; motion must be smooth at the others, and rigid at all of them."""
+def test_the_loss_depends_on_the_sample(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """New frames have larger steps and pooled L1; temporal smoothness is for the others, local rigidity for all."""
     drawn, larger, pooled, smooth, rigid = [], [], [], [], []
     next_sample = WindowCurriculum.next
     monkeypatch.setattr(WindowCurriculum, "next", lambda *args: drawn.append(next_sample(*args)) or drawn[-1])
     monkeypatch.setattr(SplineLayer, "new_frame_rows", lambda _, times: larger.extend(times) or [])
     monkeypatch.setattr(system_module, "pooled_l1", lambda *images: pooled.append(images) or 0.0)
     monkeypatch.setattr(SplineLayer, "temporal_smoothness", lambda _, t: smooth.append(float(t)) or 0.0)
-    monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, chain, t: rigid.append(float(t)) or 0.0)
+    monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, motions: rigid.append(motions) or 0.0)
     trained(small_config(model=MOTION_BASES, steps=100, pooled_l1_weight=1.0, **PHASES), scene, 40)
     deformed = [sample for sample in drawn[20:] if sample.update != "static"]
     new, others = ([s.t for s in deformed if (s.update == "motion") == is_new] for is_new in (True, False))
     assert larger == new != []
     assert len(pooled) == len(new)
     assert smooth == pytest.approx(others)
-    assert rigid == pytest.approx([sample.t for sample in deformed])
+    assert len(rigid) == len(deformed)
 
 
 def test_phases_follow_each_other_and_cover_the_run() -> None:

@@ -18,7 +18,7 @@ from tests.support.training_scene import small_config
 WEIGHT = 3.0
 
 
-def test_fog_of_the_background_color_costs_where_the_image_is_transparent(data: Path) -> None:
+def test_alpha_is_penalized_where_the_image_is_transparent(data: Path) -> None:
     scene = load_scene(data)
     frame, white = scene.splits["train"][0], torch.ones(3)
     rgba = frame.load_rgba().copy()

@@ -1,4 +1,4 @@
-"""The live view: what it draws, that training isn't changed by it, and pausing."""
+"""The live view: rendering, pausing, and no effect on training."""
 
 import contextlib
 import itertools
@@ -47,7 +47,7 @@ def loaded() -> LoadedModel:
 
 @contextlib.contextmanager
 def viewed(page: PageServer, model: LoadedModel) -> Iterator[tuple[Viewer, PageClient]]:
-    """A model file in a viewer, and a browser that looks at it."""
+    """A viewer of a model file with one browser."""
     with Viewer("127.0.0.1", 0) as viewer:
         show_model(viewer, model, "model.pt")
         page.clients[0] = client = PageClient(VIEW)
@@ -64,7 +64,7 @@ def _is_grey(drawn: np.ndarray) -> bool:
     return int(np.ptp(drawn, axis=2).max()) == 0
 
 
-def test_a_browsers_camera_is_ours() -> None:
+def test_a_browsers_camera_is_converted() -> None:
     """Axes are OpenCV's in both, viser's field of view is vertical and in radians."""
     pose = look_at(np.array([1.0, 2.0, 0.5]), np.array([-0.3, 0.1, 0.2]), np.array([0.0, 0.0, 1.0]))
     wxyz = quaternion.from_matrix(pose[:3, :3])
@@ -78,14 +78,14 @@ def test_a_browsers_camera_is_ours() -> None:
     assert_close(depths, np.ones(2), "rotation")
 
 
-def test_small_while_it_moves_and_large_when_it_is_still(page: PageServer, loaded: LoadedModel) -> None:
+def test_images_are_small_while_it_moves_and_large_at_rest(page: PageServer, loaded: LoadedModel) -> None:
     with viewed(page, loaded) as (_, client):
         wait_for(lambda: len(client.images) == 2)
         small = VIEW.resized(round(MOVING_PART * WIDTH), round(MOVING_PART * HEIGHT))
         np.testing.assert_array_equal(client.images[0], _expected(loaded, small, 0.5, 2))
         np.testing.assert_array_equal(client.images[1], _expected(loaded, VIEW, 0.5, 2))
         time.sleep(0.3)
-        assert len(client.images) == 2, "what is shown already isn't drawn again"
+        assert len(client.images) == 2, "an unchanged view isn't drawn again"
         client.look_from(CLOSER)
         wait_for(lambda: len(client.images) == 4)
         np.testing.assert_array_equal(client.images[3], _expected(loaded, CLOSER, 0.5, 2))
@@ -140,7 +140,7 @@ def test_a_model_without_motion_or_cameras_can_be_seen(page: PageServer) -> None
         assert client.images[1].any()
 
 
-def test_what_is_not_finite_is_said_and_drawn_when_it_is_again(page: PageServer, loaded: LoadedModel) -> None:
+def test_values_that_are_not_finite_are_reported_until_they_are(page: PageServer, loaded: LoadedModel) -> None:
     broken = random_model(noise=0.2)
     with torch.no_grad():
         broken.gaussians.means[5] = float("nan")
@@ -178,7 +178,7 @@ def test_a_snapshot_stays_as_it_was(data: Path) -> None:
 
 
 class _LooksOn(Observer):
-    """From the beginning on; after some steps it waits for another image."""
+    """From the first step; after some steps it waits for another image."""
 
     def __init__(self, page: PageServer) -> None:
         self._page, self.client = page, PageClient(VIEW)
@@ -193,7 +193,7 @@ class _LooksOn(Observer):
 
 
 @pytest.mark.parametrize("batch_size", [1, 3])
-def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, batch_size: int) -> None:
+def test_the_viewer_changes_no_bit_of_training(data: Path, tmp_path: Path, page: PageServer, batch_size: int) -> None:
     config = small_config(threads=2, batch_size=batch_size)
     fit(config, data, tmp_path / "alone")
     looks_on = _LooksOn(page)
@@ -201,7 +201,7 @@ def test_looking_changes_no_bit(data: Path, tmp_path: Path, page: PageServer, ba
         fit(config, data, tmp_path / "seen", observer=Observers(TrainingView(viewer, config.run.steps), looks_on))
     drawings = [drawn for drawn in looks_on.client.images if drawn.shape == (HEIGHT, WIDTH, 3)]
     assert len(drawings) >= 2
-    assert not np.array_equal(drawings[0], drawings[-1]), "training should have been seen"
+    assert not np.array_equal(drawings[0], drawings[-1]), "no image was drawn during training"
     assert_same_bits(state_of(tmp_path / "alone"), state_of(tmp_path / "seen"))
     assert "**step 24** of 24" in page.texts[0].content
     assert "PSNR" in page.texts[0].content
@@ -215,7 +215,7 @@ class _Stoppable(Observer):
         self.last, self.asked = result.step, 0
 
     def is_paused(self) -> bool:
-        """Asked again and again where another holds the run."""
+        """Called repeatedly while another observer pauses the run."""
         self.asked += 1
         return False
 

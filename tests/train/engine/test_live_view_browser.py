@@ -1,4 +1,4 @@
-"""The live view in a browser: a run is looked at, paused, stopped, and seen when it is over."""
+"""The live view in a browser: a run is viewed, paused, stopped, and viewed after its end."""
 
 import contextlib
 import re
@@ -102,7 +102,7 @@ def test_a_browsers_camera_begins_at_the_first_image(data: Path, page: Page, ope
         if not opened_early:
             page.goto(viewer.url)
         wait_for(lambda: _camera(viewer) is not None)
-        with contextlib.suppress(AssertionError):  # a page begins with a camera of its own
+        with contextlib.suppress(AssertionError):  # a page starts with viser's camera
             wait_for(lambda: np.allclose(_camera(viewer).position, stage.eye, atol=0.1), seconds=20)
         camera = _camera(viewer)
     assert_close(camera.camera_to_world, scene.splits["train"][0].camera.camera_to_world, "browser_camera")
@@ -111,6 +111,6 @@ def test_a_browsers_camera_begins_at_the_first_image(data: Path, page: Page, ope
 
 
 def _camera(viewer: Viewer) -> Any:
-    """Of the only browser; None before it has shown anything."""
+    """The camera that the only browser requests; None before the first request."""
     wanted = [browser.wanted for browser in viewer._browsers.values()]
     return wanted[0].camera(1.0) if wanted and wanted[0] else None

@@ -1,4 +1,4 @@
-"""Settings and presets: what is refused, the sizes that papers publish, and that each preset trains."""
+"""Settings and presets: invalid values, published sizes, and training of each preset."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 def sizes(config: ModelConfig, count: int = 3) -> tuple[int, int]:
-    """Parameters of the deformation, and of the modulation with its embeddings."""
+    """Numbers of parameters of the deformation, and of the modulation with its embeddings."""
     model = DynamicGaussians(
         config, CanonicalGaussians.random_in_cube(count, 1.0, config.sh_degree, 0, config.attributes())
     )
@@ -51,7 +51,7 @@ def test_published_numbers_of_parameters(name: str, deformation: int) -> None:
 
 
 def test_table_4() -> None:
-    """Its rows, in millions; N is what makes the modulation's share as large as it says."""
+    """Its rows, in millions; N follows from the modulation's published size."""
     paper = [preset(f"msdgs-{kind}").model for kind in ("mlp", "plane")]
     two = [dataclasses.replace(config, layers=config.layers[:2]) for config in paper]
     assert [in_millions(sizes(config)[0]) for config in two] == [0.47, 0.26]
@@ -70,14 +70,14 @@ def test_a_config_names_its_system() -> None:
     assert next(iter(systems())) == DEFAULT
 
 
-def test_unknown_names_are_refused_with_those_there_are() -> None:
+def test_unknown_names_are_refused_with_the_known_ones() -> None:
     with pytest.raises(InvalidInput, match=r"msdgs-nodes.*4dgs.*msdgs-mlp.*--plugin.*hexplane"):
         preset("hexplane")
 
 
 @pytest.mark.parametrize("name", systems())
 def test_each_preset_trains(name: str, data: Path) -> None:
-    """The deformation rests in the static phase, and every part of it learns then."""
+    """The deformation is unchanged in the static phase, and all of its parts are trained afterwards."""
     trainer = Trainer(shrunk(preset(name)), load_scene(data))
     deformation = splatting(trainer).model.deformation
     before = {n: p.detach().clone() for n, p in deformation.named_parameters()}
@@ -103,7 +103,7 @@ def test_settings_out_of_range_are_named(field: str, value: object) -> None:
         TrainConfig().updated(**{field: value})
 
 
-def test_settings_survive_json_and_strangers_are_refused() -> None:
+def test_settings_survive_json_and_unknown_ones_are_refused() -> None:
     config = small_config(background="random", size=24, window_start_widths=(0.1, 0.3, 0.3))
     assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
     for strange in ({"color": 1}, {"run": {"color": 1}}):

@@ -1,4 +1,4 @@
-"""`--tensorboard`: what TensorBoard reads is what `metrics.jsonl` holds, also of a run that was broken off."""
+"""`--tensorboard`: events equal `metrics.jsonl`, also after an interruption."""
 
 import io
 import math
@@ -31,7 +31,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _events(run: Path) -> Any:
-    """As TensorBoard sees the run."""
+    """The run's events as TensorBoard reads them."""
     events = accumulator.EventAccumulator(str(run / FOLDER), size_guidance={"images": 0, "scalars": 0})
     return events.Reload()
 
@@ -58,11 +58,11 @@ class _BreakAt(Observer):
 
     def step(self, result: StepResult, seconds: float) -> None:
         if result.step == self.at:
-            raise RuntimeError("as if the power had gone")
+            raise RuntimeError("simulated power failure")
 
 
 def test_a_run_that_broke_off_is_seen_once(data: Path, tmp_path: Path) -> None:
-    """Steps 9 to 14 came after the last checkpoint, and are trained and logged again."""
+    """Steps 9 to 14 are after the last checkpoint and are trained and logged again."""
     run, config = tmp_path / "run", small_config(checkpoint_every=8)
     with pytest.raises(RuntimeError, match="power"):
         fit(config, data, run, observer=_BreakAt(14), tensorboard=True)
@@ -72,7 +72,7 @@ def test_a_run_that_broke_off_is_seen_once(data: Path, tmp_path: Path) -> None:
     assert len(_events(run).Scalars("train/loss")) == config.run.steps
 
 
-def test_asked_for_when_resumed_the_past_is_there_too(data: Path, tmp_path: Path) -> None:
+def test_turned_on_by_a_resumed_run_it_has_all_steps(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     fit(small_config(steps=12), data, run)
     assert not (run / FOLDER).exists()

@@ -1,4 +1,4 @@
-"""`msdgs-train` as a program: help, errors, Ctrl-C and going on."""
+"""`msdgs-train` as a program: help, errors, Ctrl-C and resuming."""
 
 import json
 import signal
@@ -39,7 +39,7 @@ SMALL = [
         ("steps --help", "MODEL --t --out --size --camera layers nearest|in|time"),
     ],
 )
-def test_help_teaches(command: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_has_examples(command: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         cli.main(command.split())
     assert exit_info.value.code == 0
@@ -117,7 +117,7 @@ def test_data_and_options_that_are_not_there_are_named(tmp_path: Path, capsys: p
 
 
 def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
-    """Ctrl-C ends the step, saves, says how to go on; going on takes the settings from the run."""
+    """Ctrl-C finishes the step, saves, and prints the command to resume, which uses the run's settings."""
     run = tmp_path / "run"
     log = run / "metrics.jsonl"
     with program("msdgs_train.cli.main", "fit", data, run, "--steps=100000", *SMALL) as process:
@@ -142,14 +142,14 @@ def test_synthetic_makes_what_fit_reads(tmp_path: Path) -> None:
     assert cli.main(["fit", str(data), str(tmp_path / "run"), "--steps", "2", *SMALL]) == 0
 
 
-def test_a_preset_gives_way_to_what_is_given_beside_it(data: Path, tmp_path: Path) -> None:
+def test_options_override_the_preset(data: Path, tmp_path: Path) -> None:
     assert cli.main(["fit", str(data), str(tmp_path / "run"), "--preset=static", "--steps=2", *FEW]) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert (config["model"]["layers"], config["density"]["init_num_pts"]) == ([], 60)
     assert (config["curriculum"]["window_full_fraction"], config["run"]["system"]) == (0.0, "static")
 
 
-def test_parts_are_given_as_words(data: Path, tmp_path: Path) -> None:
+def test_layers_and_supports_are_parsed_from_text(data: Path, tmp_path: Path) -> None:
     options = ["--support", "nodes:num_nodes=5", "--layers", "spline:num_knots=6", "mlp:width=16,skip=1,depth=2"]
     assert cli.main(["fit", str(data), str(tmp_path / "run"), "--steps=2", *FEW, *options]) == 0
     model = json.loads((tmp_path / "run" / "config.json").read_text())["model"]

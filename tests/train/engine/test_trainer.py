@@ -1,4 +1,4 @@
-"""A whole run on a tiny scene: it learns, it stops, and it goes on with the same bits."""
+"""Runs on a tiny scene: learning, stopping, and resuming with the same bits."""
 
 import dataclasses
 import json
@@ -146,7 +146,9 @@ def test_images_of_a_step_share_it_evenly(data: Path) -> None:
         trainer = Trainer(config.updated(batch_size=batch_size, threads=threads), scene)
         found = []
         for _ in range(6 // batch_size):
-            average_gradients(trainer.system.parameter_groups(), trainer._render_and_backward())
+            average_gradients(
+                trainer.system.parameter_groups(), trainer._render_and_backward(trainer.system.parameter_groups())
+            )
             found.append([p.grad.clone() for p in splatting(trainer).model.parameters() if p.grad is not None])
         return found
 
@@ -160,7 +162,7 @@ def test_images_of_a_step_share_it_evenly(data: Path) -> None:
 
 def test_a_gradient_is_the_mean_over_the_images_that_update_the_parameter(data: Path) -> None:
     trainer = Trainer(small_config(batch_size=2, window_full_fraction=0.0), load_scene(data))
-    first, second = trainer._render_and_backward()
+    first, second = trainer._render_and_backward(trainer.system.parameter_groups())
     groups, means = trainer.system.parameter_groups(), splatting(trainer).model.gaussians.means
     average_gradients(groups, [first, second])
     assert means.grad is not None
@@ -184,7 +186,7 @@ class _Rollbacks(Observer):
 
 
 def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
-    """Not finite in those calls, counted over all trainers, and as they are in the others."""
+    """Make losses of these calls, counted over all trainers, not finite."""
     calls = iter(range(10**6))
 
     def breaking(whole: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
@@ -199,7 +201,7 @@ def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
 def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: int, back_to: int
 ) -> None:
-    """Also where the next checkpoint would be due while steps are skipped: at 20 of the first case."""
+    """Also if a checkpoint is due while steps are skipped: step 20 of the first case."""
     _break_losses(monkeypatch, range(start, start + 20))
     run, watched = tmp_path / "run", _Rollbacks()
     outcome = fit(small_config(steps=50, checkpoint_every=10, eval_every=0), data, run, observer=watched)
@@ -271,7 +273,7 @@ def test_weighted_regularizers_are_added_to_the_loss(data: Path, monkeypatch: py
         assert float(system.loss(TrainingSample(frame, 0.3, "static"), target, black, 0).loss) == 0.0
 
 
-def test_scales_that_come_out_at_nothing_are_counted(data: Path) -> None:
+def test_clamped_scales_are_counted(data: Path) -> None:
     model = dataclasses.replace(small_config().model, scale_space="linear")
     trainer = Trainer(small_config(model=model, static_fraction=0.0), load_scene(data))
     assert trainer.step().clamped_scales == 0

@@ -1,4 +1,4 @@
-"""What stands in for viser where a test looks at what a viewer does, not at how a browser shows it."""
+"""A replacement of viser for tests of the viewer without a browser."""
 
 import contextlib
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from msdgs_train.viewer import viewer as viewer_module
 
 
 class PageClient:
-    """A browser with a camera; `images` are all that it was sent, [H, W, 3] uint8."""
+    """A browser with a camera; `images` are all images that it has received, [H, W, 3] uint8."""
 
     def __init__(self, camera: Camera) -> None:
         self.client_id = -1
@@ -79,7 +79,7 @@ class PageServer:
 
 @pytest.fixture
 def page(monkeypatch: pytest.MonkeyPatch) -> PageServer:
-    """What viewers of this test are made of instead of viser."""
+    """Replace viser; returns the server of all viewers."""
     server = PageServer()
     monkeypatch.setattr(viewer_module, "_serve", lambda host, port: server)
     return server

@@ -1,4 +1,4 @@
-"""The benchmark of many scenes: its rows, its table and that it goes on from its CSV file."""
+"""The benchmark of many scenes: its rows, its table and its continuation from the CSV file."""
 
 import csv
 from pathlib import Path

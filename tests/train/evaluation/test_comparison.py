@@ -1,4 +1,4 @@
-"""`msdgs-train compare`: the matrix, its runs, what is gone on with, and the table and plots at the end."""
+"""`msdgs-train compare`: the matrix, its runs, resuming, the table and the plots."""
 
 import contextlib
 import dataclasses
@@ -159,12 +159,12 @@ def test_the_plots_show_errors() -> None:
     assert y.tolist() == pytest.approx([10 ** (-psnr / 20) for psnr in (28, 29, 30)])
     (axes,) = draw_layers([*RESULTS, made_result("wide", 2, 0, 28.0, "mlp:width=200")]).axes
     lines = [container[0].get_data() for container in axes.containers]
-    aside = BESIDE / 2  # bars of the same K stand beside each other
+    aside = BESIDE / 2  # bars of the same K don't overlap
     assert [list(x) for x, _ in lines] == [[1 - aside, 2 - aside, 4 - aside], [2 + aside]]
     assert lines[0][1][1] == pytest.approx(10 ** (-30 / 20))
 
 
-def test_each_scene_has_its_panel_and_each_system_its_look() -> None:
+def test_each_scene_has_a_panel_and_each_system_a_style() -> None:
     systems = [f"s{i}" for i in range(12)]
     here = [made_result(name, 1, 0, 20.0 + i) for i, name in enumerate(systems)]
     there = [dataclasses.replace(r, run=dataclasses.replace(r.run, scene="other"), psnr=10.0) for r in here[5:]]
@@ -223,7 +223,7 @@ def test_a_run_that_fails_is_reported_and_the_others_continue(systems_file: Path
 
 @contextlib.contextmanager
 def begun(systems_file: Path, data: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
-    """A comparison in a process of its own, once its first run has begun."""
+    """A comparison in a subprocess, after its first run has started."""
     command = arguments(systems_file, data, out, "--seeds", "0", "--steps", "100000")
     with program("msdgs_train", *command) as process:
         wait_for(lambda: process.poll() is not None or (out / "static" / "scene_0" / "config.json").exists(), 300)
@@ -246,5 +246,5 @@ def test_where_the_command_is_killed_its_runs_save_and_end(systems_file: Path, d
     out = tmp_path / "out"
     with begun(systems_file, data, out) as process:
         process.kill()
-        process.communicate(timeout=600)  # ends when the last process that writes has ended
+        process.communicate(timeout=600)  # end of file when the last writing process has ended
     assert (out / "static" / "scene_0" / "checkpoint.pt").exists()

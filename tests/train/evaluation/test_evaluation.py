@@ -1,4 +1,4 @@
-"""`msdgs-train eval`: its numbers against the service's renderings, its masks against known ones, its files."""
+"""`msdgs-train eval`: metrics against the service's renderings, masks against known ones, files."""
 
 import json
 import math
@@ -60,7 +60,7 @@ def _read(path: Path) -> np.ndarray:
 
 @torch.no_grad()
 def _render(path: Path, frame: Frame) -> np.ndarray:
-    """With the service's own rasterizer."""
+    """Render with the service's rasterizer."""
     gaussians = Gaussians(*(tensor.numpy() for tensor in load_model(path).model.pose(frame.t)))
     return np.clip(rasterize(gaussians, frame.camera, background=(1.0, 1.0, 1.0)).rgb, 0, 1)
 
@@ -138,7 +138,7 @@ def test_psnr_inside_a_mask_has_a_known_answer() -> None:
 
 
 def test_a_centre_travels_by_pixels() -> None:
-    """At depth 4 and a focal length of 40 a pixel is 0.1 wide; behind the camera nothing is seen to move."""
+    """At depth 4 and a focal length of 40 a pixel is 0.1 wide; motion behind the camera doesn't count."""
     camera = front_camera(focal=40.0)
     there = torch.tensor([[0.0, 0, 4], [0.0, 0, 4], [0.0, 0, 4], [0.0, 0, -4], [0.0, 0, 4]])
     moved = there + torch.tensor([[0.09, 0, 0], [0.11, 0, 0], [0, -0.11, 0], [9.0, 0, 0], [0, 0, 1]])
@@ -146,7 +146,7 @@ def test_a_centre_travels_by_pixels() -> None:
 
 
 class _Moving:
-    """Two Gaussians, far apart: the second one goes to the right, 1 unit in a unit of time."""
+    """Two distant Gaussians, the second of which moves to the right, 1 scene unit per unit of time."""
 
     rasterizer = GSPLAT
 
@@ -170,11 +170,11 @@ def test_the_models_region_is_where_gaussians_that_move_are_seen() -> None:
         np.testing.assert_array_equal(mask, (1 - alone).max(axis=-1) > 0.1)
         assert 10 < mask.sum() < 200
     assert not (masks[0] & masks[1]).all()
-    assert not masks[0][:, :25].any(), "the Gaussian that stays is at the left"
+    assert not masks[0][:, :25].any(), "the static Gaussian is at the left"
 
 
 def _write_fixed_camera(folder: Path) -> Path:
-    """One camera that stays but for rounding: grey, with a black square that goes to the right, 6 pixels an image."""
+    """A camera that is fixed up to rounding: grey, with a black square that moves 6 pixels to the right per image."""
     matrix = OPENGL_TO_OPENCV.copy()
     for split, times in (("train", (0.0, 0.5, 1.0)), ("test", (0.25, 0.75))):
         (folder / split).mkdir(parents=True)
@@ -193,7 +193,7 @@ def _write_fixed_camera(folder: Path) -> Path:
 
 
 def test_with_fixed_cameras_the_region_is_that_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The region is the square. The background is right and the square is left out: a known error there, none else."""
+    """The region is the square. The rendering is the background alone: a known error inside, none outside."""
     monkeypatch.setattr(fit_module, "draw_curve", lambda run: None)
     data, run = _write_fixed_camera(tmp_path / "fixed"), tmp_path / "run"
     fit(small_config(steps=2), data, run)
@@ -222,7 +222,7 @@ def test_flip_is_nvidias(data: Path, run: Path) -> None:
 
 
 @pytest.mark.usefixtures("_clean")
-def test_what_is_not_there_is_null_and_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unavailable_metrics_are_null_with_a_reason(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("flip_evaluator", "torchvision.models"):
         monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(["eval", str(run)]) == 0
@@ -238,7 +238,7 @@ def test_what_is_not_there_is_null_and_said(run: Path, monkeypatch: pytest.Monke
     assert "flip-evaluator isn't installed" in table
 
 
-def test_lpips_wants_its_weights_on_disk_and_images_in_plus_minus_one(
+def test_lpips_needs_its_weights_on_disk_and_images_in_plus_minus_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     weights = types.SimpleNamespace(IMAGENET1K_V1=types.SimpleNamespace(url="https://example.org/vgg16-1.pth"))

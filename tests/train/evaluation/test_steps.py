@@ -78,7 +78,7 @@ def test_time_and_camera_unless_given(tmp_path: Path) -> None:
         ({"out": Path("steps.jpeg")}, "`out`"),
     ],
 )
-def test_what_is_wrong_is_named(wrong: dict, word: str, model: Path, tmp_path: Path) -> None:
+def test_invalid_values_are_named(wrong: dict, word: str, model: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=word):
         write_steps(model, **{"out": tmp_path / "steps.png", **wrong})
     assert not list(tmp_path.glob("*.png"))

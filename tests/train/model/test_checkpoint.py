@@ -1,4 +1,4 @@
-"""Model files: whole or refused, old or new, never in between."""
+"""Model files: complete or refused; saving is atomic."""
 
 import pickle
 import re
@@ -23,7 +23,7 @@ def model_file(tmp_path: Path) -> Path:
 
 
 def rewritten(path: Path, part: str | None = None, **changes: object) -> None:
-    """With other contents, or other ones of a part; what is None is removed."""
+    """The file with other contents, of all or a part; None removes an entry."""
     contents = torch.load(path, weights_only=True)
     changed = contents if part is None else contents[part]
     changed.update(changes)
@@ -41,7 +41,7 @@ def rewritten(path: Path, part: str | None = None, **changes: object) -> None:
         {"layers": ("mlp",), "support": NodesConfig(num_nodes=1, k_nearest=3)},
     ],
 )
-def test_what_is_saved_comes_back(tmp_path: Path, changes: dict[str, Any]):
+def test_a_saved_model_is_loaded_unchanged(tmp_path: Path, changes: dict[str, Any]):
     model = random_model(**changes)
     save_model(tmp_path / "model.pt", model, SCENE, 42)
     loaded = load_model(tmp_path / "model.pt")
@@ -91,7 +91,7 @@ def test_a_stream_that_makes_no_sense_is_refused(tmp_path: Path, opcodes: bytes)
 
 
 class Trap:
-    """Unpickled, it makes a file."""
+    """Creates a file when unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

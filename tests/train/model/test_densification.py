@@ -1,4 +1,4 @@
-"""Density control: who is cloned, split and pruned, and that Adam's moments follow their Gaussians."""
+"""Density control: cloning, splitting and pruning, and Adam's moments of the Gaussians."""
 
 import math
 from typing import Any
@@ -70,7 +70,7 @@ def test_large_ones_are_split_inside_themselves() -> None:
     assert moment_rows(surgery, "means") == [1, 2, 4, 5, 6, 0, 0]
 
 
-def test_low_opacity_ones_go_at_once_and_giants_after_the_first_reset() -> None:
+def test_low_opacity_gaussians_are_pruned_at_once_and_huge_ones_after_a_reset() -> None:
     gaussians, surgery, control = _setup(reset_every_fraction=9 / 24)
     with torch.no_grad():
         gaussians.raw_opacities[0] = -10.0
@@ -80,7 +80,7 @@ def test_low_opacity_ones_go_at_once_and_giants_after_the_first_reset() -> None:
     assert moment_rows(surgery, "means") == [3, 4, 5, 6]
 
 
-def test_a_scene_that_has_faded_is_left_alone() -> None:
+def test_a_transparent_scene_is_not_changed() -> None:
     gaussians, surgery, control = _setup()
     with torch.no_grad():
         gaussians.raw_opacities.fill_(-10.0)

@@ -23,7 +23,7 @@ def _pair(seed: int, height: int, width: int, dtype: torch.dtype = torch.float64
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_ssim_is_that_of_torchmetrics(dtype: torch.dtype) -> None:
-    """With black all around the images, for torchmetrics mirrors them at the border."""
+    """With black all around the images, since torchmetrics mirrors them at the border."""
     rgb, target = _pair(0, 40, 31, dtype)
     padded = [torch.nn.functional.pad(v, (0, 0, *4 * [2 * RADIUS])) for v in (rgb, target)]
     expected: Any = structural_similarity_index_measure(
@@ -40,7 +40,7 @@ def test_gradient_agrees_with_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda x: photometric_loss(x, target, 0.8), (rgb,), atol=atol, rtol=0, eps=1e-7)
 
 
-def test_ssim_is_symmetric_and_does_not_know_left_from_right() -> None:
+def test_ssim_is_symmetric_and_invariant_to_flips() -> None:
     rgb, target = _pair(3, 17, 23)
     pairs = [(target, rgb), *((rgb.flip(axis), target.flip(axis)) for axis in (1, 2))]
     pairs.append((rgb.transpose(0, 1), target.transpose(0, 1)))
@@ -81,7 +81,7 @@ def test_shapes_that_disagree_are_refused() -> None:
         ssim(rgb[..., 0], target[..., 0])
 
 
-def test_what_has_moved_away_teaches_nothing_of_what_stands_still() -> None:
+def test_pixels_that_moving_objects_left_do_not_train_static_parts() -> None:
     target = torch.full((20, 30, 3), 0.5)
     rgb = (target + 0.1).requires_grad_()
     with torch.no_grad():
@@ -100,8 +100,8 @@ def _spot(left: torch.Tensor) -> torch.Tensor:
     return torch.exp(-((rows - 20) ** 2 + (columns - left) ** 2) / 2).expand(3, -1, -1).permute(1, 2, 0)
 
 
-def test_what_is_far_from_its_place_is_pulled_there_by_blocks() -> None:
-    """Pixel by pixel a spot twelve pixels off has nothing to gain by coming nearer."""
+def test_pooled_l1_has_a_gradient_at_large_displacements() -> None:
+    """L1 of single pixels has no gradient for a spot that is twelve pixels off."""
     target, place = _spot(torch.tensor(30.0)), torch.tensor(42.0, requires_grad=True)
     (by_pixels,) = torch.autograd.grad(photometric_loss(_spot(place), target, 1.0), [place])
     (by_blocks,) = torch.autograd.grad(pooled_l1(_spot(place), target), [place])
@@ -109,7 +109,7 @@ def test_what_is_far_from_its_place_is_pulled_there_by_blocks() -> None:
     assert float(by_blocks) > 1e-4
 
 
-def test_blocks_of_images_smaller_than_they_are() -> None:
+def test_blocks_larger_than_the_image() -> None:
     rgb, target = torch.full((3, 5, 3), 0.75), torch.full((3, 5, 3), 0.5)
     assert float(pooled_l1(rgb, target)) == pytest.approx(3 * 0.25)
     assert float(pooled_l1(target, target)) == 0.0

@@ -80,19 +80,6 @@ def test_stopping_after_a_step_is_a_model_of_fewer_layers():
         assert torch.equal(got, want)
 
 
-def test_a_model_without_layers_is_static():
-    model = random_model(layers=())
-    for early, late in zip(model.pose(0.0), model.pose(1.0), strict=True):
-        assert torch.equal(early, late)
-
-
-def test_a_model_without_modulation():
-    model = random_model(embedding_dim=0)
-    assert model.modulation is None
-    assert not any("embed" in name or "modulation" in name for name in model.state_dict())
-    assert model.pose(0.5).scales.isfinite().all()
-
-
 def test_time_as_number_and_as_tensor_agree():
     model = random_model()
     assert torch.equal(model.pose(0.25).means, model.pose(torch.tensor(0.25)).means)
@@ -130,7 +117,7 @@ def test_every_parameter_is_reached_by_gradients():
         assert parameter.grad.any(), name
 
 
-def test_detached_means_get_the_gradient_of_a_shift():
+def test_detached_means_get_the_gradient_of_a_translation():
     for detach in (True, False):
         model = random_model(support=GaussiansConfig(detach_deform_input=detach))
         gradient = torch.autograd.grad(model.pose(0.3).means.sum(), model.gaussians.means)[0]

@@ -1,4 +1,4 @@
-"""The plane layer against a slow one in float64, and its gradients against finite differences."""
+"""The plane layer against a slow float64 version, and its gradients against finite differences."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_gradients_match_finite_differences() -> None:
         step = torch.func.functional_call(planes, named, (means, t))
         return torch.cat(step[:4], dim=1)
 
-    means = means.detach()[2:].clamp(-1.2, 1.2).requires_grad_(True)  # a border has two slopes
+    means = means.detach()[2:].clamp(-1.2, 1.2).requires_grad_(True)  # the derivative is discontinuous at the border
     assert torch.autograd.gradcheck(run, (means, *planes.parameters()), eps=1e-6, atol=1e-7)
 
 
@@ -81,7 +81,7 @@ def test_the_same_bits_whatever_the_number_of_threads(monkeypatch: pytest.Monkey
         assert torch.equal(one, several)
 
 
-def test_what_enters_the_time_window_goes_on_from_its_border() -> None:
+def test_time_nodes_that_enter_the_window_extrapolate_its_border() -> None:
     planes = PlaneGrid(16, 32, 11, 1.0, (0.0, 1.0))
     with torch.no_grad():
         planes.time[:] = torch.arange(11.0)[None, :, None, None]

@@ -1,4 +1,4 @@
-"""Density control under a budget: its formulas against slow ones, and that the budget and the image are kept."""
+"""MCMC density control: formulas against slow ones; the budget and the image are kept."""
 
 import math
 from pathlib import Path
@@ -38,7 +38,7 @@ def shared(opacity: float, shares: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize("opacity", OPACITIES)
 @pytest.mark.parametrize("shares", SHARES)
-def test_shares_are_those_of_the_formula_and_together_look_as_one(opacity: float, shares: int) -> None:
+def test_copies_follow_the_formula_and_together_look_like_one(opacity: float, shares: int) -> None:
     """Opacity at the centre, and alpha summed along a line through it, by quadrature."""
     new, shrink = shared(opacity, shares)
     assert_close((new, shrink), slow_share(opacity, shares), "share.relative")
@@ -49,11 +49,11 @@ def test_shares_are_those_of_the_formula_and_together_look_as_one(opacity: float
     assert_close(np.trapezoid(together, x), np.trapezoid(one, x), "share.relative")
 
 
-def test_more_shares_than_the_table_has_are_divided_as_its_last() -> None:
+def test_more_copies_than_the_maximum_count_as_the_maximum() -> None:
     assert shared(0.7, 1000) == shared(0.7, MAX_COPIES)
 
 
-def test_a_wholly_opaque_one_can_be_shared() -> None:
+def test_an_opaque_gaussian_can_be_copied() -> None:
     for new, shrink in (shared(1.0, shares) for shares in SHARES):
         assert 0 < new < 1
         assert 0 < shrink <= 1
@@ -70,14 +70,14 @@ def setup(count: int = 100, **changes: Any) -> tuple[CanonicalGaussians, RowSurg
     return gaussians, with_moments(gaussians, schedule), MCMCStrategy.start(schedule)
 
 
-def test_low_opacity_ones_move_beside_others_and_share_with_them() -> None:
+def test_low_opacity_gaussians_are_relocated_to_others() -> None:
     gaussians, surgery, control = setup()
     before = {name: p.detach().clone() for name, p in gaussians.named_parameters()}
     assert control.relocate(surgery, 1_000) == (10, 5)
     assert len(gaussians) == 105
     places = {tuple(mean.tolist()): i for i, mean in enumerate(before["means"])}
     origins = torch.tensor([places[tuple(mean.tolist())] for mean in gaussians.means.detach()])
-    assert origins.min() == 10, "none is left where low-opacity ones were"
+    assert origins.min() == 10, "no low-opacity Gaussian is left"
     assert origins[:90].tolist() == list(range(10, 100))
     counts = torch.bincount(origins, minlength=100)
     for row, origin in enumerate(origins.tolist()):
@@ -118,7 +118,7 @@ def test_never_more_than_the_budget_and_all_of_it_in_the_end(budget: int, rounds
     assert counts[-1] == budget
 
 
-def test_a_scene_that_has_faded_is_left_alone() -> None:
+def test_a_transparent_scene_is_not_changed() -> None:
     gaussians, surgery, control = setup()
     with torch.no_grad():
         gaussians.raw_opacities.fill_(-9.0)

@@ -1,4 +1,4 @@
-"""Sixteen threads that draw frames of different sizes at once, for some seconds or for `MSDGS_HAMMER_SECONDS`."""
+"""Sixteen threads that draw frames of different sizes at once, for some seconds or for `MSDGS_STRESS_SECONDS`."""
 
 import multiprocessing
 import os
@@ -16,7 +16,7 @@ from tests.support.tolerances import tolerance
 pytestmark = pytest.mark.slow
 
 THREADS = 16
-SECONDS = float(os.environ.get("MSDGS_HAMMER_SECONDS", "3"))
+SECONDS = float(os.environ.get("MSDGS_STRESS_SECONDS", "3"))
 SIZES = ((1, 1), (16, 16), (53, 37), (300, 200), (17, 400), (640, 480), (128, 129), (1000, 40))
 
 
@@ -30,7 +30,7 @@ def bytes_of(scene: Scene) -> list[bytes]:
     return [channel.tobytes() for channel in rasterize(*scene)]
 
 
-def hammer(seconds: float) -> tuple[float, float, int]:
+def stress(seconds: float) -> tuple[float, float, int]:
     """Render in all threads; return MiB in use once each thread has rendered each scene, MiB in the end, and frames."""
     drawn = scenes()
     expected = [bytes_of(scene) for scene in drawn]
@@ -57,5 +57,5 @@ def hammer(seconds: float) -> tuple[float, float, int]:
 def test_many_threads_at_once():
     """Same bytes as serial frames, and memory that doesn't grow; in a process in which nothing else happens."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        warm, end, frames = process.submit(hammer, SECONDS).result()
-    assert end - warm <= tolerance("hammer.growth"), f"{frames} frames"
+        warm, end, frames = process.submit(stress, SECONDS).result()
+    assert end - warm <= tolerance("stress.growth"), f"{frames} frames"
