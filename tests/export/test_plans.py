@@ -236,11 +236,14 @@ class Rigid(Support):
     kind = "rigid"
     num_points = 1
 
-    def forward(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: torch.Tensor, num_layers: int | None
+    def motions(
+        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: torch.Tensor, num_layers: int | None = None
     ) -> Deltas:
-        deltas = chain(self.points(gaussians), t, num_layers)
-        return Deltas(*(part.expand(len(gaussians.means), -1) for part in (deltas.means, deltas.scales, deltas.quats)))
+        return chain(self.points(gaussians), t, num_layers)
+
+    def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
+        parts = (motions.means, motions.scales, motions.quats)
+        return Deltas(*(part.expand(len(gaussians.means), -1) for part in parts))
 
     def points(self, gaussians: CanonicalPoints) -> torch.Tensor:
         return gaussians.means.new_zeros(1, 3)
