@@ -68,7 +68,8 @@ def main(
     python -m benchmarks.export.nodes --widths 96 128 --seeds 0 1
 
     Errors are the largest at 50 times against the checkpoint in float64, as docs/contract.md defines `measured_error`,
-    and of the worst of 48 frames; motion is the largest between the first and the last time, in scene units. Times are of `DeformationSession.pose` of all Gaussians.
+    and of the worst of 48 frames; motion is the largest between the first and the last time, in scene units. Times are
+    of `DeformationSession.pose` of all Gaussians.
 
     Args:
         count: Gaussians, all of which move.
