@@ -13,7 +13,7 @@ from export.layers.base import HEADS
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder, to_numpy
 from export.supports.base import Layout, SupportExport, SupportInputs
-from export.supports.blocks import WEIGHT_ONE, block_layout
+from export.supports.blocks import WEIGHT_OFFSET, WEIGHT_ONE, block_layout
 from export.supports.skinning import Blend, columns_of, reshaped, skinned_deltas, skinned_poses
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.supports.base import Support
@@ -84,12 +84,15 @@ def _weights(graph: GraphBuilder, ids: np.ndarray, weights: np.ndarray, width: i
     """
     own = graph.constant("skinning.own", np.arange(width))
     one = graph.constant("skinning.one", np.array([1 / WEIGHT_ONE], np.float32))
+    offset = graph.constant("skinning.weight_offset", np.array([WEIGHT_OFFSET], np.float32))
     left, total = graph.constant("skinning.all", np.array([WEIGHT_ONE], np.float32)), ""
     for f in range(ids.shape[2]):
         name, weight = f"skinning.node{f}", left
         if f + 1 < ids.shape[2]:
-            stored = graph.constant(f"{name}.stored_weight", weights[..., f, None])
+            stored = (weights[..., f, None] - WEIGHT_OFFSET).astype(np.int16)
+            stored = graph.constant(f"{name}.stored_weight", stored)
             weight = graph.node("Cast", [stored], f"{name}.number", to=TensorProto.FLOAT)
+            weight = graph.node("Add", [weight, offset], f"{name}.fraction")
             left = graph.node("Sub", [left, weight], f"{name}.left")
         weight = graph.node("Mul", [weight, one], f"{name}.weight")
         followed = graph.node("Equal", [_stored_ids(graph, name, ids[..., f, None]), own], f"{name}.equal")
