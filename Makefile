@@ -53,7 +53,7 @@ test-cluster: $(CLUSTER)/.installed  ## Ray beside everything: the tests on a cl
 test-viewer: $(VIEWER)/.installed  ## the live view of a training in a browser, with viser
 	$(VIEWER)/bin/python -m pytest -n 0 tests/train/engine/test_live_view.py tests/train/engine/test_live_view_browser.py $(ARGS)
 
-bench-check: $(FULL)/.installed-dev  ## see that every benchmark works, at small sizes, which say nothing about speed
+bench-check: $(FULL)/.installed-dev  ## run every benchmark at small sizes (too small to measure speed)
 	@for name in $(BENCHMARKS); do echo "== benchmarks.$$name"; $(FULL)/bin/python -m benchmarks.$$name --check || exit 1; done
 	@echo "not run: benchmarks.export.splat_transform, which downloads"
 
@@ -63,7 +63,7 @@ lint: $(FULL)/.installed-dev  ## ruff, pyright and the import contracts
 	$(FULL)/bin/lint-imports
 	$(FULL)/bin/pyright
 
-format: $(FULL)/.installed-dev  ## write the sources as ruff likes them
+format: $(FULL)/.installed-dev  ## format the sources with ruff
 	$(FULL)/bin/ruff check --fix
 	$(FULL)/bin/ruff format
 
@@ -91,7 +91,7 @@ $(CLUSTER)/.installed: pyproject.toml constraints.txt
 		--editable '.[cluster,train,export,dev]'
 	@touch $@
 
-# viser 1.1 doesn't take the rich and the websockets that all else is tested with.
+# viser 1.1 needs other versions of rich and websockets than the rest.
 $(VIEWER)/.installed: pyproject.toml constraints.txt
 	$(call make_environment,$(VIEWER))
 	sed -e 's/^rich==.*/rich==14.3.4/' -e 's/^websockets==.*/websockets==16.1.1/' constraints.txt > $(VIEWER)/constraints.txt

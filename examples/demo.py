@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def parse_arguments() -> argparse.Namespace:
-    """What the command line says."""
+    """The options of the command line."""
     parser = argparse.ArgumentParser(description="Serve a scene and write one frame of it.")
     parser.add_argument("scene", type=Path, help="a scene file (.onnx)")
     parser.add_argument("--port", type=int, default=8000, help="another one is used where it is taken")

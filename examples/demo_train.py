@@ -1,4 +1,4 @@
-"""The whole path on a scene made on the spot: images → training → ONNX scene → service → a frame no one saw.
+"""The whole path on a synthetic scene: images → training → ONNX scene → service → a new view.
 
 python examples/demo_train.py --once
 """
@@ -91,7 +91,7 @@ def request_for(frame: Frame) -> dict[str, Any]:
 
 
 def step(title: str, *command: object) -> None:
-    """Run one command of the path, its output seen; ends the demo where it fails."""
+    """Run one command of the path and show its output; the demo ends if it fails."""
     words = [str(word) for word in command]
     say(f"\n== {title}\n$ {shlex.join(words)}")
     started = time.perf_counter()
@@ -101,7 +101,7 @@ def step(title: str, *command: object) -> None:
 
 
 def parse_arguments() -> argparse.Namespace:
-    """What the command line says."""
+    """The options of the command line."""
     parser = argparse.ArgumentParser(description="Make a moving scene, train on it, export, serve, compare.")
     parser.add_argument("--port", type=int, default=8000, help="another one is used where it is taken")
     parser.add_argument("--size", type=int, default=100, help="width and height of the images")

@@ -50,7 +50,7 @@ def render(url: str, request: dict[str, Any]) -> bytes:
 
 
 def stay_up(url: str) -> None:
-    """Say where the service listens and return at Ctrl-C."""
+    """Print the address of the service and return at Ctrl-C."""
     say(f"still listening on {url}, Ctrl-C stops it")
     with contextlib.suppress(KeyboardInterrupt):
         while True:

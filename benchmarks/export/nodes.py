@@ -1,4 +1,4 @@
-"""Size, error and time of exported models on control nodes, of random ones of the paper's size."""
+"""Size, error and time of exported models on control nodes, random and of the paper's size."""
 
 import math
 import os
@@ -31,13 +31,13 @@ from msdgs_train.supports.nodes import NodesConfig
 from tests.support.models import SCENE, random_model
 
 ID_BYTES = 8
-"""Of the default of `ids`, which every moving Gaussian has under every plan."""
+"""Bytes that a moving Gaussian takes in the default of the input `ids`, under every plan."""
 OPENINGS = 3
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is exported and how often it is posed."""
+    """Sizes of the model and number of poses."""
 
     count: int
     layers: int
@@ -78,7 +78,7 @@ def main(
         nodes: Control nodes.
         followed: Nodes that each Gaussian follows.
         seeds: A model each.
-        noise: Standard deviation of what is added to all parameters but means.
+        noise: Standard deviation of the noise added to all parameters but means.
         threads: Threads of onnxruntime.
         repeats: Poses that are timed, at other times each.
         size: Width of the frames in pixels.
@@ -90,12 +90,11 @@ def main(
     models = [(width, seed) for width in widths for seed in seeds]
     rows = [measured(settings, *model) for model in track(models, "models", console=Console(stderr=True))]
     console, names = report_console(), MOVING_OUTPUTS
-    errors = table(
-        f"{count:,} Gaussians, {layers} layers, {nodes} nodes", "width, seed", "motion", *names, "worst frame, dB"
-    )
-    files = table("files", "width, seed", "MB", "bytes a Gaussian, static", "moving", "of these its id", "opening, s")
+    title = f"{count:,} Gaussians, {layers} layers, {nodes} nodes"
+    errors = table(title, "width, seed", "motion", *names, "worst frame, dB")
+    files = table("files", "width, seed", "MB", "bytes per Gaussian, static", "moving", "id", "opening, s")
     times = table(
-        "ms a pose", "width, seed", *(f"{n} threads: {w}" for n in threads for w in ("median", "95 %", "CPU"))
+        "ms per pose", "width, seed", *(f"{n} threads: {w}" for n in threads for w in ("median", "95 %", "CPU"))
     )
     for row in rows:
         found = [f"{row['errors'][name]:.1e}" for name in names]
@@ -135,8 +134,8 @@ def measured(settings: Settings, width: int, seed: int) -> dict[str, Any]:
 
 
 def bytes_per_gaussian(job: ExportJob, size: int) -> tuple[float, float]:
-    """Bytes of a static Gaussian, and how many more one has that moves: `size` is that of the file of all, compared
-    with files in which every second one is static or left out."""
+    """Bytes of a static Gaussian, and how many more a moving one takes. `size` is that of the file in which all move;
+    it is compared with files in which every second Gaussian is static or left out."""
     whole, count = full_mask(job.model), len(job.model.gaussians)
     canonical, first = posed(job.model, 0.0, deform=False), np.arange(count) % 2 == 0
 
@@ -150,7 +149,7 @@ def bytes_per_gaussian(job: ExportJob, size: int) -> tuple[float, float]:
 
 
 def milliseconds(path: Path, settings: Settings) -> dict[int, tuple[float, float, float]]:
-    """Median and 95 % quantile of the time of a pose, and the median of its processor time, by number of threads."""
+    """Median and 95 % quantile of the time of a pose, and median of its processor time, by number of threads."""
     sessions = {threads: _opened(path, threads) for threads in settings.threads}
     wall, processor = Times(), Times(time.process_time)
     for t in np.linspace(0, 1, settings.repeats):
@@ -168,7 +167,7 @@ def milliseconds(path: Path, settings: Settings) -> dict[int, tuple[float, float
 
 
 def _opened(path: Path, threads: int) -> DeformationSession:
-    """The file, posed by so many threads."""
+    """A session with this number of threads."""
     before = os.environ.get(THREADS_VARIABLE)
     os.environ[THREADS_VARIABLE] = str(threads)
     try:
@@ -196,7 +195,7 @@ def _scene(width: int) -> SceneInfo:
 
 
 def self_test() -> int:
-    """A small model's export is exact, and its files grow with each Gaussian by the parts that are known."""
+    """The export of a small model is exact, and each Gaussian adds the expected number of bytes to its file."""
     settings = Settings(count=2_000, layers=2, nodes=20, followed=4, noise=0.05, threads=(1, 2), repeats=3, size=48)
     found = measured(settings, 32, 0)
     assert max(found["errors"][name] for name in MOVING_OUTPUTS) < 1e-4

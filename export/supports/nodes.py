@@ -80,7 +80,7 @@ def _blend(graph: GraphBuilder, inputs: SupportInputs) -> Blend:
 def _weights(graph: GraphBuilder, ids: np.ndarray, weights: np.ndarray, width: int) -> str:
     """[B, S, U] skinning weights of all nodes of a block. Constant: onnxruntime computes them when it opens the file.
 
-    The last weight of a Gaussian isn't stored: it is what the others leave.
+    The last weight of a Gaussian isn't stored: it is one minus the others.
     """
     own = graph.constant("skinning.own", np.arange(width))
     one = graph.constant("skinning.one", np.array([1 / WEIGHT_ONE], np.float32))

@@ -242,7 +242,7 @@ class Rigid(Support):
         return chain(self.points(gaussians), t, num_layers)
 
     def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
-        parts = (motions.means, motions.scales, motions.quats)
+        parts = motions.means, motions.scales, motions.quats
         return Deltas(*(part.expand(len(gaussians.means), -1) for part in parts))
 
     def points(self, gaussians: CanonicalPoints) -> torch.Tensor:
