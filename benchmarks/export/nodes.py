@@ -68,7 +68,8 @@ def main(
     python -m benchmarks.export.nodes --widths 96 128 --seeds 0 1
 
     Errors are the largest at 50 times against the checkpoint in float64, as docs/contract.md defines `measured_error`,
-    and of the worst of 48 frames. Times are of `DeformationSession.pose` of all Gaussians.
+    and of the worst of 48 frames; motion is the largest between the first and the last time, in scene units. Times are
+    of `DeformationSession.pose` of all Gaussians.
 
     Args:
         count: Gaussians, all of which move.
@@ -89,13 +90,15 @@ def main(
     models = [(width, seed) for width in widths for seed in seeds]
     rows = [measured(settings, *model) for model in track(models, "models", console=Console(stderr=True))]
     console, names = report_console(), MOVING_OUTPUTS
-    errors = table(f"{count:,} Gaussians, {layers} layers, {nodes} nodes", "width, seed", *names, "worst frame, dB")
+    title = f"{count:,} Gaussians, {layers} layers, {nodes} nodes"
+    errors = table(title, "width, seed", "motion", *names, "worst frame, dB")
     files = table("files", "width, seed", "MB", "bytes per Gaussian, static", "moving", "id", "opening, s")
     times = table(
         "ms per pose", "width, seed", *(f"{n} threads: {w}" for n in threads for w in ("median", "95 %", "CPU"))
     )
     for row in rows:
-        errors.add_row(row["name"], *(f"{row['errors'][name]:.1e}" for name in names), f"{row['psnr_worst']:.1f}")
+        found = [f"{row['errors'][name]:.1e}" for name in names]
+        errors.add_row(row["name"], f"{row['motion']:.2f}", *found, f"{row['psnr_worst']:.1f}")
         numbers = row["bytes"] / 1e6, row["static"], row["static"] + row["moving"]
         files.add_row(row["name"], *(f"{n:.1f}" for n in numbers), str(ID_BYTES), f"{row['opening']:.2f}")
         times.add_row(row["name"], *(f"{value:.1f}" for each in row["times"].values() for value in each))
@@ -120,6 +123,7 @@ def measured(settings: Settings, width: int, seed: int) -> dict[str, Any]:
         return {
             "name": f"{width}, {seed}",
             "errors": verify(candidate.session, candidate.pruned.moving, times=TIMES, tolerance=math.inf),
+            "motion": float(np.abs(np.subtract(*(candidate.session.pose(t)[0] for t in job.info.time_range))).max()),
             "psnr_worst": job.error(candidate).psnr_worst,
             "bytes": candidate.size,
             "static": static,
@@ -196,6 +200,7 @@ def self_test() -> int:
     found = measured(settings, 32, 0)
     assert max(found["errors"][name] for name in MOVING_OUTPUTS) < 1e-4
     assert found["psnr_worst"] > 60
+    assert found["motion"] > 0.01
     static = 4 * (3 + 4 + 3 + 1 + 3)  # mean, quaternion, scale, opacity, color
     assert abs(found["static"] - static) < 1
     assert ID_BYTES <= found["moving"] <= ID_BYTES + 12

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from export.jobs.bake import Baked, bake
-from export.layers import HEADS, export_of
+from export.layers import export_of
 from export.measure.poses import posed
 from export.spatial_order import morton_order
 from export.supports import support_export_of
@@ -26,7 +26,7 @@ class NetworkMask:
     """The parts of a deformation that are kept."""
 
     layers: tuple[int, ...]  # indices of the model's layers
-    heads: frozenset[str]  # some of `HEADS`, in layers that have heads
+    heads: frozenset[str]  # of those that can be removed
     modulated: bool
 
 
@@ -63,9 +63,8 @@ class PrunedModel:
 def full_mask(model: DynamicGaussians) -> PruningMask:
     """The mask that keeps everything."""
     count = len(model.gaussians)
-    heads = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation))
-    heads = heads if support_export_of(model.support).heads_are_removable else frozenset()
-    network = NetworkMask(tuple(range(len(model.deformation))), heads, model.modulation is not None)
+    layers = tuple(range(len(model.deformation)))
+    network = NetworkMask(layers, _removable_heads(model), model.modulation is not None)
     moves = np.full(count, len(model.deformation) > 0)
     return PruningMask(network, np.ones(count, bool), moves, model.config.sh_degree)
 
@@ -136,6 +135,7 @@ def _model(
     tensors = {name: parameter.detach()[which] for name, parameter in model.gaussians.named_parameters()}
     tensors["sh_rest"] = tensors["sh_rest"][:, : sh_coefficients(sh_degree) - 1]
     layers = [list(model.deformation)[k] for k in network.layers]
+    removed = _removable_heads(model) - network.heads
     config = replace(
         model.config,
         layers=tuple(model.config.layers[k] for k in network.layers),
@@ -146,13 +146,19 @@ def _model(
     tensors = {name: values for name, values in tensors.items() if name not in unread}
     with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are replaced
         smaller = DynamicGaussians(config, CanonicalGaussians(**tensors))
-    smaller.deformation = MultiStepDeformation(_without_heads(layer, network.heads) for layer in layers)
+    smaller.deformation = MultiStepDeformation(_without_heads(layer, removed) for layer in layers)
     smaller.support = model.support
     smaller.modulation = model.modulation if network.modulated else None
     return smaller.requires_grad_(requires_grad=False)
 
 
-def _without_heads(layer: DeformationLayer, heads: frozenset[str]) -> DeformationLayer:
+def _removable_heads(model: DynamicGaussians) -> frozenset[str]:
+    """Heads that pruning may remove: none on control nodes, where a Gaussian's pose depends on all of them."""
+    if not support_export_of(model.support).heads_are_removable:
+        return frozenset()
+    return frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation))
+
+
+def _without_heads(layer: DeformationLayer, removed: frozenset[str]) -> DeformationLayer:
     """The layer with zeros in place of the heads that are removed; a plan stores no column that is all zeros."""
-    missing = frozenset(HEADS) - heads
-    return export_of(layer).without_heads(layer, missing) if missing else layer
+    return export_of(layer).without_heads(layer, removed) if removed else layer

@@ -12,12 +12,16 @@ BLOCK_SIZES = (64, 128, 256)
 BLOCK_NODES = 8
 """Nodes of a block are padded to a multiple of this."""
 BLOCK_COST = 1250
-"""Elements of a matrix of weights whose products take as long as those of a block beside them."""
+"""Elements of a matrix of weights whose products take as long as a block adds: 64 rows per block take 1.1 times as long
+as 128."""
 SORTING_GAIN = 0.9
 """Rows are sorted if this makes the cost smaller than this times that of the order given, which needs no index from
 Gaussians to rows."""
-WEIGHT_ONE = 32767
-"""A skinning weight of 1 as it is stored, in 16 bits: one of 4 weights is off by 1.5e-5 at most."""
+WEIGHT_ONE = 131_070
+"""A skinning weight of 1. All of a Gaussian's weights but the largest, which is the last and isn't stored, are at most
+half of it, so that they have 16 bits and are off by 3.8e-6 at most."""
+WEIGHT_OFFSET = 32_768
+"""What is taken from weights to store them as int16."""
 
 
 class Blocks(NamedTuple):
@@ -25,7 +29,7 @@ class Blocks(NamedTuple):
 
     nodes: np.ndarray  # int64 [B, U]
     ids: np.ndarray  # int64 [B, S, F], indices into a row of `nodes`
-    weights: np.ndarray  # int16 [B, S, F], fractions of `WEIGHT_ONE`
+    weights: np.ndarray  # int64 [B, S, F], fractions of `WEIGHT_ONE`; the largest of a Gaussian is the last
 
     @property
     def cost(self) -> int:
@@ -42,7 +46,9 @@ def block_layout(means: np.ndarray, node_ids: np.ndarray, skinning_weights: np.n
         node_ids: [N, F] nodes that each Gaussian follows.
         skinning_weights: [N, F]; rows sum to 1.
     """
-    stored = _stored_weights(skinning_weights)
+    ascending = np.argsort(skinning_weights, axis=1, kind="stable")
+    node_ids = np.take_along_axis(node_ids, ascending, axis=1)
+    stored = _stored_weights(np.take_along_axis(skinning_weights, ascending, axis=1))
     given, sorted_ = (_cheapest(order, node_ids, stored) for order in (np.arange(len(means)), morton_order(means)))
     rows, blocks = sorted_ if sorted_[1].cost < SORTING_GAIN * given[1].cost else given
     return Layout(rows, blocks._asdict())
@@ -67,8 +73,7 @@ def _blocks(node_ids: np.ndarray, weights: np.ndarray, size: int) -> Blocks:
 
 
 def _stored_weights(weights: np.ndarray) -> np.ndarray:
-    """int16 [N, F] whose rows sum to `WEIGHT_ONE`: the largest weight absorbs the rounding."""
+    """int64 [N, F] whose rows sum to `WEIGHT_ONE`, of rows in ascending order: the last takes what rounding leaves."""
     stored = np.round(weights.astype(np.float64) * WEIGHT_ONE).astype(np.int64)
-    largest = stored.argmax(axis=1)
-    stored[np.arange(len(stored)), largest] += WEIGHT_ONE - stored.sum(axis=1)
-    return stored.astype(np.int16)
+    stored[:, -1] += WEIGHT_ONE - stored.sum(axis=1)
+    return stored

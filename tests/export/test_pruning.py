@@ -11,8 +11,10 @@ import torch
 
 from export.jobs.job import Candidate, ExportJob
 from export.jobs.write import write_scene
+from export.measure.poses import posed
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.pruning import RULES
+from export.spatial_order import morton_order
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
@@ -188,11 +190,18 @@ def test_unusual_scenes_are_pruned_and_written(tmp_path: Path, count: int, chang
     assert exported.moving_count + exported.static_count == len(candidate.pruned.ids)
 
 
-@pytest.mark.parametrize("kind", ["spline", "mlp"])
+@pytest.mark.parametrize("kind", ["spline", "mlp", "plane"])
 def test_layers_on_nodes_keep_all_heads(tmp_path: Path, kind: str):
-    model = random_model(40, support=NODES, layers=(kind,))
-    candidate = job_of(tmp_path, model).candidate("network", 50.0)
-    assert "heads" not in {entry["rule"] for entry in candidate.pruned.left_out}
+    """The file moves Gaussians as the model does, whose order alone is changed."""
+    model = random_model(40, noise=0.2, support=NODES, layers=(kind,))
+    job = job_of(tmp_path, model)
+    assert "heads" not in {entry["rule"] for entry in job.candidate("network", 50.0).pruned.left_out}
+    candidate = job.candidate("network", None)
+    order = morton_order(model.gaussians.means.detach().numpy())
+    start, end = (posed(model, t) for t in SCENE.time_range)
+    assert np.abs(end.means - start.means).max() > 0.01
+    for got, want in zip(candidate.session.pose(1.0), (end.means, end.quats, end.scales), strict=True):
+        np.testing.assert_allclose(got, want[order], rtol=0, atol=tolerance("export.nodes.relative"))
 
 
 def with_hidden_one(model: DynamicGaussians) -> DynamicGaussians:
