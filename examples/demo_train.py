@@ -47,13 +47,13 @@ def main() -> None:
 
 
 def fit_flags(arguments: argparse.Namespace) -> list[object]:
-    """Settings for minutes rather than for quality: few Gaussians, narrow layers, too small to share among threads."""
-    layer = "mlp:width=48,depth=2,xyz_frequencies=4,time_width=32,lr_final=2e-4"
-    sizes = ["--init-num-pts", 2500, "--max-gaussians", 4000, "--layers", layer, layer]
-    density = ["--refine-start-fraction", 0.08, "--refine-every-fraction", 0.04, "--grow-grad2d", 1e-3]
-    pace = [*density, "--sh-degree-fraction", 0.2]
+    """Settings for a minute rather than for quality: few Gaussians and nodes, too small to share among threads."""
+    layer = "mlp:width=64,depth=2,xyz_frequencies=4,time_width=32"
+    model = ["--support", "nodes:num_nodes=128,k_nearest=4", "--layers", layer, layer]
+    density = ["--init-num-pts", 2500, "--max-gaussians", 4000, "--grow-grad2d", 1e-3]
+    pace = ["--refine-start-fraction", 0.08, "--refine-every-fraction", 0.04, "--sh-degree-fraction", 0.2]
     rest = ["--window-full-fraction", 0.6, "--eval-every", 0, "--checkpoint-every", 500, "--threads", 1]
-    return ["--preset", "msdgs-small", "--steps", arguments.steps, *sizes, *pace, *rest]
+    return ["--steps", arguments.steps, *model, *density, *pace, *rest]
 
 
 def compare(url: str, frames: list[Frame], folder: Path, out: Path) -> None:
