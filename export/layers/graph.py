@@ -20,8 +20,10 @@ class GraphBuilder:
         self.constants: dict[str, onnx.TensorProto] = {}
 
     def constant(self, name: str, values: np.ndarray) -> str:
-        """Store an array under `name`; returns the name."""
-        self.constants[name] = numpy_helper.from_array(np.ascontiguousarray(values), name)
+        """Store an array under `name`; returns the name. Raises `ValueError` if it holds another array."""
+        tensor = numpy_helper.from_array(np.ascontiguousarray(values), name)
+        if self.constants.setdefault(name, tensor) != tensor:
+            raise ValueError(f"two constants named {name}")
         return name
 
     def node(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:

@@ -142,7 +142,7 @@ class _Assessment:
             return double.support.spread(torch.from_numpy(values), points.attributes).numpy()
 
         moved = [
-            model.support(model.deformation, model.canonical_points(model.gaussians.rows(rows)), time, None).means
+            model.support(model.deformation, model.canonical_points(model.gaussians.rows(rows)), time).means
             for model, time in ((double, torch.tensor(t, dtype=torch.float64)), (single, torch.tensor(t)))
         ]
         own = torch.linalg.vector_norm(moved[0] - moved[1].double(), dim=1).numpy()

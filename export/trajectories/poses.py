@@ -51,7 +51,7 @@ class ExactPoses:
     def _posed(self, t: float, ids: torch.Tensor) -> Poses:
         means, log_scales = self._means[ids], self._log_scales[ids]
         points = CanonicalPoints(means, self._quats[ids], {name: v[ids] for name, v in self._attributes.items()})
-        deltas = self._support(self._deformation, points, torch.tensor(t, dtype=torch.float64), None)
+        deltas = self._support(self._deformation, points, torch.tensor(t, dtype=torch.float64))
         of_means, of_scales, of_quats = (
             self._factors[head][ids] * getattr(deltas, head) if head in self._factors else getattr(deltas, head)
             for head in HEADS  # equation 12

@@ -30,6 +30,7 @@ class FitProgress(Observer):
         self._steps = steps
         self._stop = threading.Event()
         self._first: tuple[int, float] | None = None  # step and time that the speed is measured from
+        self._taken = 0  # optimizer steps since then; with `minutes` each stands for several steps of the schedule
         self._next_update = 0.0
         self._old_handler: Any = None
         state, left = TextColumn("{task.fields[state]}"), TimeRemainingColumn(elapsed_when_finished=True)
@@ -58,18 +59,20 @@ class FitProgress(Observer):
     def step(self, result: StepResult, seconds: float) -> None:
         now = time.perf_counter()
         if self._first is None:
-            self._first = (result.step, now)
+            self._first, self._taken = (result.step, now), -1
+        self._taken += 1
         if now < self._next_update and result.step < self._steps:
             return
         self._next_update = now + (UPDATE_SECONDS if console.is_terminal else PLAIN_LINE_SECONDS)
-        speed = (result.step - self._first[0]) / max(now - self._first[1], 1e-9)
+        elapsed = max(now - self._first[1], 1e-9)
+        pace = (result.step - self._first[0]) / elapsed
         state = f"loss {result.loss:.4f}  PSNR {result.psnr:.2f} dB  {result.gaussians:,} Gaussians"
-        state += f"  {speed:.1f} steps/s" if speed else ""
+        state += f"  {self._taken / elapsed:.1f} steps/s" if self._taken else ""
         state += f"  {result.skipped} skipped" if result.skipped else ""
         self._bar.update(self._task, completed=result.step, state=state)
         if not console.is_terminal:
             steps_left = self._steps - result.step
-            left = f"  {steps_left / speed:.0f} s left" if speed and steps_left else ""
+            left = f"  {steps_left / pace:.0f} s left" if pace and steps_left else ""
             self._print(f"step {result.step:,}/{self._steps:,}  {state}{left}")
 
     def evaluation(self, step: int, split: str, metrics: ImageMetrics) -> None:

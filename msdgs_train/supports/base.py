@@ -60,7 +60,7 @@ class Support(nn.Module):
     """Number of control nodes; None if the points are the Gaussians themselves."""
 
     def forward(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None
+        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None = None
     ) -> Deltas:
         """Deltas of the Gaussians at time `t`, a scalar tensor, after the first `num_layers` of the chain, or all."""
         return self.follow(gaussians, self.motions(chain, gaussians, t, num_layers))

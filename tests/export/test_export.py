@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from export.jobs.bake import ModelNotExportable, bake, starting_cameras
+from export.layers.graph import GraphBuilder
 from export.measure.verify import VerificationFailed, times_to_verify, verify
 from export.plans.registry import build
 from msdgs_serve import __version__
@@ -243,3 +244,10 @@ def test_the_scripts_run_from_any_folder_and_their_help_has_examples(tmp_path: P
 def test_no_module_shadows_another():
     names = {path.stem for path in (ROOT / "export").glob("*.py")}
     assert not names & ({"onnx", "onnxruntime", "torch", "numpy"} | sys.stdlib_module_names)
+
+
+def test_two_arrays_of_one_name_are_refused() -> None:
+    graph = GraphBuilder()
+    assert graph.constant("sizes", np.arange(3)) == graph.constant("sizes", np.arange(3))
+    with pytest.raises(ValueError, match="two constants named sizes"):
+        graph.constant("sizes", np.arange(4))
