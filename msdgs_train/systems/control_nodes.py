@@ -1,11 +1,14 @@
-"""The paper's chain of MLP layers on control nodes, which carry the Gaussians: the default system."""
+"""A chain of three layers on control nodes, which carry the Gaussians: the default system.
+
+The first layer has a spline of each node's own, which follows fast objects as the time window grows; the MLP layers
+after it share what nearby nodes have in common.
+"""
 
 from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
 from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems.registry import DEFAULT, register_system
-
-NUM_LAYERS = 4
 
 ON_NODES = TrainConfig().updated(
     model=ModelConfig(sh_degree=2, support=NodesConfig(skinning_lr_final=6e-3), embedding_dim=0, eps2d=0.15),
@@ -25,10 +28,10 @@ ON_NODES = TrainConfig().updated(
 
 register_system(
     DEFAULT,
-    "4 MLP layers on 512 control nodes, which carry the Gaussians",
+    "a spline layer and 2 MLP layers on 512 control nodes, which carry the Gaussians",
     ON_NODES.updated(
         support=NodesConfig(num_nodes=512, k_nearest=4, skinning_lr_final=6e-3),
-        layers=(SMALL_LAYER,) * NUM_LAYERS,
+        layers=(SplineConfig(), SMALL_LAYER, SMALL_LAYER),
         steps=20_000,
         window_full_fraction=0.65,
         new_frames_motion_only=False,
