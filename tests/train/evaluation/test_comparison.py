@@ -35,7 +35,7 @@ preset = "msdgs-small"
 layers = ["mlp:width=16"]
 embedding_dim = 4
 
-["k2, w = 1"]
+["k2 w=1"]
 preset = "msdgs-small"
 layers = ["mlp:width=16", "mlp:width=16,lr_init=1e-3"]
 weights = false
