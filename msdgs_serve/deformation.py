@@ -133,6 +133,8 @@ class DeformationSession:
 
     def _pose_all(self, t: float, ids: npt.NDArray[np.int64] | None, steps: float | None) -> dict[str, FloatArray]:
         """Poses by a graph of all Gaussians, one per row, and of more rows if it needs a multiple of some length."""
+        if ids is not None and not len(ids):
+            return {name: np.empty((0, _SIZES[name]), np.float32) for name in MOVING_OUTPUTS}
         rows = slice(self.scene.moving_count) if ids is None else ids
         outputs = zip(MOVING_OUTPUTS, self._run(t, np.arange(0), steps), strict=True)
         return {name: output[rows] for name, output in outputs}

@@ -78,6 +78,7 @@ def test_a_scene_on_nodes_is_posed_in_one_call():
             np.testing.assert_allclose(got, want.numpy(), rtol=0, atol=tolerance("export.nodes.relative"))
     for some, every in zip(session.pose(0.3, ids), session.pose(0.3), strict=True):
         np.testing.assert_array_equal(some, every[ids])
+    assert [part.shape for part in session.pose(0.3, [])] == [(0, 3), (0, 4), (0, 3)]
 
 
 @pytest.mark.parametrize("embedding_dim", [0, 8])
