@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from onnx import numpy_helper
 
 from export.jobs.bake import bake
 from export.plans.registry import build
@@ -79,6 +80,18 @@ def test_a_scene_on_nodes_is_posed_in_one_call():
     for some, every in zip(session.pose(0.3, ids), session.pose(0.3), strict=True):
         np.testing.assert_array_equal(some, every[ids])
     assert [part.shape for part in session.pose(0.3, [])] == [(0, 3), (0, 4), (0, 3)]
+
+
+def test_a_graph_of_all_gaussians_is_not_run_if_none_of_them_moves(monkeypatch: pytest.MonkeyPatch):
+    """A file whose `ids` are emptied still has the rows of all in its graph, which its cost of 0 calls hides."""
+    model = build("network", bake(random_model(300, support=NODES, sh_degree=0), SCENE, "0" * 64))
+    for constant in model.graph.initializer:
+        if constant.name in ("ids", "opacities", "sh"):
+            constant.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(constant)[:0], constant.name))
+    monkeypatch.setattr(DeformationSession, "_run", lambda *_: pytest.fail("the graph was run"))
+    session = DeformationSession("hostile.onnx", contents=model.SerializeToString())
+    assert session.cost.calls == 0
+    assert [len(part) for part in session.pose(0.3)] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("embedding_dim", [0, 8])
