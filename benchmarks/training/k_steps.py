@@ -16,7 +16,7 @@ from benchmarks.measuring import machine, report_console, table
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.compare import comparison_progress
 from msdgs_train.comparison.bench import Row, make_bench_runs, read_scenes, rows_of, runs_left, train_and_measure
-from msdgs_train.comparison.bench_report import paired_gain
+from msdgs_train.comparison.bench_report import gain, values_of
 from msdgs_train.comparison.matrix import Budget
 from msdgs_train.comparison.report import mean_and_deviation, save_figure
 from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
@@ -111,7 +111,7 @@ def report(rows: Sequence[Row], out: Path, console: Console) -> None:
         for k in NUM_LAYERS:
             values = [psnrs(rows, scene, name_of(family, k)) for family in FAMILIES]
             cells = [mean_and_deviation(found, 2) if found else "–" for found in values]
-            made.add_row(str(k), *cells, _gain(rows, scene, k))
+            made.add_row(str(k), *cells, gain(rows, [scene], name_of(CHAIN, k), name_of(WIDE, k)))
         console.print(made)
     console.print(machine())
     out.mkdir(parents=True, exist_ok=True)
@@ -140,19 +140,7 @@ def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
 
 def psnrs(rows: Sequence[Row], scene: str, system: str) -> list[float]:
     """PSNR on test images, one per seed."""
-    return [float(row["test_psnr"]) for row in rows if (row["scene"], row["system"]) == (scene, system)]
-
-
-def _gain(rows: Sequence[Row], scene: str, k: int) -> str:
-    """Of K layers over one of as many parameters, with its interval over images, each the mean over the seeds."""
-    images = [
-        [np.array(row["test_images"].split(), float) for row in rows if (row["scene"], row["system"]) == (scene, name)]
-        for name in (name_of(CHAIN, k), name_of(WIDE, k))
-    ]
-    if not all(images):
-        return ""
-    mean, low, high = paired_gain([np.mean(images[0], axis=0) - np.mean(images[1], axis=0)])
-    return f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"
+    return [float(value) for value in values_of(rows, scene, system, "test_psnr")]
 
 
 def self_test() -> int:

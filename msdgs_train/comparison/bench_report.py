@@ -34,7 +34,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
     shown = [markdown_table(headings, lines)]
     if len(systems) > 1:
         gains = [
-            [name, *(_gain(rows, of, system, systems[0]) for system in systems[1:])]
+            [name, *(gain(rows, of, system, systems[0]) for system in systems[1:])]
             for name, of in [*((scene, [scene]) for scene in scenes), ("mean", scenes)]
         ]
         shown += ["", f"Gain over {systems[0]} on test images, dB, with the 95 % interval over images:", ""]
@@ -44,7 +44,8 @@ def as_markdown(rows: Sequence[Row]) -> str:
     budget = f"{first['minutes']} {kind} per run on {first['threads']} thread(s) of {first['machine']}"
     days = sorted({row["date"] for row in rows})
     notes = f"PSNR in dB of the last model, mean ± standard deviation over seeds; {budget}; {days[0]} to {days[-1]}. "
-    notes += "Settings are chosen on val, results reported on test; the mean is over scenes that all systems have."
+    notes += "Settings are chosen on val, results reported on test; the mean is over scenes that all systems have, "
+    notes += "that of a gain over scenes that both systems have."
     return "\n".join([*shown, "", notes]) + "\n"
 
 
@@ -83,28 +84,34 @@ def _names(rows: Sequence[Row], column: str) -> list[str]:
     return list(dict.fromkeys(row[column] for row in rows))
 
 
-def _values(rows: Sequence[Row], scene: str, system: str, name: str) -> list[str]:
+def values_of(rows: Sequence[Row], scene: str, system: str, name: str) -> list[str]:
+    """A column of the rows of a scene and a system, without empty ones."""
     return [row[name] for row in rows if (row["scene"], row["system"]) == (scene, system) and row[name]]
 
 
 def _cell(rows: Sequence[Row], scene: str, system: str, split: str) -> str:
-    found = [float(value) for value in _values(rows, scene, system, f"{split}_psnr")]
+    found = [float(value) for value in values_of(rows, scene, system, f"{split}_psnr")]
     return mean_and_deviation(found, 2) if found else "–"
 
 
 def _mean_over_scenes(
     rows: Sequence[Row], scenes: Sequence[str], systems: Sequence[str], split: str
 ) -> list[float | None]:
-    cells = [[_values(rows, scene, system, f"{split}_psnr") for system in systems] for scene in scenes]
+    cells = [[values_of(rows, scene, system, f"{split}_psnr") for system in systems] for scene in scenes]
     complete = [[statistics.fmean(map(float, values)) for values in cell] for cell in cells if all(cell)]
     return [statistics.fmean(column) for column in zip(*complete, strict=True)] or [None] * len(systems)
 
 
-def _gain(rows: Sequence[Row], scenes: Sequence[str], system: str, first: str) -> str:
-    """Over scenes that both systems have, and over images, each the mean over the seeds."""
+def gain(rows: Sequence[Row], scenes: Sequence[str], system: str, first: str) -> str:
+    """The gain of `system` over `first` on test images and its interval, as text; – if no scene has both.
+
+    The mean is over scenes that both systems have, and over images, each the mean over the seeds.
+    """
     gains = []
     for scene in scenes:
-        images = [[np.array(v.split(), float) for v in _values(rows, scene, s, "test_images")] for s in (first, system)]
+        images = [
+            [np.array(v.split(), float) for v in values_of(rows, scene, s, "test_images")] for s in (first, system)
+        ]
         if all(images):
             gains.append(np.mean(images[1], axis=0) - np.mean(images[0], axis=0))
     if not gains:

@@ -147,8 +147,8 @@ def _encode_backward(grad: Tensor, encoded: Tensor, frequencies: Tensor) -> Tens
 
 
 class _Network(torch.autograd.Function):
-    """All outputs of an `MLPLayer`, [N, sum of `heads.sizes`], with a backward of its own: of the 512 rows of control
-    nodes, products take less time than the operations that torch records between them."""
+    """All outputs of an `MLPLayer`, [N, sum of `heads.sizes`], with a backward of its own: for the 512 rows of control
+    nodes, matrix products take less time than the operations that torch records between them."""
 
     @staticmethod
     def forward(
