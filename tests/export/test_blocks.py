@@ -10,7 +10,7 @@ from onnx import numpy_helper
 from export.jobs.bake import bake
 from export.plans.registry import build
 from export.spatial_order import morton_order
-from export.supports.blocks import WEIGHT_ONE, block_layout
+from export.supports.blocks import block_layout
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.spline import SplineLayer
@@ -40,11 +40,11 @@ def test_each_row_has_the_nodes_and_weights_of_its_gaussian(count: int, nodes: i
     for block in range(blocks):
         for row in range(size):
             of_row = stored["nodes"][block][stored["ids"][block, row]]
-            np.add.at(dense[block * size + row], of_row, stored["weights"][block, row] / WEIGHT_ONE)
+            np.add.at(dense[block * size + row], of_row, stored["weights"][block, row])
     want = np.zeros((count, nodes))
     np.put_along_axis(want, node_ids, weights, axis=1)
-    np.testing.assert_allclose(dense, want[layout.rows], atol=follows / WEIGHT_ONE)
-    np.testing.assert_array_equal(stored["weights"].sum(axis=2), WEIGHT_ONE)
+    np.testing.assert_allclose(dense, want[layout.rows], atol=tolerance("float32.relative"))
+    assert stored["weights"][..., :-1].max(initial=0) <= 0.5
 
 
 def test_morton_order_of_a_grid_visits_each_octant_at_once():
