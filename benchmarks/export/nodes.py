@@ -147,14 +147,8 @@ def measured(settings: Settings, width: int, seed: int) -> dict[str, Any]:
 
 def _file(job: ExportJob, candidate: Candidate, error: RenderedError, kinds: Mapping[str, str]) -> dict[str, float]:
     static, moving = bytes_per_gaussian(job, candidate.size, kinds)
-    opening = _seconds_to_open(candidate.path)
-    return {
-        "bytes": candidate.size,
-        "static": static,
-        "moving": moving,
-        "psnr_worst": error.psnr_worst,
-        "opening": opening,
-    }
+    figures = {"bytes": candidate.size, "static": static, "moving": moving}
+    return {**figures, "psnr_worst": error.psnr_worst, "opening": _seconds_to_open(candidate.path)}
 
 
 def bytes_per_gaussian(job: ExportJob, size: int, kinds: Mapping[str, str]) -> tuple[float, float]:
@@ -226,9 +220,12 @@ def self_test() -> int:
     assert max(found["errors"][name] for name in MOVING_OUTPUTS) < 1e-4
     assert found["psnr_worst"] > 60
     assert found["motion"] > 0.01
+    exact, small = found["files"].values()
     static = 4 * (3 + 4 + 3 + 1 + 3)  # mean, quaternion, scale, opacity, color
-    assert abs(found["static"] - static) < 1
-    assert ID_BYTES <= found["moving"] <= ID_BYTES + 12
+    assert abs(exact["static"] - static) < 1
+    assert small["static"] < static / 2
+    assert ID_BYTES <= small["moving"] <= ID_BYTES + 12
+    assert small["psnr_worst"] >= MIN_PSNR
     return main(count=200, layers=1, widths=(16,), nodes=8, seeds=(0,), repeats=2, size=32)
 
 
