@@ -1,5 +1,6 @@
 """Storage of the chosen candidate: its arrays in as few bytes as what plan and pruning left of the error allows."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import onnx
@@ -13,7 +14,7 @@ PLAN_PART = 0.75
 """Of the squared error that a file may have, the part that plan and pruning may use."""
 
 ESTIMATE_STRIDE = 6
-"""Estimates compare every 6th frame."""
+"""Estimates compare every 6th frame, or all if that was misleading."""
 
 
 def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: float) -> tuple[Candidate, RenderedError]:
@@ -29,14 +30,15 @@ def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: fl
         on_trial()
         return job.error(smaller, every)
 
-    def estimate(model: onnx.ModelProto) -> float:
-        return squared(measured(model, ESTIMATE_STRIDE).psnr_worst)
+    def estimate(every: int) -> Callable[[onnx.ModelProto], float]:
+        return lambda model: squared(measured(model, every).psnr_worst)
 
     def is_allowed(model: onnx.ModelProto) -> bool:
         tried.append(measured(model))
         return tried[-1].psnr_worst >= min_psnr
 
-    found = fewest_bytes(contents, estimate, is_allowed, squared(min_psnr) - squared(error.psnr_worst))
+    allowed = squared(min_psnr) - squared(error.psnr_worst)
+    found = fewest_bytes(contents, [estimate(ESTIMATE_STRIDE), estimate(1)], is_allowed, allowed)
     if found is None:
         return chosen, error
     saved = contents.ByteSize() - found.contents.ByteSize()

@@ -1,8 +1,8 @@
 """The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows."""
 
 import re
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +15,9 @@ from export.storage.kinds import Pack, directions, fractions, in_range, logarith
 MIN_VALUES = 256
 """Arrays of fewer values stay float32: the nodes that unfold them would take as many bytes."""
 
-MAX_VALUES = 1 << 27
+MAX_VALUES = 1 << 26
 """Files with more float32 values stay as they are: readers limit the bytes of the values of all nodes, and unfolding
-has up to five nodes per array."""
+has up to six nodes per array."""
 
 
 class Group(NamedTuple):
@@ -58,41 +58,63 @@ class Stored(NamedTuple):
 
 def fewest_bytes(
     contents: onnx.ModelProto,
-    estimate: Callable[[onnx.ModelProto], float],
+    estimates: Sequence[Callable[[onnx.ModelProto], float]],
     is_allowed: Callable[[onnx.ModelProto], bool],
     allowed: float,
 ) -> Stored | None:
     """The smallest scene file that `is_allowed`, or None if only the given one is.
 
-    Groups are packed one at a time to `estimate` their squared errors, which add up. All groups start with their
-    coarsest kind; while the sum is above `allowed`, the group with the largest error per byte gets its next kind.
+    Groups are packed one at a time to estimate their squared errors, which add up; if the sum was wrong, the next of
+    `estimates` is taken, and after the last of them a smaller sum.
     """
-    present = {name: [*GROUPS[name].kinds, None] for name in _members(contents)}
-
-    @cache
-    def alone(name: str, level: int) -> tuple[float, int]:
-        kind = present[name][level]
-        model = contents if kind is None else packed(contents, {name: kind})
-        return max(0.0, estimate(model) - before) if kind else 0.0, model.ByteSize()
-
-    def gain(name: str) -> float:
-        level = levels[name]
-        finer = alone(name, level + 1) if level + 1 < len(present[name]) else None
-        return alone(name, level)[0] / max(finer[1] - alone(name, level)[1], 1) if finer else -1.0
-
-    before, levels = estimate(contents), dict.fromkeys(present, 0)
+    choices = [_Choice(contents, estimate) for estimate in estimates[::-1]]
     while True:
-        while (total := sum(alone(name, level)[0] for name, level in levels.items())) > allowed:
-            levels[max(levels, key=gain)] += 1
-        kinds = {name: kind for name, level in levels.items() if (kind := present[name][level]) is not None}
+        kinds, total = choices[-1].within(allowed)
         if not kinds:
             return None
         model = packed(contents, kinds)
         if is_allowed(model):
             return Stored(model, kinds)
-        if not total:
+        if len(choices) > 1:
+            choices.pop()
+        elif total:
+            allowed = total / 2
+        else:
             return None
-        allowed = total / 2
+
+
+class _Choice:
+    """Kinds of all groups by one estimate of their squared errors."""
+
+    def __init__(self, contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float]) -> None:
+        self._contents, self._estimate = contents, estimate
+        self._kinds: dict[str, list[str | None]] = {name: [*GROUPS[name].kinds, None] for name in _members(contents)}
+        self._alone = cache(self._packed_alone)
+
+    def within(self, allowed: float) -> tuple[dict[str, str], float]:
+        """Kinds whose errors sum to `allowed` at most, without groups in float32, and the sum. All groups start with
+        their coarsest kind; the one with the largest error per byte that its next kind adds gets that kind."""
+        levels = dict.fromkeys(self._kinds, 0)
+        while (total := sum(self._alone(name, level)[0] for name, level in levels.items())) > allowed:
+            levels[max(levels, key=lambda name: self._gain(name, levels[name]))] += 1
+        kinds = {name: self._kinds[name][level] for name, level in levels.items()}
+        return {name: kind for name, kind in kinds.items() if kind is not None}, total
+
+    def _gain(self, name: str, level: int) -> float:
+        error, size = self._alone(name, level)
+        return error / max(self._alone(name, level + 1)[1] - size, 1) if error else -1.0
+
+    def _packed_alone(self, name: str, level: int) -> tuple[float, int]:
+        """Squared error and bytes of a file in which only this group is packed."""
+        kind = self._kinds[name][level]
+        if kind is None:
+            return 0.0, self._contents.ByteSize()
+        model = packed(self._contents, {name: kind})
+        return max(0.0, self._estimate(model) - self._before), model.ByteSize()
+
+    @cached_property
+    def _before(self) -> float:
+        return self._estimate(self._contents)
 
 
 def packed(contents: onnx.ModelProto, kinds: Mapping[str, str]) -> onnx.ModelProto:
