@@ -6,15 +6,13 @@ from dataclasses import replace
 import onnx
 
 from export.jobs.job import Candidate, ExportJob
+from export.jobs.sweep import ESTIMATE_STRIDE
 from export.jobs.write import properties, set_properties
 from export.measure.rendered_error import RenderedError
 from export.storage.choice import fewest_bytes
 
 PLAN_PART = 0.75
 """Of the squared error that a file may have, the part that plan and pruning may use."""
-
-ESTIMATE_STRIDE = 6
-"""Estimates compare every 6th frame, or all if that was misleading."""
 
 
 def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: float) -> tuple[Candidate, RenderedError]:
@@ -46,6 +44,7 @@ def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: fl
     entry = {"rule": "float32", "what": "bytes of arrays in float32", **numbers, "stored": found.kinds}
     set_properties(found.contents, left_out=[*properties(contents)["left_out"], entry])
     smaller.path.write_bytes(found.contents.SerializeToString())
+    smaller.close()  # its metadata has changed
     return smaller, tried[-1]
 
 
