@@ -59,6 +59,8 @@ class ExportOptions:
     """Keep modulation whose factors are 1."""
     keep_sh: Flag = False
     """Keep SH bands that change nothing."""
+    keep_float32: Flag = False
+    """Keep all arrays in float32 instead of fewer bits."""
     tolerance: float = 1e-4
     """Largest relative error of poses that the plan `network` may have against the model's layers."""
     times: int = 50

@@ -59,6 +59,7 @@ class DeformationSession:
         del contents  # `scene_file` has copies of all large arrays
         self.cost = scene_file.cost
         self._steps, self._outputs, self._selected = scene_file.steps, scene_file.outputs, scene_file.selected
+        self._takes_ids = scene_file.takes_ids
         self._chunk = chunk or (max(scene_file.moving_count, 1) if scene_file.poses_all else CHUNK)
         self.scene = self._read_scene(scene_file)
         self._session = self._open(scene_file.graph, thread_count() if scene_file.poses_all else 1)
@@ -192,7 +193,9 @@ class DeformationSession:
             Gaussians(*posed, self.scene.opacities[sample], self.scene.sh[sample]).validate()
 
     def _run(self, t: float, ids: npt.NDArray[np.int64], steps: float | None = None) -> list[FloatArray]:
-        inputs = {"t": np.array([t], np.float32), "ids": ids}
+        inputs: dict[str, np.ndarray] = {"t": np.array([t], np.float32)}
+        if self._takes_ids:
+            inputs["ids"] = ids
         if self._steps is not None:
             inputs[OPTIONAL_INPUT] = np.array([self._steps if steps is None else steps], np.float32)
         return self._call(self._session, self._outputs, inputs)

@@ -5,22 +5,29 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import tyro
 from rich.console import Console
 from rich.progress import track
 
 from benchmarks.measuring import Times, machine, report_console, table
-from export.jobs.job import ExportJob
+from export.jobs.job import Candidate, ExportJob
+from export.jobs.store import stored
+from export.jobs.write import properties
 from export.measure.poses import posed
+from export.measure.rendered_error import RenderedError
+from export.measure.stability import MIN_PSNR
 from export.measure.verify import TIMES, verify
 from export.plans.base import BASELINE
 from export.plans.registry import build
 from export.pruning.mask import PruningMask, bake_pruned, full_mask, pruned
+from export.storage.choice import GROUPS, packed
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.threads import THREADS_VARIABLE
@@ -30,8 +37,6 @@ from msdgs_train.gaussians.model_file import SceneInfo, save_model
 from msdgs_train.supports.nodes import NodesConfig
 from tests.support.models import SCENE, random_model
 
-ID_BYTES = 8
-"""Bytes that a moving Gaussian takes in the default of the input `ids`, under every plan."""
 OPENINGS = 3
 
 
@@ -62,8 +67,8 @@ def main(
     size: int = 256,
     check: bool = False,
 ) -> int:
-    """Export random models on control nodes as `export/to_onnx.py --plan network` does, unpruned, and print errors,
-    sizes and times.
+    """Export random models on control nodes as `export/to_onnx.py --plan network` does, unpruned, in float32 and in
+    fewer bits, and print errors, sizes and times.
 
     python -m benchmarks.export.nodes --widths 96 128 --seeds 0 1
 
@@ -92,15 +97,18 @@ def main(
     console, names = report_console(), MOVING_OUTPUTS
     title = f"{count:,} Gaussians, {layers} layers, {nodes} nodes"
     errors = table(title, "width, seed", "motion", *names, "worst frame, dB")
-    files = table("files", "width, seed", "MB", "bytes per Gaussian, static", "moving", "id", "opening, s")
+    files = table(
+        "files", "width, seed", "storage", "MB", "bytes per Gaussian, static", "moving", "worst frame, dB", "opening, s"
+    )
     times = table(
         "ms per pose", "width, seed", *(f"{n} threads: {w}" for n in threads for w in ("median", "95 %", "CPU"))
     )
     for row in rows:
         found = [f"{row['errors'][name]:.1e}" for name in names]
         errors.add_row(row["name"], f"{row['motion']:.2f}", *found, f"{row['psnr_worst']:.1f}")
-        numbers = row["bytes"] / 1e6, row["static"], row["static"] + row["moving"]
-        files.add_row(row["name"], *(f"{n:.1f}" for n in numbers), str(ID_BYTES), f"{row['opening']:.2f}")
+        for storage, file in row["files"].items():
+            numbers = file["bytes"] / 1e6, file["static"], file["static"] + file["moving"], file["psnr_worst"]
+            files.add_row(row["name"], storage, *(f"{n:.1f}" for n in numbers), f"{file['opening']:.2f}")
         times.add_row(row["name"], *(f"{value:.1f}" for each in row["times"].values() for value in each))
     for each in (machine(), errors, files, times):
         console.print(each)
@@ -119,29 +127,38 @@ def measured(settings: Settings, width: int, seed: int) -> dict[str, Any]:
         save_model(checkpoint, model, _scene(settings.size), 1)
         job = ExportJob(checkpoint, Path(folder), rules=())
         candidate = job.candidate(BASELINE, None)
-        static, moving = bytes_per_gaussian(job, candidate.size)
+        error = job.error(candidate)
+        smaller, smaller_error = stored(job, candidate, error, MIN_PSNR)
+        kinds = properties(onnx.load(smaller.path))["left_out"][-1]["stored"]
         return {
             "name": f"{width}, {seed}",
             "errors": verify(candidate.session, candidate.pruned.moving, times=TIMES, tolerance=math.inf),
             "motion": float(np.abs(np.subtract(*(candidate.session.pose(t)[0] for t in job.info.time_range))).max()),
-            "psnr_worst": job.error(candidate).psnr_worst,
-            "bytes": candidate.size,
-            "static": static,
-            "moving": moving,
-            "opening": _seconds_to_open(candidate.path),
-            "times": milliseconds(candidate.path, settings),
+            "psnr_worst": error.psnr_worst,
+            "files": {
+                "float32": _file(job, candidate, error, {}),
+                ", ".join(f"{name} {kind}" for name, kind in kinds.items()): _file(job, smaller, smaller_error, kinds),
+            },
+            "times": milliseconds(smaller.path, settings),
         }
 
 
-def bytes_per_gaussian(job: ExportJob, size: int) -> tuple[float, float]:
+def _file(job: ExportJob, candidate: Candidate, error: RenderedError, kinds: Mapping[str, str]) -> dict[str, float]:
+    static, moving = bytes_per_gaussian(job, candidate.size, kinds)
+    figures = {"bytes": candidate.size, "static": static, "moving": moving}
+    return {**figures, "psnr_worst": error.psnr_worst, "opening": _seconds_to_open(candidate.path)}
+
+
+def bytes_per_gaussian(job: ExportJob, size: int, kinds: Mapping[str, str]) -> tuple[float, float]:
     """Bytes of a static Gaussian, and how many more a moving one takes. `size` is that of the file in which all move;
-    it is compared with files in which every second Gaussian is static or left out."""
+    it is compared with files in which every second Gaussian is static or left out, whose arrays are stored alike."""
     whole, count = full_mask(job.model), len(job.model.gaussians)
     canonical, first = posed(job.model, 0.0, deform=False), np.arange(count) % 2 == 0
+    alike = {**kinds, **{f"static {name}": kind for name, kind in kinds.items() if f"static {name}" in GROUPS}}
 
     def size_of(mask: PruningMask) -> int:
         baked = bake_pruned(pruned(job.model, mask, canonical, []), job.info, job.sha256)
-        return build(BASELINE, baked).ByteSize()
+        return packed(build(BASELINE, baked), alike).ByteSize()
 
     half_static, half = size_of(whole.without(moves=first)), size_of(whole.without(kept=first))
     changed = count - int(first.sum())
@@ -201,9 +218,12 @@ def self_test() -> int:
     assert max(found["errors"][name] for name in MOVING_OUTPUTS) < 1e-4
     assert found["psnr_worst"] > 60
     assert found["motion"] > 0.01
+    exact, small = found["files"].values()
     static = 4 * (3 + 4 + 3 + 1 + 3)  # mean, quaternion, scale, opacity, color
-    assert abs(found["static"] - static) < 1
-    assert ID_BYTES <= found["moving"] <= ID_BYTES + 12
+    assert abs(exact["static"] - static) < 1
+    assert small["static"] < static / 2
+    assert 0 < small["moving"] <= 12
+    assert small["psnr_worst"] >= MIN_PSNR
     return main(count=200, layers=1, widths=(16,), nodes=8, seeds=(0,), repeats=2, size=32)
 
 

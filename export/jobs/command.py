@@ -6,6 +6,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from rich.table import Column, Table
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
+from export.jobs.store import PLAN_PART, squared, stored
 from export.jobs.sweep import Sweep
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
 
 LOWEST_MIN_PSNR = 10.0
 """Smallest `min_psnr`, dB. Frames below it don't resemble the scene."""
+
+STORAGE = "float32"
+"""The rule of storage, as `ExportOptions.keep_float32` switches it off."""
 
 WIDE = 180
 """Width of the terminal, in characters, from which the table has all columns."""
@@ -52,17 +57,22 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
         rules = [rule for rule in RULES if rule not in options.keep]
         training = images.training if images else []
         job = ExportJob(model, Path(folder), min_psnr=options.min_psnr, rules=rules, training=training, progress=track)
-        contents = None
+        packs = STORAGE not in options.keep
+        part, result = PLAN_PART if packs else 1.0, None
         if options.chosen_plan is None:
-            result = Sweep(job, options.min_psnr, images).run()
-            contents = report(job, result)
+            result = Sweep(job, options.min_psnr, images, part=part).run()
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
         else:
-            chosen, error = _planned(job, options.chosen_plan, options.min_psnr)
+            chosen, error = _planned(job, options.chosen_plan, options.min_psnr, part)
+        written, error = stored(job, chosen, error, options.min_psnr) if packs else (chosen, error)
+        if result:
+            result.points[result.chosen] = replace(result.points[result.chosen], candidate=written, error=error)
+        contents = report(job, result) if result else None
         exported = write_scene(
             options.scene_file,
             onnx.load(chosen.path),
             chosen.pruned.moving,
+            packed=None if written is chosen else onnx.load(written.path),
             rendered=error.to_plain(),
             tolerance=options.tolerance,
             times=options.times,
@@ -112,19 +122,19 @@ def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutIma
     return HeldOutImages(data, load_model(model).scene, lambda count: track("images", count))
 
 
-def _planned(job: ExportJob, plan: str, min_psnr: float) -> tuple[Candidate, RenderedError]:
-    """A candidate of the plan that was asked for, pruned as far as its own error allows."""
+def _planned(job: ExportJob, plan: str, min_psnr: float, part: float) -> tuple[Candidate, RenderedError]:
+    """A candidate of the plan that was asked for, pruned as far as a part of what its own error leaves allows."""
     whole = job.candidate(plan, None)
     best = job.error(whole)
     if best.psnr_worst < min_psnr:
         reachable = f"at most {math.floor(10 * best.psnr_worst) / 10:.1f}, which the plan {plan} reaches"
         raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", min_psnr)
     if job.rules:
-        budget = 10 ** (-min_psnr / 10) - 10 ** (-best.psnr_worst / 10)
+        budget = part * (squared(min_psnr) - squared(best.psnr_worst))
         for fraction in (1.0, 0.5, 0.25) if budget > 0 else ():
             pruned = job.candidate(plan, -10 * math.log10(fraction * budget))
             error = job.error(pruned)
-            if error.psnr_worst >= min_psnr:
+            if squared(error.psnr_worst) <= squared(best.psnr_worst) + budget:
                 return pruned, error
     return whole, best
 

@@ -49,6 +49,7 @@ LEGEND = """\
 - **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
   a Gaussian, in scene units and in pixels, transparent and hidden ones included.
 - **held-out**: mean PSNR in dB against held-out images.
+- The chosen point's MB and errors are those of the written file, whose arrays have fewer bits; others have float32.
 - Points with other rasterizer options show their effect. A file can't select them, so none is chosen.
 """
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MAX_RELATIVE_COST = 4.0
 """A plan that runs layers isn't tried if its layers take this many times the whole frame of a plan within the error."""
 
-PRUNING_STEPS = (20.0, 10.0, 5.0, 1.0, -5.0, -10.0, -15.0)
+PRUNING_STEPS = (20.0, 10.0, 5.0, 2.0, -5.0, -10.0, -15.0)
 """dB above or below `min_psnr` at which pruning is tried."""
 
 MIN_PRUNING_DB, MIN_USEFUL_DB = 25.0, 20.0
@@ -142,8 +142,12 @@ class SweepResult(NamedTuple):
 class Sweep:
     """One sweep over the candidates of a job."""
 
-    def __init__(self, job: ExportJob, min_psnr: float, images: "HeldOutImages | None" = None) -> None:
+    def __init__(
+        self, job: ExportJob, min_psnr: float, images: "HeldOutImages | None" = None, *, part: float = 1.0
+    ) -> None:
+        """`part` is how much of the squared error of `min_psnr` dB the chosen point has if possible."""
         self.job, self.min_psnr, self.images = job, min_psnr, images
+        self.preferred_psnr = min_psnr - 10 * math.log10(part)
         self.estimates: list[QuickEstimate] = []
         self.baseline: QuickEstimate | None = None  # the whole network; None if it can't be run in float32
         self.refused: list[tuple[str, str]] = []
@@ -261,7 +265,8 @@ class Sweep:
         ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)[:MAX_POINTS]
         ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
         points = self._points([estimate.candidate for estimate in ahead])
-        best = choose(points, self.min_psnr)
+        best = choose(points, self.preferred_psnr)
+        best = choose(points, self.min_psnr) if best is None else best
         if best is None:  # estimates see only some of the frames
             raise TargetNotReached("min_psnr", f"at most {max(p.error.psnr_worst for p in points):.1f}", self.min_psnr)
         left = [estimate for estimate in self.estimates if estimate not in ahead]

@@ -9,7 +9,7 @@ from typing import Any
 import onnx
 from onnx import helper
 
-from export.measure.verify import TIMES, TOLERANCE, verify
+from export.measure.verify import TIMES, TOLERANCE, differences, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene, SceneMetadata
 from msdgs_train.datasets.common.files import replacing
@@ -36,34 +36,42 @@ def write_scene(
     contents: onnx.ModelProto,
     model: DynamicGaussians,
     *,
+    packed: onnx.ModelProto | None = None,
     rendered: dict[str, Any] | None = None,
     tolerance: float = TOLERANCE,
     times: int = TIMES,
     on_time: Callable[[], object] = lambda: None,
 ) -> Exported:
-    """Write a scene file that is compared with the model of its moving part.
+    """Write a scene file that is compared with the model of its moving part, or in its place the same with packed
+    arrays, of which only the difference is measured.
 
-    `rendered` is the error of its frames, which is stored in its metadata.
+    `rendered` is the error of frames of what is written, which is stored in its metadata.
     """
 
     def measured(session: DeformationSession) -> dict[str, Any]:
         errors = verify(session, model, times=times, tolerance=tolerance, on_time=on_time)
+        if packed is not None:
+            errors["storage"] = differences(DeformationSession(output, contents=packed.SerializeToString()), session)
         return errors if rendered is None else {**errors, "rendered": rendered}
 
-    scene = write_measured(output, contents, measured)
+    scene = write_measured(output, contents, measured, packed)
     return Exported(output, output.stat().st_size, scene.moving_count, scene.static_count, scene.metadata)
 
 
 def write_measured(
-    output: Path, contents: onnx.ModelProto, measure: Callable[[DeformationSession], dict[str, Any]]
+    output: Path,
+    contents: onnx.ModelProto,
+    measure: Callable[[DeformationSession], dict[str, Any]],
+    packed: onnx.ModelProto | None = None,
 ) -> BakedScene:
     """Write a scene file beside `output`, add what `measure` finds to its `measured_error`, and only then move it
-    there."""
+    there, or the file with packed arrays."""
     with replacing(output) as temporary:
         temporary.write_bytes(contents.SerializeToString())
         measured = measure(DeformationSession(temporary))
-        set_properties(contents, measured_error=properties(contents)["measured_error"] | measured)
-        temporary.write_bytes(contents.SerializeToString())
+        written = contents if packed is None else packed
+        set_properties(written, measured_error=properties(contents)["measured_error"] | measured)
+        temporary.write_bytes(written.SerializeToString())
         return DeformationSession(temporary).scene  # opened again: its metadata has changed
 
 

@@ -17,6 +17,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 
 TOLERANCE = 1e-4
 TIMES = 50
+DIFFERENCE_TIMES = 3
 GAUSSIANS_PER_TIME = 5_000
 """In larger scenes every n-th Gaussian is compared, with another start at each time."""
 
@@ -87,6 +88,18 @@ def verify(
         "unstable": {"count": int(unstable.sum()), "error": unstable_worst},
         "times": times,
     }
+
+
+def differences(got: DeformationSession, expected: DeformationSession) -> dict[str, float]:
+    """The largest errors of all Gaussians of a file against another of the same scene, at a few times, by output."""
+    worst: dict[str, float] = dict.fromkeys(MOVING_OUTPUTS, 0.0)
+    bounds = expected.scene.metadata.bounds
+    for t in times_to_verify(*expected.scene.metadata.time_range, DIFFERENCE_TIMES):
+        pose, reference = got.gaussians(t), expected.gaussians(t)
+        _give_sign_of(reference.quats, pose.quats)
+        for name, errors in pose_errors(pose, reference, half_diagonal(bounds)).items():
+            worst[name] = max(worst[name], float(errors.max(initial=0)))
+    return worst
 
 
 def _displacements(distances: np.ndarray, bound: dict[str, Any] | None) -> dict[str, Any]:

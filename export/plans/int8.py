@@ -6,7 +6,7 @@ Encodings, the first product, which reads them, the heads and everything that de
 
 import logging
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def int8(baked: Baked) -> onnx.ModelProto:
         quantize_static(
             exact,
             path,
-            _Calibration(baked),
+            _Calibration(baked, [given.name for given in exact.graph.input]),
             quant_format=QuantFormat.QDQ,
             nodes_to_quantize=products,
             per_channel=True,
@@ -70,10 +70,11 @@ def _quiet() -> Iterator[None]:
 
 
 class _Calibration(CalibrationDataReader):
-    """Inputs of the network: evenly spread Gaussians, others at each time."""
+    """Inputs of the network, those of `names`: evenly spread Gaussians, others at each time."""
 
-    def __init__(self, baked: Baked) -> None:
-        self._inputs = self._each(len(baked.moving), baked.scene.metadata.time_range)
+    def __init__(self, baked: Baked, names: Collection[str]) -> None:
+        each = self._each(len(baked.moving), baked.scene.metadata.time_range)
+        self._inputs = ({name: given[name] for name in given if name in names} for given in each)
 
     def get_next(self) -> dict[str, Any] | None:  # type: ignore[override]
         return next(self._inputs, None)

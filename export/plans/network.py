@@ -19,15 +19,16 @@ from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT, MIN_SCALE
 
 def network(baked: Baked, plan: str = "network") -> onnx.ModelProto:
     """The scene with all its layers, exactly as trained."""
-    graph = new_graph(baked)
-    _deform(graph, baked)
+    layout = support_export_of(baked.support).layout(baked.moving.means, baked.moving.baked_attributes)
+    graph = new_graph(baked) if layout is None else GraphBuilder()
+    _deform(graph, baked, layout)
     return finished(graph, baked, plan)
 
 
-def _deform(graph: GraphBuilder, baked: Baked) -> None:
-    """Canonical values of the ids, moved by the chain on its support, then activated: `DynamicGaussians.pose`."""
+def _deform(graph: GraphBuilder, baked: Baked, layout: Layout | None) -> None:
+    """Canonical values of the rows, moved by the chain on its support, then activated: `DynamicGaussians.pose`."""
     moving, export = baked.moving, support_export_of(baked.support)
-    rows = _Rows(graph, len(moving), export.layout(moving.means, moving.baked_attributes))
+    rows = _Rows(graph, len(moving), layout)
     means = rows.of("canonical_means", moving.means)
     log_scales = rows.of("canonical_log_scales", moving.log_scales)
     quats = rows.of("canonical_quats", moving.quats)
@@ -47,11 +48,11 @@ def _deform(graph: GraphBuilder, baked: Baked) -> None:
         _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space, poses["scales"])
         raw_quats = graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats
         unit_quats(graph, raw_quats, poses["quats"])
-    rows.select(poses)
+    rows.put_in_order(poses)
 
 
 class _Rows:
-    """The Gaussians that a graph poses: those asked for, or all in the order of a layout, from which it selects."""
+    """The Gaussians that a graph poses: those asked for, or all in the order of a layout, which it undoes."""
 
     def __init__(self, graph: GraphBuilder, count: int, layout: Layout | None) -> None:
         self.layout, self._graph, self._count = layout, graph, count
@@ -63,21 +64,23 @@ class _Rows:
         return self._graph.constant(name, values[self.layout.rows])
 
     def output(self, name: str) -> str:
-        """The name of an output before the selection."""
+        """The name of an output in the order of the rows."""
         return name if self.layout is None else f"rows.{name}"
 
-    def select(self, poses: Mapping[str, str]) -> None:
-        """Add the nodes that select the ids from the poses of a layout's rows."""
+    def put_in_order(self, poses: Mapping[str, str]) -> None:
+        """Add the nodes that take each Gaussian once, in order, from the poses of a layout's rows."""
         if self.layout is None:
             return
         graph, row_of_id = self._graph, np.zeros(self._count, np.int32)
         row_of_id[self.layout.rows[::-1]] = np.arange(len(self.layout.rows))[::-1]
-        ids = "ids"
-        if not np.array_equal(row_of_id, np.arange(self._count)):
-            rows = graph.node("Cast", [graph.constant("row_of_id", row_of_id)], "rows.of_id", to=TensorProto.INT64)
-            ids = graph.node("Gather", [rows, "ids"], "rows.ids")
-        for name, value in poses.items():
-            graph.node("Gather", [value, ids], name)
+        padding = len(self.layout.rows) - self._count
+        if np.array_equal(row_of_id, np.arange(self._count)):
+            for name, value in poses.items():
+                graph.split(value, [name, f"{name}.padding"], [self._count, padding], axis=0)
+        else:
+            ids = graph.node("Cast", [graph.constant("row_of_id", row_of_id)], "rows.of_id", to=TensorProto.INT64)
+            for name, value in poses.items():
+                graph.node("Gather", [value, ids], name)
 
 
 def _modulated(graph: GraphBuilder, rows: _Rows, part: str, factors: np.ndarray | None, deltas: str) -> str:

@@ -29,13 +29,16 @@ def finished(
     `error_bound` of a fitted plan is `measured_error` until the file is measured.
     """
     scene = baked.scene
-    count: int | str = "M" if scene.moving_count else 0
+    has_ids = "ids" in graph.constants
+    count: int | str = "M" if has_ids and scene.moving_count else scene.moving_count
     outputs: dict[str, list[int | str]] = {"means": [count, 3], "quats": [count, 4], "scales": [count, 3]}
     for name in CONSTANT_OUTPUTS:
         array = getattr(scene, name)
         graph.constant(name, array)
         outputs[name] = list(array.shape)
-    inputs = {"t": (TensorProto.FLOAT, [1]), "ids": (TensorProto.INT64, ["M"])}
+    inputs: dict[str, tuple[int, list[int | str]]] = {"t": (TensorProto.FLOAT, [1])}
+    if has_ids:
+        inputs["ids"] = (TensorProto.INT64, ["M"])
     if "steps" in graph.constants:
         inputs["steps"] = (TensorProto.FLOAT, [1])
     return graph.model(

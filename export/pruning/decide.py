@@ -12,8 +12,8 @@ from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.model import DynamicGaussians
 
 POSE_BYTES, OPACITY_BYTES, COLOR_BYTES = 40, 4, 12
-MOVING_BYTES, MODULATION_BYTES = 8, 12
-"""Sizes per Gaussian in a scene file: pose, opacity, an SH coefficient; and if it moves, its id and its modulation."""
+MODULATION_BYTES = 12
+"""Sizes per Gaussian in a scene file in float32: pose, opacity, an SH coefficient; and if it moves, its modulation."""
 
 
 def prune(
@@ -48,6 +48,6 @@ def stored_bytes(model: DynamicGaussians, mask: PruningMask) -> int:
     gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(mask.sh_degree)
     layers = [list(model.deformation)[k] for k in mask.network.layers] if mask.moves.any() else []
     attributes = support_export_of(model.support).bytes_per_gaussian(model.support) if layers else 0
-    moving = MOVING_BYTES + MODULATION_BYTES * mask.network.modulated + attributes
+    moving = MODULATION_BYTES * mask.network.modulated + attributes
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())
     return gaussian * int(mask.kept.sum()) + moving * int(mask.moves.sum()) + weights

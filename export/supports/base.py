@@ -36,8 +36,8 @@ class SupportExport:
     """Whether a head that is 0 in all layers is 0 for the Gaussians too."""
 
     def bytes_per_gaussian(self, support: Support) -> int:
-        """Bytes per Gaussian that the support stores in a scene file."""
-        return 0
+        """Bytes per moving Gaussian that the support stores in a scene file, in float32; by default an id."""
+        return 8
 
     def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout | None:
         """The rows of a graph of all moving Gaussians, of canonical means [M, 3] and attributes `Support.baked`; None

@@ -17,11 +17,6 @@ as 128."""
 SORTING_GAIN = 0.9
 """Rows are sorted if this makes the cost smaller than this times that of the order given, which needs no index from
 Gaussians to rows."""
-WEIGHT_ONE = 131_070
-"""A skinning weight of 1. All of a Gaussian's weights but the largest, which is the last and isn't stored, are at most
-half of it, so that they have 16 bits and are off by 3.8e-6 at most."""
-WEIGHT_OFFSET = 32_768
-"""What is taken from weights to store them as int16."""
 
 
 class Blocks(NamedTuple):
@@ -29,7 +24,7 @@ class Blocks(NamedTuple):
 
     nodes: np.ndarray  # int64 [B, U]
     ids: np.ndarray  # int64 [B, S, F], indices into a row of `nodes`
-    weights: np.ndarray  # int64 [B, S, F], fractions of `WEIGHT_ONE`; the largest of a Gaussian is the last
+    weights: np.ndarray  # float32 [B, S, F]; the largest of a Gaussian is the last, so that others are 0.5 at most
 
     @property
     def cost(self) -> int:
@@ -48,8 +43,8 @@ def block_layout(means: np.ndarray, node_ids: np.ndarray, skinning_weights: np.n
     """
     ascending = np.argsort(skinning_weights, axis=1, kind="stable")
     node_ids = np.take_along_axis(node_ids, ascending, axis=1)
-    stored = _stored_weights(np.take_along_axis(skinning_weights, ascending, axis=1))
-    given, sorted_ = (_cheapest(order, node_ids, stored) for order in (np.arange(len(means)), morton_order(means)))
+    weights = np.take_along_axis(skinning_weights, ascending, axis=1).astype(np.float32)
+    given, sorted_ = (_cheapest(order, node_ids, weights) for order in (np.arange(len(means)), morton_order(means)))
     rows, blocks = sorted_ if sorted_[1].cost < SORTING_GAIN * given[1].cost else given
     return Layout(rows, blocks._asdict())
 
@@ -70,10 +65,3 @@ def _blocks(node_ids: np.ndarray, weights: np.ndarray, size: int) -> Blocks:
     nodes = np.stack([np.pad(nodes, (0, width - len(nodes)), mode="edge") for nodes, _ in distinct])
     ids = np.stack([local.reshape(size, -1) for _, local in distinct])
     return Blocks(nodes, ids, weights.reshape(members.shape))
-
-
-def _stored_weights(weights: np.ndarray) -> np.ndarray:
-    """int64 [N, F] whose rows sum to `WEIGHT_ONE`, of rows in ascending order: the last takes what rounding leaves."""
-    stored = np.round(weights.astype(np.float64) * WEIGHT_ONE).astype(np.int64)
-    stored[:, -1] += WEIGHT_ONE - stored.sum(axis=1)
-    return stored

@@ -13,7 +13,7 @@ from export.layers.base import HEADS
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder, to_numpy
 from export.supports.base import Layout, SupportExport, SupportInputs
-from export.supports.blocks import WEIGHT_OFFSET, WEIGHT_ONE, block_layout
+from export.supports.blocks import block_layout
 from export.supports.skinning import Blend, columns_of, reshaped, skinned_deltas, skinned_poses
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.supports.base import Support
@@ -28,8 +28,8 @@ class NodesExport(SupportExport):
     heads_are_removable = False
 
     def bytes_per_gaussian(self, support: Support) -> int:
-        """An index in 8 bits and, but for the last, a weight in 16 bits for each node that a Gaussian follows."""
-        return 3 * cast(NodesSupport, support).config.followed - 2
+        """An index in 8 bits and, but for the last, a weight for each node that a Gaussian follows."""
+        return 5 * cast(NodesSupport, support).config.followed - 4
 
     def layout(self, means: np.ndarray, attributes: Mapping[str, np.ndarray]) -> Layout:
         """Blocks of Gaussians that are near each other."""
@@ -53,7 +53,8 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     raw = graph.node("Add", [parts["quats"], graph.constant("nodes.identity", IDENTITY)], "nodes.raw_rots")
     rots = _unit(graph, "nodes.rots", raw)
     matrices = _stretching(graph, "nodes.matrices", _matrices(graph, "nodes.rotations", rots), parts["scales"])
-    factors = graph.constant("nodes.factors", np.repeat(positions, 3, axis=1))
+    columns = graph.constant("nodes.columns", np.repeat(np.arange(3), 3))
+    factors = graph.node("Gather", [nodes, columns], "nodes.factors", axis=1)
     add_columns = graph.constant("nodes.add_columns", np.tile(np.eye(3, dtype=np.float32), (3, 1)))
     products = graph.node("Mul", [matrices, factors], "nodes.products")
     rotated = graph.node("MatMul", [products, add_columns], "nodes.rotated")
@@ -83,18 +84,12 @@ def _weights(graph: GraphBuilder, ids: np.ndarray, weights: np.ndarray, width: i
     The last weight of a Gaussian isn't stored: it is one minus the others.
     """
     own = graph.constant("skinning.own", np.arange(width))
-    one = graph.constant("skinning.one", np.array([1 / WEIGHT_ONE], np.float32))
-    offset = graph.constant("skinning.weight_offset", np.array([WEIGHT_OFFSET], np.float32))
-    left, total = graph.constant("skinning.all", np.array([WEIGHT_ONE], np.float32)), ""
+    left, total = graph.constant("skinning.one", np.ones(1, np.float32)), ""
     for f in range(ids.shape[2]):
         name, weight = f"skinning.node{f}", left
         if f + 1 < ids.shape[2]:
-            stored = (weights[..., f, None] - WEIGHT_OFFSET).astype(np.int16)
-            stored = graph.constant(f"{name}.stored_weight", stored)
-            weight = graph.node("Cast", [stored], f"{name}.number", to=TensorProto.FLOAT)
-            weight = graph.node("Add", [weight, offset], f"{name}.fraction")
+            weight = graph.constant(f"skinning.weight{f}", weights[..., f, None])
             left = graph.node("Sub", [left, weight], f"{name}.left")
-        weight = graph.node("Mul", [weight, one], f"{name}.weight")
         followed = graph.node("Equal", [_stored_ids(graph, name, ids[..., f, None]), own], f"{name}.equal")
         place = graph.node("Cast", [followed], f"{name}.place", to=TensorProto.FLOAT)
         term = graph.node("Mul", [place, weight], f"{name}.matrix")

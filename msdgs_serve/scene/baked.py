@@ -12,7 +12,6 @@ from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 __all__ = [
     "CONSTANT_OUTPUTS",
     "CONTRACT",
-    "INPUTS",
     "MOVING_OUTPUTS",
     "OPTIONAL_INPUT",
     "BakedScene",
@@ -20,7 +19,6 @@ __all__ = [
     "SceneMetadata",
 ]
 
-INPUTS = ("t", "ids")
 OPTIONAL_INPUT = "steps"
 MOVING_OUTPUTS = ("means", "quats", "scales")
 MAX_SH = 1e30

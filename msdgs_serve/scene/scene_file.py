@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, INPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT
+from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_serve.scene.metadata import SceneMetadata
 from msdgs_serve.scene.onnx import (
@@ -59,6 +59,7 @@ class SceneFile:
     metadata: SceneMetadata
     moving_count: int
     steps: float | None  # the default input; None if the plan doesn't run layers
+    takes_ids: bool  # whether the graph has the input `ids`
     poses_all: bool  # whether a call computes all Gaussians in any case
     outputs: tuple[str, ...]  # those of `graph` with the values of MOVING_OUTPUTS
     selected: bool  # whether rows of the outputs are those of the input `ids`; otherwise row i is of Gaussian i
@@ -89,13 +90,14 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
     for tensor in model.constants.values():
         _check_finite(tensor)
     inputs = _inputs(model)
-    moving_count, steps = _default_ids(model), _default_steps(model)
+    takes_ids = "ids" in inputs
+    moving_count, steps = _default_ids(model) if takes_ids else _rows(model), _default_steps(model)
     returned = moving_count * _POSED_BYTES
-    poses_all = steps is None or _poses_all(model, inputs, moving_count)
+    poses_all = not takes_ids or steps is None or _poses_all(model, inputs, moving_count)
     ids = moving_count if poses_all else min(CHUNK, moving_count)
     calls = -(-moving_count // max(ids, 1))
     values, cost = infer(model, inputs, limits, ids, calls, returned)
-    _check_outputs(model, values, moving_count)
+    _check_outputs(model, values, moving_count, takes_ids)
     _check_count(moving_count + values["static_means"].shape[0].fixed, limits)
     constants = {}
     for name in CONSTANT_OUTPUTS:
@@ -109,6 +111,7 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
         metadata,
         moving_count,
         steps,
+        takes_ids,
         poses_all,
         outputs,
         rows is None,
@@ -127,24 +130,28 @@ def _poses_all(model: Model, inputs: Mapping[str, Value], moving_count: int) -> 
 
 def _before_selection(model: Model, values: Mapping[str, Value], moving_count: int) -> tuple[str, ...] | None:
     """The names of the poses of all Gaussians, row i of Gaussian i, from which the last nodes of a graph select the
-    ids. None if its last nodes do something else.
+    ids, or the first rows. None if it has the input `ids` and its last nodes do something else.
 
     The selection takes 2.5 of 10.7 ms of a pose of 106,500 Gaussians on one thread, and usually selects all in order.
     """
     if not moving_count:
         return None
     makers, rows = {node.outputs[0]: node for node in model.nodes}, []
+    takes_ids = "ids" in model.inputs
+    otherwise, operator = (None, "Gather") if takes_ids else (MOVING_OUTPUTS, "Split")
     for name in MOVING_OUTPUTS:
         node = makers.get(name)
-        if node is None or node.operator != "Gather" or node.inputs[1] != "ids" or node.attributes.get("axis", 0):
-            return None
+        if node is None or node.operator != operator or node.attributes.get("axis", 0):
+            return otherwise
+        if takes_ids and node.inputs[1] != "ids":
+            return otherwise
         value = values[node.inputs[0]]
         rows_range = range(moving_count, moving_count + MAX_PADDING + 1)
         if not value.varies or value.shape[0].per_id or value.shape[0].fixed not in rows_range:
-            return None
+            return otherwise
         rows.append(node.inputs[0])
-    if len({*rows}) < len(rows) or "ids" in names_needed(model, rows):
-        return None
+    if len({*rows}) < len(rows) or (takes_ids and "ids" in names_needed(model, rows)):
+        return otherwise
     return tuple(rows)
 
 
@@ -159,9 +166,10 @@ def _check_finite(tensor: Tensor) -> None:
 
 
 def _inputs(model: Model) -> dict[str, Value]:
-    for name in INPUTS:
-        if name not in model.inputs:
-            raise ModelInvalid(name, "is missing from the inputs")
+    if "t" not in model.inputs:
+        raise ModelInvalid("t", "is missing from the inputs")
+    if "t" in model.constants:
+        raise ModelInvalid("t", "has a default value; only `ids` and `steps` may have one")
     for name, port in model.inputs.items():
         if name not in _INPUTS:
             raise ModelInvalid(name, "isn't an input of this contract")
@@ -185,9 +193,16 @@ def _is_of_shape(port: Port, shape: Shape) -> bool:
     )
 
 
+def _rows(model: Model) -> int:
+    """The number of rows that `means` is declared to have, in a graph without `ids`."""
+    means = model.outputs.get("means")
+    rows = None if means is None else (means.shape or (None,))[0]
+    if not isinstance(rows, int) or rows < 0:
+        raise ModelInvalid("ids", "is missing from the inputs, and `means` has no fixed number of rows")
+    return rows
+
+
 def _default_ids(model: Model) -> int:
-    if "t" in model.constants:
-        raise ModelInvalid("t", "has a default value; only `ids` and `steps` may have one")
     ids = model.constants.get("ids")
     if ids is None:
         raise ModelInvalid("ids", "has no default value, which must be all moving Gaussians")
@@ -212,7 +227,7 @@ def _check_count(gaussians: int, limits: GraphLimits) -> None:
         raise ModelInvalid("ids", f"and `static_means` are {gaussians:,} Gaussians; the limit is {limits.gaussians:,}")
 
 
-def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int) -> None:
+def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int, takes_ids: bool) -> None:
     for name in (*MOVING_OUTPUTS, *CONSTANT_OUTPUTS):
         if name not in model.outputs or name not in values:
             raise ModelInvalid(name, "is missing from the outputs")
@@ -226,6 +241,7 @@ def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int)
         if not values[name].shape:
             raise ModelInvalid(name, "is a single number")
     for name, columns in _COLUMNS.items():
-        shapes = [(IDS, *fixed([columns]))] + ([] if moving_count else [fixed([0, columns])])
+        every = fixed([moving_count, columns])
+        shapes = [every] if not takes_ids else [(IDS, *fixed([columns]))] + ([] if moving_count else [every])
         if values[name].shape not in shapes:
             raise ModelInvalid(name, f"has shape {text(values[name].shape)}, not {text(shapes[0])}")

@@ -1,0 +1,149 @@
+"""The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, cached_property
+from typing import NamedTuple
+
+import numpy as np
+import onnx
+from onnx import TensorProto, numpy_helper
+
+from export.layers.graph import GraphBuilder
+from export.storage.kinds import Pack, directions, fractions, in_range, logarithms
+
+MIN_VALUES = 256
+"""Arrays of fewer values stay float32: the nodes that unfold them would take as many bytes."""
+
+MAX_VALUES = 1 << 26
+"""Files with more float32 values stay as they are: readers limit the bytes of the values of all nodes, and unfolding
+has up to six nodes per array."""
+
+
+class Group(NamedTuple):
+    """Arrays that are stored alike."""
+
+    names: str  # regular expression of the names of their constants
+    kinds: Mapping[str, Pack]  # from coarse to fine; the last resort is float32
+
+
+def _bits(kind: Callable[[int], Pack], *bits: int) -> dict[str, Pack]:
+    return {f"{n} bits": kind(n) for n in bits}
+
+
+GROUPS = {
+    "static means": Group(r"static_means", _bits(in_range, 16)),
+    "means": Group(r"canonical_means", _bits(in_range, 16)),
+    "static quats": Group(r"static_quats", _bits(directions, 8, 16)),
+    "quats": Group(r"canonical_quats", _bits(directions, 8, 16)),
+    "static scales": Group(r"static_scales", _bits(logarithms, 8, 16)),
+    "scales": Group(r"canonical_log_scales", _bits(in_range, 8, 16)),
+    "opacities": Group(r"opacities", _bits(lambda bits: fractions(bits, 1.0), 8, 16)),
+    "sh": Group(r"sh", _bits(in_range, 8, 16)),
+    "modulation": Group(r"\w+_modulation", _bits(in_range, 8, 16)),
+    "skinning weights": Group(r"skinning\.weight\d+", _bits(lambda bits: fractions(bits, 0.5), 8, 16)),
+    "curves and planes": Group(r"layer\d+\.(table|space|time)", _bits(in_range, 8, 16)),
+    "network": Group(r"layer\d+\..*weight.*", _bits(in_range, 8, 16)),
+    "other": Group(r".*", _bits(in_range, 16)),
+}
+"""By name. A constant belongs to the first whose expression matches its whole name."""
+
+
+class Stored(NamedTuple):
+    """A scene file with packed arrays."""
+
+    contents: onnx.ModelProto
+    kinds: dict[str, str]  # by group, of those that are packed
+
+
+def fewest_bytes(
+    contents: onnx.ModelProto,
+    estimates: Sequence[Callable[[onnx.ModelProto], float]],
+    is_allowed: Callable[[onnx.ModelProto], bool],
+    allowed: float,
+) -> Stored | None:
+    """The smallest scene file that `is_allowed`, or None if only the given one is.
+
+    Groups are packed one at a time to estimate their squared errors, which add up; if the sum was wrong, the next of
+    `estimates` is taken, and after the last of them a smaller sum.
+    """
+    choices = [_Choice(contents, estimate) for estimate in estimates[::-1]]
+    while True:
+        kinds, total = choices[-1].within(allowed)
+        if not kinds:
+            return None
+        model = packed(contents, kinds)
+        if is_allowed(model):
+            return Stored(model, kinds)
+        if len(choices) > 1:
+            choices.pop()
+        elif total:
+            allowed = total / 2
+        else:
+            return None
+
+
+class _Choice:
+    """Kinds of all groups by one estimate of their squared errors."""
+
+    def __init__(self, contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float]) -> None:
+        self._contents, self._estimate = contents, estimate
+        self._kinds: dict[str, list[str | None]] = {name: [*GROUPS[name].kinds, None] for name in _members(contents)}
+        self._alone = cache(self._packed_alone)
+
+    def within(self, allowed: float) -> tuple[dict[str, str], float]:
+        """Kinds whose errors sum to `allowed` at most, without groups in float32, and the sum. All groups start with
+        their coarsest kind; the one with the largest error per byte that its next kind adds gets that kind."""
+        levels = dict.fromkeys(self._kinds, 0)
+        while (total := sum(self._alone(name, level)[0] for name, level in levels.items())) > allowed:
+            levels[max(levels, key=lambda name: self._gain(name, levels[name]))] += 1
+        kinds = {name: self._kinds[name][level] for name, level in levels.items()}
+        return {name: kind for name, kind in kinds.items() if kind is not None}, total
+
+    def _gain(self, name: str, level: int) -> float:
+        error, size = self._alone(name, level)
+        return error / max(self._alone(name, level + 1)[1] - size, 1) if error else -1.0
+
+    def _packed_alone(self, name: str, level: int) -> tuple[float, int]:
+        """Squared error and bytes of a file in which only this group is packed."""
+        kind = self._kinds[name][level]
+        if kind is None:
+            return 0.0, self._contents.ByteSize()
+        model = packed(self._contents, {name: kind})
+        return max(0.0, self._estimate(model) - self._before), model.ByteSize()
+
+    @cached_property
+    def _before(self) -> float:
+        return self._estimate(self._contents)
+
+
+def packed(contents: onnx.ModelProto, kinds: Mapping[str, str]) -> onnx.ModelProto:
+    """A copy of a scene file in which some groups are stored by these kinds."""
+    members, graph = _members(contents), GraphBuilder()
+    for name, kind in kinds.items():
+        for constant in members.get(name, ()):
+            GROUPS[name].kinds[kind](graph, constant.name, numpy_helper.to_array(constant))
+    replaced = {constant.name for name in kinds for constant in members.get(name, ())}
+    model = onnx.ModelProto()
+    model.CopyFrom(contents)
+    del model.graph.initializer[:], model.graph.node[:]
+    model.graph.initializer.extend(each for each in contents.graph.initializer if each.name not in replaced)
+    model.graph.initializer.extend(graph.constants.values())
+    model.graph.node.extend([*graph.nodes, *contents.graph.node])
+    return model
+
+
+def _members(contents: onnx.ModelProto) -> dict[str, list[onnx.TensorProto]]:
+    """The constants of a scene file that can be packed, by group."""
+    quantizers = {"QuantizeLinear", "DequantizeLinear"}  # whose factors must be constants of the file
+    taken = {name for node in contents.graph.node if node.op_type in quantizers for name in node.input}
+    taken |= {each.name for each in contents.graph.input}
+    floats = [each for each in contents.graph.initializer if each.data_type == TensorProto.FLOAT]
+    if sum(int(np.prod(each.dims)) for each in floats) > MAX_VALUES:
+        return {}
+    members: dict[str, list[onnx.TensorProto]] = {}
+    for each in floats:
+        if each.name not in taken and np.prod(each.dims) >= MIN_VALUES:
+            name = next(name for name, group in GROUPS.items() if re.fullmatch(group.names, each.name))
+            members.setdefault(name, []).append(each)
+    return members

@@ -1,0 +1,161 @@
+"""Arrays in fewer bits: each kind against float64, every plan, and files whose frames have the error that they say."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+from onnx import TensorProto
+
+from export.jobs.bake import bake
+from export.jobs.job import ExportJob
+from export.jobs.write import properties
+from export.layers.graph import GraphBuilder
+from export.options import ExportOptions
+from export.plans.registry import build
+from export.storage.choice import GROUPS, fewest_bytes, packed
+from export.storage.kinds import Pack, directions, fractions, in_range, logarithms
+from export.to_onnx import main
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.baked import MOVING_OUTPUTS
+from tests.support.models import MLP, NODES, SCENE, moving_object, random_model, saved
+from tests.support.scenes import unit_quats
+from tests.support.tolerances import tolerance
+
+pytestmark = pytest.mark.slow
+
+FINE = {name: list(group.kinds)[-1] for name, group in GROUPS.items()}
+COARSE = {name: next(iter(group.kinds)) for name, group in GROUPS.items()}
+
+
+def unfolded(pack: Pack, values: np.ndarray) -> tuple[np.ndarray, int]:
+    """The array that onnxruntime computes, and the bytes of the stored integers."""
+    graph = GraphBuilder()
+    assert pack(graph, "x", values.astype(np.float32)) == "x"
+    model = graph.model({"t": (TensorProto.FLOAT, [1])}, {"x": list(values.shape)}, {})
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    (got,) = session.run(["x"], {"t": np.zeros(1, np.float32)})
+    return np.asarray(got, np.float64), max(len(each.raw_data) for each in graph.constants.values())
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("count", [1, 2, 500])
+def test_each_kind_is_off_by_half_a_step(bits: int, count: int):
+    rng = np.random.default_rng(count)
+    columns = [rng.normal(size=count), np.full(count, -7.25), np.zeros(count), 1e30 * rng.normal(size=count),
+               1e-38 * rng.normal(size=count), 1e6 + rng.normal(size=count)]  # fmt: skip
+    values = np.stack(columns, axis=1).astype(np.float32).astype(np.float64)
+    ranges, largest = np.ptp(values, axis=0), np.abs(values).max(axis=0)
+    got, stored = unfolded(in_range(bits), values)
+    rounding = tolerance("float32.relative") * largest + np.finfo(np.float32).tiny
+    assert (np.abs(got - values) <= ranges / (2**bits - 1) / 2 + rounding).all()
+    assert (got[:, 1:3] == values[:, 1:3]).all()
+    assert stored >= values.size * bits // 8
+
+    scales = np.exp(rng.uniform(-18, 18, (count, 3)))
+    got, _ = unfolded(logarithms(bits), scales)
+    assert np.abs(np.log(got / scales)).max() <= 36 / (2**bits - 1) / 2 + tolerance("stored_scale")
+
+    opacities = np.append(rng.uniform(size=count), [0, 1])
+    got, _ = unfolded(fractions(bits, 1.0), opacities)
+    assert np.abs(got - opacities).max() <= 1 / (2 ** min(bits, 15) - 1) / 2 + tolerance("float32.relative")
+    assert (got[-2:] == [0, 1]).all()
+    assert got.max() <= 1
+
+    quats = np.concatenate([unit_quats(rng, count), np.eye(4)])
+    got, _ = unfolded(directions(bits), quats)
+    np.testing.assert_allclose(np.linalg.norm(got, axis=1), 1, atol=tolerance("float32.relative"))
+    assert np.abs(got - quats).max() <= 2 / (2 ** (bits - 1) - 1)
+
+
+MODELS: dict[str, dict[str, Any]] = {
+    "mlp": {"layers": (replace(MLP, xyz_frequencies=2),) * 2, "noise": 0.02},
+    "plane": {"layers": ("plane",), "modulation_targets": ("quats", "means")},
+    "nodes": {"layers": ("spline", "mlp"), "support": NODES, "noise": 0.02, "embedding_dim": 0},
+    "still": {"layers": ()},
+}
+PLANS = ("network", "prefix:1", "int8", "lowrank:4", "lowrank", "keyframes:9", "keyframes")
+
+
+@pytest.mark.parametrize(
+    ("kind", "plan"), [(kind, plan) for kind in MODELS for plan in PLANS if (kind, plan) != ("plane", "int8")]
+)
+def test_every_plan_works_with_storage(tmp_path: Path, kind: str, plan: str):
+    contents = build(plan, bake(random_model(400, **MODELS[kind]), SCENE, "0" * 64))
+    (tmp_path / "exact.onnx").write_bytes(contents.SerializeToString())
+    exact = DeformationSession(tmp_path / "exact.onnx")
+    sizes, errors = [contents.ByteSize()], []
+    for kinds in (FINE, COARSE):
+        model = packed(contents, kinds)
+        onnx.checker.check_model(model)
+        session = DeformationSession(tmp_path / "x.onnx", contents=model.SerializeToString())
+        assert session.scene.moving_count == exact.scene.moving_count
+        got, want = session.gaussians(0.4).validate(), exact.gaussians(0.4)
+        errors.append(max(float(np.abs(getattr(got, name) - getattr(want, name)).max()) for name in vars(got)))
+        sizes.append(model.ByteSize())
+    assert sizes == sorted(sizes, reverse=True)
+    assert 0 < errors[0] < tolerance("int8.relative" if plan == "int8" else "stored_16bit")
+    assert errors[1] < tolerance("int8.relative" if plan == "int8" else "stored_8bit")
+
+
+@pytest.mark.parametrize("plan", ["network", None])
+def test_a_written_file_is_smaller_and_its_frames_have_the_error_that_it_says(tmp_path: Path, plan: str | None):
+    checkpoint = saved(tmp_path, moving_object())
+    sizes = {}
+    for keep in (True, False):
+        output = tmp_path / f"{keep}.onnx"
+        assert main(ExportOptions(checkpoint, output, plan=plan, min_psnr=45.0, keep_float32=keep, times=4)) == 0
+        sizes[keep] = output.stat().st_size
+    scene = DeformationSession(output).scene
+    (entry,) = (each for each in scene.metadata.left_out if each["rule"] == "float32")
+    kept = DeformationSession(tmp_path / "True.onnx").scene.metadata
+    assert "float32" not in {each["rule"] for each in kept.left_out}
+    assert "storage" not in kept.measured_error
+    assert entry["count"] == entry["bytes_saved"] > 0
+    assert set(scene.metadata.measured_error["storage"]) == set(MOVING_OUTPUTS)
+    rendered = scene.metadata.measured_error["rendered"]
+    assert rendered["psnr_worst"] == entry["worst_frame_db"] >= 45
+    if plan is None:
+        points = json.loads((tmp_path / "False.report.json").read_text())["points"]
+        (chosen,) = (point for point in points if point["chosen"])
+        assert chosen["left_out"] == list(scene.metadata.left_out)
+    else:  # a sweep may choose another plan
+        assert sizes[False] < sizes[True]
+        session, any_ids = DeformationSession(output), np.zeros(len(scene), int)  # which only distances depend on
+        drawn = ExportJob(checkpoint, tmp_path).exact.measure(session.gaussians, any_ids)
+        assert drawn.psnr_worst == rendered["psnr_worst"]
+
+
+@pytest.mark.parametrize(
+    ("count", "layers", "packs"), [(0, ("mlp",), False), (1, ("mlp",), True), (1, (), False), (300, (), True)]
+)
+def test_unusual_scenes_are_written(tmp_path: Path, count: int, layers: tuple[str, ...], packs: bool):
+    model = random_model(count, layers=layers)
+    assert main(ExportOptions(saved(tmp_path, model), quick=True, keep_invisible=True, times=2)) == 0
+    stored = properties(onnx.load(tmp_path / "model.onnx"))["left_out"]
+    assert ("float32" in {entry["rule"] for entry in stored}) == packs
+
+
+def test_the_group_of_the_largest_error_per_byte_becomes_finer_first():
+    contents = build("network", bake(random_model(400), SCENE, "0" * 64))
+
+    def estimate(model: onnx.ModelProto) -> float:
+        names = {each.name: each.data_type for each in model.graph.initializer}
+        return 1.0 + 4.0 * (names.get("sh.stored") == TensorProto.UINT8) + 2.0 * ("opacities.stored" in names)
+
+    def chosen(allowed: float, is_allowed: bool = True) -> dict[str, str] | None:
+        found = fewest_bytes(contents, [estimate], lambda model: is_allowed, allowed)
+        return found and found.kinds
+
+    everything = chosen(10.0)
+    assert everything is not None
+    assert (everything["sh"], everything["opacities"]) == ("8 bits", "8 bits")
+    # 2 per byte for 400 opacities, 4 for 400 · 16 · 3 values of SH, and their 16 bits are no more exact
+    without = {name: kind for name, kind in everything.items() if name != "opacities"}
+    assert chosen(5.0) == without
+    assert chosen(0.0) == without | {"sh": "16 bits"}
+    assert chosen(10.0, is_allowed=False) is None
