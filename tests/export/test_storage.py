@@ -26,6 +26,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from tests.support.models import MLP, NODES, SCENE, moving_object, random_model, saved
 from tests.support.scenes import unit_quats
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -151,9 +152,25 @@ def test_a_scene_file_is_stored_anew(tmp_path: Path, kind: str):
     check = RoundTrip(exact)
     assert 37 < min(check.psnr(small.gaussians(t), t) for t in (0.13, 0.57, 0.91)) < 70
     before = out.read_bytes()
-    for min_psnr in (100.0, 5.0):
+    for min_psnr in (101.0, 5.0):
         assert convert_main(ConvertOptions(scene, out, min_psnr=min_psnr)) == 1
+    scene.write_bytes(build("network", bake(random_model(1, layers=()), SCENE, "0" * 64)).SerializeToString())
+    assert convert_main(ConvertOptions(scene, out)) == 1  # all arrays are small
     assert out.read_bytes() == before
+
+
+def test_imported_splats_are_stored_alike(tmp_path: Path):
+    splats, out = tmp_path / "a.ply", tmp_path / "a.onnx"
+    splats.write_bytes(ply_bytes(inria_columns(some_gaussians(300))))
+    sizes = []
+    for keep_float32 in (True, False):
+        assert main(ExportOptions(splats, out, keep_float32=keep_float32)) == 0
+        sizes.append(out.stat().st_size)
+    metadata = DeformationSession(out).scene.metadata
+    (entry,) = metadata.left_out
+    assert entry["worst_frame_db"] >= 50
+    assert sizes[0] - entry["bytes_saved"] == pytest.approx(sizes[1], abs=1000)  # metadata
+    assert set(metadata.measured_error["storage"]) == set(MOVING_OUTPUTS)
 
 
 @pytest.mark.parametrize(
