@@ -101,17 +101,19 @@ class ConvertOptions:
 
     python export/convert.py ball.onnx ball.visionary.onnx     the whole scene, for Visionary in a browser
 
+    python export/convert.py ball.onnx small.onnx        the scene file itself, with arrays in fewer bits
+
     For videos use msdgs-render: msdgs-render ball.onnx turn.mp4. docs/formats.md lists what each format keeps.
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
     """A scene file (.onnx)."""
     out: Annotated[Path, tyro.conf.Positional]
-    """The output: name.ply, name.spz, name.glb, name.usdc (or .usda, .usd), name.visionary.onnx, or a folder."""
+    """The output: name.ply, .spz, .glb, .usdc (or .usda, .usd), .visionary.onnx, .onnx, or a folder."""
     t: float | None = None
     """The time of a single file; by default the start of the scene's time range."""
     frames: int = 30
     """The number of files in a folder or frames of OpenUSD, evenly over the time range, including both ends."""
     min_psnr: float | None = None
-    """PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and Visionary
-    and 60 for the others, which are lossless."""
+    """PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and Visionary,
+    50 for scene files, and 60 for the others, which are lossless."""

@@ -5,8 +5,10 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from dataclasses import replace as replaced
 from functools import cached_property
 from pathlib import Path
+from typing import BinaryIO, NamedTuple
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import Framing, framing
@@ -19,7 +21,14 @@ MAX_OPEN_ATTEMPTS = 5
 
 logger = logging.getLogger("msdgs_serve")
 
-Signature = tuple[Path, int, int, int]
+
+class Signature(NamedTuple):
+    """What changes with the contents of a file."""
+
+    path: Path
+    modified: int  # ns
+    size: int  # bytes
+    inode: int
 
 
 class SceneExists(MsdgsError):
@@ -32,6 +41,7 @@ class ServedScene:
 
     name: str
     session: DeformationSession
+    signature: Signature  # of the file
 
     @property
     def sha256(self) -> str:
@@ -42,6 +52,26 @@ class ServedScene:
     def framing(self) -> Framing:
         """The default view; cached, as every request needs it."""
         return framing(self.session.scene.metadata)
+
+
+@dataclass(frozen=True)
+class SceneContents:
+    """The open file of a loaded scene, which stays whole if it is replaced or deleted meanwhile."""
+
+    name: str
+    sha256: str
+    file: BinaryIO
+    signature: Signature
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self.signature.size
+
+    @property
+    def is_unchanged(self) -> bool:
+        """Whether no program has written into the file since it was loaded."""
+        return _signature(self.signature.path, os.fstat(self.file.fileno())) == self.signature
 
 
 @dataclass(frozen=True)
@@ -118,6 +148,24 @@ class SceneStore:
             raise entry.problem.again() if entry.problem else SceneNotFound(name, [])
         return entry.served
 
+    def open(self, name: str) -> SceneContents | None:
+        """Open the file of the version that `get` returns; return None if it has changed and isn't reloaded yet.
+
+        Raises `SceneNotFound`, and `SceneFileInvalid` if the file violates the contract, also if an earlier version of
+        it is loaded.
+        """
+        served, path = self.get(name), self._file(name)
+        if problem := self._entry(name).problem:
+            raise problem.again()
+        try:
+            contents = SceneContents(name, served.sha256, path.open("rb"), served.signature)
+        except FileNotFoundError:
+            raise SceneNotFound(name, self.names()) from None
+        if contents.is_unchanged:
+            return contents
+        contents.file.close()
+        return None
+
     def refresh(self) -> None:
         """Reload files that changed since the last attempt. Scenes that were never requested are not loaded."""
         for name, file in self._files().items():
@@ -152,14 +200,14 @@ class SceneStore:
             present = self._files().get(name, target)
             if present != target or (present.exists() and not replace):
                 raise SceneExists(f"the scene `{name}` exists already")
-            session = self._open(incoming)
+            scene = self._open(incoming, name)
             _sync(incoming)
             entry = self._entry(name)
             with entry.lock:
                 os.replace(incoming, target)
                 _sync(target.parent)
-                entry.served, entry.problem = ServedScene(name, session), None
-                entry.tried = _signature(target)
+                entry.tried = _signature(target, os.stat(target))
+                entry.served, entry.problem = replaced(scene, signature=entry.tried), None
             return entry.served
 
     def remove(self, name: str) -> None:
@@ -198,7 +246,7 @@ class SceneStore:
     def _update(self, entry: _Entry, file: Path) -> None:
         """Load `file` if it changed since the last attempt. Other threads wait only if no version is loaded."""
         try:
-            signature = _signature(file)
+            signature = _signature(file, os.stat(file))
         except FileNotFoundError:
             return
         if entry.tried == signature or not entry.lock.acquire(blocking=entry.served is None):
@@ -211,7 +259,7 @@ class SceneStore:
 
     def _load(self, entry: _Entry, file: Path, signature: Signature) -> None:
         try:
-            entry.served, entry.problem = ServedScene(file.stem, self._open(file)), None
+            entry.served, entry.problem = self._open(file, file.stem), None
         except SceneFileInvalid as error:
             entry.problem = error.again()
         except OSError as error:
@@ -221,13 +269,13 @@ class SceneStore:
             entry.problem = SceneFileInvalid(file.name, "file", f"can't be opened: {type(error).__name__}")
         entry.tried = signature
 
-    def _open(self, file: Path) -> DeformationSession:
+    def _open(self, file: Path, name: str) -> ServedScene:
         """Open the scene in a file, again if the file changes meanwhile."""
         for _ in range(MAX_OPEN_ATTEMPTS):
-            before = _signature(file)
+            before = _signature(file, os.stat(file))
             session = self._open_scene(file)
-            if _signature(file) == before:
-                return session
+            if _signature(file, os.stat(file)) == before:
+                return ServedScene(name, session, before)
         raise SceneFileInvalid(file.name, "file", "changes while it is being read")
 
     def _entry(self, name: str) -> _Entry:
@@ -276,9 +324,8 @@ def _is_scene(file: Path) -> bool:
     return file.suffix == SUFFIX and is_servable_name(file.stem) and file.is_file()
 
 
-def _signature(path: Path) -> Signature:
-    status = os.stat(path)
-    return path, status.st_mtime_ns, status.st_size, status.st_ino
+def _signature(path: Path, status: os.stat_result) -> Signature:
+    return Signature(path, status.st_mtime_ns, status.st_size, status.st_ino)
 
 
 def _sync(path: Path) -> None:

@@ -4,19 +4,22 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnx
 from rich.console import Console
 from rich.progress import Progress, track
 
 from export.exporters.gltf import read_gltf, write_gltf
 from export.exporters.ply import write_ply
-from export.exporters.round_trip import RoundTrip, require, visionary_of
+from export.exporters.round_trip import ConversionFailed, RoundTrip, require, visionary_of
 from export.exporters.spz import write_spz
 from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
 from export.importers.sequence import is_switched, of_the_moment
 from export.importers.splats.formats import read_splats
-from export.options import ConvertOptions
+from export.jobs.store import stored_anew
+from export.jobs.write import set_properties, storage_differences, write_measured
+from export.options import ConvertOptions, ExportOptions
 from export.plans.registry import PLANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
@@ -26,7 +29,7 @@ from msdgs_train.datasets.common.files import replacing, write_text
 LOSSLESS, LOSSY = 60.0, 45.0
 """Default minimum PSNR of a written file against the scene, dB."""
 
-VISIONARY = ".visionary.onnx"
+ONNX, VISIONARY = ".onnx", ".visionary.onnx"
 SINGLE = (".ply", ".spz", ".glb")
 USD = (".usdc", ".usda", ".usd")
 VIDEOS = (".mp4", ".webm")
@@ -43,6 +46,8 @@ def convert(options: ConvertOptions, console: Console) -> None:
     session = DeformationSession(options.scene)
     if out.name.endswith(VISIONARY):
         written = _visionary(session, options, console)
+    elif out.suffix == ONNX:
+        written = _stored_anew(session, options, console)
     elif out.suffix in USD:
         written = _usd(session, options, console)
     elif out.suffix in SINGLE:
@@ -52,7 +57,7 @@ def convert(options: ConvertOptions, console: Console) -> None:
     elif not out.suffix:
         written = _sequence(session, options, console)
     else:
-        raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD))} or {VISIONARY}", out.name)
+        raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD, ONNX))} or {VISIONARY}", out.name)
     console.print(f"{out}: {written} against the scene", markup=False)
     eps2d = session.scene.metadata.eps2d
     if eps2d != GSPLAT.eps2d:
@@ -140,6 +145,21 @@ def _visionary(session: DeformationSession, options: ConvertOptions, console: Co
     if session.scene.moving_count and plan is not None and not plan.fitted:
         console.print("a browser runs all layers every frame: to_onnx.py --plan lowrank makes a faster scene")
     return f"{_megabytes(out)}, {worst:.1f} dB"
+
+
+def _stored_anew(session: DeformationSession, options: ConvertOptions, console: Console) -> str:
+    """Write the scene with packed arrays."""
+    out, contents = options.out, onnx.load(options.scene)
+    min_psnr = ExportOptions.min_psnr if options.min_psnr is None else options.min_psnr
+    with console.status("storage in fewer bits"):
+        found = stored_anew(contents, min_psnr)
+    if found is None:
+        raise ConversionFailed(f"no array of {options.scene.name} can have fewer bits with {min_psnr:g} dB")
+    packed, error = found
+    others = {name: each for name, each in session.scene.metadata.measured_error.items() if name != "rendered"}
+    set_properties(contents, measured_error=others)  # frames aren't compared with those of the model again
+    write_measured(out, contents, lambda exact: {"storage": storage_differences(out, packed, exact)}, packed)
+    return f"{_megabytes(out)} of {_megabytes(options.scene)}, {error.psnr_worst:.1f} dB"
 
 
 def _megabytes(file: Path) -> str:

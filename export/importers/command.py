@@ -18,11 +18,13 @@ from msdgs_serve.scene.errors import InvalidInput
 
 
 @contextmanager
-def model_or_import(path: Path, file_format: str, output: Path, console: Console) -> Iterator[Path | None]:
+def model_or_import(
+    path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None = None
+) -> Iterator[Path | None]:
     """The model.pt to export: `path` itself, or a temporary one that is made from another trainer's run.
 
-    Splats and sequences are written as scene files directly; the result is then None. `file_format` is one of
-    `FORMATS`, or "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
+    Splats and sequences are written as scene files directly, in fewer bits if `min_psnr` is given; the result is then
+    None. `file_format` is one of `FORMATS`, or "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
     """
     if file_format == "detect":
         file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
@@ -40,17 +42,18 @@ def model_or_import(path: Path, file_format: str, output: Path, console: Console
         if not output.parent.is_dir():
             raise InvalidInput("output", "in a folder that exists", str(output))
         write = _splats if file_format in READERS else _sequence
-        _print(write(path, file_format, output, console), output, console)
+        _print(write(path, file_format, output, console, min_psnr), output, console)
         yield None
 
 
-def _splats(path: Path, file_format: str, output: Path, console: Console) -> BakedScene:
+def _splats(path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None) -> BakedScene:
     with console.status(f"reading {path}"):
         source = read_splats(path, file_format)
-        return write_imported(output, static_scene(source, digest(path)), lambda t: source.gaussians, [0.0])
+        contents = static_scene(source, digest(path))
+        return write_imported(output, contents, lambda t: source.gaussians, [0.0], min_psnr=min_psnr)
 
 
-def _sequence(path: Path, file_format: str, output: Path, console: Console) -> BakedScene:
+def _sequence(path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None) -> BakedScene:
     how = file_format.partition(":")[2] or None
     with Progress(console=console, transient=True) as progress:
         reading = progress.add_task("reading frames", total=len(frame_files(path)))
@@ -64,6 +67,7 @@ def _sequence(path: Path, file_format: str, output: Path, console: Console) -> B
             times,
             lambda: progress.advance(comparing),
             rows=lambda t: shown_rows(sequence, times.index(t)),
+            min_psnr=min_psnr,
         )
     way = "blended" if sequence.blended else "switched, since they don't correspond or blending is off"
     console.print(f"{len(times)} frames, {way}")

@@ -10,7 +10,8 @@ import onnx
 
 from export.importers.splats.base import Splats
 from export.jobs.bake import Baked, Moving
-from export.jobs.write import properties, set_properties, write_measured
+from export.jobs.store import stored_anew
+from export.jobs.write import properties, set_properties, storage_differences, write_measured
 from export.measure.poses import half_diagonal
 from export.plans.base import BASELINE
 from export.plans.registry import build
@@ -86,8 +87,10 @@ def write_imported(
     times: Sequence[float],
     on_time: Callable[[], object] = lambda: None,
     rows: Callable[[float], slice] = lambda t: slice(None),
+    min_psnr: float | None = None,
 ) -> BakedScene:
-    """Write a scene file that is compared with the imported files at some times.
+    """Write a scene file that is compared with the imported files at some times, or in its place the same with packed
+    arrays, of which frames have at least `min_psnr` dB.
 
     `rows` are the rows of the scene that `expected` returns. The largest differences are stored in the metadata: of
     means relative to the half diagonal of the bounds or, further out, to the largest coordinate; of entries of rotation
@@ -100,9 +103,12 @@ def write_imported(
             for name, error in _differences(session, expected(t), t, rows(t)).items():
                 worst[name] = max(worst[name], error)
             on_time()
-        return {**worst, "against": "the files that were imported", "times": len(times)}
+        storage = {} if packed is None else {"storage": storage_differences(output, packed, session)}
+        return {**worst, "against": "the files that were imported", "times": len(times), **storage}
 
-    return write_measured(output, contents, measured)
+    found = None if min_psnr is None else stored_anew(contents, min_psnr)
+    packed = found and found[0]
+    return write_measured(output, contents, measured, packed)
 
 
 def note_left_out(file: Path, lost: Sequence[dict[str, Any]]) -> None:

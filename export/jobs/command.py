@@ -17,7 +17,7 @@ from rich.table import Column, Table
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
-from export.jobs.store import PLAN_PART, squared, stored
+from export.jobs.store import PLAN_PART, check_min_psnr, squared, stored
 from export.jobs.sweep import Sweep
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
@@ -26,14 +26,10 @@ from export.plans.registry import parse
 from export.progress import Track
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:
     from export.measure.images import HeldOutImages
-
-LOWEST_MIN_PSNR = 10.0
-"""Smallest `min_psnr`, dB. Frames below it don't resemble the scene."""
 
 STORAGE = "float32"
 """The rule of storage, as `ExportOptions.keep_float32` switches it off."""
@@ -99,9 +95,7 @@ def _tracker(console: Console, progress: Progress) -> Track:
 
 
 def _check(options: ExportOptions) -> None:
-    if not (math.isfinite(options.min_psnr) and LOWEST_MIN_PSNR <= options.min_psnr <= MAX_PSNR):
-        allowed = f"a PSNR in dB from {LOWEST_MIN_PSNR:g} to {MAX_PSNR:g}; at 50 no difference is visible"
-        raise InvalidInput("min_psnr", allowed, options.min_psnr)
+    check_min_psnr(options.min_psnr)
     if not options.tolerance >= 0:
         raise InvalidInput("tolerance", "0 or more", options.tolerance)
     if options.times < 2:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from export.jobs.bake import Baked
-from export.measure.poses import posed
+from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
@@ -103,9 +103,9 @@ class ExportJob:
     def exact(self) -> ExactFrames:
         """Frames in float64, computed on first use."""
         views = evaluation_views(self.cameras, self.info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
-        return ExactFrames(
-            self.model, views, self.info.background, self.progress("exact frames in float64", len(views))
-        )
+        on_frame = self.progress("exact frames in float64", len(views))
+        pose, options = in_float64(self.model), self.model.rasterizer
+        return ExactFrames(pose, len(self.model.gaussians), views, self.info.background, options, on_frame)
 
     @cached_property
     def statistics(self) -> PruningStatistics:

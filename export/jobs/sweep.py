@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.measure.frame_memory import frame_memory
-from export.measure.rendered_error import Pose, RenderedError
+from export.measure.poses import Pose
+from export.measure.rendered_error import RenderedError
 from export.measure.timing import REPEATS, FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from export.measure.frames import compare, render
-from export.measure.rendered_error import Pose
+from export.measure.poses import Pose
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_train.datasets import Frame, composite, load_scene

@@ -1,6 +1,8 @@
 """Poses of a model, and errors of poses by Gaussian."""
 
+import copy
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -10,6 +12,8 @@ from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.supports.base import Support
+
+Pose = Callable[[float], Gaussians]
 
 SMALLEST_VISIBLE = 1e-3
 """Scales below this fraction of the scene's half diagonal are less than a pixel; errors are relative to at least it."""
@@ -27,6 +31,12 @@ def posed(model: DynamicGaussians, t: float, ids: np.ndarray | None = None, *, d
     rows = None if ids is None else torch.from_numpy(ids)
     pose = model.pose(float(np.float32(t)), ids=rows, deform=deform)
     return Gaussians(*(tensor.numpy() for tensor in pose))
+
+
+def in_float64(model: DynamicGaussians) -> Pose:
+    """The Gaussians of a model as a function of time, computed in float64."""
+    double = copy.deepcopy(model).double()
+    return lambda t: posed(double, t)
 
 
 def operations(support: Support, chain: MultiStepDeformation, count: int) -> float:

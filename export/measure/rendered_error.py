@@ -1,6 +1,5 @@
-"""The rendered error of an export: its frames against those of the exact network in float64."""
+"""The rendered error of an export: its frames against exact ones."""
 
-import copy
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -9,20 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from export.measure.frames import compare, in_frame, project, render
-from export.measure.poses import posed
+from export.measure.poses import Pose
 from export.measure.views import View
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
-from msdgs_train.gaussians.model import DynamicGaussians
 
 MEMORY = 768e6
 """Largest size in bytes of exact frames and poses; with larger images there are fewer views."""
 
 POSE_BYTES = 52
 """Bytes per Gaussian and time: its mean in float64, the rest in float32."""
-
-Pose = Callable[[float], Gaussians]
 
 
 class WorstFrame(NamedTuple):
@@ -50,32 +46,30 @@ class RenderedError:
 
 
 class ExactFrames:
-    """Frames of the model in float64, deformation and rasterizer, computed once and compared with many candidates."""
+    """Frames of all Gaussians in the poses' precision, computed once and compared with many candidates."""
 
     def __init__(
         self,
-        model: DynamicGaussians,
+        pose: Pose,
+        count: int,
         views: Sequence[View],
         background: Sequence[float],
+        options: RasterizerOptions,
         on_frame: Callable[[], object] = lambda: None,
     ) -> None:
-        self.background = background
-        self.views = within_memory(views, len(model.gaussians))
+        """`pose` returns `count` Gaussians."""
+        self.pose, self.background, self._options = pose, background, options
+        self.views = within_memory(views, count)
         self._frames: list[FloatArray] = []
         self._poses: dict[float, Gaussians] = {}
-        self._model = copy.deepcopy(model).double()
         for t, views_then in by_time(self.views):
             gaussians = self.pose(t)
             quats, scales = gaussians.quats.astype(np.float32), gaussians.scales.astype(np.float32)
             first = next(iter(self._poses.values()), gaussians)
             self._poses[t] = Gaussians(gaussians.means, quats, scales, first.opacities, first.sh)
             for view in views_then:
-                self._frames.append(render(gaussians, view.camera, background, model.rasterizer).astype(np.float32))
+                self._frames.append(render(gaussians, view.camera, background, options).astype(np.float32))
                 on_frame()
-
-    def pose(self, t: float) -> Gaussians:
-        """All Gaussians of the model in float64."""
-        return posed(self._model, t)
 
     def kept(self, t: float) -> Gaussians:
         """All Gaussians at one of the views' times; quaternions and scales rounded to float32."""
@@ -89,10 +83,10 @@ class ExactFrames:
         options: RasterizerOptions | None = None,
         every: int = 1,
     ) -> RenderedError:
-        """The error of `pose`, whose rows are the model's Gaussians `ids`, over all views or every n-th of them.
+        """The error of `pose`, whose rows are the Gaussians `ids`, over all views or every n-th of them.
 
-        By default, frames are drawn with the model's own rasterizer options."""
-        options = options or self._model.rasterizer
+        By default, frames are drawn with the rasterizer options of the exact ones."""
+        options = options or self._options
         psnrs: list[float] = []
         worst, worst_frame, worst_pixel, position, position_pixels = np.inf, None, 0.0, 0.0, 0.0
         chosen = list(zip(self.views, self._frames, strict=True))[::every]

@@ -7,9 +7,11 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 from urllib.parse import quote
 
 import numpy as np
+from fastapi import Header
 
 from msdgs_serve import __version__
 from msdgs_serve.api.cameras import resolve_camera
@@ -24,6 +26,9 @@ from msdgs_serve.renderer import Background, RenderOptions, Shutter, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
 
+IfNoneMatch = Annotated[
+    str | None, Header(max_length=8192, description="`ETag`s of the client's cached versions", examples=['"0123"'])
+]
 ZIP = "application/zip"
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the first date that ZIP supports; equal requests give equal bytes
 

@@ -38,7 +38,21 @@ IMAGE_RESPONSE: Responses = {
         },
     }
 }
-NOT_MODIFIED: Responses = {304: {"description": "The client has this frame"}}
+NOT_MODIFIED: Responses = {304: {"description": "The client has this version"}}
+FILE_RESPONSE: Responses = {
+    200: {
+        "description": "The file",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        "headers": {
+            name: {"description": text, "schema": {"type": "string"}}
+            for name, text in {
+                "ETag": "SHA-256 of the file, weak if it is compressed",
+                "Content-Encoding": "`zstd`, if the client takes it",
+                "Content-Disposition": "with the file's name",
+            }.items()
+        },
+    }
+}
 BATCH_RESPONSE: Responses = {
     200: {
         "description": "A frame or a problem per line or part",

@@ -10,6 +10,7 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated
 
+import anyio
 import anyio.to_thread
 from fastapi import Depends, FastAPI, Request
 
@@ -29,6 +30,9 @@ from msdgs_serve.trial import try_scene
 
 JOIN_SECONDS = 2.0
 """Time that shutdown waits for the thread that refreshes scenes: if it is killed, libraries print errors."""
+
+READ_AT_ONCE = 2
+"""Threads that read and compress scene files for downloads: more would delay renders."""
 
 logger = logging.getLogger("msdgs_serve")
 
@@ -51,6 +55,7 @@ class Service:
         self.settings = settings
         self.queue = WorkQueue(settings.concurrent_renders, settings.queued_renders, settings.render_seconds)
         self.uploads = Uploads(store.folder, settings)
+        self.reading = anyio.CapacityLimiter(READ_AT_ONCE)
         self.metrics = Metrics(store, renderer.cache, self.queue)
         self.phase = Phase.STARTING
         self.failure: MsdgsError | None = None

@@ -1,6 +1,6 @@
 // The page: its state and the connections between its parts.
 
-import { getJson, keepKey, readKey, scenePath } from "./api.js";
+import { call, getJson, keepKey, readKey, render, scenePath } from "./api.js";
 import { Camera } from "./camera.js";
 import { Connection } from "./connection.js";
 import { Controls } from "./controls.js";
@@ -12,7 +12,7 @@ import { Pace } from "./pace.js";
 import { Player } from "./player.js";
 import { frameBody, numbersBody } from "./request.js";
 import { SceneList } from "./scenes.js";
-import { copy, curlCommand, download, fromHash, toHash } from "./share.js";
+import { copy, curlCommand, fromHash, save, toHash } from "./share.js";
 import { Stage } from "./stage.js";
 import { Timeline } from "./timeline.js";
 
@@ -213,9 +213,10 @@ async function takeAlong(kind) {
     find("command").select();
     return undefined;
   }
+  const { name } = state.scene;
+  if (kind === "onnx") return save(await call(`${scenePath(name)}/file`), `${name}.onnx`);
   const body = kind === "exr" ? numbersBody(state) : { ...frameBody(state), format: kind };
-  await download({ ...body, ...size }, `${state.scene.name}-${state.player.t}.${kind}`);
-  return undefined;
+  return save(await render({ ...body, ...size }), `${name}-${state.player.t}.${kind}`);
 }
 
 function listen() {

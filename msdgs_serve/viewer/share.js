@@ -1,6 +1,6 @@
 // Exports a frame as a command, a file or a URL.
 
-import { readKey, render } from "./api.js";
+import { readKey } from "./api.js";
 import { short } from "./camera.js";
 
 /** Return the curl command for the frame, without the API key. */
@@ -24,9 +24,9 @@ export async function copy(text) {
   }
 }
 
-/** Request the frame and save it as a file. */
-export async function download(body, name) {
-  const blob = await (await render(body)).blob();
+/** Save the body of a response as a file. */
+export async function save(response, name) {
+  const blob = await response.blob();
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
   link.download = name;

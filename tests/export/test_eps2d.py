@@ -11,7 +11,7 @@ from onnx import helper
 
 from export.jobs.job import ExportJob
 from export.measure.frames import render
-from export.measure.poses import posed
+from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames
 from export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
@@ -86,8 +86,9 @@ def test_a_served_frame(folder: Path, camera: Camera, expected: np.ndarray):
 def test_exact_frames_of_an_export(
     folder: Path, tmp_path: Path, loaded: LoadedModel, camera: Camera, expected: np.ndarray
 ):
-    exact = ExactFrames(loaded.model, [View(camera, T, "a")], SCENE.background)
-    rows = np.arange(len(loaded.model.gaussians))
+    model = loaded.model
+    rows = np.arange(len(model.gaussians))
+    exact = ExactFrames(in_float64(model), len(rows), [View(camera, T, "a")], SCENE.background, model.rasterizer)
     assert exact.measure(exact.pose, rows).psnr_worst == 100.0
     assert exact.measure(exact.pose, rows, options=GSPLAT).psnr_worst < 40.0
     job = ExportJob(folder / "model.pt", tmp_path)

@@ -231,7 +231,7 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
     ("plan", "out", "message"),
     [
         ("network", "a.mp4", r"msdgs-render"),
-        ("network", "a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd or .visionary.onnx"),
+        ("network", "a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd, .onnx or .visionary.onnx"),
         ("int8", "a.visionary.onnx", r"--plan lowrank"),
     ],
 )

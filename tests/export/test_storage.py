@@ -11,11 +11,13 @@ import onnxruntime as ort
 import pytest
 from onnx import TensorProto
 
+from export.convert import main as convert_main
+from export.exporters.round_trip import RoundTrip
 from export.jobs.bake import bake
 from export.jobs.job import ExportJob
-from export.jobs.write import properties
+from export.jobs.write import properties, set_properties
 from export.layers.graph import GraphBuilder
-from export.options import ExportOptions
+from export.options import ConvertOptions, ExportOptions
 from export.plans.registry import build
 from export.storage.choice import GROUPS, fewest_bytes, packed
 from export.storage.kinds import Pack, directions, fractions, in_range, logarithms
@@ -24,6 +26,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from tests.support.models import MLP, NODES, SCENE, moving_object, random_model, saved
 from tests.support.scenes import unit_quats
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -128,6 +131,46 @@ def test_a_written_file_is_smaller_and_its_frames_have_the_error_that_it_says(tm
         session, any_ids = DeformationSession(output), np.zeros(len(scene), int)  # which only distances depend on
         drawn = ExportJob(checkpoint, tmp_path).exact.measure(session.gaussians, any_ids)
         assert drawn.psnr_worst == rendered["psnr_worst"]
+
+
+@pytest.mark.parametrize("kind", ["nodes", "still"])
+def test_a_scene_file_is_stored_anew(tmp_path: Path, kind: str):
+    """The worst of other frames has about the stated PSNR, too."""
+    scene, out = tmp_path / "scene.onnx", tmp_path / "small.onnx"
+    contents = build("network", bake(random_model(400, **MODELS[kind]), SCENE, "0" * 64))
+    set_properties(contents, measured_error={"means": 0.25, "rendered": {"psnr_worst": 70.0}})
+    scene.write_bytes(contents.SerializeToString())
+    assert convert_main(ConvertOptions(scene, out, min_psnr=40.0)) == 0
+    exact, small = DeformationSession(scene), DeformationSession(out)
+    metadata = small.scene.metadata
+    (entry,) = (each for each in metadata.left_out if each["rule"] == "float32")
+    assert out.stat().st_size < 0.75 * scene.stat().st_size
+    assert entry["worst_frame_db"] >= 40
+    assert set(metadata.measured_error) == {"means", "storage"}
+    assert metadata.measured_error["means"] == 0.25
+    assert max(metadata.measured_error["storage"].values()) > 0
+    check = RoundTrip(exact)
+    assert 37 < min(check.psnr(small.gaussians(t), t) for t in (0.13, 0.57, 0.91)) < 70
+    before = out.read_bytes()
+    for min_psnr in (101.0, 5.0):
+        assert convert_main(ConvertOptions(scene, out, min_psnr=min_psnr)) == 1
+    scene.write_bytes(build("network", bake(random_model(1, layers=()), SCENE, "0" * 64)).SerializeToString())
+    assert convert_main(ConvertOptions(scene, out)) == 1  # all arrays are small
+    assert out.read_bytes() == before
+
+
+def test_imported_splats_are_stored_alike(tmp_path: Path):
+    splats, out = tmp_path / "a.ply", tmp_path / "a.onnx"
+    splats.write_bytes(ply_bytes(inria_columns(some_gaussians(300))))
+    sizes = []
+    for keep_float32 in (True, False):
+        assert main(ExportOptions(splats, out, keep_float32=keep_float32)) == 0
+        sizes.append(out.stat().st_size)
+    metadata = DeformationSession(out).scene.metadata
+    (entry,) = metadata.left_out
+    assert entry["worst_frame_db"] >= 50
+    assert sizes[0] - entry["bytes_saved"] == pytest.approx(sizes[1], abs=1000)  # metadata
+    assert set(metadata.measured_error["storage"]) == set(MOVING_OUTPUTS)
 
 
 @pytest.mark.parametrize(

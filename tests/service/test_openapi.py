@@ -99,6 +99,7 @@ def test_the_calls_are_these(client: httpx.Client):
     paths = client.get("/openapi.json").json()["paths"]
     assert set(paths) == {
         *("/render", "/render/batch", "/render/video", "/scenes", "/scenes/{name}", "/scenes/{name}/report"),
+        "/scenes/{name}/file",
         *("/live", "/ready", "/metrics"),
     }
     answers = {"200", "304", "400", "404", "408", "413", "422", "503", "504"}
@@ -110,7 +111,7 @@ def test_every_call_answers_as_the_document_says(client: httpx.Client):
     schema = schemathesis.openapi.from_url(f"{str(client.base_url).rstrip('/')}/openapi.json")
     found = [result.ok() for result in schema.get_all_operations()]  # pyright: ignore[reportAttributeAccessIssue]
     every = [operation for operation in found if operation.method != "delete"]  # deletes the scene
-    assert len(every) == 11
+    assert len(every) == 12
     for operation in every:
 
         @settings(max_examples=-(-CASES // len(every)), **SEEDED)

@@ -291,6 +291,10 @@ def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Cli
             assert download.value.suggested_filename == f"it's-0.5.{image_format}"
             content = Path(download.value.path()).read_bytes()
             assert decode(content, image_format)[0].shape == (*image(page).shape[:2], channels)
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Download the file").click()
+        assert download.value.suggested_filename == "it's.onnx"
+        assert Path(download.value.path()).read_bytes() == client.get("/scenes/it's/file").content
 
 
 def test_it_reports_an_unavailable_service_and_recovers(page: Page, scenes: Path):

@@ -14,7 +14,7 @@ import torch
 from export.importers.runs.base import Loss
 from export.importers.splats.base import as_float32, logit
 from export.measure.frames import compare, render
-from export.measure.poses import posed
+from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames
 from export.measure.views import cameras_of, selection_views
 from msdgs_serve.scene.gaussians import Gaussians
@@ -89,7 +89,7 @@ def static_appearance(model: DynamicGaussians, info: SceneInfo) -> tuple[Dynamic
     kept = {name for name in static.state_dict() if not name.startswith("gaussians.")}
     static.load_state_dict({n: v for n, v in model.state_dict().items() if n in kept}, strict=False)
     views = selection_views(cameras_of(info), info.time_range, FRAMES)
-    exact = ExactFrames(model, views, info.background)
+    exact = ExactFrames(in_float64(model), len(model.gaussians), views, info.background, model.rasterizer)
     error = exact.measure(lambda t: posed(static, t), np.arange(len(model.gaussians)))
     what = "changes of opacities and colors with time, replaced by their means"
     note = (

@@ -5,10 +5,10 @@ from http import HTTPStatus
 from typing import Annotated
 
 import anyio.to_thread
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from msdgs_serve.api.frames import FramePlan, draw_plan, is_unchanged, plan_frame, server_timing
+from msdgs_serve.api.frames import FramePlan, IfNoneMatch, draw_plan, is_unchanged, plan_frame, server_timing
 from msdgs_serve.api.openapi import IMAGE_RESPONSE, NOT_MODIFIED, problems
 from msdgs_serve.api.queries import request_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
@@ -16,9 +16,6 @@ from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
 from msdgs_serve.render_job import RenderJob
 
-IfNoneMatch = Annotated[
-    str | None, Header(max_length=8192, description="`ETag`s of the client's cached frames", examples=['"0123"'])
-]
 RESPONSES = {
     **IMAGE_RESPONSE,
     **NOT_MODIFIED,

@@ -1,4 +1,4 @@
-"""List, describe, add and delete scenes."""
+"""List, describe, download, add and delete scenes."""
 
 import asyncio
 import hashlib
@@ -13,13 +13,15 @@ from urllib.parse import quote
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
+from msdgs_serve.api.downloads import SceneFileResponse, file_headers, takes_zstd
 from msdgs_serve.api.errors import ClientGone, RequestRejected
+from msdgs_serve.api.frames import IfNoneMatch, is_unchanged
 from msdgs_serve.api.keys import CLIENT
 from msdgs_serve.api.numbers import Name
-from msdgs_serve.api.openapi import SCENE_BODY, problems
+from msdgs_serve.api.openapi import FILE_RESPONSE, NOT_MODIFIED, SCENE_BODY, problems
 from msdgs_serve.api.schemas import (
     GaussianCounts,
     GraphCost,
@@ -79,6 +81,39 @@ def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
     if report is None:
         raise RequestRejected(HTTPStatus.NOT_FOUND, "not_found", "There is no report for this scene.")
     return report
+
+
+@router.get(
+    "/scenes/{name}/file",
+    summary="The scene's file",
+    response_class=Response,
+    responses={
+        **FILE_RESPONSE,
+        **NOT_MODIFIED,
+        **problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
+    },
+)
+def scene_file(
+    name: SceneName,
+    service: SharedService,
+    accept_encoding: Annotated[str | None, Header(max_length=1000, examples=["zstd"])] = None,
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """The bytes that were uploaded or lie in the folder, compressed if `Accept-Encoding` takes `zstd`.
+
+    Loads the scene if necessary. A download is finished if the scene is replaced or deleted meanwhile. 503 with
+    `Retry-After` until a file that has changed is reloaded, and without it if the new one is broken.
+    """
+    contents = service.store.open(name)
+    if contents is None:
+        detail = "The scene's file has changed and is being reloaded."
+        raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "reloading", detail, retry_after=1)
+    compressed = takes_zstd(accept_encoding)
+    headers = file_headers(contents, compressed=compressed)
+    if is_unchanged(if_none_match, f'"{contents.sha256}"'):
+        contents.file.close()
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    return SceneFileResponse(contents, headers, service.reading, compressed=compressed)
 
 
 @router.post(
