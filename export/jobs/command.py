@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, ExportJob, TargetNotReached
+from export.jobs.job import Candidate, ExportJob, TargetNotReached, rounded_down
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
-from export.jobs.store import PLAN_PART, squared, stored
-from export.jobs.sweep import Sweep
+from export.jobs.store import PLAN_PART, squared, stored, within_bytes
+from export.jobs.sweep import Sweep, pruning_levels
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
@@ -55,29 +55,36 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
         track = _tracker(console, progress)
         images = _held_out_images(model, options.data, track)
         rules = [rule for rule in RULES if rule not in options.keep]
-        training = images.training if images else []
-        job = ExportJob(model, Path(folder), min_psnr=options.min_psnr, rules=rules, training=training, progress=track)
-        packs = STORAGE not in options.keep
-        part, result = PLAN_PART if packs else 1.0, None
+        packs, max_bytes = STORAGE not in options.keep, options.max_bytes
+        job = ExportJob(
+            model, Path(folder), min_psnr=options.min_psnr, rules=rules, packs=packs, images=images, progress=track
+        )
+        min_psnr = job.min_psnr if max_bytes is None else options.min_psnr
+        result = None
         if options.chosen_plan is None:
-            result = Sweep(job, options.min_psnr, images, part=part).run()
+            result = Sweep(job, min_psnr, max_bytes).run()
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
+        elif max_bytes is None:
+            chosen, error = _planned(job, options.chosen_plan)
         else:
-            chosen, error = _planned(job, options.chosen_plan, options.min_psnr, part)
-        written, error = stored(job, chosen, error, options.min_psnr) if packs else (chosen, error)
-        if result:
-            result.points[result.chosen] = replace(result.points[result.chosen], candidate=written, error=error)
-        contents = report(job, result) if result else None
+            chosen, error = _planned_within(job, options.chosen_plan, min_psnr, max_bytes)
+        if packs and max_bytes is None:
+            chosen, error = stored(job, chosen, error, job.min_psnr)
         exported = write_scene(
             options.scene_file,
-            onnx.load(chosen.path),
+            onnx.load(chosen.float32 or chosen.path),
             chosen.pruned.moving,
-            packed=None if written is chosen else onnx.load(written.path),
+            packed=onnx.load(chosen.path) if chosen.float32 else None,
             rendered=error.to_plain(),
             tolerance=options.tolerance,
             times=options.times,
             on_time=track("comparing poses with the model", options.times),
         )
+        contents = None
+        if result:
+            result.points[result.chosen] = replace(result.points[result.chosen], candidate=chosen, error=error)
+            contents = report(job, result)
+            contents["points"][result.chosen]["bytes"] = exported.size
     if contents:
         _print_table(contents, console)
         console.print(gain(contents), markup=False)
@@ -99,9 +106,11 @@ def _tracker(console: Console, progress: Progress) -> Track:
 
 
 def _check(options: ExportOptions) -> None:
-    if not (math.isfinite(options.min_psnr) and LOWEST_MIN_PSNR <= options.min_psnr <= MAX_PSNR):
+    if options.min_psnr is not None and not LOWEST_MIN_PSNR <= options.min_psnr <= MAX_PSNR:
         allowed = f"a PSNR in dB from {LOWEST_MIN_PSNR:g} to {MAX_PSNR:g}; at 50 no difference is visible"
         raise InvalidInput("min_psnr", allowed, options.min_psnr)
+    if options.max_mb is not None and not 0 < options.max_mb < math.inf:
+        raise InvalidInput("max_mb", "a positive number of megabytes, 10⁶ bytes each", options.max_mb)
     if not options.tolerance >= 0:
         raise InvalidInput("tolerance", "0 or more", options.tolerance)
     if options.times < 2:
@@ -122,21 +131,35 @@ def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutIma
     return HeldOutImages(data, load_model(model).scene, lambda count: track("images", count))
 
 
-def _planned(job: ExportJob, plan: str, min_psnr: float, part: float) -> tuple[Candidate, RenderedError]:
+def _planned(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
     """A candidate of the plan that was asked for, pruned as far as a part of what its own error leaves allows."""
     whole = job.candidate(plan, None)
     best = job.error(whole)
-    if best.psnr_worst < min_psnr:
-        reachable = f"at most {math.floor(10 * best.psnr_worst) / 10:.1f}, which the plan {plan} reaches"
-        raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", min_psnr)
+    if best.psnr_worst < job.min_psnr:
+        reachable = f"at most {rounded_down(best.psnr_worst)}, which the plan {plan} reaches"
+        raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", job.min_psnr)
     if job.rules:
-        budget = part * (squared(min_psnr) - squared(best.psnr_worst))
+        budget = (PLAN_PART if job.packs else 1.0) * (squared(job.min_psnr) - squared(best.psnr_worst))
         for fraction in (1.0, 0.5, 0.25) if budget > 0 else ():
             pruned = job.candidate(plan, -10 * math.log10(fraction * budget))
             error = job.error(pruned)
             if squared(error.psnr_worst) <= squared(best.psnr_worst) + budget:
                 return pruned, error
     return whole, best
+
+
+def _planned_within(
+    job: ExportJob, plan: str, min_psnr: float | None, max_bytes: int
+) -> tuple[Candidate, RenderedError]:
+    """The candidate of the plan with the smallest error in `max_bytes`, of all levels of pruning."""
+    levels = [None, *(pruning_levels(job.min_psnr, smaller=True) if job.rules else ())]
+    different = {candidate.digest: candidate for candidate in (job.candidate(plan, level) for level in levels)}
+    measured = within_bytes(job, list(different.values()), max_bytes)
+    chosen, error = max(measured, key=lambda each: each[1].psnr_worst)
+    if min_psnr is not None and error.psnr_worst < min_psnr:
+        reachable = f"at most {rounded_down(error.psnr_worst)}, which the plan {plan} reaches in {max_bytes / 1e6:g} MB"
+        raise TargetNotReached("min_psnr", reachable, min_psnr)
+    return chosen, error
 
 
 def _print_table(contents: dict, console: Console) -> None:

@@ -1,53 +1,104 @@
-"""Storage of the chosen candidate: its arrays in as few bytes as what plan and pruning left of the error allows."""
+"""Storage of candidates: arrays in as few bytes as an error allows, or as fine as so many bytes allow."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import onnx
 
-from export.jobs.job import Candidate, ExportJob
-from export.jobs.sweep import ESTIMATE_STRIDE
+from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
 from export.jobs.write import properties, set_properties
 from export.measure.rendered_error import RenderedError
-from export.storage.choice import fewest_bytes
+from export.storage.choice import COARSEST, Stored, fewest_bytes, packed, smallest_error
 
 PLAN_PART = 0.75
 """Of the squared error that a file may have, the part that plan and pruning may use."""
+
+METADATA_BYTES = 3000
+"""Bytes that are kept free for what is measured last and added to the metadata of the written file."""
 
 
 def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: float) -> tuple[Candidate, RenderedError]:
     """The candidate with packed arrays and its error, whose worst frame has at least `min_psnr` dB as the given one
     has; or the given ones if nothing can be packed."""
-    contents, tried = onnx.load(chosen.path), list[RenderedError]()
-    smaller = replace(chosen, path=job.folder / "stored.onnx")
-    on_trial = job.progress("storage in fewer bits", 0)
-
-    def measured(model: onnx.ModelProto, every: int = 1) -> RenderedError:
-        smaller.close()
-        smaller.path.write_bytes(model.SerializeToString())
-        on_trial()
-        return job.error(smaller, every)
-
-    def estimate(every: int) -> Callable[[onnx.ModelProto], float]:
-        return lambda model: squared(measured(model, every).psnr_worst)
+    trial, tried = _Trial(job, chosen), list[RenderedError]()
 
     def is_allowed(model: onnx.ModelProto) -> bool:
-        tried.append(measured(model))
+        tried.append(trial.error(model))
         return tried[-1].psnr_worst >= min_psnr
 
     allowed = squared(min_psnr) - squared(error.psnr_worst)
-    found = fewest_bytes(contents, [estimate(ESTIMATE_STRIDE), estimate(1)], is_allowed, allowed)
-    if found is None:
-        return chosen, error
-    saved = contents.ByteSize() - found.contents.ByteSize()
-    numbers = {"count": saved, "of": contents.ByteSize(), "bytes_saved": saved, "worst_frame_db": tried[-1].psnr_worst}
-    entry = {"rule": "float32", "what": "bytes of arrays in float32", **numbers, "stored": found.kinds}
-    set_properties(found.contents, left_out=[*properties(contents)["left_out"], entry])
-    smaller.path.write_bytes(found.contents.SerializeToString())
-    smaller.close()  # its metadata has changed
-    return smaller, tried[-1]
+    estimates = [trial.estimate(ESTIMATE_STRIDE), trial.estimate(1)]
+    found = fewest_bytes(trial.contents, estimates, is_allowed, allowed)
+    return trial.kept(found, tried[-1]) if found else (chosen, error)
+
+
+def within_bytes(
+    job: ExportJob, candidates: Sequence[Candidate], max_bytes: int
+) -> list[tuple[Candidate, RenderedError]]:
+    """Those of the candidates that fit into `max_bytes`, with arrays as fine as these allow, and their errors.
+
+    Raises `TargetNotReached` if none fits.
+    """
+    sizes = [min_bytes(job, candidate) for candidate in candidates]
+    if min(sizes) > max_bytes:
+        smallest = candidates[sizes.index(min(sizes))]
+        worst = _Trial(job, smallest).error(packed(onnx.load(smallest.path), COARSEST if job.packs else {})).psnr_worst
+        reachable = f"at least {math.ceil(min(sizes) / 1e3) / 1e3:.3f}, the smallest file: {worst:.1f} dB"
+        raise TargetNotReached("max_mb", f"{reachable} on its worst frame", max_bytes / 1e6)
+    fitting = [candidate for candidate, size in zip(candidates, sizes, strict=True) if size <= max_bytes]
+    return [_finest(job, candidate, max_bytes) for candidate in fitting]
+
+
+def min_bytes(job: ExportJob, candidate: Candidate) -> int:
+    """Size of the smallest file in which a candidate can be written."""
+    size = packed(onnx.load(candidate.path), COARSEST).ByteSize() if job.packs else candidate.size
+    return size + METADATA_BYTES
 
 
 def squared(psnr: float) -> float:
     """Squared error of a frame of this PSNR, dB."""
     return 10 ** (-psnr / 10)
+
+
+def _finest(job: ExportJob, candidate: Candidate, max_bytes: int) -> tuple[Candidate, RenderedError]:
+    if job.packs and candidate.size + METADATA_BYTES > max_bytes:
+        trial = _Trial(job, candidate)
+        found = smallest_error(trial.contents, trial.estimate(ESTIMATE_STRIDE), max_bytes - METADATA_BYTES)
+        assert found is not None
+        return trial.kept(found, trial.error(found.contents))
+    return candidate, job.error(candidate)
+
+
+class _Trial:
+    """A candidate whose arrays are packed in several ways."""
+
+    def __init__(self, job: ExportJob, candidate: Candidate) -> None:
+        self.contents = onnx.load(candidate.path)
+        self._job = job
+        self._smaller = replace(candidate, path=candidate.path.with_suffix(".stored.onnx"), float32=candidate.path)
+        self._on_trial = job.progress("storage in fewer bits", 0)
+
+    def error(self, model: onnx.ModelProto, every: int = 1) -> RenderedError:
+        """The error of a packed file, of all frames or of every n-th."""
+        self._write(model)
+        self._on_trial()
+        return self._job.error(self._smaller, every)
+
+    def estimate(self, every: int) -> Callable[[onnx.ModelProto], float]:
+        """A function that returns the squared error of the worst of every n-th frame."""
+        return lambda model: squared(self.error(model, every).psnr_worst)
+
+    def kept(self, found: Stored, error: RenderedError) -> tuple[Candidate, RenderedError]:
+        """The packed candidate, which says in its metadata what was saved, and its error."""
+        size = self.contents.ByteSize()
+        saved = size - found.contents.ByteSize()
+        numbers = {"count": saved, "of": size, "bytes_saved": saved, "worst_frame_db": error.psnr_worst}
+        entry = {"rule": "float32", "what": "bytes of arrays in float32", **numbers, "stored": found.kinds}
+        set_properties(found.contents, left_out=[*properties(self.contents)["left_out"], entry])
+        self._write(found.contents)
+        return self._smaller, error
+
+    def _write(self, model: onnx.ModelProto) -> None:
+        self._smaller.close()
+        self._smaller.path.write_bytes(model.SerializeToString())

@@ -5,26 +5,26 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from export.jobs.job import Candidate, ExportJob, TargetNotReached
+from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached, rounded_down
+from export.jobs.store import PLAN_PART, min_bytes, within_bytes
 from export.measure.frame_memory import frame_memory
-from export.measure.rendered_error import Pose, RenderedError
+from export.measure.rendered_error import RenderedError
 from export.measure.timing import REPEATS, FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
-from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
-
-if TYPE_CHECKING:
-    from export.measure.images import HeldOutImages
 
 MAX_RELATIVE_COST = 4.0
 """A plan that runs layers isn't tried if its layers take this many times the whole frame of a plan within the error."""
 
 PRUNING_STEPS = (20.0, 10.0, 5.0, 2.0, -5.0, -10.0, -15.0)
 """dB above or below `min_psnr` at which pruning is tried."""
+
+SMALLER_STEPS = (-20.0, -25.0)
+"""The same, if bytes are limited too."""
 
 MIN_PRUNING_DB, MIN_USEFUL_DB = 25.0, 20.0
 """Pruning isn't tried below the first; candidates below the second are dropped."""
@@ -33,8 +33,8 @@ HEADROOM = (2.0, -3.0)
 """dB. Each level of pruning is tried with the fastest plan whose error, mildly pruned, is better than the level by the
 first value, and by the second. Of plans that are about as fast, the one with the smallest file counts."""
 
-ESTIMATE_STRIDE, ESTIMATE_REPEATS = 6, 3
-"""A quick estimate compares every 6th frame and takes the minimum of 3 timings."""
+ESTIMATE_REPEATS = 3
+"""A quick estimate takes the minimum of 3 timings."""
 
 TIME_MARGIN, DB_MARGIN = 1.15, 0.5
 MAX_POINTS = 24
@@ -59,11 +59,12 @@ class QuickEstimate:
     cpu: float  # milliseconds per frame, the minimum of a few
     cpu_deformation: float  # milliseconds of these
     worst_db: float  # PSNR of the worst of these frames
+    size: int  # bytes: of the smallest file if they are limited, else in float32
 
     def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
-        """Whether it is faster and has a smaller error than another, by more than the margins."""
+        """Whether it is faster and has a smaller error than another, by more than the margins, and isn't larger."""
         faster = self.cpu * time_margin < other.cpu
-        return faster and self.worst_db > other.worst_db + db_margin
+        return faster and self.worst_db > other.worst_db + db_margin and self.size <= other.size
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -87,6 +88,11 @@ class Point:
         """Minimum over the repeats of a whole frame."""
         return self.time.total.min
 
+    @property
+    def costs(self) -> tuple[float, float, int]:
+        """What is better if smaller: milliseconds, negative PSNR of the worst frame, bytes."""
+        return self.milliseconds, -self.error.psnr_worst, self.candidate.size
+
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
         scene = self.candidate.session.scene
@@ -95,6 +101,7 @@ class Point:
             "static": scene.static_count,
             "layers": len(scene.metadata.layers),
             "bytes": self.candidate.size,
+            "packed": self.candidate.float32 is not None,
             "memory_bytes": self.memory,
             "milliseconds": self.time.to_plain(),
             "error": self.error.to_plain(),
@@ -110,23 +117,31 @@ def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
 
 
 def front(points: Sequence[Point]) -> list[int]:
-    """Indices of the points on the Pareto front of time and error, the fastest first.
+    """Indices of the points on the Pareto front of time, error and bytes, the fastest first.
 
     Only those with default rasterizer options, since a file can't ask for others.
     """
-    usual = [i for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
-    best, kept = -1.0, []
-    for i in sorted(usual, key=lambda i: (points[i].milliseconds, -points[i].error.psnr_worst)):
-        if points[i].error.psnr_worst > best:
-            best = points[i].error.psnr_worst
-            kept.append(i)
-    return kept
+    usual = [(point.costs, i) for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
+    kept: list[tuple[tuple[float, float, int], int]] = []
+    for costs, i in sorted(usual):  # a point comes after those that are better in all
+        if not any(all(a <= b for a, b in zip(other, costs, strict=True)) for other, _ in kept):
+            kept.append((costs, i))
+    return [i for _, i in kept]
 
 
-def choose(points: Sequence[Point], min_psnr: float) -> int | None:
-    """The index of the fastest point whose worst frame is within `min_psnr` dB, which lies on the front."""
-    within = [i for i in front(points) if points[i].error.psnr_worst >= min_psnr]
-    return within[0] if within else None
+def choose(points: Sequence[Point], min_psnr: float | None, max_bytes: int | None = None) -> int | None:
+    """The index of the fastest point whose worst frame has at least `min_psnr` dB and whose file has `max_bytes` at
+    most; without `min_psnr` of the one with the smallest error. It lies on the front."""
+    within = [i for i in front(points) if max_bytes is None or points[i].candidate.size <= max_bytes]
+    if min_psnr is None:
+        return max(within, key=lambda i: points[i].error.psnr_worst, default=None)
+    return next((i for i in within if points[i].error.psnr_worst >= min_psnr), None)
+
+
+def pruning_levels(min_psnr: float, smaller: bool) -> list[float]:
+    """The PSNRs, dB, to which pruning is tried, the mildest first."""
+    levels = [min_psnr + step for step in (*PRUNING_STEPS, *(SMALLER_STEPS if smaller else ()))]
+    return [level for level in levels if level >= MIN_PRUNING_DB]
 
 
 class SweepResult(NamedTuple):
@@ -136,18 +151,17 @@ class SweepResult(NamedTuple):
     estimates: list[QuickEstimate]  # of candidates that were dropped
     chosen: int  # index of a point
     refused: list[tuple[str, str]]  # plans and why they were refused
-    exact_images_psnr: float | None
+    front: list[int]  # indices of points
+    min_psnr: float | None
+    max_bytes: int | None
 
 
 class Sweep:
     """One sweep over the candidates of a job."""
 
-    def __init__(
-        self, job: ExportJob, min_psnr: float, images: "HeldOutImages | None" = None, *, part: float = 1.0
-    ) -> None:
-        """`part` is how much of the squared error of `min_psnr` dB the chosen point has if possible."""
-        self.job, self.min_psnr, self.images = job, min_psnr, images
-        self.preferred_psnr = min_psnr - 10 * math.log10(part)
+    def __init__(self, job: ExportJob, min_psnr: float | None, max_bytes: int | None = None) -> None:
+        """Limits as in `choose`. With `max_bytes`, points are packed."""
+        self.job, self.min_psnr, self.max_bytes = job, min_psnr, max_bytes
         self.estimates: list[QuickEstimate] = []
         self.baseline: QuickEstimate | None = None  # the whole network; None if it can't be run in float32
         self.refused: list[tuple[str, str]] = []
@@ -157,9 +171,10 @@ class Sweep:
     def run(self) -> SweepResult:
         """Estimate all candidates, then measure those that may be on the front.
 
-        Raises `TargetNotReached` if even the whole network in float32 is further from float64 than allowed.
+        Raises `TargetNotReached` if even the whole network in float32 is further from float64 than allowed, or if no
+        file keeps the limits.
         """
-        levels = [self.min_psnr + step for step in PRUNING_STEPS if self.min_psnr + step >= MIN_PRUNING_DB]
+        levels = pruning_levels(self.job.min_psnr, smaller=self.max_bytes is not None)
         self.baseline = self._estimate(BASELINE, None)
         self._reachable(self.baseline)
         # the mildest pruning that removes anything: plans are then fitted to moving Gaussians only
@@ -196,7 +211,8 @@ class Sweep:
         error = self.job.error(candidate, every=ESTIMATE_STRIDE)
         deformation, _, total = (min(run[part] for run in runs) for part in range(3))
         candidate.close()
-        self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst))
+        size = candidate.size if self.max_bytes is None else min_bytes(self.job, candidate)
+        self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst, size))
         return self.estimates[-1]
 
     def _estimate_all(self, name: str, candidates: Sequence[tuple]) -> None:
@@ -208,7 +224,9 @@ class Sweep:
 
     def _too_expensive(self, plan: str, pruning_db: float | None) -> str | None:
         """Why a plan that runs layers isn't tried; None if it is."""
-        enough = [estimate for estimate in self.estimates if estimate.worst_db >= self.min_psnr]
+        if self.max_bytes is not None:
+            return None  # its file may be smaller
+        enough = [estimate for estimate in self.estimates if estimate.worst_db >= self.job.min_psnr]
         fitted = [estimate for estimate in enough if plan_of(estimate.candidate.plan).fitted]
         fastest = min(fitted, key=lambda estimate: estimate.cpu, default=None)
         kind = plan_of(plan)
@@ -224,13 +242,12 @@ class Sweep:
         return f"not tried: its layers would take about {expected:.0f} ms of processor time; {taken}"
 
     def _reachable(self, estimate: QuickEstimate | None) -> None:
-        if estimate is None:  # its layers can't be run in float32; fitted plans may still work
+        if estimate is None or self.min_psnr is None:  # its layers can't be run in float32; fitted plans may still work
             return
         best = self.job.error(estimate.candidate)
         if best.psnr_worst < self.min_psnr:
-            reachable = math.floor(10 * best.psnr_worst) / 10
-            expected = f"at most {reachable:.1f}, which the whole network in float32 reaches on its worst frame"
-            raise TargetNotReached("min_psnr", expected, self.min_psnr)
+            reachable = f"at most {rounded_down(best.psnr_worst)}, which the whole network in float32 reaches"
+            raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", self.min_psnr)
 
     def _pairs(self, unvaried: list[QuickEstimate], level: float) -> set[tuple[str, float]]:
         """The plans to try with pruning to `level` dB."""
@@ -244,8 +261,9 @@ class Sweep:
         return pairs
 
     def _degrees(self) -> list[tuple[str, float | None, int]]:
-        """Lower SH degrees of the fastest candidates that aren't dominated so far."""
-        ahead = sorted(self._undominated(0.0), key=lambda estimate: estimate.cpu)
+        """Lower SH degrees of the fastest candidates that aren't dominated so far, or of those nearest to the limit."""
+        limit = self.max_bytes
+        ahead = sorted(self._undominated(0.0), key=lambda e: e.cpu if limit is None else abs(e.size - limit))
         chosen = [estimate.candidate for estimate in ahead[:LOWER_DEGREES]]
         chosen.sort(key=lambda c: c.pruning_db or 0.0)  # so that the trajectories of a pruned model are sampled once
         return [(c.plan, c.pruning_db, degree) for c in chosen for degree in range(c.sh_degree)]
@@ -262,43 +280,56 @@ class Sweep:
     def _measured(self) -> SweepResult:
         if not self.estimates:
             raise InvalidInput("model", "one that some plan can hold", "; ".join(why for _, why in self.refused))
-        ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)[:MAX_POINTS]
+        ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)
+        if self.max_bytes is not None:
+            ahead = [e for e in ahead if e.size <= self.max_bytes] or [min(self.estimates, key=lambda e: e.size)]
+        ahead = ahead[:MAX_POINTS]
         ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
-        points = self._points([estimate.candidate for estimate in ahead])
-        best = choose(points, self.preferred_psnr)
-        best = choose(points, self.min_psnr) if best is None else best
-        if best is None:  # estimates see only some of the frames
-            raise TargetNotReached("min_psnr", f"at most {max(p.error.psnr_worst for p in points):.1f}", self.min_psnr)
+        candidates = [estimate.candidate for estimate in ahead]
+        points = self._points(
+            self._errors(candidates) if self.max_bytes is None else within_bytes(self.job, candidates, self.max_bytes)
+        )
         left = [estimate for estimate in self.estimates if estimate not in ahead]
-        exact_images_psnr = self._images_psnr(self.job.exact.pose, self.job.model.rasterizer)
-        return SweepResult(points, left, best, self.refused, exact_images_psnr)
+        return SweepResult(points, left, self._best(points), self.refused, front(points), self.min_psnr, self.max_bytes)
 
-    def _points(self, candidates: list[Candidate]) -> list[Point]:
-        """All measured in full; the fastest within the error also with other rasterizer options."""
-        errors = self._errors(candidates)
-        within = [c for c, error in zip(candidates, errors, strict=True) if error.psnr_worst >= self.min_psnr]
-        names = [DEFAULT_RASTERIZER] * len(candidates)
+    def _best(self, points: list[Point]) -> int:
+        best = None
+        if self.min_psnr is not None and self.max_bytes is None and self.job.packs:  # what remains is for storage
+            best = choose(points, self.min_psnr - 10 * math.log10(PLAN_PART))
+        best = choose(points, self.min_psnr) if best is None else best
+        if best is None:  # estimates see only some of the frames, and in float32
+            reachable = f"at most {rounded_down(max(p.error.psnr_worst for p in points))}"
+            within = "" if self.max_bytes is None else f" in {self.max_bytes / 1e6:g} MB"
+            raise TargetNotReached("min_psnr", reachable + within, self.min_psnr)
+        return best
+
+    def _points(self, measured: Sequence[tuple[Candidate, RenderedError]]) -> list[Point]:
+        """Points of candidates and their errors; the fastest within the error also with other rasterizer options."""
+        measured, names = list(measured), [DEFAULT_RASTERIZER] * len(measured)
+        within = [c for c, error in measured if self.min_psnr is None or error.psnr_worst >= self.min_psnr]
         if within:  # candidates are sorted by processor time
             usual = within[0].options
-            variants = [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
-            candidates, names = [*candidates, *variants], [*names, *RASTERIZERS]
-            errors += self._errors(variants)
-        images = [self._images_psnr(c.session.gaussians, c.options) for c in candidates]
+            measured += self._errors(
+                [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
+            )
+            names += RASTERIZERS
+        candidates = [candidate for candidate, _ in measured]
+        images = [self._images_psnr(candidate) for candidate in candidates]
         background, on_repeat = self.job.info.background, self.job.progress("timing", REPEATS)
         times = time_frames(candidates, self._timed, background, on_repeat=on_repeat)
         memory = frame_memory(
             [c.path for c in candidates], SceneCamera("timed", self._timed[0].t, self._timed[0].camera)
         )
-        parts = zip(candidates, names, times, errors, memory, images, strict=True)
-        return [Point(*part) for part in parts]
+        parts = zip(measured, names, times, memory, images, strict=True)
+        return [Point(c, name, time, error, bytes_, psnr) for (c, error), name, time, bytes_, psnr in parts]
 
-    def _errors(self, candidates: list[Candidate]) -> list[RenderedError]:
+    def _errors(self, candidates: list[Candidate]) -> list[tuple[Candidate, RenderedError]]:
         on_error = self.job.progress("all frames of the points", len(candidates))
         errors = []
         for candidate in candidates:
-            errors.append(self.job.error(candidate))
+            errors.append((candidate, self.job.error(candidate)))
             on_error()
         return errors
 
-    def _images_psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
-        return self.images.psnr(pose, options) if self.images else None
+    def _images_psnr(self, candidate: Candidate) -> float | None:
+        return self.job.images.psnr(candidate.session.gaussians, candidate.options) if self.job.images else None

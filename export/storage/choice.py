@@ -1,4 +1,4 @@
-"""The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows."""
+"""The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows, or the reverse."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -48,6 +48,8 @@ GROUPS = {
 }
 """By name. A constant belongs to the first whose expression matches its whole name."""
 
+COARSEST = {name: next(iter(group.kinds)) for name, group in GROUPS.items()}
+
 
 class Stored(NamedTuple):
     """A scene file with packed arrays."""
@@ -83,6 +85,16 @@ def fewest_bytes(
             return None
 
 
+def smallest_error(
+    contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float], max_bytes: int
+) -> Stored | None:
+    """The scene file of `max_bytes` at most with the smallest sum of squared errors, or None if all are larger."""
+    if packed(contents, COARSEST).ByteSize() > max_bytes:
+        return None
+    kinds = _Choice(contents, estimate).within_bytes(max_bytes)
+    return Stored(packed(contents, kinds), kinds)
+
+
 class _Choice:
     """Kinds of all groups by one estimate of their squared errors."""
 
@@ -97,12 +109,35 @@ class _Choice:
         levels = dict.fromkeys(self._kinds, 0)
         while (total := sum(self._alone(name, level)[0] for name, level in levels.items())) > allowed:
             levels[max(levels, key=lambda name: self._gain(name, levels[name]))] += 1
+        return self._chosen(levels), total
+
+    def within_bytes(self, max_bytes: int) -> dict[str, str]:
+        """Kinds of a file of `max_bytes` at most, chosen likewise: a group gets its next kind if that fits."""
+        levels = dict.fromkeys(self._kinds, 0)
+        free = max_bytes - packed(self._contents, self._chosen(levels)).ByteSize()
+        while gains := {
+            name: self._gain(name, level)
+            for name, level in levels.items()
+            if self._kinds[name][level] is not None and self._added_bytes(name, level) <= free
+        }:
+            name = max(gains, key=lambda name: gains[name])
+            if gains[name] < 0:
+                break  # the others have no error
+            free -= self._added_bytes(name, levels[name])
+            levels[name] += 1
+        return self._chosen(levels)
+
+    def _chosen(self, levels: Mapping[str, int]) -> dict[str, str]:
         kinds = {name: self._kinds[name][level] for name, level in levels.items()}
-        return {name: kind for name, kind in kinds.items() if kind is not None}, total
+        return {name: kind for name, kind in kinds.items() if kind is not None}
 
     def _gain(self, name: str, level: int) -> float:
-        error, size = self._alone(name, level)
-        return error / max(self._alone(name, level + 1)[1] - size, 1) if error else -1.0
+        error, _ = self._alone(name, level)
+        return error / max(self._added_bytes(name, level), 1) if error else -1.0
+
+    def _added_bytes(self, name: str, level: int) -> int:
+        """How much larger a file is in which this group has its next kind."""
+        return self._alone(name, level + 1)[1] - self._alone(name, level)[1]
 
     def _packed_alone(self, name: str, level: int) -> tuple[float, int]:
         """Squared error and bytes of a file in which only this group is packed."""
