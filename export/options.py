@@ -77,11 +77,6 @@ class ExportOptions:
         return self.model.with_suffix(".onnx") if self.output is None else self.output
 
     @property
-    def max_bytes(self) -> int | None:
-        """The largest size of the file in bytes."""
-        return None if self.max_mb is None else round(1e6 * self.max_mb)
-
-    @property
     def chosen_plan(self) -> str | None:
         """The plan to write; None: a sweep chooses."""
         return "network" if self.quick and self.plan is None else self.plan

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, ExportJob, TargetNotReached, rounded_down
+from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
 from export.jobs.store import PLAN_PART, squared, stored, within_bytes
 from export.jobs.sweep import Sweep, pruning_levels
@@ -55,20 +55,16 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
         track = _tracker(console, progress)
         images = _held_out_images(model, options.data, track)
         rules = [rule for rule in RULES if rule not in options.keep]
-        packs, max_bytes = STORAGE not in options.keep, options.max_bytes
-        job = ExportJob(
-            model, Path(folder), min_psnr=options.min_psnr, rules=rules, packs=packs, images=images, progress=track
-        )
-        min_psnr = job.min_psnr if max_bytes is None else options.min_psnr
-        result = None
+        packs, result = STORAGE not in options.keep, None
+        limits = {"min_psnr": options.min_psnr, "max_bytes": options.max_mb and round(1e6 * options.max_mb)}
+        job = ExportJob(model, Path(folder), **limits, rules=rules, packs=packs, images=images, progress=track)
         if options.chosen_plan is None:
-            result = Sweep(job, min_psnr, max_bytes).run()
+            result = Sweep(job).run()
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
-        elif max_bytes is None:
-            chosen, error = _planned(job, options.chosen_plan)
         else:
-            chosen, error = _planned_within(job, options.chosen_plan, min_psnr, max_bytes)
-        if packs and max_bytes is None:
+            planned = _planned if job.max_bytes is None else _planned_within_bytes
+            chosen, error = planned(job, options.chosen_plan)
+        if packs and job.max_bytes is None:
             chosen, error = stored(job, chosen, error, job.min_psnr)
         exported = write_scene(
             options.scene_file,
@@ -136,8 +132,7 @@ def _planned(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
     whole = job.candidate(plan, None)
     best = job.error(whole)
     if best.psnr_worst < job.min_psnr:
-        reachable = f"at most {rounded_down(best.psnr_worst)}, which the plan {plan} reaches"
-        raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", job.min_psnr)
+        raise TargetNotReached.psnr(best.psnr_worst, f"the plan {plan} reaches", job.min_psnr)
     if job.rules:
         budget = (PLAN_PART if job.packs else 1.0) * (squared(job.min_psnr) - squared(best.psnr_worst))
         for fraction in (1.0, 0.5, 0.25) if budget > 0 else ():
@@ -148,17 +143,13 @@ def _planned(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
     return whole, best
 
 
-def _planned_within(
-    job: ExportJob, plan: str, min_psnr: float | None, max_bytes: int
-) -> tuple[Candidate, RenderedError]:
-    """The candidate of the plan with the smallest error in `max_bytes`, of all levels of pruning."""
-    levels = [None, *(pruning_levels(job.min_psnr, smaller=True) if job.rules else ())]
-    different = {candidate.digest: candidate for candidate in (job.candidate(plan, level) for level in levels)}
-    measured = within_bytes(job, list(different.values()), max_bytes)
-    chosen, error = max(measured, key=lambda each: each[1].psnr_worst)
-    if min_psnr is not None and error.psnr_worst < min_psnr:
-        reachable = f"at most {rounded_down(error.psnr_worst)}, which the plan {plan} reaches in {max_bytes / 1e6:g} MB"
-        raise TargetNotReached("min_psnr", reachable, min_psnr)
+def _planned_within_bytes(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
+    """The candidate of the plan with the smallest error that fits, of all levels of pruning."""
+    candidates = [job.candidate(plan, level) for level in (None, *(pruning_levels(job) if job.rules else ()))]
+    different = list({candidate.digest: candidate for candidate in candidates}.values())
+    chosen, error = max(within_bytes(job, different), key=lambda each: each[1].psnr_worst)
+    if job.required_psnr is not None and error.psnr_worst < job.required_psnr:
+        raise TargetNotReached.psnr(error.psnr_worst, f"the plan {plan} reaches in so many bytes", job.required_psnr)
     return chosen, error
 
 

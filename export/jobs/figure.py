@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,76 +19,64 @@ LABEL_SIZE = np.array([250, 15])
 OTHER = "#9498a0"
 
 
-class _Panel(NamedTuple):
-    """One of the diagrams side by side."""
-
-    axes: Any
-    cost: Callable[[dict[str, Any]], float]  # of a point, on the x axis
-
-    def places(self, points: list[dict[str, Any]]) -> tuple[list[float], list[float]]:
-        return [self.cost(point) for point in points], [_rms(point["error"]["psnr_worst"]) for point in points]
+Cost = Callable[[dict[str, Any]], float]
+COSTS: tuple[Cost, Cost] = (lambda p: p["milliseconds"]["total"]["min"], lambda p: p["bytes"] / 1e6)
+"""The x axes of the panels side by side."""
 
 
 def draw(contents: dict[str, Any], path: Path) -> None:
     """Write the diagram of a report as PNG."""
     figure = Figure(figsize=(16, 6.5), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    panels = _Panel(left, lambda p: p["milliseconds"]["total"]["min"]), _Panel(right, lambda p: p["bytes"] / 1e6)
-    for panel in panels:
-        _draw_points(panel, contents["points"])
-        _draw_limit(panel.axes, contents["min_psnr"])
-    machine = contents["machine"]
-    left.set_xlabel(
-        f"milliseconds per frame, deformation and drawing ({machine['processor']}, {machine['threads']} threads)"
-    )
-    right.set_xlabel("megabytes (10⁶ bytes); ○: in float32, before packing")
+    points, budget, limit = (contents[name] for name in ("points", "min_psnr", "max_bytes"))
+    for axes, cost in zip((left, right), COSTS, strict=True):
+        _draw_points(axes, cost, points)
+        _set_ticks(axes, cost, points)
+        if budget is not None:
+            axes.axhline(_rms(budget), color="black", linewidth=1, linestyle="--")
+            text, place = f"allowed: {budget:g} dB ", axes.get_yaxis_transform()
+            axes.text(0.995, _rms(budget), text, transform=place, va="bottom", ha="right")
+    if limit is not None:
+        right.axvline(limit / 1e6, color="black", linewidth=1, linestyle="--")
+    machine = f"{contents['machine']['processor']}, {contents['machine']['threads']} threads"
+    left.set_xlabel(f"milliseconds per frame, deformation and drawing ({machine})")
+    right.set_xlabel("megabytes (10⁶ bytes); hollow: in float32")
     left.set_ylabel("error of the worst frame against the exact one:\nPSNR and RMSE")
     figure.suptitle("Each point is one way to store this scene: left is faster or smaller, down is more exact.")
-    if contents["max_bytes"] is not None:
-        right.axvline(contents["max_bytes"] / 1e6, color="black", linewidth=1, linestyle="--")
     left.legend(loc="upper right", framealpha=0.95)
     figure.draw_without_rendering()  # fixes the positions of labels
-    for panel in panels:
-        _label(panel, contents["points"])
+    for axes, cost in zip((left, right), COSTS, strict=True):
+        _label(axes, cost, points)
     figure.savefig(path, dpi=110, format="png")
 
 
-def _draw_points(panel: _Panel, points: list[dict[str, Any]]) -> None:
-    axes = panel.axes
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+def _draw_points(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
+    def scatter(group: list[dict[str, Any]], label: str, **style: Any) -> None:
+        errors = [_rms(point["error"]["psnr_worst"]) for point in group]
+        axes.scatter([cost(point) for point in group], errors, label=label, **style)
+
+    usual = [point for point in points if point["rasterizer"] == DEFAULT_RASTERIZER]
     for kind in dict.fromkeys(_kind(point) for point in points):
-        group = [point for point in points if _kind(point) == kind and point["rasterizer"] == DEFAULT_RASTERIZER]
-        color = PLANS[kind].color
-        faces = [color if point["packed"] else "none" for point in group]
-        axes.scatter(*panel.places(group), s=55, facecolors=faces, edgecolors=color, zorder=3)
-        axes.scatter([], [], s=55, color=color, label=f"plan {kind}")
-    others = [point for point in points if point["rasterizer"] != DEFAULT_RASTERIZER]
-    if others:
-        axes.scatter(*panel.places(others), s=55, marker="x", color=OTHER, label="other rasterizer options", zorder=3)
+        group, color = [point for point in usual if _kind(point) == kind], PLANS[kind].color
+        faces = [color if point["packed"] else "white" for point in group]
+        scatter(group, f"plan {kind}", s=55, facecolors=faces, edgecolors=color, linewidths=2, zorder=3)
+    if others := [point for point in points if point not in usual]:
+        scatter(others, "other rasterizer options", s=55, marker="x", color=OTHER, zorder=3)
     ahead = [point for point in points if point["front"]]
-    axes.scatter(*panel.places(ahead), s=130, marker="D", facecolors="none", edgecolors="black", label="Pareto front")
-    chosen = panel.places([point for point in points if point["chosen"]])
-    axes.scatter(*chosen, s=420, marker="*", facecolors="gold", edgecolors="black", label="chosen", zorder=4)
-    _set_ticks(panel, points)
+    scatter(ahead, "Pareto front", s=150, marker="D", facecolors="none", edgecolors="black", zorder=2)
+    chosen = [point for point in points if point["chosen"]]
+    scatter(chosen, "chosen", s=420, marker="*", facecolors="gold", edgecolors="black", zorder=4)
 
 
-def _draw_limit(axes: Any, min_psnr: float | None) -> None:
-    if min_psnr is not None:
-        y, text = _rms(min_psnr), f"allowed: {min_psnr:g} dB "
-        axes.axhline(y, color="black", linewidth=1, linestyle="--")
-        axes.text(0.995, y, text, transform=axes.get_yaxis_transform(), va="bottom", ha="right")
-
-
-def _label(panel: _Panel, points: list[dict[str, Any]]) -> None:
+def _label(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
     """Label the points on the front and those that aren't pruned, the chosen one first, without overlaps."""
-    axes, taken = panel.axes, list[np.ndarray]()
+    taken: list[np.ndarray] = []
     named = [point for point in points if point["front"] or point["pruning_db"] is None]
     for point in sorted(named, key=lambda point: not point["chosen"]):
-        x, y = panel.places([point])
-        place = axes.transData.transform((x[0], y[0]))
+        at = cost(point), _rms(point["error"]["psnr_worst"])
+        place = axes.transData.transform(at)
         if all((np.abs(place - other) > LABEL_SIZE).any() for other in taken):
-            axes.annotate(_text(point), (x[0], y[0]), xytext=(9, -11), textcoords="offset points", fontsize=8, zorder=5)
+            axes.annotate(_text(point), at, xytext=(9, -11), textcoords="offset points", fontsize=8, zorder=5)
             taken.append(place)
 
 
@@ -97,14 +85,15 @@ def _text(point: dict[str, Any]) -> str:
     return f"{point['plan']}, {pruned}, SH {point['sh_degree']}"
 
 
-def _set_ticks(panel: _Panel, points: list[dict[str, Any]]) -> None:
-    axes = panel.axes
+def _set_ticks(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
     decibels = [point["error"]["psnr_worst"] for point in points]
     ticks = np.arange(DB_STEP * np.floor(min(decibels) / DB_STEP), min(max(decibels), MAX_DB) + DB_STEP, DB_STEP)
     axes.yaxis.set_major_locator(FixedLocator([_rms(db) for db in ticks]))
     axes.yaxis.set_major_formatter(FixedFormatter([f"{db:.0f} dB\n{100 * _rms(db):.2g} %" for db in ticks]))
     axes.yaxis.set_minor_locator(NullLocator())
-    costs = [panel.cost(point) for point in points]
+    costs = [cost(point) for point in points]
     low, high = min(costs) / 1.15, max(costs) * 1.5
     places = [base * 10.0**power for power in range(-3, 6) for base in (1, 1.5, 2, 3, 4, 5, 7)]
     places = [place for place in places if low <= place <= high]

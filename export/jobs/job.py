@@ -50,10 +50,10 @@ SAMPLED_KEPT = 2
 class TargetNotReached(InvalidInput):
     """No export of this model reaches the PSNR, or is as small, as was asked for."""
 
-
-def rounded_down(psnr: float) -> str:
-    """A PSNR that is reached, dB, to a tenth."""
-    return f"{math.floor(10 * psnr) / 10:.1f}"
+    @classmethod
+    def psnr(cls, reached: float, where: str, asked: float) -> "TargetNotReached":
+        """Where the worst frame reached another PSNR, dB."""
+        return cls("min_psnr", f"at most {math.floor(10 * reached) / 10:.1f}, which {where} on its worst frame", asked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +101,7 @@ class ExportJob:
         folder: Path,
         *,
         min_psnr: float | None = None,
+        max_bytes: int | None = None,
         rules: Collection[str] = tuple(RULES),
         packs: bool = True,
         images: "HeldOutImages | None" = None,
@@ -109,7 +110,7 @@ class ExportJob:
         """`packs` is whether arrays may be stored in fewer bits. With `images`, errors are measured from their
         training cameras. Raises `CheckpointInvalid`."""
         self.folder, self.rules, self.packs, self.progress = folder, rules, packs, progress
-        self._min_psnr, self.images = min_psnr, images
+        self._min_psnr, self.max_bytes, self.images = min_psnr, max_bytes, images
         model, self.info, _ = load_model(checkpoint)
         self.model = in_spatial_order(model)
         with checkpoint.open("rb") as file:
@@ -136,12 +137,15 @@ class ExportJob:
     def min_psnr(self) -> float:
         """PSNR of the worst frame, dB: the given one, or the smallest that adds no more than `ADDED_DB` to the error
         against held-out images, rounded up to a tenth, or `MIN_PSNR`. Squared errors add up."""
-        if self._min_psnr is not None:
-            return self._min_psnr
-        if self.exact_images_psnr is None:
-            return MIN_PSNR
+        if self._min_psnr is not None or self.exact_images_psnr is None:
+            return MIN_PSNR if self._min_psnr is None else self._min_psnr
         added = 10 * math.log10(10 ** (ADDED_DB / 10) - 1)
         return min(math.ceil(10 * (self.exact_images_psnr - added)) / 10, MAX_PSNR)
+
+    @property
+    def required_psnr(self) -> float | None:
+        """`min_psnr`, if the written file must have it: None if only its bytes are limited."""
+        return self.min_psnr if self.max_bytes is None else self._min_psnr
 
     @cached_property
     def statistics(self) -> PruningStatistics:

@@ -68,8 +68,8 @@ def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
         "package_version": __version__,
         "checkpoint_sha256": job.sha256,
         "machine": {"processor": processor(), "threads": thread_count(), "system": platform.platform()},
-        "min_psnr": result.min_psnr,
-        "max_bytes": result.max_bytes,
+        "min_psnr": job.required_psnr,
+        "max_bytes": job.max_bytes,
         "views": {
             "cameras": len(job.cameras),
             "evaluation_frames": len(job.exact.views),
@@ -104,7 +104,7 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
     summary = [
         f"{machine['processor']}, {machine['threads']} threads.",
         f"{views['evaluation_frames']} frames of {views['width']} × {views['height']} were compared.",
-        *_limits(contents),
+        _limits(contents),
     ]
     lines = [
         f"# {scene}: error against run time and bytes",
@@ -129,18 +129,15 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _limits(contents: dict[str, Any]) -> list[str]:
-    """Sentences: what was allowed, and what this means for the error against held-out images."""
+def _limits(contents: dict[str, Any]) -> str:
+    """What was allowed, and what this means for the error against held-out images."""
     exact, min_psnr, max_bytes = (contents[name] for name in ("exact_images_psnr", "min_psnr", "max_bytes"))
-    limits = [f"{min_psnr:g} dB on the worst frame"] if min_psnr is not None else []
-    limits += [f"{max_bytes / 1e6:g} MB"] if max_bytes is not None else []
-    sentences = [f"Allowed: {' and '.join(limits)}."]
-    if exact is not None:
-        sentences.append(f"The exact network has {exact:.2f} dB against held-out images.")
-        if min_psnr is not None:
-            added = 10 * math.log10(1 + squared(min_psnr) / squared(exact))
-            sentences.append(f"A frame with the error allowed has {added:.2f} dB less.")
-    return sentences
+    texts = ["" if min_psnr is None else f"{min_psnr:g} dB on the worst frame", max_bytes and f"{max_bytes / 1e6:g} MB"]
+    allowed = f"Allowed: {' and '.join(filter(None, texts))}."
+    if exact is None:
+        return allowed
+    added = "" if min_psnr is None else f", {10 * math.log10(1 + squared(min_psnr - exact)):.2f} less with this error"
+    return f"{allowed} The exact network has {exact:.2f} dB against held-out images{added}."
 
 
 def gain(contents: dict[str, Any]) -> str:

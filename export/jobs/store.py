@@ -33,21 +33,19 @@ def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: fl
     return trial.kept(found, tried[-1]) if found else (chosen, error)
 
 
-def within_bytes(
-    job: ExportJob, candidates: Sequence[Candidate], max_bytes: int
-) -> list[tuple[Candidate, RenderedError]]:
-    """Those of the candidates that fit into `max_bytes`, with arrays as fine as these allow, and their errors.
+def within_bytes(job: ExportJob, candidates: Sequence[Candidate]) -> list[tuple[Candidate, RenderedError]]:
+    """Those of the candidates that fit into the job's bytes, with arrays as fine as these allow, and their errors.
 
     Raises `TargetNotReached` if none fits.
     """
-    sizes = [min_bytes(job, candidate) for candidate in candidates]
-    if min(sizes) > max_bytes:
-        smallest = candidates[sizes.index(min(sizes))]
-        worst = _Trial(job, smallest).error(packed(onnx.load(smallest.path), COARSEST if job.packs else {})).psnr_worst
-        reachable = f"at least {math.ceil(min(sizes) / 1e3) / 1e3:.3f}, the smallest file: {worst:.1f} dB"
-        raise TargetNotReached("max_mb", f"{reachable} on its worst frame", max_bytes / 1e6)
-    fitting = [candidate for candidate, size in zip(candidates, sizes, strict=True) if size <= max_bytes]
-    return [_finest(job, candidate, max_bytes) for candidate in fitting]
+    assert job.max_bytes is not None
+    sizes = {candidate: min_bytes(job, candidate) for candidate in candidates}
+    if fitting := [candidate for candidate, size in sizes.items() if size <= job.max_bytes]:
+        return [_finest(job, candidate, job.max_bytes) for candidate in fitting]
+    candidate, size = min(sizes.items(), key=lambda each: each[1])
+    worst = _finest(job, candidate, job.max_bytes)[1].psnr_worst
+    smallest = f"at least {math.ceil(size / 1e3) / 1e3:.3f}, the smallest file: {worst:.1f} dB on its worst frame"
+    raise TargetNotReached("max_mb", smallest, job.max_bytes / 1e6)
 
 
 def min_bytes(job: ExportJob, candidate: Candidate) -> int:
@@ -62,12 +60,11 @@ def squared(psnr: float) -> float:
 
 
 def _finest(job: ExportJob, candidate: Candidate, max_bytes: int) -> tuple[Candidate, RenderedError]:
-    if job.packs and candidate.size + METADATA_BYTES > max_bytes:
-        trial = _Trial(job, candidate)
-        found = smallest_error(trial.contents, trial.estimate(ESTIMATE_STRIDE), max_bytes - METADATA_BYTES)
-        assert found is not None
-        return trial.kept(found, trial.error(found.contents))
-    return candidate, job.error(candidate)
+    if not job.packs or candidate.size + METADATA_BYTES <= max_bytes:
+        return candidate, job.error(candidate)
+    trial = _Trial(job, candidate)
+    found = smallest_error(trial.contents, trial.estimate(ESTIMATE_STRIDE), max_bytes - METADATA_BYTES)
+    return trial.kept(found, trial.error(found.contents))
 
 
 class _Trial:

@@ -5,9 +5,10 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import le
 from typing import Any, NamedTuple
 
-from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached, rounded_down
+from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
 from export.jobs.store import PLAN_PART, min_bytes, within_bytes
 from export.measure.frame_memory import frame_memory
 from export.measure.rendered_error import RenderedError
@@ -61,7 +62,7 @@ class QuickEstimate:
     worst_db: float  # PSNR of the worst of these frames
     size: int  # bytes: of the smallest file if they are limited, else in float32
 
-    def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
+    def dominates(self, other: "QuickEstimate", time_margin: float, db_margin: float) -> bool:
         """Whether it is faster and has a smaller error than another, by more than the margins, and isn't larger."""
         faster = self.cpu * time_margin < other.cpu
         return faster and self.worst_db > other.worst_db + db_margin and self.size <= other.size
@@ -121,26 +122,21 @@ def front(points: Sequence[Point]) -> list[int]:
 
     Only those with default rasterizer options, since a file can't ask for others.
     """
-    usual = [(point.costs, i) for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
-    kept: list[tuple[tuple[float, float, int], int]] = []
-    for costs, i in sorted(usual):  # a point comes after those that are better in all
-        if not any(all(a <= b for a, b in zip(other, costs, strict=True)) for other, _ in kept):
-            kept.append((costs, i))
-    return [i for _, i in kept]
+    usual = sorted((point.costs, i) for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER)
+    return [i for n, (costs, i) in enumerate(usual) if not any(all(map(le, other, costs)) for other, _ in usual[:n])]
 
 
-def choose(points: Sequence[Point], min_psnr: float | None, max_bytes: int | None = None) -> int | None:
-    """The index of the fastest point whose worst frame has at least `min_psnr` dB and whose file has `max_bytes` at
-    most; without `min_psnr` of the one with the smallest error. It lies on the front."""
-    within = [i for i in front(points) if max_bytes is None or points[i].candidate.size <= max_bytes]
+def choose(points: Sequence[Point], min_psnr: float | None) -> int | None:
+    """The index of the fastest point whose worst frame has at least `min_psnr` dB, or if that is None, of the one with
+    the smallest error. It lies on the front."""
     if min_psnr is None:
-        return max(within, key=lambda i: points[i].error.psnr_worst, default=None)
-    return next((i for i in within if points[i].error.psnr_worst >= min_psnr), None)
+        return max(front(points), key=lambda i: points[i].error.psnr_worst, default=None)
+    return next((i for i in front(points) if points[i].error.psnr_worst >= min_psnr), None)
 
 
-def pruning_levels(min_psnr: float, smaller: bool) -> list[float]:
+def pruning_levels(job: ExportJob) -> list[float]:
     """The PSNRs, dB, to which pruning is tried, the mildest first."""
-    levels = [min_psnr + step for step in (*PRUNING_STEPS, *(SMALLER_STEPS if smaller else ()))]
+    levels = [job.min_psnr + step for step in PRUNING_STEPS + (SMALLER_STEPS if job.max_bytes is not None else ())]
     return [level for level in levels if level >= MIN_PRUNING_DB]
 
 
@@ -152,16 +148,14 @@ class SweepResult(NamedTuple):
     chosen: int  # index of a point
     refused: list[tuple[str, str]]  # plans and why they were refused
     front: list[int]  # indices of points
-    min_psnr: float | None
-    max_bytes: int | None
 
 
 class Sweep:
     """One sweep over the candidates of a job."""
 
-    def __init__(self, job: ExportJob, min_psnr: float | None, max_bytes: int | None = None) -> None:
-        """Limits as in `choose`. With `max_bytes`, points are packed."""
-        self.job, self.min_psnr, self.max_bytes = job, min_psnr, max_bytes
+    def __init__(self, job: ExportJob) -> None:
+        """If the job limits bytes, points are packed to fit."""
+        self.job, self.min_psnr, self.max_bytes = job, job.required_psnr, job.max_bytes
         self.estimates: list[QuickEstimate] = []
         self.baseline: QuickEstimate | None = None  # the whole network; None if it can't be run in float32
         self.refused: list[tuple[str, str]] = []
@@ -174,7 +168,7 @@ class Sweep:
         Raises `TargetNotReached` if even the whole network in float32 is further from float64 than allowed, or if no
         file keeps the limits.
         """
-        levels = pruning_levels(self.job.min_psnr, smaller=self.max_bytes is not None)
+        levels = pruning_levels(self.job)
         self.baseline = self._estimate(BASELINE, None)
         self._reachable(self.baseline)
         # the mildest pruning that removes anything: plans are then fitted to moving Gaussians only
@@ -242,12 +236,11 @@ class Sweep:
         return f"not tried: its layers would take about {expected:.0f} ms of processor time; {taken}"
 
     def _reachable(self, estimate: QuickEstimate | None) -> None:
-        if estimate is None or self.min_psnr is None:  # its layers can't be run in float32; fitted plans may still work
+        if estimate is None or self.min_psnr is None:  # its layers can't be run in float32; fitted plans may work
             return
         best = self.job.error(estimate.candidate)
         if best.psnr_worst < self.min_psnr:
-            reachable = f"at most {rounded_down(best.psnr_worst)}, which the whole network in float32 reaches"
-            raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", self.min_psnr)
+            raise TargetNotReached.psnr(best.psnr_worst, "the whole network in float32 reaches", self.min_psnr)
 
     def _pairs(self, unvaried: list[QuickEstimate], level: float) -> set[tuple[str, float]]:
         """The plans to try with pruning to `level` dB."""
@@ -263,19 +256,16 @@ class Sweep:
     def _degrees(self) -> list[tuple[str, float | None, int]]:
         """Lower SH degrees of the fastest candidates that aren't dominated so far, or of those nearest to the limit."""
         limit = self.max_bytes
-        ahead = sorted(self._undominated(0.0), key=lambda e: e.cpu if limit is None else abs(e.size - limit))
+        ahead = sorted(self._undominated(1.0, 0.0), key=lambda e: e.cpu if limit is None else abs(e.size - limit))
         chosen = [estimate.candidate for estimate in ahead[:LOWER_DEGREES]]
         chosen.sort(key=lambda c: c.pruning_db or 0.0)  # so that the trajectories of a pruned model are sampled once
         return [(c.plan, c.pruning_db, degree) for c in chosen for degree in range(c.sh_degree)]
 
-    def _undominated(self, db_margin: float = DB_MARGIN) -> list[QuickEstimate]:
+    def _undominated(self, time_margin: float = TIME_MARGIN, db_margin: float = DB_MARGIN) -> list[QuickEstimate]:
         def dominated(estimate: QuickEstimate) -> bool:
-            margins = {"time_margin": TIME_MARGIN if db_margin else 1.0, "db_margin": db_margin}
-            return any(other.dominates(estimate, **margins) for other in self.estimates)
+            return any(other.dominates(estimate, time_margin, db_margin) for other in self.estimates)
 
-        return [
-            estimate for estimate in self.estimates if estimate.worst_db >= MIN_USEFUL_DB and not dominated(estimate)
-        ]
+        return [e for e in self.estimates if e.worst_db >= MIN_USEFUL_DB and not dominated(e)]
 
     def _measured(self) -> SweepResult:
         if not self.estimates:
@@ -286,33 +276,27 @@ class Sweep:
         ahead = ahead[:MAX_POINTS]
         ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
         candidates = [estimate.candidate for estimate in ahead]
-        points = self._points(
-            self._errors(candidates) if self.max_bytes is None else within_bytes(self.job, candidates, self.max_bytes)
-        )
+        measured = self._errors(candidates) if self.max_bytes is None else within_bytes(self.job, candidates)
+        points = self._points(measured)
         left = [estimate for estimate in self.estimates if estimate not in ahead]
-        return SweepResult(points, left, self._best(points), self.refused, front(points), self.min_psnr, self.max_bytes)
+        return SweepResult(points, left, self._best(points), self.refused, front(points))
 
     def _best(self, points: list[Point]) -> int:
-        best = None
-        if self.min_psnr is not None and self.max_bytes is None and self.job.packs:  # what remains is for storage
-            best = choose(points, self.min_psnr - 10 * math.log10(PLAN_PART))
-        best = choose(points, self.min_psnr) if best is None else best
-        if best is None:  # estimates see only some of the frames, and in float32
-            reachable = f"at most {rounded_down(max(p.error.psnr_worst for p in points))}"
-            within = "" if self.max_bytes is None else f" in {self.max_bytes / 1e6:g} MB"
-            raise TargetNotReached("min_psnr", reachable + within, self.min_psnr)
-        return best
+        best = choose(points, self.min_psnr)
+        if best is None:  # estimates see only some of the frames, in float32
+            reached = max(point.error.psnr_worst for point in points)
+            raise TargetNotReached.psnr(reached, "a file reaches that fits", self.job.min_psnr)
+        leaves = choose(points, self.job.min_psnr - 10 * math.log10(PLAN_PART))  # something for storage
+        return best if leaves is None or self.max_bytes is not None or not self.job.packs else leaves
 
-    def _points(self, measured: Sequence[tuple[Candidate, RenderedError]]) -> list[Point]:
+    def _points(self, measured: list[tuple[Candidate, RenderedError]]) -> list[Point]:
         """Points of candidates and their errors; the fastest within the error also with other rasterizer options."""
-        measured, names = list(measured), [DEFAULT_RASTERIZER] * len(measured)
+        names = [DEFAULT_RASTERIZER] * len(measured)
         within = [c for c, error in measured if self.min_psnr is None or error.psnr_worst >= self.min_psnr]
         if within:  # candidates are sorted by processor time
             usual = within[0].options
-            measured += self._errors(
-                [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
-            )
-            names += RASTERIZERS
+            variants = [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
+            measured, names = measured + self._errors(variants), [*names, *RASTERIZERS]
         candidates = [candidate for candidate, _ in measured]
         images = [self._images_psnr(candidate) for candidate in candidates]
         background, on_repeat = self.job.info.background, self.job.progress("timing", REPEATS)

@@ -1,7 +1,8 @@
 """The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows, or the reverse."""
 
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from typing import NamedTuple
 
@@ -85,12 +86,8 @@ def fewest_bytes(
             return None
 
 
-def smallest_error(
-    contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float], max_bytes: int
-) -> Stored | None:
-    """The scene file of `max_bytes` at most with the smallest sum of squared errors, or None if all are larger."""
-    if packed(contents, COARSEST).ByteSize() > max_bytes:
-        return None
+def smallest_error(contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float], max_bytes: int) -> Stored:
+    """The scene file with the smallest sum of squared errors in `max_bytes`, or the smallest of all if none fits."""
     kinds = _Choice(contents, estimate).within_bytes(max_bytes)
     return Stored(packed(contents, kinds), kinds)
 
@@ -104,36 +101,37 @@ class _Choice:
         self._alone = cache(self._packed_alone)
 
     def within(self, allowed: float) -> tuple[dict[str, str], float]:
-        """Kinds whose errors sum to `allowed` at most, without groups in float32, and the sum. All groups start with
-        their coarsest kind; the one with the largest error per byte that its next kind adds gets that kind."""
-        levels = dict.fromkeys(self._kinds, 0)
-        while (total := sum(self._alone(name, level)[0] for name, level in levels.items())) > allowed:
-            levels[max(levels, key=lambda name: self._gain(name, levels[name]))] += 1
+        """The coarsest kinds whose errors sum to `allowed` at most, without groups in float32, and the sum."""
+        sums = ((levels, sum(self._alone(*each)[0] for each in levels.items())) for levels in self._refined(math.inf))
+        levels, total = next((levels, total) for levels, total in sums if total <= allowed)
         return self._chosen(levels), total
 
     def within_bytes(self, max_bytes: int) -> dict[str, str]:
-        """Kinds of a file of `max_bytes` at most, chosen likewise: a group gets its next kind if that fits."""
-        levels = dict.fromkeys(self._kinds, 0)
-        free = max_bytes - packed(self._contents, self._chosen(levels)).ByteSize()
-        while gains := {
-            name: self._gain(name, level)
-            for name, level in levels.items()
-            if self._kinds[name][level] is not None and self._added_bytes(name, level) <= free
-        }:
-            name = max(gains, key=lambda name: gains[name])
-            if gains[name] < 0:
-                break  # the others have no error
-            free -= self._added_bytes(name, levels[name])
-            levels[name] += 1
+        """The finest kinds of a file of `max_bytes`, likewise."""
+        smallest = packed(self._contents, self._chosen(dict.fromkeys(self._kinds, 0)))
+        *_, levels = self._refined(max_bytes - smallest.ByteSize())
         return self._chosen(levels)
+
+    def _refined(self, free: float) -> Iterator[dict[str, int]]:
+        """Levels of all groups. They start with their coarsest kind; of those whose next kind adds no more than the
+        `free` bytes, the one with the largest error per byte that it adds gets it, until none has an error."""
+        levels = dict.fromkeys(self._kinds, 0)
+        while True:
+            yield levels
+            gains = {name: self._gain(name, level) for name, level in levels.items() if self._alone(name, level)[0]}
+            gains = {name: gain for name, gain in gains.items() if self._added_bytes(name, levels[name]) <= free}
+            if not gains:
+                return
+            name = max(gains, key=lambda name: gains[name])
+            free -= self._added_bytes(name, levels[name])
+            levels = levels | {name: levels[name] + 1}
 
     def _chosen(self, levels: Mapping[str, int]) -> dict[str, str]:
         kinds = {name: self._kinds[name][level] for name, level in levels.items()}
         return {name: kind for name, kind in kinds.items() if kind is not None}
 
     def _gain(self, name: str, level: int) -> float:
-        error, _ = self._alone(name, level)
-        return error / max(self._added_bytes(name, level), 1) if error else -1.0
+        return self._alone(name, level)[0] / max(self._added_bytes(name, level), 1)
 
     def _added_bytes(self, name: str, level: int) -> int:
         """How much larger a file is in which this group has its next kind."""
