@@ -59,10 +59,8 @@ LEGEND = """\
 
 def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
     """The report as plain values. Errors are reproducible; times are those of this machine."""
-    points = [
-        {"front": i in result.front, "chosen": i == result.chosen, **point.to_plain()}
-        for i, point in enumerate(result.points)
-    ]
+    numbered = enumerate(result.points)
+    points = [{"front": i in result.front, "chosen": i == result.chosen, **p.to_plain()} for i, p in numbered]
     return {
         "format": FORMAT,
         "package_version": __version__,

@@ -44,7 +44,7 @@ def within_bytes(job: ExportJob, candidates: Sequence[Candidate]) -> list[tuple[
         return [_finest(job, candidate, job.max_bytes) for candidate in fitting]
     candidate, size = min(sizes.items(), key=lambda each: each[1])
     worst = _finest(job, candidate, job.max_bytes)[1].psnr_worst
-    smallest = f"at least {math.ceil(size / 1e3) / 1e3:.3f}, the smallest file: {worst:.1f} dB on its worst frame"
+    smallest = f"at least {math.ceil(size / 1e3) / 1e3:.3f}, the smallest file tried: {worst:.1f} dB on its worst frame"
     raise TargetNotReached("max_mb", smallest, job.max_bytes / 1e6)
 
 

@@ -250,7 +250,9 @@ class Sweep:
             least = min((estimate.cpu_deformation for estimate in enough), default=0.0)
             fast = [estimate for estimate in enough if estimate.cpu_deformation <= TIME_MARGIN * least]
             if fast:
-                pairs.add((min(fast, key=lambda estimate: estimate.candidate.size).candidate.plan, level))
+                pairs.add((min(fast, key=lambda estimate: estimate.size).candidate.plan, level))
+            if enough and self.max_bytes is not None:
+                pairs.add((min(enough, key=lambda estimate: estimate.size).candidate.plan, level))
         return pairs
 
     def _degrees(self) -> list[tuple[str, float | None, int]]:
