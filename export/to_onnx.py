@@ -18,7 +18,8 @@ def main(options: ExportOptions) -> int:
         with console.status("loading torch and onnxruntime"):
             from export.importers.command import model_or_import  # slow to import: not before --help
             from export.jobs.command import export
-        min_psnr = None if options.keep_float32 else options.min_psnr
+            from export.measure.stability import MIN_PSNR
+        min_psnr = None if options.keep_float32 else options.min_psnr or MIN_PSNR
         with model_or_import(options.model, options.format, options.scene_file, console, min_psnr) as model:
             if model is not None:
                 export(model, options, console)

@@ -19,7 +19,8 @@ from export.importers.sequence import is_switched, of_the_moment
 from export.importers.splats.formats import read_splats
 from export.jobs.store import stored_anew
 from export.jobs.write import set_properties, storage_differences, write_measured
-from export.options import ConvertOptions, ExportOptions
+from export.measure.stability import MIN_PSNR
+from export.options import ConvertOptions
 from export.plans.registry import PLANS
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
@@ -150,7 +151,7 @@ def _visionary(session: DeformationSession, options: ConvertOptions, console: Co
 def _stored_anew(session: DeformationSession, options: ConvertOptions, console: Console) -> str:
     """Write the scene with packed arrays."""
     out, contents = options.out, onnx.load(options.scene)
-    min_psnr = ExportOptions.min_psnr if options.min_psnr is None else options.min_psnr
+    min_psnr = MIN_PSNR if options.min_psnr is None else options.min_psnr
     with console.status("storage in fewer bits"):
         found = stored_anew(contents, min_psnr)
     if found is None:

@@ -17,8 +17,8 @@ from rich.table import Column, Table
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
-from export.jobs.store import PLAN_PART, check_min_psnr, squared, stored
-from export.jobs.sweep import Sweep
+from export.jobs.store import PLAN_PART, check_min_psnr, squared, stored, within_bytes
+from export.jobs.sweep import Sweep, pruning_levels
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
@@ -51,29 +51,32 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
         track = _tracker(console, progress)
         images = _held_out_images(model, options.data, track)
         rules = [rule for rule in RULES if rule not in options.keep]
-        training = images.training if images else []
-        job = ExportJob(model, Path(folder), min_psnr=options.min_psnr, rules=rules, training=training, progress=track)
-        packs = STORAGE not in options.keep
-        part, result = PLAN_PART if packs else 1.0, None
+        packs, result = STORAGE not in options.keep, None
+        limits = {"min_psnr": options.min_psnr, "max_bytes": options.max_mb and round(1e6 * options.max_mb)}
+        job = ExportJob(model, Path(folder), **limits, rules=rules, packs=packs, images=images, progress=track)
         if options.chosen_plan is None:
-            result = Sweep(job, options.min_psnr, images, part=part).run()
+            result = Sweep(job).run()
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
         else:
-            chosen, error = _planned(job, options.chosen_plan, options.min_psnr, part)
-        written, error = stored(job, chosen, error, options.min_psnr) if packs else (chosen, error)
-        if result:
-            result.points[result.chosen] = replace(result.points[result.chosen], candidate=written, error=error)
-        contents = report(job, result) if result else None
+            planned = _planned if job.max_bytes is None else _planned_within_bytes
+            chosen, error = planned(job, options.chosen_plan)
+        if packs and job.max_bytes is None:
+            chosen, error = stored(job, chosen, error, job.min_psnr)
         exported = write_scene(
             options.scene_file,
-            onnx.load(chosen.path),
+            onnx.load(chosen.float32 or chosen.path),
             chosen.pruned.moving,
-            packed=None if written is chosen else onnx.load(written.path),
+            packed=onnx.load(chosen.path) if chosen.float32 else None,
             rendered=error.to_plain(),
             tolerance=options.tolerance,
             times=options.times,
             on_time=track("comparing poses with the model", options.times),
         )
+        contents = None
+        if result:
+            result.points[result.chosen] = replace(result.points[result.chosen], candidate=chosen, error=error)
+            contents = report(job, result)
+            contents["points"][result.chosen]["bytes"] = exported.size
     if contents:
         _print_table(contents, console)
         console.print(gain(contents), markup=False)
@@ -95,7 +98,10 @@ def _tracker(console: Console, progress: Progress) -> Track:
 
 
 def _check(options: ExportOptions) -> None:
-    check_min_psnr(options.min_psnr)
+    if options.min_psnr is not None:
+        check_min_psnr(options.min_psnr)
+    if options.max_mb is not None and not 0 < options.max_mb < math.inf:
+        raise InvalidInput("max_mb", "a positive number of megabytes, 10⁶ bytes each", options.max_mb)
     if not options.tolerance >= 0:
         raise InvalidInput("tolerance", "0 or more", options.tolerance)
     if options.times < 2:
@@ -116,21 +122,30 @@ def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutIma
     return HeldOutImages(data, load_model(model).scene, lambda count: track("images", count))
 
 
-def _planned(job: ExportJob, plan: str, min_psnr: float, part: float) -> tuple[Candidate, RenderedError]:
+def _planned(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
     """A candidate of the plan that was asked for, pruned as far as a part of what its own error leaves allows."""
     whole = job.candidate(plan, None)
     best = job.error(whole)
-    if best.psnr_worst < min_psnr:
-        reachable = f"at most {math.floor(10 * best.psnr_worst) / 10:.1f}, which the plan {plan} reaches"
-        raise TargetNotReached("min_psnr", f"{reachable} on its worst frame", min_psnr)
+    if best.psnr_worst < job.min_psnr:
+        raise TargetNotReached.psnr(best.psnr_worst, f"the plan {plan} reaches", job.min_psnr)
     if job.rules:
-        budget = part * (squared(min_psnr) - squared(best.psnr_worst))
+        budget = (PLAN_PART if job.packs else 1.0) * (squared(job.min_psnr) - squared(best.psnr_worst))
         for fraction in (1.0, 0.5, 0.25) if budget > 0 else ():
             pruned = job.candidate(plan, -10 * math.log10(fraction * budget))
             error = job.error(pruned)
             if squared(error.psnr_worst) <= squared(best.psnr_worst) + budget:
                 return pruned, error
     return whole, best
+
+
+def _planned_within_bytes(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
+    """The candidate of the plan with the smallest error that fits, of all levels of pruning."""
+    candidates = [job.candidate(plan, level) for level in (None, *(pruning_levels(job) if job.rules else ()))]
+    different = list({candidate.digest: candidate for candidate in candidates}.values())
+    chosen, error = max(within_bytes(job, different), key=lambda each: each[1].psnr_worst)
+    if job.required_psnr is not None and error.psnr_worst < job.required_psnr:
+        raise TargetNotReached.psnr(error.psnr_worst, f"the plan {plan} reaches in so many bytes", job.required_psnr)
+    return chosen, error
 
 
 def _print_table(contents: dict, console: Console) -> None:

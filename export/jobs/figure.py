@@ -1,5 +1,6 @@
-"""The work-precision diagram: milliseconds per frame on the x axis, error of the worst frame on the y axis."""
+"""The work-precision diagram: the error of the worst frame against milliseconds per frame, and against megabytes."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,48 +19,64 @@ LABEL_SIZE = np.array([250, 15])
 OTHER = "#9498a0"
 
 
+Cost = Callable[[dict[str, Any]], float]
+COSTS: tuple[Cost, Cost] = (lambda p: p["milliseconds"]["total"]["min"], lambda p: p["bytes"] / 1e6)
+"""The x axes of the panels side by side."""
+
+
 def draw(contents: dict[str, Any], path: Path) -> None:
     """Write the diagram of a report as PNG."""
-    figure = Figure(figsize=(10, 6.5), layout="constrained")
-    axes = figure.subplots()
-    points, budget = contents["points"], contents["min_psnr"]
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    _front_line(axes, points)
-    for kind in dict.fromkeys(_kind(point) for point in points):
-        group = [point for point in points if _kind(point) == kind]
-        usual = [point for point in group if point["rasterizer"] == DEFAULT_RASTERIZER]
-        axes.scatter(*_places(usual), s=55, color=PLANS[kind].color, label=f"plan {kind}", zorder=3)
-    others = [point for point in points if point["rasterizer"] != DEFAULT_RASTERIZER]
-    if others:
-        axes.scatter(*_places(others), s=55, marker="x", color=OTHER, label="other rasterizer options", zorder=3)
-    chosen = [point for point in points if point["chosen"]]
-    axes.scatter(*_places(chosen), s=420, marker="*", facecolors="gold", edgecolors="black", label="chosen", zorder=4)
-    axes.axhline(_rms(budget), color="black", linewidth=1, linestyle="--")
-    axes.text(
-        0.995, _rms(budget), f"allowed: {budget:g} dB ", transform=axes.get_yaxis_transform(), va="bottom", ha="right"
-    )
-    _axes(axes, points, contents)
-    axes.legend(loc="upper right", framealpha=0.95)
+    figure = Figure(figsize=(16, 6.5), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    points, budget, limit = (contents[name] for name in ("points", "min_psnr", "max_bytes"))
+    for axes, cost in zip((left, right), COSTS, strict=True):
+        _draw_points(axes, cost, points)
+        _set_ticks(axes, cost, points)
+        if budget is not None:
+            axes.axhline(_rms(budget), color="black", linewidth=1, linestyle="--")
+            text, place = f"allowed: {budget:g} dB ", axes.get_yaxis_transform()
+            axes.text(0.995, _rms(budget), text, transform=place, va="bottom", ha="right")
+    if limit is not None:
+        right.axvline(limit / 1e6, color="black", linewidth=1, linestyle="--")
+    machine = f"{contents['machine']['processor']}, {contents['machine']['threads']} threads"
+    left.set_xlabel(f"milliseconds per frame, deformation and drawing ({machine})")
+    right.set_xlabel("megabytes (10⁶ bytes); hollow: in float32")
+    left.set_ylabel("error of the worst frame against the exact one:\nPSNR and RMSE")
+    figure.suptitle("Each point is one way to store this scene: left is faster or smaller, down is more exact.")
+    left.legend(loc="upper right", framealpha=0.95)
     figure.draw_without_rendering()  # fixes the positions of labels
-    _label(axes, points)
+    for axes, cost in zip((left, right), COSTS, strict=True):
+        _label(axes, cost, points)
     figure.savefig(path, dpi=110, format="png")
 
 
-def _front_line(axes: Any, points: list[dict[str, Any]]) -> None:
-    ahead = sorted((p for p in points if p["front"]), key=lambda p: p["milliseconds"]["total"]["min"])
-    axes.plot(*_places(ahead), drawstyle="steps-post", color="black", linewidth=1.5, zorder=2, label="Pareto front")
+def _draw_points(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
+    def scatter(group: list[dict[str, Any]], label: str, **style: Any) -> None:
+        errors = [_rms(point["error"]["psnr_worst"]) for point in group]
+        axes.scatter([cost(point) for point in group], errors, label=label, **style)
+
+    usual = [point for point in points if point["rasterizer"] == DEFAULT_RASTERIZER]
+    for kind in dict.fromkeys(_kind(point) for point in points):
+        group, color = [point for point in usual if _kind(point) == kind], PLANS[kind].color
+        faces = [color if point["packed"] else "white" for point in group]
+        scatter(group, f"plan {kind}", s=55, facecolors=faces, edgecolors=color, linewidths=2, zorder=3)
+    if others := [point for point in points if point not in usual]:
+        scatter(others, "other rasterizer options", s=55, marker="x", color=OTHER, zorder=3)
+    ahead = [point for point in points if point["front"]]
+    scatter(ahead, "Pareto front", s=150, marker="D", facecolors="none", edgecolors="black", zorder=2)
+    chosen = [point for point in points if point["chosen"]]
+    scatter(chosen, "chosen", s=420, marker="*", facecolors="gold", edgecolors="black", zorder=4)
 
 
-def _label(axes: Any, points: list[dict[str, Any]]) -> None:
+def _label(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
     """Label the points on the front and those that aren't pruned, the chosen one first, without overlaps."""
     taken: list[np.ndarray] = []
     named = [point for point in points if point["front"] or point["pruning_db"] is None]
     for point in sorted(named, key=lambda point: not point["chosen"]):
-        x, y = _places([point])
-        place = axes.transData.transform((x[0], y[0]))
+        at = cost(point), _rms(point["error"]["psnr_worst"])
+        place = axes.transData.transform(at)
         if all((np.abs(place - other) > LABEL_SIZE).any() for other in taken):
-            axes.annotate(_text(point), (x[0], y[0]), xytext=(9, -11), textcoords="offset points", fontsize=8, zorder=5)
+            axes.annotate(_text(point), at, xytext=(9, -11), textcoords="offset points", fontsize=8, zorder=5)
             taken.append(place)
 
 
@@ -68,36 +85,27 @@ def _text(point: dict[str, Any]) -> str:
     return f"{point['plan']}, {pruned}, SH {point['sh_degree']}"
 
 
-def _axes(axes: Any, points: list[dict[str, Any]], contents: dict[str, Any]) -> None:
+def _set_ticks(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
     decibels = [point["error"]["psnr_worst"] for point in points]
     ticks = np.arange(DB_STEP * np.floor(min(decibels) / DB_STEP), min(max(decibels), MAX_DB) + DB_STEP, DB_STEP)
     axes.yaxis.set_major_locator(FixedLocator([_rms(db) for db in ticks]))
     axes.yaxis.set_major_formatter(FixedFormatter([f"{db:.0f} dB\n{100 * _rms(db):.2g} %" for db in ticks]))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylabel("error of the worst frame against the exact one:\nPSNR and RMSE")
-    times = [point["milliseconds"]["total"]["min"] for point in points]
-    low, high = min(times) / 1.15, max(times) * 1.5
+    costs = [cost(point) for point in points]
+    low, high = min(costs) / 1.15, max(costs) * 1.5
     places = [base * 10.0**power for power in range(-3, 6) for base in (1, 1.5, 2, 3, 4, 5, 7)]
     places = [place for place in places if low <= place <= high]
     axes.set_xlim(low, high)
     axes.xaxis.set_major_locator(FixedLocator(places))
     axes.xaxis.set_major_formatter(FixedFormatter([f"{place:g}" for place in places]))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    machine = contents["machine"]
-    axes.set_xlabel(
-        f"milliseconds per frame, deformation and drawing ({machine['processor']}, {machine['threads']} threads)"
-    )
-    axes.set_title("Each point is one way to store this scene: left is faster, down is more exact.")
     axes.grid(alpha=0.3, which="major")
 
 
 def _kind(point: dict[str, Any]) -> str:
     return point["plan"].split(":")[0]
-
-
-def _places(points: list[dict[str, Any]]) -> tuple[list[float], list[float]]:
-    x = [point["milliseconds"]["total"]["min"] for point in points]
-    return x, [_rms(point["error"]["psnr_worst"]) for point in points]
 
 
 def _rms(db: float) -> float:

@@ -1,10 +1,12 @@
 """The exports of one model file: candidates by plan, and the exact frames and pruning statistics that all use."""
 
 import hashlib
-from collections.abc import Collection, Sequence
+import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,13 +22,22 @@ from export.pruning.mask import bake_pruned, in_spatial_order, rows, unpruned, w
 from export.trajectories.sampling import Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
-from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
+
+if TYPE_CHECKING:
+    from export.measure.images import HeldOutImages
 
 EVALUATION_TIMES, CAMERAS_PER_TIME = 16, 3
 SELECTION_TIMES = 33
+ESTIMATE_STRIDE = 6
+"""A quick estimate compares every 6th frame."""
+
+ADDED_DB = 0.05
+"""What an export may add to the error against held-out images, dB, if no `min_psnr` is given."""
+
 BACK_OFFS = 4
 """Repeats of pruning with a smaller error, if its rules together cost more than each of them alone."""
 
@@ -37,7 +48,12 @@ SAMPLED_KEPT = 2
 
 
 class TargetNotReached(InvalidInput):
-    """No export of this model reaches the PSNR that was asked for."""
+    """No export of this model reaches the PSNR, or is as small, as was asked for."""
+
+    @classmethod
+    def psnr(cls, reached: float, where: str, asked: float) -> "TargetNotReached":
+        """Where the worst frame reached another PSNR, dB."""
+        return cls("min_psnr", f"at most {math.floor(10 * reached) / 10:.1f}, which {where} on its worst frame", asked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +65,7 @@ class Candidate:
     pruned: PrunedModel
     path: Path
     options: RasterizerOptions  # of its frames
+    float32: Path | None = None  # the same in float32, if the arrays of this file are packed
 
     @cached_property
     def session(self) -> DeformationSession:
@@ -83,18 +100,22 @@ class ExportJob:
         checkpoint: Path,
         folder: Path,
         *,
-        min_psnr: float = MIN_PSNR,
+        min_psnr: float | None = None,
+        max_bytes: int | None = None,
         rules: Collection[str] = tuple(RULES),
-        training: Sequence[Camera] = (),
+        packs: bool = True,
+        images: "HeldOutImages | None" = None,
         progress: Track = no_progress,
     ) -> None:
-        """`training` are the cameras of the training images, if known. Raises `CheckpointInvalid`."""
-        self.folder, self.min_psnr, self.rules, self.progress = folder, min_psnr, rules, progress
+        """`packs` is whether arrays may be stored in fewer bits. With `images`, errors are measured from their
+        training cameras. Raises `CheckpointInvalid`."""
+        self.folder, self.rules, self.packs, self.progress = folder, rules, packs, progress
+        self._min_psnr, self.max_bytes, self.images = min_psnr, max_bytes, images
         model, self.info, _ = load_model(checkpoint)
         self.model = in_spatial_order(model)
         with checkpoint.open("rb") as file:
             self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-        self.cameras = cameras_of(self.info, training)
+        self.cameras = cameras_of(self.info, images.training if images else ())
         self._files = 0
         self._pruned: dict[float | None, PrunedModel] = {None: unpruned(self.model)}
         self._sampled: list[tuple[bytes, np.ndarray, Trajectories]] = []
@@ -106,6 +127,25 @@ class ExportJob:
         on_frame = self.progress("exact frames in float64", len(views))
         pose, options = in_float64(self.model), self.model.rasterizer
         return ExactFrames(pose, len(self.model.gaussians), views, self.info.background, options, on_frame)
+
+    @cached_property
+    def exact_images_psnr(self) -> float | None:
+        """Mean PSNR of the exact frames against held-out images, dB; None if there are none."""
+        return self.images.psnr(self.exact.pose, self.model.rasterizer) if self.images else None
+
+    @cached_property
+    def min_psnr(self) -> float:
+        """PSNR of the worst frame, dB: the given one, or the smallest that adds no more than `ADDED_DB` to the error
+        against held-out images, rounded up to a tenth, or `MIN_PSNR`. Squared errors add up."""
+        if self._min_psnr is not None or self.exact_images_psnr is None:
+            return MIN_PSNR if self._min_psnr is None else self._min_psnr
+        added = 10 * math.log10(10 ** (ADDED_DB / 10) - 1)
+        return min(math.ceil(10 * (self.exact_images_psnr - added)) / 10, MAX_PSNR)
+
+    @property
+    def required_psnr(self) -> float | None:
+        """`min_psnr`, if the written file must have it: None if only its bytes are limited."""
+        return self.min_psnr if self.max_bytes is None else self._min_psnr
 
     @cached_property
     def statistics(self) -> PruningStatistics:

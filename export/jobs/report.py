@@ -1,6 +1,7 @@
 """The report of a sweep: `model.report.json`, `.md` and `.png` beside the scene file."""
 
 import json
+import math
 import platform
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import Any
 
 from export.jobs.figure import draw
 from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, SELECTION_TIMES, ExportJob
-from export.jobs.sweep import DEFAULT_RASTERIZER, SweepResult, front
+from export.jobs.store import squared
+from export.jobs.sweep import DEFAULT_RASTERIZER, SweepResult
 from export.measure.machine import processor
 from export.plans.base import BASELINE
 from msdgs_serve import __version__
@@ -28,7 +30,7 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
     "median": lambda p: f"{p['milliseconds']['total']['median']:.1f}",
     "deform": lambda p: f"{p['milliseconds']['deformation']['min']:.1f}",
     "draw": lambda p: f"{p['milliseconds']['rasterization']['min']:.1f}",
-    "MB": lambda p: f"{p['bytes'] / 1e6:.2f}",
+    "MB": lambda p: f"{p['bytes'] / 1e6:.2f}{'' if p['packed'] else ' *'}",
     "memory": lambda p: "–" if p["memory_bytes"] is None else f"{p['memory_bytes'] / 1e6:.0f} MB",
     "worst frame": lambda p: f"{p['error']['psnr_worst']:.1f}",
     "mean": lambda p: f"{p['error']['psnr_mean']:.1f}",
@@ -40,8 +42,9 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
 """Columns by name, each with a function from a point to its text."""
 
 LEGEND = """\
-- **◆ on the front**: no other point is faster and has a smaller error. **★ chosen**: the fastest within the error
-  allowed.
+- **◆ on the front**: no other point is faster, smaller and has a smaller error; compared before the chosen one is
+  packed if others aren't. **★ chosen**: the fastest within the error allowed; if bytes alone are limited, the one with
+  the smallest error.
 - **pruned to**: lowest PSNR of a frame that pruning alone may cause; "–": not pruned.
 - **ms**: per frame, deformation and rasterization; minimum and median of interleaved repeats, mean of three views.
 - **memory**: peak while loading the file and drawing a frame, above that of the idle process.
@@ -49,23 +52,22 @@ LEGEND = """\
 - **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
   a Gaussian, in scene units and in pixels, transparent and hidden ones included.
 - **held-out**: mean PSNR in dB against held-out images.
-- The chosen point's MB and errors are those of the written file, whose arrays have fewer bits; others have float32.
+- **MB**: 10⁶ bytes. MB and errors are those of a file whose arrays have fewer bits, or, if marked *, float32.
 - Points with other rasterizer options show their effect. A file can't select them, so none is chosen.
 """
 
 
 def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
     """The report as plain values. Errors are reproducible; times are those of this machine."""
-    ahead = set(front(result.points))
-    points = [
-        {"front": i in ahead, "chosen": i == result.chosen, **point.to_plain()} for i, point in enumerate(result.points)
-    ]
+    numbered = enumerate(result.points)
+    points = [{"front": i in result.front, "chosen": i == result.chosen, **p.to_plain()} for i, p in numbered]
     return {
         "format": FORMAT,
         "package_version": __version__,
         "checkpoint_sha256": job.sha256,
         "machine": {"processor": processor(), "threads": thread_count(), "system": platform.platform()},
-        "min_psnr": job.min_psnr,
+        "min_psnr": job.required_psnr,
+        "max_bytes": job.max_bytes,
         "views": {
             "cameras": len(job.cameras),
             "evaluation_frames": len(job.exact.views),
@@ -75,7 +77,7 @@ def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
             "width": job.exact.views[0].camera.width,
             "height": job.exact.views[0].camera.height,
         },
-        "exact_images_psnr": result.exact_images_psnr,
+        "exact_images_psnr": job.exact_images_psnr,
         "points": points,
         "dropped": [estimate.to_plain() for estimate in result.estimates],
         "refused": [{"plan": plan, "why": why} for plan, why in result.refused],
@@ -95,21 +97,19 @@ def write_report(contents: dict[str, Any], scene: Path) -> list[Path]:
 def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
     """The report as Markdown."""
     machine, views = contents["machine"], contents["views"]
-    exact = contents["exact_images_psnr"]
     chosen = next(point for point in contents["points"] if point["chosen"])
     left_out = [f"- {entry['what']}: {entry['count']:,} of {entry['of']:,}" for entry in chosen["left_out"]]
     summary = [
         f"{machine['processor']}, {machine['threads']} threads.",
         f"{views['evaluation_frames']} frames of {views['width']} × {views['height']} were compared.",
-        f"Allowed: {contents['min_psnr']:g} dB on the worst frame.",
-        f"The exact network has {exact:.2f} dB against held-out images." if exact is not None else "",
+        _limits(contents),
     ]
     lines = [
-        f"# {scene}: error against run time",
+        f"# {scene}: error against run time and bytes",
         "",
         " ".join(summary).strip(),
         "",
-        f"![error against milliseconds per frame]({figure})",
+        f"![error against milliseconds per frame, and against megabytes]({figure})",
         "",
         "| " + " | ".join(COLUMNS) + " |",
         "|" + "---|" * len(COLUMNS),
@@ -118,13 +118,24 @@ def markdown(contents: dict[str, Any], scene: str, figure: str) -> str:
         LEGEND,
         gain(contents),
         "",
-        f"{len(contents['dropped'])} more candidates were dropped after a quick estimate: others are better.",
+        f"{len(contents['dropped'])} more candidates were dropped after a quick estimate: others are better, or fit.",
         "",
         "Pruned from the chosen file:" if left_out else "Nothing was pruned from the chosen file.",
         "",
         *left_out,
     ]
     return "\n".join(lines) + "\n"
+
+
+def _limits(contents: dict[str, Any]) -> str:
+    """What was allowed, and what this means for the error against held-out images."""
+    exact, min_psnr, max_bytes = (contents[name] for name in ("exact_images_psnr", "min_psnr", "max_bytes"))
+    texts = ["" if min_psnr is None else f"{min_psnr:g} dB on the worst frame", max_bytes and f"{max_bytes / 1e6:g} MB"]
+    allowed = f"Allowed: {' and '.join(filter(None, texts))}."
+    if exact is None:
+        return allowed
+    added = "" if min_psnr is None else f", {10 * math.log10(1 + squared(min_psnr - exact)):.2f} less with this error"
+    return f"{allowed} The exact network has {exact:.2f} dB against held-out images{added}."
 
 
 def gain(contents: dict[str, Any]) -> str:

@@ -1,18 +1,18 @@
-"""Storage of arrays in as few bytes as an error of frames allows: of the chosen candidate, or of a scene file."""
+"""Storage of arrays, of candidates or of a scene file: in as few bytes as an error of frames allows, or as fine as so
+many bytes allow."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import onnx
 
-from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, Candidate, ExportJob
-from export.jobs.sweep import ESTIMATE_STRIDE
+from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob, TargetNotReached
 from export.jobs.write import properties, set_properties
 from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.views import cameras_of, evaluation_views
-from export.storage.choice import fewest_bytes
+from export.storage.choice import COARSEST, Stored, fewest_bytes, packed, smallest_error
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained
 from msdgs_serve.scene.errors import InvalidInput
@@ -25,6 +25,9 @@ PLAN_PART = 0.75
 LOWEST_MIN_PSNR = 10.0
 """Smallest `min_psnr`, dB. Frames below it don't resemble the scene."""
 
+METADATA_BYTES = 3000
+"""Bytes that are kept free for what is measured last and added to the metadata of the written file."""
+
 Measure = Callable[[onnx.ModelProto, int], RenderedError]
 """The error of a scene file's frames: of all, or of every n-th."""
 
@@ -32,20 +35,9 @@ Measure = Callable[[onnx.ModelProto, int], RenderedError]
 def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: float) -> tuple[Candidate, RenderedError]:
     """The candidate with packed arrays and its error, whose worst frame has at least `min_psnr` dB as the given one
     has; or the given ones if nothing can be packed."""
-    smaller, on_trial = replace(chosen, path=job.folder / "stored.onnx"), job.progress("storage in fewer bits", 0)
-
-    def written(model: onnx.ModelProto) -> Candidate:
-        smaller.close()
-        smaller.path.write_bytes(model.SerializeToString())
-        return smaller
-
-    def measured(model: onnx.ModelProto, every: int) -> RenderedError:
-        on_trial()
-        return job.error(written(model), every)
-
-    allowed = squared(min_psnr) - squared(error.psnr_worst)
-    found = _in_fewer_bits(onnx.load(chosen.path), measured, min_psnr, allowed)
-    return (chosen, error) if found is None else (written(found[0]), found[1])
+    trial = _Trial(job, chosen)
+    found = _in_fewer_bits(trial.contents, trial.error, min_psnr, squared(min_psnr) - squared(error.psnr_worst))
+    return (chosen, error) if found is None else trial.kept(*found)
 
 
 def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelProto, RenderedError] | None:
@@ -73,30 +65,34 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
     def measured(model: onnx.ModelProto, every: int) -> RenderedError:
         return frames.measure(session(model).gaussians, ids, every=every)
 
-    return _in_fewer_bits(contents, measured, min_psnr, squared(min_psnr))
+    found = _in_fewer_bits(contents, measured, min_psnr, squared(min_psnr))
+    return None if found is None else (_with_entry(contents, *found), found[1])
 
 
-def _in_fewer_bits(
-    contents: onnx.ModelProto, measured: Measure, min_psnr: float, allowed: float
-) -> tuple[onnx.ModelProto, RenderedError] | None:
-    """The smallest file by estimates of its squared error within `allowed`, and its error."""
-    tried = list[RenderedError]()
+def within_bytes(job: ExportJob, candidates: Sequence[Candidate]) -> list[tuple[Candidate, RenderedError]]:
+    """Those of the candidates that fit into the job's bytes, with arrays as fine as these allow, and their errors.
 
-    def estimate(every: int) -> Callable[[onnx.ModelProto], float]:
-        return lambda model: squared(measured(model, every).psnr_worst)
+    Raises `TargetNotReached` if none fits.
+    """
+    assert job.max_bytes is not None
+    sizes = {candidate: min_bytes(job, candidate) for candidate in candidates}
+    if fitting := [candidate for candidate, size in sizes.items() if size <= job.max_bytes]:
+        return [_finest(job, candidate, job.max_bytes) for candidate in fitting]
+    candidate, size = min(sizes.items(), key=lambda each: each[1])
+    worst = _finest(job, candidate, job.max_bytes)[1].psnr_worst
+    smallest = f"at least {math.ceil(size / 1e3) / 1e3:.3f}, the smallest file tried: {worst:.1f} dB on its worst frame"
+    raise TargetNotReached("max_mb", smallest, job.max_bytes / 1e6)
 
-    def is_allowed(model: onnx.ModelProto) -> bool:
-        tried.append(measured(model, 1))
-        return tried[-1].psnr_worst >= min_psnr
 
-    found = fewest_bytes(contents, [estimate(ESTIMATE_STRIDE), estimate(1)], is_allowed, allowed)
-    if found is None:
-        return None
-    saved = contents.ByteSize() - found.contents.ByteSize()
-    numbers = {"count": saved, "of": contents.ByteSize(), "bytes_saved": saved, "worst_frame_db": tried[-1].psnr_worst}
-    entry = {"rule": "float32", "what": "bytes of arrays in float32", **numbers, "stored": found.kinds}
-    set_properties(found.contents, left_out=[*properties(contents)["left_out"], entry])
-    return found.contents, tried[-1]
+def min_bytes(job: ExportJob, candidate: Candidate) -> int:
+    """Size of the smallest file in which a candidate can be written."""
+    size = packed(onnx.load(candidate.path), COARSEST).ByteSize() if job.packs else candidate.size
+    return size + METADATA_BYTES
+
+
+def squared(psnr: float) -> float:
+    """Squared error of a frame of this PSNR, dB."""
+    return 10 ** (-psnr / 10)
 
 
 def check_min_psnr(min_psnr: float) -> None:
@@ -106,6 +102,64 @@ def check_min_psnr(min_psnr: float) -> None:
         raise InvalidInput("min_psnr", allowed, min_psnr)
 
 
-def squared(psnr: float) -> float:
-    """Squared error of a frame of this PSNR, dB."""
-    return 10 ** (-psnr / 10)
+def _in_fewer_bits(
+    contents: onnx.ModelProto, measured: Measure, min_psnr: float, allowed: float
+) -> tuple[Stored, RenderedError] | None:
+    """The smallest file by estimates of its squared error within `allowed`, and its error."""
+    tried = list[RenderedError]()
+
+    def is_allowed(model: onnx.ModelProto) -> bool:
+        tried.append(measured(model, 1))
+        return tried[-1].psnr_worst >= min_psnr
+
+    estimates = [_estimate(measured, every) for every in (ESTIMATE_STRIDE, 1)]
+    found = fewest_bytes(contents, estimates, is_allowed, allowed)
+    return None if found is None else (found, tried[-1])
+
+
+def _estimate(measured: Measure, every: int) -> Callable[[onnx.ModelProto], float]:
+    """A function that returns the squared error of the worst of every n-th frame."""
+    return lambda model: squared(measured(model, every).psnr_worst)
+
+
+def _with_entry(contents: onnx.ModelProto, found: Stored, error: RenderedError) -> onnx.ModelProto:
+    """The packed file, which says in its metadata what was saved."""
+    size = contents.ByteSize()
+    saved = size - found.contents.ByteSize()
+    numbers = {"count": saved, "of": size, "bytes_saved": saved, "worst_frame_db": error.psnr_worst}
+    entry = {"rule": "float32", "what": "bytes of arrays in float32", **numbers, "stored": found.kinds}
+    set_properties(found.contents, left_out=[*properties(contents)["left_out"], entry])
+    return found.contents
+
+
+def _finest(job: ExportJob, candidate: Candidate, max_bytes: int) -> tuple[Candidate, RenderedError]:
+    if not job.packs or candidate.size + METADATA_BYTES <= max_bytes:
+        return candidate, job.error(candidate)
+    trial = _Trial(job, candidate)
+    found = smallest_error(trial.contents, _estimate(trial.error, ESTIMATE_STRIDE), max_bytes - METADATA_BYTES)
+    return trial.kept(found, trial.error(found.contents))
+
+
+class _Trial:
+    """A candidate whose arrays are packed in several ways."""
+
+    def __init__(self, job: ExportJob, candidate: Candidate) -> None:
+        self.contents = onnx.load(candidate.path)
+        self._job = job
+        self._smaller = replace(candidate, path=candidate.path.with_suffix(".stored.onnx"), float32=candidate.path)
+        self._on_trial = job.progress("storage in fewer bits", 0)
+
+    def error(self, model: onnx.ModelProto, every: int = 1) -> RenderedError:
+        """The error of a packed file, of all frames or of every n-th."""
+        self._write(model)
+        self._on_trial()
+        return self._job.error(self._smaller, every)
+
+    def kept(self, found: Stored, error: RenderedError) -> tuple[Candidate, RenderedError]:
+        """The packed candidate and its error."""
+        self._write(_with_entry(self.contents, found, error))
+        return self._smaller, error
+
+    def _write(self, model: onnx.ModelProto) -> None:
+        self._smaller.close()
+        self._smaller.path.write_bytes(model.SerializeToString())

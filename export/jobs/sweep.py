@@ -5,27 +5,27 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from operator import le
+from typing import Any, NamedTuple
 
-from export.jobs.job import Candidate, ExportJob, TargetNotReached
+from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
+from export.jobs.store import PLAN_PART, min_bytes, within_bytes
 from export.measure.frame_memory import frame_memory
-from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import REPEATS, FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
-from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
-
-if TYPE_CHECKING:
-    from export.measure.images import HeldOutImages
 
 MAX_RELATIVE_COST = 4.0
 """A plan that runs layers isn't tried if its layers take this many times the whole frame of a plan within the error."""
 
 PRUNING_STEPS = (20.0, 10.0, 5.0, 2.0, -5.0, -10.0, -15.0)
 """dB above or below `min_psnr` at which pruning is tried."""
+
+SMALLER_STEPS = (-20.0, -25.0)
+"""The same, if bytes are limited too."""
 
 MIN_PRUNING_DB, MIN_USEFUL_DB = 25.0, 20.0
 """Pruning isn't tried below the first; candidates below the second are dropped."""
@@ -34,8 +34,8 @@ HEADROOM = (2.0, -3.0)
 """dB. Each level of pruning is tried with the fastest plan whose error, mildly pruned, is better than the level by the
 first value, and by the second. Of plans that are about as fast, the one with the smallest file counts."""
 
-ESTIMATE_STRIDE, ESTIMATE_REPEATS = 6, 3
-"""A quick estimate compares every 6th frame and takes the minimum of 3 timings."""
+ESTIMATE_REPEATS = 3
+"""A quick estimate takes the minimum of 3 timings."""
 
 TIME_MARGIN, DB_MARGIN = 1.15, 0.5
 MAX_POINTS = 24
@@ -60,11 +60,12 @@ class QuickEstimate:
     cpu: float  # milliseconds per frame, the minimum of a few
     cpu_deformation: float  # milliseconds of these
     worst_db: float  # PSNR of the worst of these frames
+    size: int  # bytes: of the smallest file if they are limited, else in float32
 
-    def dominates(self, other: "QuickEstimate", *, time_margin: float, db_margin: float) -> bool:
-        """Whether it is faster and has a smaller error than another, by more than the margins."""
+    def dominates(self, other: "QuickEstimate", time_margin: float, db_margin: float) -> bool:
+        """Whether it is faster and has a smaller error than another, by more than the margins, and isn't larger."""
         faster = self.cpu * time_margin < other.cpu
-        return faster and self.worst_db > other.worst_db + db_margin
+        return faster and self.worst_db > other.worst_db + db_margin and self.size <= other.size
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -88,6 +89,11 @@ class Point:
         """Minimum over the repeats of a whole frame."""
         return self.time.total.min
 
+    @property
+    def costs(self) -> tuple[float, float, int]:
+        """What is better if smaller: milliseconds, negative PSNR of the worst frame, bytes."""
+        return self.milliseconds, -self.error.psnr_worst, self.candidate.size
+
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
         scene = self.candidate.session.scene
@@ -96,6 +102,7 @@ class Point:
             "static": scene.static_count,
             "layers": len(scene.metadata.layers),
             "bytes": self.candidate.size,
+            "packed": self.candidate.float32 is not None,
             "memory_bytes": self.memory,
             "milliseconds": self.time.to_plain(),
             "error": self.error.to_plain(),
@@ -111,23 +118,26 @@ def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
 
 
 def front(points: Sequence[Point]) -> list[int]:
-    """Indices of the points on the Pareto front of time and error, the fastest first.
+    """Indices of the points on the Pareto front of time, error and bytes, the fastest first.
 
     Only those with default rasterizer options, since a file can't ask for others.
     """
-    usual = [i for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER]
-    best, kept = -1.0, []
-    for i in sorted(usual, key=lambda i: (points[i].milliseconds, -points[i].error.psnr_worst)):
-        if points[i].error.psnr_worst > best:
-            best = points[i].error.psnr_worst
-            kept.append(i)
-    return kept
+    usual = sorted((point.costs, i) for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER)
+    return [i for n, (costs, i) in enumerate(usual) if not any(all(map(le, other, costs)) for other, _ in usual[:n])]
 
 
-def choose(points: Sequence[Point], min_psnr: float) -> int | None:
-    """The index of the fastest point whose worst frame is within `min_psnr` dB, which lies on the front."""
-    within = [i for i in front(points) if points[i].error.psnr_worst >= min_psnr]
-    return within[0] if within else None
+def choose(points: Sequence[Point], min_psnr: float | None) -> int | None:
+    """The index of the fastest point whose worst frame has at least `min_psnr` dB, or if that is None, of the one with
+    the smallest error. It lies on the front."""
+    if min_psnr is None:
+        return max(front(points), key=lambda i: points[i].error.psnr_worst, default=None)
+    return next((i for i in front(points) if points[i].error.psnr_worst >= min_psnr), None)
+
+
+def pruning_levels(job: ExportJob) -> list[float]:
+    """The PSNRs, dB, to which pruning is tried, the mildest first."""
+    levels = [job.min_psnr + step for step in PRUNING_STEPS + (SMALLER_STEPS if job.max_bytes is not None else ())]
+    return [level for level in levels if level >= MIN_PRUNING_DB]
 
 
 class SweepResult(NamedTuple):
@@ -137,18 +147,15 @@ class SweepResult(NamedTuple):
     estimates: list[QuickEstimate]  # of candidates that were dropped
     chosen: int  # index of a point
     refused: list[tuple[str, str]]  # plans and why they were refused
-    exact_images_psnr: float | None
+    front: list[int]  # indices of points
 
 
 class Sweep:
     """One sweep over the candidates of a job."""
 
-    def __init__(
-        self, job: ExportJob, min_psnr: float, images: "HeldOutImages | None" = None, *, part: float = 1.0
-    ) -> None:
-        """`part` is how much of the squared error of `min_psnr` dB the chosen point has if possible."""
-        self.job, self.min_psnr, self.images = job, min_psnr, images
-        self.preferred_psnr = min_psnr - 10 * math.log10(part)
+    def __init__(self, job: ExportJob) -> None:
+        """If the job limits bytes, points are packed to fit."""
+        self.job, self.min_psnr, self.max_bytes = job, job.required_psnr, job.max_bytes
         self.estimates: list[QuickEstimate] = []
         self.baseline: QuickEstimate | None = None  # the whole network; None if it can't be run in float32
         self.refused: list[tuple[str, str]] = []
@@ -158,9 +165,10 @@ class Sweep:
     def run(self) -> SweepResult:
         """Estimate all candidates, then measure those that may be on the front.
 
-        Raises `TargetNotReached` if even the whole network in float32 is further from float64 than allowed.
+        Raises `TargetNotReached` if even the whole network in float32 is further from float64 than allowed, or if no
+        file keeps the limits.
         """
-        levels = [self.min_psnr + step for step in PRUNING_STEPS if self.min_psnr + step >= MIN_PRUNING_DB]
+        levels = pruning_levels(self.job)
         self.baseline = self._estimate(BASELINE, None)
         self._reachable(self.baseline)
         # the mildest pruning that removes anything: plans are then fitted to moving Gaussians only
@@ -197,7 +205,8 @@ class Sweep:
         error = self.job.error(candidate, every=ESTIMATE_STRIDE)
         deformation, _, total = (min(run[part] for run in runs) for part in range(3))
         candidate.close()
-        self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst))
+        size = candidate.size if self.max_bytes is None else min_bytes(self.job, candidate)
+        self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst, size))
         return self.estimates[-1]
 
     def _estimate_all(self, name: str, candidates: Sequence[tuple]) -> None:
@@ -209,7 +218,9 @@ class Sweep:
 
     def _too_expensive(self, plan: str, pruning_db: float | None) -> str | None:
         """Why a plan that runs layers isn't tried; None if it is."""
-        enough = [estimate for estimate in self.estimates if estimate.worst_db >= self.min_psnr]
+        if self.max_bytes is not None:
+            return None  # its file may be smaller
+        enough = [estimate for estimate in self.estimates if estimate.worst_db >= self.job.min_psnr]
         fitted = [estimate for estimate in enough if plan_of(estimate.candidate.plan).fitted]
         fastest = min(fitted, key=lambda estimate: estimate.cpu, default=None)
         kind = plan_of(plan)
@@ -225,13 +236,11 @@ class Sweep:
         return f"not tried: its layers would take about {expected:.0f} ms of processor time; {taken}"
 
     def _reachable(self, estimate: QuickEstimate | None) -> None:
-        if estimate is None:  # its layers can't be run in float32; fitted plans may still work
+        if estimate is None or self.min_psnr is None:  # its layers can't be run in float32; fitted plans may work
             return
         best = self.job.error(estimate.candidate)
         if best.psnr_worst < self.min_psnr:
-            reachable = math.floor(10 * best.psnr_worst) / 10
-            expected = f"at most {reachable:.1f}, which the whole network in float32 reaches on its worst frame"
-            raise TargetNotReached("min_psnr", expected, self.min_psnr)
+            raise TargetNotReached.psnr(best.psnr_worst, "the whole network in float32 reaches", self.min_psnr)
 
     def _pairs(self, unvaried: list[QuickEstimate], level: float) -> set[tuple[str, float]]:
         """The plans to try with pruning to `level` dB."""
@@ -241,65 +250,72 @@ class Sweep:
             least = min((estimate.cpu_deformation for estimate in enough), default=0.0)
             fast = [estimate for estimate in enough if estimate.cpu_deformation <= TIME_MARGIN * least]
             if fast:
-                pairs.add((min(fast, key=lambda estimate: estimate.candidate.size).candidate.plan, level))
+                pairs.add((min(fast, key=lambda estimate: estimate.size).candidate.plan, level))
+            if enough and self.max_bytes is not None:
+                pairs.add((min(enough, key=lambda estimate: estimate.size).candidate.plan, level))
         return pairs
 
     def _degrees(self) -> list[tuple[str, float | None, int]]:
-        """Lower SH degrees of the fastest candidates that aren't dominated so far."""
-        ahead = sorted(self._undominated(0.0), key=lambda estimate: estimate.cpu)
+        """Lower SH degrees of the fastest candidates that aren't dominated so far, or of those nearest to the limit."""
+        limit = self.max_bytes
+        ahead = sorted(self._undominated(1.0, 0.0), key=lambda e: e.cpu if limit is None else abs(e.size - limit))
         chosen = [estimate.candidate for estimate in ahead[:LOWER_DEGREES]]
         chosen.sort(key=lambda c: c.pruning_db or 0.0)  # so that the trajectories of a pruned model are sampled once
         return [(c.plan, c.pruning_db, degree) for c in chosen for degree in range(c.sh_degree)]
 
-    def _undominated(self, db_margin: float = DB_MARGIN) -> list[QuickEstimate]:
+    def _undominated(self, time_margin: float = TIME_MARGIN, db_margin: float = DB_MARGIN) -> list[QuickEstimate]:
         def dominated(estimate: QuickEstimate) -> bool:
-            margins = {"time_margin": TIME_MARGIN if db_margin else 1.0, "db_margin": db_margin}
-            return any(other.dominates(estimate, **margins) for other in self.estimates)
+            return any(other.dominates(estimate, time_margin, db_margin) for other in self.estimates)
 
-        return [
-            estimate for estimate in self.estimates if estimate.worst_db >= MIN_USEFUL_DB and not dominated(estimate)
-        ]
+        return [e for e in self.estimates if e.worst_db >= MIN_USEFUL_DB and not dominated(e)]
 
     def _measured(self) -> SweepResult:
         if not self.estimates:
             raise InvalidInput("model", "one that some plan can hold", "; ".join(why for _, why in self.refused))
-        ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)[:MAX_POINTS]
+        ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)
+        if self.max_bytes is not None:
+            ahead = [e for e in ahead if e.size <= self.max_bytes] or [min(self.estimates, key=lambda e: e.size)]
+        ahead = ahead[:MAX_POINTS]
         ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
-        points = self._points([estimate.candidate for estimate in ahead])
-        best = choose(points, self.preferred_psnr)
-        best = choose(points, self.min_psnr) if best is None else best
-        if best is None:  # estimates see only some of the frames
-            raise TargetNotReached("min_psnr", f"at most {max(p.error.psnr_worst for p in points):.1f}", self.min_psnr)
+        candidates = [estimate.candidate for estimate in ahead]
+        measured = self._errors(candidates) if self.max_bytes is None else within_bytes(self.job, candidates)
+        points = self._points(measured)
         left = [estimate for estimate in self.estimates if estimate not in ahead]
-        exact_images_psnr = self._images_psnr(self.job.exact.pose, self.job.model.rasterizer)
-        return SweepResult(points, left, best, self.refused, exact_images_psnr)
+        return SweepResult(points, left, self._best(points), self.refused, front(points))
 
-    def _points(self, candidates: list[Candidate]) -> list[Point]:
-        """All measured in full; the fastest within the error also with other rasterizer options."""
-        errors = self._errors(candidates)
-        within = [c for c, error in zip(candidates, errors, strict=True) if error.psnr_worst >= self.min_psnr]
-        names = [DEFAULT_RASTERIZER] * len(candidates)
+    def _best(self, points: list[Point]) -> int:
+        best = choose(points, self.min_psnr)
+        if best is None:  # estimates see only some of the frames, in float32
+            reached = max(point.error.psnr_worst for point in points)
+            raise TargetNotReached.psnr(reached, "a file reaches that fits", self.job.min_psnr)
+        leaves = choose(points, self.job.min_psnr - 10 * math.log10(PLAN_PART))  # something for storage
+        return best if leaves is None or self.max_bytes is not None or not self.job.packs else leaves
+
+    def _points(self, measured: list[tuple[Candidate, RenderedError]]) -> list[Point]:
+        """Points of candidates and their errors; the fastest within the error also with other rasterizer options."""
+        names = [DEFAULT_RASTERIZER] * len(measured)
+        within = [c for c, error in measured if self.min_psnr is None or error.psnr_worst >= self.min_psnr]
         if within:  # candidates are sorted by processor time
             usual = within[0].options
             variants = [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
-            candidates, names = [*candidates, *variants], [*names, *RASTERIZERS]
-            errors += self._errors(variants)
-        images = [self._images_psnr(c.session.gaussians, c.options) for c in candidates]
+            measured, names = measured + self._errors(variants), [*names, *RASTERIZERS]
+        candidates = [candidate for candidate, _ in measured]
+        images = [self._images_psnr(candidate) for candidate in candidates]
         background, on_repeat = self.job.info.background, self.job.progress("timing", REPEATS)
         times = time_frames(candidates, self._timed, background, on_repeat=on_repeat)
         memory = frame_memory(
             [c.path for c in candidates], SceneCamera("timed", self._timed[0].t, self._timed[0].camera)
         )
-        parts = zip(candidates, names, times, errors, memory, images, strict=True)
-        return [Point(*part) for part in parts]
+        parts = zip(measured, names, times, memory, images, strict=True)
+        return [Point(c, name, time, error, bytes_, psnr) for (c, error), name, time, bytes_, psnr in parts]
 
-    def _errors(self, candidates: list[Candidate]) -> list[RenderedError]:
+    def _errors(self, candidates: list[Candidate]) -> list[tuple[Candidate, RenderedError]]:
         on_error = self.job.progress("all frames of the points", len(candidates))
         errors = []
         for candidate in candidates:
-            errors.append(self.job.error(candidate))
+            errors.append((candidate, self.job.error(candidate)))
             on_error()
         return errors
 
-    def _images_psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
-        return self.images.psnr(pose, options) if self.images else None
+    def _images_psnr(self, candidate: Candidate) -> float | None:
+        return self.job.images.psnr(candidate.session.gaussians, candidate.options) if self.job.images else None

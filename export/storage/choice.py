@@ -1,7 +1,8 @@
-"""The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows."""
+"""The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows, or the reverse."""
 
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from typing import NamedTuple
 
@@ -48,6 +49,8 @@ GROUPS = {
 }
 """By name. A constant belongs to the first whose expression matches its whole name."""
 
+COARSEST = {name: next(iter(group.kinds)) for name, group in GROUPS.items()}
+
 
 class Stored(NamedTuple):
     """A scene file with packed arrays."""
@@ -83,6 +86,12 @@ def fewest_bytes(
             return None
 
 
+def smallest_error(contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float], max_bytes: int) -> Stored:
+    """The scene file with the smallest sum of squared errors in `max_bytes`, or the smallest of all if none fits."""
+    kinds = _Choice(contents, estimate).within_bytes(max_bytes)
+    return Stored(packed(contents, kinds), kinds)
+
+
 class _Choice:
     """Kinds of all groups by one estimate of their squared errors."""
 
@@ -92,17 +101,41 @@ class _Choice:
         self._alone = cache(self._packed_alone)
 
     def within(self, allowed: float) -> tuple[dict[str, str], float]:
-        """Kinds whose errors sum to `allowed` at most, without groups in float32, and the sum. All groups start with
-        their coarsest kind; the one with the largest error per byte that its next kind adds gets that kind."""
+        """The coarsest kinds whose errors sum to `allowed` at most, without groups in float32, and the sum."""
+        sums = ((levels, sum(self._alone(*each)[0] for each in levels.items())) for levels in self._refined(math.inf))
+        levels, total = next((levels, total) for levels, total in sums if total <= allowed)
+        return self._chosen(levels), total
+
+    def within_bytes(self, max_bytes: int) -> dict[str, str]:
+        """The finest kinds of a file of `max_bytes`, likewise."""
+        smallest = packed(self._contents, self._chosen(dict.fromkeys(self._kinds, 0)))
+        *_, levels = self._refined(max_bytes - smallest.ByteSize())
+        return self._chosen(levels)
+
+    def _refined(self, free: float) -> Iterator[dict[str, int]]:
+        """Levels of all groups. They start with their coarsest kind; of those whose next kind adds no more than the
+        `free` bytes, the one with the largest error per byte that it adds gets it, until none has an error."""
         levels = dict.fromkeys(self._kinds, 0)
-        while (total := sum(self._alone(name, level)[0] for name, level in levels.items())) > allowed:
-            levels[max(levels, key=lambda name: self._gain(name, levels[name]))] += 1
+        while True:
+            yield levels
+            gains = {name: self._gain(name, level) for name, level in levels.items() if self._alone(name, level)[0]}
+            gains = {name: gain for name, gain in gains.items() if self._added_bytes(name, levels[name]) <= free}
+            if not gains:
+                return
+            name = max(gains, key=lambda name: gains[name])
+            free -= self._added_bytes(name, levels[name])
+            levels = levels | {name: levels[name] + 1}
+
+    def _chosen(self, levels: Mapping[str, int]) -> dict[str, str]:
         kinds = {name: self._kinds[name][level] for name, level in levels.items()}
-        return {name: kind for name, kind in kinds.items() if kind is not None}, total
+        return {name: kind for name, kind in kinds.items() if kind is not None}
 
     def _gain(self, name: str, level: int) -> float:
-        error, size = self._alone(name, level)
-        return error / max(self._alone(name, level + 1)[1] - size, 1) if error else -1.0
+        return self._alone(name, level)[0] / max(self._added_bytes(name, level), 1)
+
+    def _added_bytes(self, name: str, level: int) -> int:
+        """How much larger a file is in which this group has its next kind."""
+        return self._alone(name, level + 1)[1] - self._alone(name, level)[1]
 
     def _packed_alone(self, name: str, level: int) -> tuple[float, int]:
         """Squared error and bytes of a file in which only this group is packed."""

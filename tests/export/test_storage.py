@@ -19,7 +19,7 @@ from export.jobs.write import properties, set_properties
 from export.layers.graph import GraphBuilder
 from export.options import ConvertOptions, ExportOptions
 from export.plans.registry import build
-from export.storage.choice import GROUPS, fewest_bytes, packed
+from export.storage.choice import COARSEST, GROUPS, fewest_bytes, packed, smallest_error
 from export.storage.kinds import Pack, directions, fractions, in_range, logarithms
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
@@ -32,7 +32,6 @@ from tests.support.tolerances import tolerance
 pytestmark = pytest.mark.slow
 
 FINE = {name: list(group.kinds)[-1] for name, group in GROUPS.items()}
-COARSE = {name: next(iter(group.kinds)) for name, group in GROUPS.items()}
 
 
 def unfolded(pack: Pack, values: np.ndarray) -> tuple[np.ndarray, int]:
@@ -92,7 +91,7 @@ def test_every_plan_works_with_storage(tmp_path: Path, kind: str, plan: str):
     (tmp_path / "exact.onnx").write_bytes(contents.SerializeToString())
     exact = DeformationSession(tmp_path / "exact.onnx")
     sizes, errors = [contents.ByteSize()], []
-    for kinds in (FINE, COARSE):
+    for kinds in (FINE, COARSEST):
         model = packed(contents, kinds)
         onnx.checker.check_model(model)
         session = DeformationSession(tmp_path / "x.onnx", contents=model.SerializeToString())
@@ -202,3 +201,12 @@ def test_the_group_of_the_largest_error_per_byte_becomes_finer_first():
     assert chosen(5.0) == without
     assert chosen(0.0) == without | {"sh": "16 bits"}
     assert chosen(10.0, is_allowed=False) is None
+
+    # the same order if bytes are limited, and no byte for what has no error
+    smallest = packed(contents, COARSEST).ByteSize()
+    assert smallest_error(contents, estimate, 0).kinds == everything
+    assert smallest_error(contents, estimate, smallest + 1300).kinds == without
+    finest = smallest_error(contents, estimate, 10**9)
+    assert finest.kinds == {name: kind for name, kind in without.items() if name != "sh"} | {"sh": "16 bits"}
+    for most in range(smallest, finest.contents.ByteSize(), 997):
+        assert smallest_error(contents, estimate, most).contents.ByteSize() <= most
