@@ -1,15 +1,13 @@
 """The order of the images, and the parameters that each of them updates.
 
 First all images train a static scene. Then motion is tracked from the middle of the scene's time in a window that
-grows in both directions, once or more. While it grows for the first time, of four samples
+grows in both directions. While it grows, of four samples
 
 - one is drawn uniformly from all images of the window, and updates everything;
 - two are drawn from the newest ones, at its border, and update motion alone: canonical Gaussians that learned from so
   few images as often would overfit them and lose their textures;
 - one is drawn from those outside, and updates static parts alone, where they are visible: otherwise the few
   images in the middle of time would be explained by any geometry that their few cameras can't tell from the true one.
-
-When it grows again, motion is nearly right: all images of the window update everything.
 """
 
 from typing import Literal, NamedTuple
@@ -52,9 +50,8 @@ class WindowCurriculum:
         self._order = state
 
     def next(self, number: int, step: int, generator: torch.Generator) -> TrainingSample:
-        schedule = self._schedule
-        window = schedule.window(step)
-        grows = window < 0.5 and schedule.is_first_pass(step)
+        window = self._schedule.window(step)
+        grows = window < 0.5
         if (
             self._config.outside_frames_static_only
             and grows
@@ -62,7 +59,7 @@ class WindowCurriculum:
             and len(outside := torch.nonzero(self.distances > window)[:, 0])
         ):
             return self._sample(self._drawn(outside, generator), window, "static")
-        if grows and number % 2 == 1 and step >= schedule.deform_start_step:
+        if grows and number % 2 == 1 and step >= self._schedule.deform_start_step:
             new = self._new_frames(window)
             update = "motion" if self._config.new_frames_motion_only else "all"
             return self._sample(self._drawn(new, generator), window, update)

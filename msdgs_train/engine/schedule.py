@@ -53,18 +53,15 @@ class Schedule(NamedTuple):
 
     def phases(self) -> list[Phase]:
         """The phases of at least one step, in order."""
-        starts = self.config.curriculum.window_start_widths
         if not self.config.model.layers or self.config.curriculum.window_full_fraction == 0:
             start = min(self.deform_start_step, self.num_steps) if self.config.model.layers else self.num_steps
             found = [Phase("static, all images", 0, start), Phase("all times", start, self.num_steps)]
         else:
             grown = max(self.full_window_step, self.deform_start_step)
-            edges = [self.deform_start_step + (grown - self.deform_start_step) * i // len(starts)
-                     for i in range(len(starts) + 1)]  # fmt: skip
             found = [
                 Phase("static, all images", 0, self.static_steps),
                 Phase("static, first time window", self.static_steps, self.deform_start_step),
-                *(Phase(f"time window grows from {start:g}", edges[i], edges[i + 1]) for i, start in enumerate(starts)),
+                Phase("growing time window", self.deform_start_step, grown),
                 Phase("all times", grown, self.num_steps),
             ]
         return [phase for phase in found if phase.stop > phase.first]
@@ -74,20 +71,9 @@ class Schedule(NamedTuple):
         c = self.config
         if c.curriculum.window_full_fraction == 0 or not c.model.layers or step < self.static_steps:
             return 0.5
-        grown, starts = self._growth(step), c.curriculum.window_start_widths
-        if grown >= len(starts):
-            return 0.5
-        start = starts[int(grown)]
-        return start + (0.5 - start) * (grown % 1)
-
-    def is_first_pass(self, step: int) -> bool:
-        """Whether the window grows for the first time."""
-        return self._growth(step) <= 1
-
-    def _growth(self, step: int) -> float:
-        """Number of times that the window has grown to all times, with a fraction."""
-        done = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
-        return done * len(self.config.curriculum.window_start_widths)
+        start = c.curriculum.window_start_width
+        grown = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
+        return start + (0.5 - start) * grown if grown < 1 else 0.5
 
     def deforms(self, step: int) -> bool:
         """Whether the deformation takes part."""

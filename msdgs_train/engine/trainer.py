@@ -17,7 +17,7 @@ from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum import TrainingSample, WindowCurriculum
 from msdgs_train.engine.gradients import ViewGradients, average_gradients, differentiate
-from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates, step_with_new_frames
+from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.evaluation.metrics import ImageMetrics, image_metrics, psnr_from_mse
 from msdgs_train.gaussians import safe_load
@@ -97,9 +97,7 @@ class Trainer:
         if is_finite:
             # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
             clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], MAX_GRADIENT_NORM)
-            new_times = [view.sample.t for view in views if view.sample.update == "motion"]
-            rows = self.system.new_frame_rows(new_times) if new_times else []
-            step_with_new_frames(self.optimizer, rows)
+            self.optimizer.step()
             self._average([view for view in views if view.sample.update == "all"])
         self.system.after_step(
             self.optimizer, self.reached, [(view.sample, view.view) for view in views] if is_finite else []

@@ -189,7 +189,7 @@ class PlaneLayer(DeformationLayer):
             ParamGroup("networks", networks, LearningRate(c.lr_init, c.lr_final, holds=True), "motion", True),
         ]
 
-    def regularizers(self, t: Tensor, is_new_frame: bool) -> dict[str, Tensor]:
+    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
         c, terms = self.config, {}
         for i, grid in enumerate(self.plane_grids()):
             for weight, name, term in (

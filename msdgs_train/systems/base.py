@@ -65,10 +65,6 @@ class System(Protocol):
         """Render a sample and compare it with its image; called from several threads at once."""
         ...
 
-    def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Parameters, each with a mask of the rows that take larger steps because new frames are at `times`."""
-        ...
-
     def after_step(
         self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[TrainingSample, ViewLoss]]
     ) -> None:

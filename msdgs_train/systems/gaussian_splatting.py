@@ -22,7 +22,7 @@ from msdgs_train.gaussians.scale_space import count_clamped
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.parameters import LearningRate, ParamGroup, constant
-from msdgs_train.losses.photometric import masked_l1, photometric_loss, pooled_l1
+from msdgs_train.losses.photometric import masked_l1, photometric_loss
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.systems.base import Target, ViewLoss
 
@@ -77,7 +77,7 @@ class GaussianSplatting:
         if schedule.deform_start_step in steps:
             self.model.support.on_deform_start(self.model.gaussians, surgery)
         before, after = schedule.window(steps.start - 1), schedule.window(steps.stop - 1)
-        if before < after and schedule.is_first_pass(steps.stop - 1):
+        if before < after:
             for layer in self.model.deformation:
                 layer.on_window(before, after)
 
@@ -90,14 +90,9 @@ class GaussianSplatting:
         else:
             loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
             loss = loss + self._regularizers(posed, motions, sample, step)
-        if sample.update == "motion" and c.pooled_l1_weight:
-            loss = loss + c.pooled_l1_weight * pooled_l1(rgb, target.rgb)
         if c.empty_weight:
             loss = loss + c.empty_weight * (target.transparency * alpha).mean()
         return ViewLoss(loss, rgb, count_clamped(self.config.model.scale_space, posed.scales), info)
-
-    def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        return [rows for layer in self.model.deformation for rows in layer.new_frame_rows(times)]
 
     def after_step(
         self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[TrainingSample, ViewLoss]]
@@ -170,7 +165,7 @@ class GaussianSplatting:
             time = posed.means.new_tensor(sample.t)
             terms += self.model.support.regularizers(motions).values()
             for layer in self.model.deformation:
-                terms += layer.regularizers(time, is_new_frame=sample.update == "motion").values()
+                terms += layer.regularizers(time).values()
         total: Tensor | float = 0.0
         for term in terms:
             total = total + term

@@ -61,9 +61,8 @@ def test_straight_motion_is_smooth() -> None:
         layer.transls[5, 0, 1] += 0.6
         assert float(layer.temporal_smoothness(time(0.5))) == pytest.approx((0.6 + 1.2) / (2 * 2 * 3))
         assert float(layer.temporal_smoothness(time(0.1))) <= EXACT
-        weighted = layer.regularizers(time(0.5), is_new_frame=False)
+        weighted = layer.regularizers(time(0.5))
         assert float(weighted["motion_smoothness"]) == pytest.approx(0.2 * (0.6 + 1.2) / (2 * 2 * 3))
-        assert layer.regularizers(time(0.5), is_new_frame=True) == {}, "a bounce needs a kink"
 
 
 def test_rigid_motions_stay_rigid() -> None:
