@@ -155,8 +155,8 @@ class GaussianSplatting:
         """Those of the support, once for the pose and the regularizers."""
         if not (self.schedule.deforms(step) and len(self.model.deformation)):
             return None
-        points = self.model.canonical_points()
-        return self.model.support.motions(self.model.deformation, points, points.means.new_tensor(t))
+        means = self.model.gaussians.means
+        return self.model.support.motions(self.model.deformation, means, means.new_tensor(t))
 
     def _regularizers(self, posed: PosedGaussians, motions: Any, sample: TrainingSample, step: int) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
