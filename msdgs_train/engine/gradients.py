@@ -10,9 +10,6 @@ from msdgs_train.engine.curriculum import TrainingSample
 from msdgs_train.layers.parameters import ParamGroup
 from msdgs_train.systems.base import ViewLoss
 
-ROLES = {"all": ("static", "motion", "binding"), "motion": ("motion",), "static": ("static",)}
-"""Roles of the parameters that a sample updates."""
-
 
 class ViewGradients(NamedTuple):
     """One image of a batch after its backward pass."""
@@ -28,7 +25,7 @@ def differentiate(
     groups: Sequence[ParamGroup], sample: TrainingSample, view: ViewLoss, target: Tensor
 ) -> ViewGradients:
     """The gradients of the parameters whose role the sample updates."""
-    parameters = [p for group in groups if group.role in ROLES[sample.update] for p in group.params]
+    parameters = [p for group in groups if sample.update in ("all", group.role) for p in group.params]
     found = torch.autograd.grad(view.loss, parameters, allow_unused=True)
     gradients = {id(p): gradient for p, gradient in zip(parameters, found, strict=True) if gradient is not None}
     squared_error = float((view.rgb.detach() - target).square().mean())

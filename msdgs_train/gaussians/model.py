@@ -101,7 +101,7 @@ class DynamicGaussians(nn.Module):
         for name, attribute in self.config.attributes().items():
             parameter = self.gaussians.get_parameter(name)
             if parameter.requires_grad:
-                groups.append(ParamGroup(name, [parameter], attribute.lr, attribute.role))
+                groups.append(ParamGroup(name, [parameter], attribute.lr, "static"))
         return groups
 
     def _modulated(self, deltas: Deltas, attributes: dict[str, Tensor]) -> Deltas:

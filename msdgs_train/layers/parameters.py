@@ -4,9 +4,8 @@ from typing import Literal, NamedTuple
 
 from torch import nn
 
-Role = Literal["static", "motion", "binding"]
-"""static: canonical attributes; motion: deformation; binding: skinning weights, which only samples that update all
-parameters train."""
+Role = Literal["static", "motion"]
+"""static: what is stored per Gaussian, and the modulation; motion: layers."""
 
 
 class LearningRate(NamedTuple):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.layers.parameters import LearningRate, Role
+from msdgs_train.layers.parameters import LearningRate
 
 if TYPE_CHECKING:
     from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -21,7 +21,6 @@ class Attribute(NamedTuple):
     columns: int
     init: Callable[[int, int, torch.Generator], Tensor]  # of rows, columns and a generator; integers aren't trained
     lr: LearningRate
-    role: Role
 
 
 class CanonicalPoints(NamedTuple):

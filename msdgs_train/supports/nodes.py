@@ -70,8 +70,8 @@ class NodesConfig(SupportConfig):
     def attributes(self) -> dict[str, Attribute]:
         lr = LearningRate(self.skinning_lr_init, self.skinning_lr_final, holds=True)
         return {
-            "skinning_logits": Attribute(self.followed, lambda n, columns, _: torch.zeros(n, columns), lr, "binding"),
-            "node_ids": Attribute(self.followed, _first_nodes, lr, "binding"),
+            "skinning_logits": Attribute(self.followed, lambda n, columns, _: torch.zeros(n, columns), lr),
+            "node_ids": Attribute(self.followed, _first_nodes, lr),
         }
 
 

@@ -89,7 +89,7 @@ class GaussianSplatting:
             loss = masked_l1(rgb, target.rgb, 1 - c.ssim_lambda)
         else:
             loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
-            loss = loss + self._regularizers(posed, motions, sample, step)
+            loss = loss + self._regularizers(posed, motions, sample.t)
         if c.empty_weight:
             loss = loss + c.empty_weight * (target.transparency * alpha).mean()
         return ViewLoss(loss, rgb, count_clamped(self.config.model.scale_space, posed.scales), info)
@@ -158,11 +158,11 @@ class GaussianSplatting:
         means = self.model.gaussians.means
         return self.model.support.motions(self.model.deformation, means, means.new_tensor(t))
 
-    def _regularizers(self, posed: PosedGaussians, motions: Any, sample: TrainingSample, step: int) -> Tensor | float:
+    def _regularizers(self, posed: PosedGaussians, motions: Any, t: float) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
         terms = list(self.density.regularizers(posed).values())
         if motions is not None:
-            time = posed.means.new_tensor(sample.t)
+            time = posed.means.new_tensor(t)
             terms += self.model.support.regularizers(motions).values()
             for layer in self.model.deformation:
                 terms += layer.regularizers(time).values()

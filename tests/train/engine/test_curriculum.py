@@ -110,15 +110,14 @@ def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, name: s
         trainer.optimizer_steps += 1
         changed = {role for role, p, old in before if not torch.equal(p, old)}
         (update,) = [view.sample.update for view in views]
-        roles = {group.role for group in groups}
-        assert changed == (roles if update == "all" else {update})
+        assert changed == ({"static", "motion"} if update == "all" else {update})
         seen.add(update)
     assert seen == {"all", "motion", "static"}
-    names = {role: {group.name for group in groups if group.role == role} for role in ("static", "motion", "binding")}
+    names = {role: {group.name for group in groups if group.role == role} for role in ("static", "motion")}
     canonical = {"means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"}
-    assert names["static"] == canonical | {"modulation", "embeddings"}
+    skinning = {"skinning_logits"} if model.support.moves_nodes else set()
+    assert names["static"] == canonical | {"modulation", "embeddings"} | skinning
     assert all(name.startswith("layers.") for name in names["motion"])
-    assert names["binding"] == ({"skinning_logits"} if model.support.moves_nodes else set())
 
 
 def test_the_loss_depends_on_the_sample(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
