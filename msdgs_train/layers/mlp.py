@@ -128,11 +128,6 @@ class MLPLayer(DeformationLayer):
         frequencies = self.xyz_frequency_matrix, self.time_frequency_matrix
         return LayerStep.of_columns(_Network.apply(means, t, *frequencies, self.skip, *tensors), self.outputs)
 
-    def time_code(self, t: Tensor) -> Tensor:
-        """[time_features] of time `t`, the same for all points."""
-        encoded = positional_encoding(t.reshape(1, 1), self.time_frequency_matrix)
-        return self.time_output(self.time_hidden(encoded).relu_())[0]
-
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
         return [ParamGroup("network", list(self.parameters()), lr, "motion", is_clipped=True)]
