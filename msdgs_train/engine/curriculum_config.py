@@ -17,11 +17,8 @@ class CurriculumConfig(Checked):
     window_start_width: float = 0.03
     """Half width at which the time window, centered in the scene's time, begins to grow, as a fraction of that time."""
     window_full_fraction: float = 0.75
-    """The fraction of the run after which all times take part; 0: from the start."""
-    new_frames_motion_only: bool = True
-    """While the window grows, half of the steps, on newly admitted images, train motion alone."""
-    outside_frames_static_only: bool = True
-    """While it grows, a quarter of the steps, on images outside, train static parts alone."""
+    """The fraction of the run after which all times take part; 0: from the start. Until then half of the images are
+    the newest of the window."""
 
     def __post_init__(self) -> None:
         self.require_fractions("static_fraction", "static_window_fraction", "window_full_fraction")

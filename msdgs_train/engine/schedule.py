@@ -27,7 +27,6 @@ class Schedule(NamedTuple):
     reset_every: int  # 0: opacities are never reset
     sh_degree_interval: int
     ema_steps: int  # 0: no average
-    num_reseeded: int  # random Gaussians that are added after the static phase
 
     @classmethod
     def from_config(cls, config: TrainConfig) -> "Schedule":
@@ -35,7 +34,6 @@ class Schedule(NamedTuple):
         c, steps = config.curriculum, config.run.steps
         static_window = c.static_window_fraction if c.window_full_fraction else 0.0
         static_steps = round(c.static_fraction * steps)
-        reseeds = static_steps and c.window_full_fraction and config.model.layers
         return cls(
             config,
             steps,
@@ -48,7 +46,6 @@ class Schedule(NamedTuple):
             reset_every=_interval(config.density.reset_every_fraction, steps),
             sh_degree_interval=_interval(config.optimizer.sh_degree_fraction, steps),
             ema_steps=_interval(config.optimizer.ema_fraction, steps),
-            num_reseeded=int(config.density.reseed_fraction * config.density.max_gaussians) if reseeds else 0,
         )
 
     def phases(self) -> list[Phase]:
@@ -88,11 +85,6 @@ class Schedule(NamedTuple):
         """Dilation of projected covariances in this step, counted from 1, px²."""
         init = self.config.optimizer.eps2d_init
         return self.config.model.eps2d if init is None or step > self.full_window_step else init
-
-    def max_gaussians(self, step: int) -> int:
-        """Upper bound of the number of Gaussians after this step, counted from 1."""
-        most = self.config.density.max_gaussians
-        return most - 2 * self.num_reseeded if step <= self.static_steps else most
 
     def refines_at(self, step: int) -> bool:
         """Whether a round of density control is due after this step, counted from 1."""

@@ -15,7 +15,7 @@ from msdgs_serve.threads import sharing_cores
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.engine.config import TrainConfig
-from msdgs_train.engine.curriculum import TrainingSample, WindowCurriculum
+from msdgs_train.engine.curriculum import WindowCurriculum
 from msdgs_train.engine.gradients import ViewGradients, average_gradients, differentiate
 from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.schedule import Schedule
@@ -98,9 +98,9 @@ class Trainer:
             # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
             clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], MAX_GRADIENT_NORM)
             self.optimizer.step()
-            self._average([view for view in views if view.sample.update == "all"])
+            self._average(views)
         self.system.after_step(
-            self.optimizer, self.reached, [(view.sample, view.view) for view in views] if is_finite else []
+            self.optimizer, self.reached, [(view.frame, view.view) for view in views] if is_finite else []
         )
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         clamped = max(view.view.clamped_scales for view in views)
@@ -197,10 +197,10 @@ class Trainer:
         return ThreadPoolExecutor(self.config.run.threads, "image", torch.set_num_threads, (1,))
 
     @sharing_cores()
-    def _differentiate(self, groups: Sequence[ParamGroup], sample: TrainingSample, background: Tensor) -> ViewGradients:
-        target = Target.over(self._images.rgba(sample.frame), background)
-        view = self.system.loss(sample, target, background, self.step_count)
-        return differentiate(groups, sample, view, target.rgb)
+    def _differentiate(self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor) -> ViewGradients:
+        target = Target.over(self._images.rgba(frame), background)
+        view = self.system.loss(frame, target, background, self.step_count)
+        return differentiate(groups, frame, view, target.rgb)
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":
@@ -221,9 +221,6 @@ class Trainer:
         return False
 
     def _average(self, views: list[ViewGradients]) -> None:
-        """Add samples that update all parameters; the others are drawn from images with large errors."""
-        if not views:
-            return
         loss, error = (sum(getattr(v, name) for v in views) / len(views) for name in ("loss", "squared_error"))
         old = self._averages or (loss, error)
         self._averages = (

@@ -97,11 +97,11 @@ class DynamicGaussians(nn.Module):
         ]
         if self.modulation is not None:
             params = list(self.modulation.parameters())
-            groups.append(ParamGroup("modulation", params, self.config.modulation_lr, "static"))
+            groups.append(ParamGroup("modulation", params, self.config.modulation_lr))
         for name, attribute in self.config.attributes().items():
             parameter = self.gaussians.get_parameter(name)
             if parameter.requires_grad:
-                groups.append(ParamGroup(name, [parameter], attribute.lr, "static"))
+                groups.append(ParamGroup(name, [parameter], attribute.lr))
         return groups
 
     def _modulated(self, deltas: Deltas, attributes: dict[str, Tensor]) -> Deltas:

@@ -130,7 +130,7 @@ class MLPLayer(DeformationLayer):
 
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
-        return [ParamGroup("network", list(self.parameters()), lr, "motion", is_clipped=True)]
+        return [ParamGroup("network", list(self.parameters()), lr, is_clipped=True)]
 
 
 def _encode_backward(grad: Tensor, encoded: Tensor, frequencies: Tensor) -> Tensor:

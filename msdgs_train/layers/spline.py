@@ -89,7 +89,7 @@ class SplineLayer(DeformationLayer):
 
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
-        return [ParamGroup("curves", list(self.parameters()), lr, "motion")]
+        return [ParamGroup("curves", list(self.parameters()), lr)]
 
     def regularizers(self, t: Tensor) -> dict[str, Tensor]:
         return {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}

@@ -1,12 +1,9 @@
-"""The photometric loss, L = λ L1 + (1 − λ) D-SSIM (equation 13), and its variant for static parts."""
+"""The photometric loss, L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
 
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from msdgs_train.losses.ssim import check_pair, ssim
 
-CHANGE_THRESHOLD = 0.25
-"""Mean color difference of a pixel from which on an object is assumed to have moved there."""
 MSE_SCALE = 4.0
 """Factor of MSE, at which it equals L1 for an error of 0.25."""
 
@@ -28,12 +25,3 @@ def photometric_loss(rgb: Tensor, target: Tensor, l1_weight: float, mse_fraction
     if mse_fraction == 0.0:
         return loss
     return (1 - mse_fraction) * loss + mse_fraction * MSE_SCALE * error.square().mean()
-
-
-def masked_l1(rgb: Tensor, target: Tensor, l1_weight: float) -> Tensor:
-    """λ L1 over the pixels in which two images, [H, W, 3], agree: no pixel in the 5×5 around them differs by
-    `CHANGE_THRESHOLD` or more."""
-    check_pair(rgb, target)
-    error = (rgb - target).abs()
-    worst = max_pool2d(error.detach().mean(dim=2)[None], kernel_size=5, stride=1, padding=2)[0]
-    return l1_weight * (error * (worst < CHANGE_THRESHOLD)[:, :, None]).mean()

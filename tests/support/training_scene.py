@@ -66,7 +66,7 @@ def small_config(**changes: Any) -> TrainConfig:
 
 def parameter_groups(gaussians: CanonicalGaussians) -> list[ParamGroup]:
     """One group per attribute, all with one rate."""
-    return [ParamGroup(name, [p], constant(1e-3), "static") for name, p in gaussians.named_parameters()]
+    return [ParamGroup(name, [p], constant(1e-3)) for name, p in gaussians.named_parameters()]
 
 
 def with_moments(gaussians: CanonicalGaussians, schedule: Schedule) -> RowSurgery:

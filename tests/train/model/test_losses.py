@@ -10,7 +10,7 @@ from torchmetrics.functional.image import peak_signal_noise_ratio, structural_si
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.evaluation.metrics import MAX_PSNR, ImageMetrics, image_metrics, mean_metrics, psnr
-from msdgs_train.losses.photometric import MSE_SCALE, masked_l1, photometric_loss
+from msdgs_train.losses.photometric import MSE_SCALE, photometric_loss
 from msdgs_train.losses.ssim import RADIUS, ssim
 from tests.support.tolerances import assert_close, tolerance
 
@@ -79,19 +79,6 @@ def test_shapes_that_disagree_are_refused() -> None:
             photometric_loss(rgb, other, 0.8)
     with pytest.raises(InvalidInput, match="`rgb`"):
         ssim(rgb[..., 0], target[..., 0])
-
-
-def test_pixels_that_moving_objects_left_do_not_train_static_parts() -> None:
-    target = torch.full((20, 30, 3), 0.5)
-    rgb = (target + 0.1).requires_grad_()
-    with torch.no_grad():
-        rgb[4, 5] += 0.3
-    loss = masked_l1(rgb, target, 0.8)
-    (gradient,) = torch.autograd.grad(loss, [rgb])
-    elsewhere = torch.ones(20, 30, dtype=torch.bool)
-    elsewhere[2:7, 3:8] = False
-    assert torch.equal(gradient.any(dim=2), elsewhere)
-    assert float(loss.detach()) == pytest.approx(0.8 * 0.1 * float(elsewhere.double().mean()))
 
 
 def test_psnr_is_that_of_torchmetrics() -> None:
