@@ -31,26 +31,16 @@ class DeformationSession:
     onnxruntime never reads the file itself: `read_scene_file` checks it and writes a new graph.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        chunk: int | None = None,
-        contents: bytes | None = None,
-        limits: GraphLimits | None = None,
-    ) -> None:
+    def __init__(self, path: str | Path, *, contents: bytes | None = None, limits: GraphLimits | None = None) -> None:
         """Load a scene file.
 
         Args:
             path: the file, or its name in messages if `contents` are given.
-            chunk: Gaussians per call; the default depends on the file's graph.
             contents: of the file, if they are in memory already.
             limits: of the graph's cost.
 
         Raises `SceneFileInvalid` naming the field if the file isn't a complete, finite `msdgs/1` scene.
         """
-        if chunk is not None and chunk < 1:
-            raise InvalidInput("chunk", "1 or more", chunk)
         self.path = Path(path)
         self._file = self.path.name
         contents = self._read() if contents is None else contents
@@ -60,7 +50,7 @@ class DeformationSession:
         self.cost = scene_file.cost
         self._steps, self._outputs, self._selected = scene_file.steps, scene_file.outputs, scene_file.selected
         self._takes_ids = scene_file.takes_ids
-        self._chunk = chunk or (max(scene_file.moving_count, 1) if scene_file.poses_all else CHUNK)
+        self._chunk = max(scene_file.moving_count, 1) if scene_file.poses_all else CHUNK
         self.scene = self._read_scene(scene_file)
         self._session = self._open(scene_file.graph, thread_count() if scene_file.poses_all else 1)
         for t in self.scene.metadata.time_range:

@@ -19,7 +19,7 @@ from export.precision.formats import FLOAT32, Format, in_format
 from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians, limits_met
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, canonical_points
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MIN_PSNR = 50.0
@@ -133,8 +133,8 @@ class _Assessment:
         """Growth of the Gaussians `ids`; on control nodes that of the nodes, plus the measured round-off of skinning in
         float32."""
         double, single, rows = self.double, self.single, torch.from_numpy(ids)
-        points = double.canonical_points(double.gaussians.rows(rows))
-        found = growth(double.deformation, single.deformation, double.support.points(points), t)
+        points = canonical_points(double.gaussians.rows(rows))
+        found = growth(double.deformation, single.deformation, double.support.points(points.means), t)
         if double.support.num_points is None:
             return found
 
@@ -142,7 +142,7 @@ class _Assessment:
             return double.support.spread(torch.from_numpy(values), points.attributes).numpy()
 
         moved = [
-            model.support(model.deformation, model.canonical_points(model.gaussians.rows(rows)), time).means
+            model.support(model.deformation, canonical_points(model.gaussians.rows(rows)), time).means
             for model, time in ((double, torch.tensor(t, dtype=torch.float64)), (single, torch.tensor(t)))
         ]
         own = torch.linalg.vector_norm(moved[0] - moved[1].double(), dim=1).numpy()

@@ -19,7 +19,7 @@ class Bench:
     A system is a preset, or a table of a TOML file: a `preset` and settings of `fit` that replace its own. Settings are
     chosen by the mean over scenes on val images; test images are reported.
 
-    Example, 40 minutes per system:  msdgs-train bench msdgs-nodes motion-bases --data data --out runs/bench
+    Example, 40 minutes per system:  msdgs-train bench msdgs-nodes msdgs-small --data data --out runs/bench
     """
 
     systems: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG...")]

@@ -169,7 +169,7 @@ def measure(run: Run, scene: BenchScene) -> Row:
 
 
 def _scores(run: Run, split: str) -> dict[str, str]:
-    evaluation = evaluate_run(run.folder, run.data, split, last_only=True)
+    evaluation = evaluate_run(run.folder, run.data, split, brief=True)
     (model,) = evaluation.models
     mean = model.mean
     moving = mean.moving_psnr if evaluation.region_source == "images" else None

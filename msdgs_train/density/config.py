@@ -43,9 +43,6 @@ class DensityConfig(Checked):
     gradient if not given."""
     scale_reg: float | None = None
     """Weight of the mean scale in scene units; 0.01 with mcmc and 0 with gradient if not given."""
-    reseed_fraction: float = 0.25
-    """Random Gaussians that are added after the static phase, as a fraction of max_gaussians: briefly crossed regions
-    have lost theirs by then. Until then there are at most max_gaussians less twice as many."""
 
     def __post_init__(self) -> None:
         self.require_counts("init_num_pts", "max_gaussians")
@@ -53,7 +50,6 @@ class DensityConfig(Checked):
         self.require_fractions("reset_every_fraction", "prune_opa")
         self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
         self.require_weights("noise_lr", *(n for n in ("opacity_reg", "scale_reg") if getattr(self, n) is not None))
-        self.require(("reseed_fraction",), "in [0, 0.5]", lambda v: 0 <= v <= 0.5)
         self.require(("max_gaussians",), "init_num_pts or more", lambda v: v >= self.init_num_pts)
         self.require(("density_strategy",), "gradient or mcmc", lambda v: v in ("gradient", "mcmc"))
 

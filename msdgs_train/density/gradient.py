@@ -84,24 +84,21 @@ class GradientStrategy:
         gaussians = surgery.gaussians
         with torch.no_grad():
             pruned = self._to_prune(gaussians, step)
-            chosen = self._to_densify(pruned, step)
+            chosen = self._to_densify(pruned)
             large = gaussians.log_scales.exp().amax(dim=1) > self.config.grow_scale3d * self.scene_scale
             cloned, split = (torch.nonzero(m)[:, 0] for m in (chosen & ~large, chosen & large))
             halves = self._halves(gaussians, split.repeat(2))
             added = {name: torch.cat([p[cloned], halves[name]]) for name, p in gaussians.named_parameters()}
             kept = torch.nonzero(~pruned & ~(chosen & large))[:, 0]
             surgery.replace_rows(kept, added)
-        self.reset(len(kept) + len(cloned) + 2 * len(split))
+        count = len(kept) + len(cloned) + 2 * len(split)
+        self.gradients, self.counts = torch.zeros(count), torch.zeros(count)
         return DensityChange(len(cloned), len(split), int(pruned.sum()))
 
     def reset_opacities(self, surgery: RowSurgery) -> None:
         """Clamp all opacities to 0.01: Gaussians that the images need recover, the rest is pruned."""
         ceiling = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
         surgery.replace_values("raw_opacities", surgery.gaussians.raw_opacities.detach().clamp(max=ceiling))
-
-    def reset(self, count: int) -> None:
-        """Drop the accumulated gradients; there are `count` Gaussians now."""
-        self.gradients, self.counts = torch.zeros(count), torch.zeros(count)
 
     def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
         pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
@@ -111,11 +108,11 @@ class GradientStrategy:
             return torch.zeros_like(pruned)
         return pruned
 
-    def _to_densify(self, pruned: Tensor, step: int) -> Tensor:
+    def _to_densify(self, pruned: Tensor) -> Tensor:
         """[N] bool: large gradients, the largest first up to the maximum number."""
         mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
         chosen = mean >= self.config.grow_grad2d
-        room = self.schedule.max_gaussians(step) - int((~pruned).sum())
+        room = self.config.max_gaussians - int((~pruned).sum())
         if int(chosen.sum()) > room:
             strongest = torch.sort(mean, descending=True, stable=True).indices[: max(room, 0)]
             chosen = torch.zeros_like(chosen).index_fill_(0, strongest, True)

@@ -51,9 +51,6 @@ class MCMCStrategy:
     def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Unused: relocation depends on opacities."""
 
-    def reset(self, count: int) -> None:
-        """Nothing to reset."""
-
     def state(self) -> tuple[Tensor, ...]:
         """No state besides the generator."""
         return ()
@@ -73,17 +70,17 @@ class MCMCStrategy:
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """Relocate if a round is due, then inject noise in proportion to the learning rate of means."""
         if any(map(self.schedule.refines_at, steps)):
-            self.relocate(surgery, steps[-1])
+            self.relocate(surgery)
         self.inject_noise(surgery.gaussians, surgery.learning_rate("means"))
 
     @torch.no_grad()
-    def relocate(self, surgery: RowSurgery, step: int) -> Relocated:
+    def relocate(self, surgery: RowSurgery) -> Relocated:
         """Relocate low-opacity Gaussians, and add new ones within the budget, at others drawn by opacity."""
         gaussians = surgery.gaussians
         opacities = gaussians.raw_opacities.double().sigmoid()
         alive = torch.nonzero(opacities > self.config.prune_opa)[:, 0]
         count = len(opacities)
-        added = max(0, min(self.schedule.max_gaussians(step), int(GROWTH * count)) - count)
+        added = max(0, min(self.config.max_gaussians, int(GROWTH * count)) - count)
         moved = count - len(alive)
         if moved + added == 0 or len(alive) == 0:  # a scene that is wholly transparent may recover
             return Relocated(0, 0)

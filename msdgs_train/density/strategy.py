@@ -29,10 +29,6 @@ class DensityStrategy(Protocol):
         """Density control after an optimizer step, which stands for these steps of the schedule, counted from 1."""
         ...
 
-    def reset(self, count: int) -> None:
-        """Drop the accumulated state; there are `count` Gaussians now."""
-        ...
-
     def state(self) -> tuple[Tensor, ...]:
         """The accumulated state, besides the generator, for a bit-exact continuation."""
         ...

@@ -6,37 +6,32 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from msdgs_train.engine.curriculum import TrainingSample
+from msdgs_train.datasets import Frame
 from msdgs_train.layers.parameters import ParamGroup
 from msdgs_train.systems.base import ViewLoss
-
-ROLES = {"all": ("static", "motion", "binding"), "motion": ("motion",), "static": ("static",)}
-"""Roles of the parameters that a sample updates."""
 
 
 class ViewGradients(NamedTuple):
     """One image of a batch after its backward pass."""
 
-    sample: TrainingSample
+    frame: Frame
     view: ViewLoss
     loss: float
     squared_error: float  # mean over pixels and channels
-    gradients: dict[int, Tensor]  # by id of the parameter; those that the sample updates and the loss depends on
+    gradients: dict[int, Tensor]  # by id of the parameter; those that the loss depends on
 
 
-def differentiate(
-    groups: Sequence[ParamGroup], sample: TrainingSample, view: ViewLoss, target: Tensor
-) -> ViewGradients:
-    """The gradients of the parameters whose role the sample updates."""
-    parameters = [p for group in groups if group.role in ROLES[sample.update] for p in group.params]
+def differentiate(groups: Sequence[ParamGroup], frame: Frame, view: ViewLoss, target: Tensor) -> ViewGradients:
+    """The gradients of the parameters that the loss depends on."""
+    parameters = [p for group in groups for p in group.params]
     found = torch.autograd.grad(view.loss, parameters, allow_unused=True)
     gradients = {id(p): gradient for p, gradient in zip(parameters, found, strict=True) if gradient is not None}
     squared_error = float((view.rgb.detach() - target).square().mean())
-    return ViewGradients(sample, view, view.loss.item(), squared_error, gradients)
+    return ViewGradients(frame, view, view.loss.item(), squared_error, gradients)
 
 
 def average_gradients(groups: Sequence[ParamGroup], views: Sequence[ViewGradients]) -> None:
-    """Set `grad` to the mean over the images that update each parameter, added up in their order, so that the same
+    """Set `grad` to the mean over the images that depend on each parameter, added up in their order, so that the same
     seed gives the same bits."""
     for parameter in (p for group in groups for p in group.params):
         known = [view.gradients[id(parameter)] for view in views if id(parameter) in view.gradients]

@@ -1,18 +1,14 @@
-"""Adam over parameter groups with their own learning rates, and larger steps at new frames."""
+"""Adam over parameter groups with their own learning rates."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import torch
-from torch import nn
 
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.parameters import ParamGroup
 
 EPSILON = 1e-15
 """Adam's own default, 1e-8, is as large as the gradients of small Gaussians."""
-
-NEW_FRAME_LR_MULTIPLIER = 8.0
-"""Step multiplier of motion at new frames: fast objects move far between two images."""
 
 
 def make_optimizer(groups: Sequence[ParamGroup], schedule: Schedule) -> torch.optim.Adam:
@@ -33,12 +29,3 @@ def set_learning_rates(
 
 def _rate(group: ParamGroup, schedule: Schedule, step: int) -> float:
     return group.lr.at(step, schedule.num_steps, schedule.full_window_step)
-
-
-@torch.no_grad()
-def step_with_new_frames(optimizer: torch.optim.Optimizer, rows: Iterable[tuple[nn.Parameter, torch.Tensor]]) -> None:
-    """An optimizer step in which the masked rows move `NEW_FRAME_LR_MULTIPLIER` times as far."""
-    before = [(parameter, mask, parameter[mask]) for parameter, mask in rows]
-    optimizer.step()
-    for parameter, mask, old in before:
-        parameter[mask] = torch.lerp(old, parameter[mask], NEW_FRAME_LR_MULTIPLIER)

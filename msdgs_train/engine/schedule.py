@@ -27,7 +27,6 @@ class Schedule(NamedTuple):
     reset_every: int  # 0: opacities are never reset
     sh_degree_interval: int
     ema_steps: int  # 0: no average
-    num_reseeded: int  # random Gaussians that are added after the static phase
 
     @classmethod
     def from_config(cls, config: TrainConfig) -> "Schedule":
@@ -35,7 +34,6 @@ class Schedule(NamedTuple):
         c, steps = config.curriculum, config.run.steps
         static_window = c.static_window_fraction if c.window_full_fraction else 0.0
         static_steps = round(c.static_fraction * steps)
-        reseeds = static_steps and c.window_full_fraction and config.model.layers
         return cls(
             config,
             steps,
@@ -48,23 +46,19 @@ class Schedule(NamedTuple):
             reset_every=_interval(config.density.reset_every_fraction, steps),
             sh_degree_interval=_interval(config.optimizer.sh_degree_fraction, steps),
             ema_steps=_interval(config.optimizer.ema_fraction, steps),
-            num_reseeded=int(config.density.reseed_fraction * config.density.max_gaussians) if reseeds else 0,
         )
 
     def phases(self) -> list[Phase]:
         """The phases of at least one step, in order."""
-        starts = self.config.curriculum.window_start_widths
         if not self.config.model.layers or self.config.curriculum.window_full_fraction == 0:
             start = min(self.deform_start_step, self.num_steps) if self.config.model.layers else self.num_steps
             found = [Phase("static, all images", 0, start), Phase("all times", start, self.num_steps)]
         else:
             grown = max(self.full_window_step, self.deform_start_step)
-            edges = [self.deform_start_step + (grown - self.deform_start_step) * i // len(starts)
-                     for i in range(len(starts) + 1)]  # fmt: skip
             found = [
                 Phase("static, all images", 0, self.static_steps),
                 Phase("static, first time window", self.static_steps, self.deform_start_step),
-                *(Phase(f"time window grows from {start:g}", edges[i], edges[i + 1]) for i, start in enumerate(starts)),
+                Phase("growing time window", self.deform_start_step, grown),
                 Phase("all times", grown, self.num_steps),
             ]
         return [phase for phase in found if phase.stop > phase.first]
@@ -74,20 +68,9 @@ class Schedule(NamedTuple):
         c = self.config
         if c.curriculum.window_full_fraction == 0 or not c.model.layers or step < self.static_steps:
             return 0.5
-        grown, starts = self._growth(step), c.curriculum.window_start_widths
-        if grown >= len(starts):
-            return 0.5
-        start = starts[int(grown)]
-        return start + (0.5 - start) * (grown % 1)
-
-    def is_first_pass(self, step: int) -> bool:
-        """Whether the window grows for the first time."""
-        return self._growth(step) <= 1
-
-    def _growth(self, step: int) -> float:
-        """Number of times that the window has grown to all times, with a fraction."""
-        done = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
-        return done * len(self.config.curriculum.window_start_widths)
+        start = c.curriculum.window_start_width
+        grown = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
+        return start + (0.5 - start) * grown if grown < 1 else 0.5
 
     def deforms(self, step: int) -> bool:
         """Whether the deformation takes part."""
@@ -102,11 +85,6 @@ class Schedule(NamedTuple):
         """Dilation of projected covariances in this step, counted from 1, px²."""
         init = self.config.optimizer.eps2d_init
         return self.config.model.eps2d if init is None or step > self.full_window_step else init
-
-    def max_gaussians(self, step: int) -> int:
-        """Upper bound of the number of Gaussians after this step, counted from 1."""
-        most = self.config.density.max_gaussians
-        return most - 2 * self.num_reseeded if step <= self.static_steps else most
 
     def refines_at(self, step: int) -> bool:
         """Whether a round of density control is due after this step, counted from 1."""

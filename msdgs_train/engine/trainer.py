@@ -15,9 +15,9 @@ from msdgs_serve.threads import sharing_cores
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.engine.config import TrainConfig
-from msdgs_train.engine.curriculum import TrainingSample, WindowCurriculum
+from msdgs_train.engine.curriculum import WindowCurriculum
 from msdgs_train.engine.gradients import ViewGradients, average_gradients, differentiate
-from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates, step_with_new_frames
+from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.evaluation.metrics import ImageMetrics, image_metrics, psnr_from_mse
 from msdgs_train.gaussians import safe_load
@@ -97,12 +97,10 @@ class Trainer:
         if is_finite:
             # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
             clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], MAX_GRADIENT_NORM)
-            new_times = [view.sample.t for view in views if view.sample.update == "motion"]
-            rows = self.system.new_frame_rows(new_times) if new_times else []
-            step_with_new_frames(self.optimizer, rows)
-            self._average([view for view in views if view.sample.update == "all"])
+            self.optimizer.step()
+            self._average(views)
         self.system.after_step(
-            self.optimizer, self.reached, [(view.sample, view.view) for view in views] if is_finite else []
+            self.optimizer, self.reached, [(view.frame, view.view) for view in views] if is_finite else []
         )
         average_loss, average_error = self._averages or (float("nan"), float("nan"))
         clamped = max(view.view.clamped_scales for view in views)
@@ -199,10 +197,10 @@ class Trainer:
         return ThreadPoolExecutor(self.config.run.threads, "image", torch.set_num_threads, (1,))
 
     @sharing_cores()
-    def _differentiate(self, groups: Sequence[ParamGroup], sample: TrainingSample, background: Tensor) -> ViewGradients:
-        target = Target.over(self._images.rgba(sample.frame), background)
-        view = self.system.loss(sample, target, background, self.step_count)
-        return differentiate(groups, sample, view, target.rgb)
+    def _differentiate(self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor) -> ViewGradients:
+        target = Target.over(self._images.rgba(frame), background)
+        view = self.system.loss(frame, target, background, self.step_count)
+        return differentiate(groups, frame, view, target.rgb)
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":
@@ -223,9 +221,6 @@ class Trainer:
         return False
 
     def _average(self, views: list[ViewGradients]) -> None:
-        """Add samples that update all parameters; the others are drawn from images with large errors."""
-        if not views:
-            return
         loss, error = (sum(getattr(v, name) for v in views) / len(views) for name in ("loss", "squared_error"))
         old = self._averages or (loss, error)
         self._averages = (

@@ -70,22 +70,23 @@ def evaluate_run(
     split: str = "test",
     progress: Callable[[int, int], None] | None = None,
     *,
-    last_only: bool = False,
+    brief: bool = False,
 ) -> Evaluation:
-    """Evaluate `model.pt` and, if there is one and not `last_only`, `best.pt` of the run in folder `run` on a split.
+    """Evaluate `model.pt` and, if there is one, `best.pt` of the run in folder `run` on a split; if `brief`, without
+    `best.pt` and ꟻLIP.
 
     The other arguments are the options of `msdgs-train eval`; `progress` is called with (done, total) images.
 
     Raises `RunInvalid`, `CheckpointInvalid` and `DatasetInvalid`, which name the file that is missing or broken.
     """
     settings = read_config(run).data
-    names = [name for name, file in FILES.items() if name == "last" or (not last_only and (run / file).exists())]
+    names = [name for name, file in FILES.items() if name == "last" or (not brief and (run / file).exists())]
     loaded = {name: load_model(run / FILES[name]) for name in names}
     data = _data_folder(run, data)
     scene = load_scene(data, settings.size, settings.llffhold)
     frames = _frames(scene, data, split)
     region = moving_region(scene, split, list(loaded.values()))
-    perceptual = perceptual_metrics()
+    perceptual = perceptual_metrics(with_flip=not brief)
     models = [EvaluatedModel(name, model, []) for name, model in loaded.items()]
     masks = []
     for index, frame in enumerate(frames):

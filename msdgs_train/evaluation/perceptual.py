@@ -24,10 +24,11 @@ class PerceptualMetrics(NamedTuple):
     unavailable: dict[str, str]
 
 
-def perceptual_metrics() -> PerceptualMetrics:
+def perceptual_metrics(*, with_flip: bool = True) -> PerceptualMetrics:
     """Load `lpips` and `flip`, each as a metric or with the reason why it is unavailable."""
     found = PerceptualMetrics({}, {})
-    for name, load in (("lpips", _load_lpips), ("flip", _load_flip)):
+    loaders = {"lpips": _load_lpips} | ({"flip": _load_flip} if with_flip else {})
+    for name, load in loaders.items():
         try:
             found.metrics[name] = load()
         except Unavailable as error:

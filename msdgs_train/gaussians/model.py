@@ -66,13 +66,13 @@ class DynamicGaussians(nn.Module):
         g = self.gaussians.rows(ids)
         rest = sh_coefficients(self.config.sh_degree if sh_degree is None else sh_degree) - 1
         sh = torch.cat([g.sh_dc, g.sh_rest if rest == g.sh_rest.shape[1] else g.sh_rest[:, :rest]], dim=1)
-        means, quats, raw_opacities = g.means, unit_or_identity(g.raw_quats), g.raw_opacities
+        points, raw_opacities = canonical_points(g), g.raw_opacities
+        means, quats, _ = points
         if not (deform and len(self.deformation) and num_layers != 0):
             return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)
-        points = CanonicalPoints(means, quats, g.attributes)
         if motions is None:
             time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
-            motions = self.support.motions(self.deformation, points, time, num_layers)
+            motions = self.support.motions(self.deformation, means, time, num_layers)
         deltas = self.support.follow(points, motions)
         deltas = self._modulated(deltas, g.attributes)
         if deltas.opacities is not None:
@@ -87,11 +87,6 @@ class DynamicGaussians(nn.Module):
             sh,
         )
 
-    def canonical_points(self, rows: GaussianRows | None = None) -> CanonicalPoints:
-        """The input of the support, of all Gaussians or of some rows."""
-        g = self.gaussians.rows() if rows is None else rows
-        return CanonicalPoints(g.means, unit_or_identity(g.raw_quats), g.attributes)
-
     def motion_groups(self) -> list[ParamGroup]:
         """The parameter groups of layers, of modulation, and of attributes of modulation and support."""
         groups = [
@@ -102,11 +97,11 @@ class DynamicGaussians(nn.Module):
         ]
         if self.modulation is not None:
             params = list(self.modulation.parameters())
-            groups.append(ParamGroup("modulation", params, self.config.modulation_lr, "static"))
+            groups.append(ParamGroup("modulation", params, self.config.modulation_lr))
         for name, attribute in self.config.attributes().items():
             parameter = self.gaussians.get_parameter(name)
             if parameter.requires_grad:
-                groups.append(ParamGroup(name, [parameter], attribute.lr, attribute.role))
+                groups.append(ParamGroup(name, [parameter], attribute.lr))
         return groups
 
     def _modulated(self, deltas: Deltas, attributes: dict[str, Tensor]) -> Deltas:
@@ -115,6 +110,11 @@ class DynamicGaussians(nn.Module):
             return deltas
         factors: Factors = self.modulation(attributes[EMBEDDINGS])
         return deltas._replace(**{name: f * getattr(deltas, name) for name, f in factors.present().items()})
+
+
+def canonical_points(rows: GaussianRows) -> CanonicalPoints:
+    """What a support reads of these Gaussians."""
+    return CanonicalPoints(rows.means, unit_or_identity(rows.raw_quats), rows.attributes)
 
 
 def _check_shapes(config: ModelConfig, gaussians: CanonicalGaussians) -> None:

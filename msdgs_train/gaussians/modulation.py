@@ -35,9 +35,7 @@ class Factors(NamedTuple):
 
 def embeddings_attribute(dim: int, lr: LearningRate) -> Attribute:
     """Small random embeddings, [N, dim]."""
-    return Attribute(
-        dim, lambda n, columns, generator: 0.1 * torch.randn(n, columns, generator=generator), lr, "static"
-    )
+    return Attribute(dim, lambda n, columns, generator: 0.1 * torch.randn(n, columns, generator=generator), lr)
 
 
 class Modulation(nn.Module):

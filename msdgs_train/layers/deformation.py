@@ -1,6 +1,5 @@
 """The interface of a deformation layer, and its outputs."""
 
-from collections.abc import Iterable
 from typing import ClassVar, NamedTuple
 
 from torch import Tensor, nn
@@ -42,17 +41,12 @@ class DeformationLayer(nn.Module):
         """All trainable parameters, each in one group, with their learning rates."""
         raise NotImplementedError
 
-    def regularizers(self, t: Tensor, is_new_frame: bool) -> dict[str, Tensor]:
-        """Weighted terms of the loss at time `t`, by name; `is_new_frame` if the image at `t` has just been admitted
-        to the time window."""
+    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
+        """Weighted terms of the loss at time `t`, by name."""
         return {}
 
     def on_window(self, before: float, after: float) -> None:
         """Extrapolate when the time window widens; half widths, as fractions of the time range."""
-
-    def new_frame_rows(self, times: Iterable[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Parameters, each with a mask of the rows that take larger steps because new frames are at `times`."""
-        return []
 
     def operations(self) -> int:
         """Floating-point operations per point; by default a product and a sum per weight of a Linear."""

@@ -128,14 +128,9 @@ class MLPLayer(DeformationLayer):
         frequencies = self.xyz_frequency_matrix, self.time_frequency_matrix
         return LayerStep.of_columns(_Network.apply(means, t, *frequencies, self.skip, *tensors), self.outputs)
 
-    def time_code(self, t: Tensor) -> Tensor:
-        """[time_features] of time `t`, the same for all points."""
-        encoded = positional_encoding(t.reshape(1, 1), self.time_frequency_matrix)
-        return self.time_output(self.time_hidden(encoded).relu_())[0]
-
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
-        return [ParamGroup("network", list(self.parameters()), lr, "motion", is_clipped=True)]
+        return [ParamGroup("network", list(self.parameters()), lr, is_clipped=True)]
 
 
 def _encode_backward(grad: Tensor, encoded: Tensor, frequencies: Tensor) -> Tensor:
@@ -190,13 +185,15 @@ class _Network(torch.autograd.Function):
         begin, end = ctx.split
         grads: list[Tensor] = [grad.t() @ hidden[-1], grad.sum(dim=0)]
         grad_hidden = grad @ heads_weight
+        wants_means, wants_t = ctx.needs_input_grad[:2]
         grad_encoded, grad_code = torch.zeros_like(encoded), torch.zeros_like(code)
         for index in reversed(range(len(hidden))):
             weight, below = trunk[2 * index], hidden[index - 1] if index else None
             grad_read = torch.ops.aten.threshold_backward(grad_hidden, hidden[index], 0)
             grad_bias = grad_read.sum(dim=0)
             if index in (0, ctx.skip):
-                grad_encoded.addmm_(grad_read, weight[:, :begin])
+                if wants_means:
+                    grad_encoded.addmm_(grad_read, weight[:, :begin])
                 grad_code.addmv_(weight[:, begin:end].t(), grad_bias)
                 parts = [grad_read.t() @ encoded, torch.outer(grad_bias, code)]
                 parts += [] if below is None else [grad_read.t() @ below]
@@ -208,9 +205,9 @@ class _Network(torch.autograd.Function):
         grad_time_hidden = torch.ops.aten.threshold_backward(code_weight.t() @ grad_code, time_hidden, 0)
         grads = [torch.outer(grad_time_hidden, encoded_time), grad_time_hidden,
                  torch.outer(grad_code, time_hidden), grad_code, *grads]  # fmt: skip
-        grad_means = _encode_backward(grad_encoded, encoded, xyz_frequencies)
+        grad_means = _encode_backward(grad_encoded, encoded, xyz_frequencies) if wants_means else None
         grad_t = None
-        if ctx.needs_input_grad[1]:
+        if wants_t:
             grad_encoded_time = (time_weight.t() @ grad_time_hidden)[None]
             grad_t = _encode_backward(grad_encoded_time, encoded_time[None], time_frequencies).reshape(ctx.time_shape)
         return grad_means, grad_t, None, None, None, *grads

@@ -1,12 +1,8 @@
-"""Parameter groups: names, roles in the curriculum, and learning rates."""
+"""Parameter groups: names and learning rates."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from torch import nn
-
-Role = Literal["static", "motion", "binding"]
-"""static: canonical attributes; motion: deformation; binding: skinning weights, which only samples that update all
-parameters train."""
 
 
 class LearningRate(NamedTuple):
@@ -38,5 +34,4 @@ class ParamGroup(NamedTuple):
     name: str  # unique in a model
     params: list[nn.Parameter]
     lr: LearningRate
-    role: Role
     is_clipped: bool = False  # whether their gradients are clipped, all clipped groups of a model together

@@ -185,11 +185,11 @@ class PlaneLayer(DeformationLayer):
         networks = [p for p in self.parameters() if id(p) not in own]
         c = self.config
         return [
-            ParamGroup("grids", grids, LearningRate(c.grid_lr_init, c.grid_lr_final, holds=True), "motion", True),
-            ParamGroup("networks", networks, LearningRate(c.lr_init, c.lr_final, holds=True), "motion", True),
+            ParamGroup("grids", grids, LearningRate(c.grid_lr_init, c.grid_lr_final, holds=True), True),
+            ParamGroup("networks", networks, LearningRate(c.lr_init, c.lr_final, holds=True), True),
         ]
 
-    def regularizers(self, t: Tensor, is_new_frame: bool) -> dict[str, Tensor]:
+    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
         c, terms = self.config, {}
         for i, grid in enumerate(self.plane_grids()):
             for weight, name, term in (

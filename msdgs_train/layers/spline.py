@@ -5,7 +5,6 @@ control nodes these are Shape of Motion's motion bases (Wang et al. 2024) on spl
 fewer of them than of rigid ones.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -90,12 +89,9 @@ class SplineLayer(DeformationLayer):
 
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
-        return [ParamGroup("curves", list(self.parameters()), lr, "motion")]
+        return [ParamGroup("curves", list(self.parameters()), lr)]
 
-    def regularizers(self, t: Tensor, is_new_frame: bool) -> dict[str, Tensor]:
-        """Temporal smoothness, but not at new frames, where motion may change abruptly, as in a bounce."""
-        if is_new_frame:
-            return {}
+    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
         return {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}
 
     def temporal_smoothness(self, t: Tensor) -> Tensor:
@@ -119,13 +115,6 @@ class SplineLayer(DeformationLayer):
                 if abs(k - last) <= 3:  # knots that times within the window read
                     rot = unit(multiply(step, rot))
                 self.transls[k], self.rots[k], self.stretches[k] = self.transls[last], rot, self.stretches[last]
-
-    def new_frame_rows(self, times: Iterable[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Translations and rotations, but not stretches: a misplaced object would shrink until it has no gradient."""
-        rows = torch.zeros(len(self.transls), dtype=torch.bool)
-        for t in times:
-            rows[self.knots_at(torch.tensor(t))[0]] = True
-        return [(self.transls, rows), (self.rots, rows)]
 
     def operations(self) -> int:
         """0: curves are evaluated once per frame."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.layers.parameters import LearningRate, Role
+from msdgs_train.layers.parameters import LearningRate
 
 if TYPE_CHECKING:
     from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -21,7 +21,6 @@ class Attribute(NamedTuple):
     columns: int
     init: Callable[[int, int, torch.Generator], Tensor]  # of rows, columns and a generator; integers aren't trained
     lr: LearningRate
-    role: Role
 
 
 class CanonicalPoints(NamedTuple):
@@ -63,20 +62,19 @@ class Support(nn.Module):
         self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None = None
     ) -> Deltas:
         """Deltas of the Gaussians at time `t`, a scalar tensor, after the first `num_layers` of the chain, or all."""
-        return self.follow(gaussians, self.motions(chain, gaussians, t, num_layers))
+        return self.follow(gaussians, self.motions(chain, gaussians.means, t, num_layers))
 
-    def motions(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None = None
-    ) -> Any:
-        """The motions of the points at time `t`, which `follow` and `regularizers` read."""
+    def motions(self, chain: MultiStepDeformation, means: Tensor, t: Tensor, num_layers: int | None = None) -> Any:
+        """The motions of the points at time `t`, which `follow` and `regularizers` read; `means`, [N, 3], are those of
+        the canonical Gaussians."""
         raise NotImplementedError
 
     def follow(self, gaussians: CanonicalPoints, motions: Any) -> Deltas:
         """Deltas of the Gaussians, given the motions of the points."""
         raise NotImplementedError
 
-    def points(self, gaussians: CanonicalPoints) -> Tensor:
-        """[M, 3] canonical positions of the points that the chain moves."""
+    def points(self, means: Tensor) -> Tensor:
+        """[M, 3] canonical positions of the points that the chain moves, given canonical means, [N, 3]."""
         raise NotImplementedError
 
     def on_deform_start(self, gaussians: "CanonicalGaussians", surgery: "RowSurgery") -> None:

@@ -35,10 +35,8 @@ class GaussiansSupport(Support):
         super().__init__()
         self.config = config
 
-    def motions(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None = None
-    ) -> Deltas:
-        means = self.points(gaussians)
+    def motions(self, chain: MultiStepDeformation, means: Tensor, t: Tensor, num_layers: int | None = None) -> Deltas:
+        means = self.points(means)
         if torch.is_grad_enabled() or len(means) <= CHUNK:
             return chain(means, t, num_layers)
         parts = [chain(chunk, t, num_layers) for chunk in means.split(CHUNK)]
@@ -48,5 +46,5 @@ class GaussiansSupport(Support):
     def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
         return motions
 
-    def points(self, gaussians: CanonicalPoints) -> Tensor:
-        return gaussians.means.detach() if self.config.detach_deform_input else gaussians.means
+    def points(self, means: Tensor) -> Tensor:
+        return means.detach() if self.config.detach_deform_input else means

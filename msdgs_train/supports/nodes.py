@@ -70,8 +70,8 @@ class NodesConfig(SupportConfig):
     def attributes(self) -> dict[str, Attribute]:
         lr = LearningRate(self.skinning_lr_init, self.skinning_lr_final, holds=True)
         return {
-            "skinning_logits": Attribute(self.followed, lambda n, columns, _: torch.zeros(n, columns), lr, "binding"),
-            "node_ids": Attribute(self.followed, _first_nodes, lr, "binding"),
+            "skinning_logits": Attribute(self.followed, lambda n, columns, _: torch.zeros(n, columns), lr),
+            "node_ids": Attribute(self.followed, _first_nodes, lr),
         }
 
 
@@ -94,12 +94,10 @@ class NodesSupport(Support):
         columns = skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions)
         return Deltas(*columns.split((3, 3, 4), dim=1))
 
-    def points(self, gaussians: CanonicalPoints) -> Tensor:
+    def points(self, means: Tensor) -> Tensor:
         return self.nodes
 
-    def motions(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints | None, t: Tensor, num_layers: int | None = None
-    ) -> Tensor:
+    def motions(self, chain: MultiStepDeformation, means: Tensor, t: Tensor, num_layers: int | None = None) -> Tensor:
         """[M, 16] matrices, offsets and quaternions of the nodes at time `t`: x → matrix x + offset."""
         deltas = chain(self.nodes, t, num_layers)
         rots = unit(deltas.quats + deltas.quats.new_tensor([1.0, 0.0, 0.0, 0.0]))

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene import Camera
-from msdgs_train.datasets import composite
-from msdgs_train.engine.curriculum import TrainingSample
+from msdgs_train.datasets import Frame, composite
 from msdgs_train.layers.parameters import ParamGroup
 
 
@@ -53,7 +52,7 @@ class System(Protocol):
         ...
 
     def parameter_groups(self) -> list[ParamGroup]:
-        """All current trainable parameters, with learning rates and roles."""
+        """All current trainable parameters, with learning rates."""
         ...
 
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
@@ -61,17 +60,11 @@ class System(Protocol):
         one: one, unless the schedule follows the clock."""
         ...
 
-    def loss(self, sample: TrainingSample, target: Target, background: Tensor, step: int) -> ViewLoss:
-        """Render a sample and compare it with its image; called from several threads at once."""
+    def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
+        """Render a frame and compare it with its image; called from several threads at once."""
         ...
 
-    def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        """Parameters, each with a mask of the rows that take larger steps because new frames are at `times`."""
-        ...
-
-    def after_step(
-        self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[TrainingSample, ViewLoss]]
-    ) -> None:
+    def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
         """Density control and averaging after these steps of the schedule, counted from 1, of one optimizer step; no
         views if its loss wasn't finite."""
         ...

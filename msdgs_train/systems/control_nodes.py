@@ -10,33 +10,30 @@ from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems.registry import DEFAULT, register_system
 
-ON_NODES = TrainConfig().updated(
-    model=ModelConfig(sh_degree=2, support=NodesConfig(skinning_lr_final=6e-3), embedding_dim=0, eps2d=0.15),
-    static_fraction=0.05,
-    eps2d_init=0.3,
-    ema_fraction=1 / 40,
-    sh_degree_fraction=1 / 20,
-    refine_start_fraction=1 / 80,
-    refine_every_fraction=1 / 400,
-    refine_stop_fraction=0.75,
-    max_gaussians=18_000,
-    grow_grad2d=8e-4,
-    means_lr_final=5e-5,
-    mse_fraction=0.8,
-)
-"""Settings that the systems on control nodes share."""
-
 register_system(
     DEFAULT,
     "a spline layer and 2 MLP layers on 512 control nodes, which carry the Gaussians",
-    ON_NODES.updated(
-        support=NodesConfig(num_nodes=512, k_nearest=4, skinning_lr_final=6e-3),
-        layers=(SplineConfig(), SMALL_LAYER, SMALL_LAYER),
+    TrainConfig().updated(
+        model=ModelConfig(
+            sh_degree=2,
+            support=NodesConfig(num_nodes=512, k_nearest=4, skinning_lr_final=6e-3),
+            layers=(SplineConfig(), SMALL_LAYER, SMALL_LAYER),
+            embedding_dim=0,
+            eps2d=0.15,
+        ),
         steps=20_000,
+        static_fraction=0.05,
         window_full_fraction=0.65,
-        new_frames_motion_only=False,
-        outside_frames_static_only=False,
-        reseed_fraction=0.0,
+        eps2d_init=0.3,
+        ema_fraction=1 / 40,
+        sh_degree_fraction=1 / 20,
+        refine_start_fraction=1 / 80,
+        refine_every_fraction=1 / 400,
+        refine_stop_fraction=0.75,
+        max_gaussians=18_000,
+        grow_grad2d=8e-4,
+        means_lr_final=5e-5,
+        mse_fraction=0.8,
         empty_weight=0.1,
     ),
 )

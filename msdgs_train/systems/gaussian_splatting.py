@@ -9,10 +9,11 @@ from torch import Tensor, nn
 
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera
-from msdgs_train.datasets import SceneData
-from msdgs_train.density.reseed import make_strategy, reseed
+from msdgs_train.datasets import Frame, SceneData
+from msdgs_train.density.gradient import GradientStrategy
+from msdgs_train.density.mcmc import MCMCStrategy
+from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.averaging import WeightAverage
-from msdgs_train.engine.curriculum import TrainingSample
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
 from msdgs_train.gaussians.bounds import camera_entry, scene_bounds, scene_scale
@@ -22,7 +23,7 @@ from msdgs_train.gaussians.scale_space import count_clamped
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.parameters import LearningRate, ParamGroup, constant
-from msdgs_train.losses.photometric import masked_l1, photometric_loss, pooled_l1
+from msdgs_train.losses.photometric import photometric_loss
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.systems.base import Target, ViewLoss
 
@@ -39,7 +40,10 @@ class GaussianSplatting:
         self.scene_half_size = config.data.scene_half_size or scene.scene_half_size
         self._model = _new_model(schedule, scene, SceneBounds(self.scene_half_size, scene.time_range))
         scale = scene_scale([frame.camera for frame in scene.splits["train"]]) or self.scene_half_size
-        self.density = make_strategy(schedule, scale, self.size)
+        is_mcmc = config.density.density_strategy == "mcmc"
+        self.density: DensityStrategy = (
+            MCMCStrategy.start(schedule) if is_mcmc else GradientStrategy.start(schedule, scale, self.size)
+        )
         self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
 
     @property
@@ -65,46 +69,33 @@ class GaussianSplatting:
             "sh_dc": constant(o.sh_dc_lr),
             "sh_rest": constant(o.sh_rest_lr),
         }
-        own = [ParamGroup(name, [g.get_parameter(name)], lr, "static") for name, lr in rates.items()]
+        own = [ParamGroup(name, [g.get_parameter(name)], lr) for name, lr in rates.items()]
         return own + self.model.motion_groups()
 
     @torch.no_grad()
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
         schedule, surgery = self.schedule, RowSurgery(self.model.gaussians, optimizer)
-        if schedule.static_steps in steps and schedule.num_reseeded:
-            reseed(surgery, schedule, self.scene_half_size)
-            self.density.reset(self.size)
         if schedule.deform_start_step in steps:
             self.model.support.on_deform_start(self.model.gaussians, surgery)
         before, after = schedule.window(steps.start - 1), schedule.window(steps.stop - 1)
-        if before < after and schedule.is_first_pass(steps.stop - 1):
+        if before < after:
             for layer in self.model.deformation:
                 layer.on_window(before, after)
 
-    def loss(self, sample: TrainingSample, target: Target, background: Tensor, step: int) -> ViewLoss:
-        motions, c = self._motions(sample.t, step), self.config.loss
-        posed = self._pose(self.model, sample.t, step, motions)
-        rgb, alpha, info = rasterize(*posed, sample.frame.camera, background, self._options(step + 1))
-        if sample.update == "static":
-            loss = masked_l1(rgb, target.rgb, 1 - c.ssim_lambda)
-        else:
-            loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
-            loss = loss + self._regularizers(posed, motions, sample, step)
-        if sample.update == "motion" and c.pooled_l1_weight:
-            loss = loss + c.pooled_l1_weight * pooled_l1(rgb, target.rgb)
+    def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
+        motions, c = self._motions(frame.t, step), self.config.loss
+        posed = self._pose(self.model, frame.t, step, motions)
+        rgb, alpha, info = rasterize(*posed, frame.camera, background, self._options(step + 1))
+        loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
+        loss = loss + self._regularizers(posed, motions, frame.t)
         if c.empty_weight:
             loss = loss + c.empty_weight * (target.transparency * alpha).mean()
         return ViewLoss(loss, rgb, count_clamped(self.config.model.scale_space, posed.scales), info)
 
-    def new_frame_rows(self, times: list[float]) -> list[tuple[nn.Parameter, Tensor]]:
-        return [rows for layer in self.model.deformation for rows in layer.new_frame_rows(times)]
-
-    def after_step(
-        self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[TrainingSample, ViewLoss]]
-    ) -> None:
-        for sample, view in views:
-            if sample.update == "all" and view.screen.means2d_grads is not None:
-                camera = sample.frame.camera
+    def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
+        for frame, view in views:
+            if view.screen.means2d_grads is not None:
+                camera = frame.camera
                 self.density.accumulate(view.screen.means2d_grads, view.screen.radii, camera.width, camera.height)
         self.density.after_step(RowSurgery(self.model.gaussians, optimizer), steps)
         if self.schedule.averages_at(steps.stop - 1):
@@ -160,17 +151,17 @@ class GaussianSplatting:
         """Those of the support, once for the pose and the regularizers."""
         if not (self.schedule.deforms(step) and len(self.model.deformation)):
             return None
-        points = self.model.canonical_points()
-        return self.model.support.motions(self.model.deformation, points, points.means.new_tensor(t))
+        means = self.model.gaussians.means
+        return self.model.support.motions(self.model.deformation, means, means.new_tensor(t))
 
-    def _regularizers(self, posed: PosedGaussians, motions: Any, sample: TrainingSample, step: int) -> Tensor | float:
+    def _regularizers(self, posed: PosedGaussians, motions: Any, t: float) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
         terms = list(self.density.regularizers(posed).values())
         if motions is not None:
-            time = posed.means.new_tensor(sample.t)
+            time = posed.means.new_tensor(t)
             terms += self.model.support.regularizers(motions).values()
             for layer in self.model.deformation:
-                terms += layer.regularizers(time, is_new_frame=sample.update == "motion").values()
+                terms += layer.regularizers(time).values()
         total: Tensor | float = 0.0
         for term in terms:
             total = total + term

@@ -27,7 +27,7 @@ from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.viewer.snapshot import Snapshot
 from tests.support.models import CAMERA, SCENE, export_scene, random_model, saved, small_config
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import MOTION_BASES, write_scene
+from tests.support.training_scene import SPLINES, write_scene
 from tests.support.training_scene import small_config as training_config
 
 pytestmark = pytest.mark.slow
@@ -111,7 +111,7 @@ def test_a_file_without_eps2d_has_the_default(folder: Path, tmp_path: Path):
 
 def test_training_may_start_with_a_larger_eps2d(tmp_path: Path):
     """Saved models have the eps2d of their training step, also after a checkpoint is loaded."""
-    sizes = replace(MOTION_BASES, eps2d=EPS2D)
+    sizes = replace(SPLINES, eps2d=EPS2D)
     config = training_config(model=sizes, window_full_fraction=0.5, eps2d_init=0.4)
     trainer = Trainer(config, load_scene(write_scene(tmp_path / "data")))
 

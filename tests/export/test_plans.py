@@ -237,16 +237,16 @@ class Rigid(Support):
     num_points = 1
 
     def motions(
-        self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: torch.Tensor, num_layers: int | None = None
+        self, chain: MultiStepDeformation, means: torch.Tensor, t: torch.Tensor, num_layers: int | None = None
     ) -> Deltas:
-        return chain(self.points(gaussians), t, num_layers)
+        return chain(self.points(means), t, num_layers)
 
     def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
         parts = motions.means, motions.scales, motions.quats
         return Deltas(*(part.expand(len(gaussians.means), -1) for part in parts))
 
-    def points(self, gaussians: CanonicalPoints) -> torch.Tensor:
-        return gaussians.means.new_zeros(1, 3)
+    def points(self, means: torch.Tensor) -> torch.Tensor:
+        return means.new_zeros(1, 3)
 
 
 class RigidExport(SupportExport):

@@ -7,7 +7,6 @@ from tests.support.processes import ROOT
 
 RETIRED = {
     "photographs?|photographed": "image, captured",
-    "sow|sown|sowing": "reseed",
     "stillness": "static",
     "settling": "static time window",
     "taught": "updated",

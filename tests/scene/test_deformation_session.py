@@ -12,6 +12,7 @@ import torch
 
 from export.jobs.bake import bake
 from export.plans.registry import build
+from msdgs_serve import deformation
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -34,7 +35,9 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def session(path: Path) -> DeformationSession:
-    return DeformationSession(path, chunk=128)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(deformation, "CHUNK", 128)
+        return DeformationSession(path)
 
 
 def test_all_moving_gaussians_by_default(session: DeformationSession):

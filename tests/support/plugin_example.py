@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from msdgs_train.datasets import Frame
 from msdgs_train.engine.config import TrainConfig
-from msdgs_train.engine.curriculum import TrainingSample
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.base import HEAD_COLUMNS, Heads, LayerConfig, SceneBounds, check_size
 from msdgs_train.layers.deformation import DeformationLayer, LayerStep
@@ -67,7 +67,7 @@ class FourierLayer(DeformationLayer):
 
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
-        return [ParamGroup("series", list(self.parameters()), lr, "motion", is_clipped=True)]
+        return [ParamGroup("series", list(self.parameters()), lr, is_clipped=True)]
 
     def operations(self) -> int:
         return 2 * 3 * self.offsets.shape[1]
@@ -84,11 +84,11 @@ MOTION_WEIGHT = 0.01
 class SparseMotion(GaussianSplatting):
     """Gaussian splatting that prefers to leave Gaussians where they are."""
 
-    def loss(self, sample: TrainingSample, target: Target, background: Tensor, step: int) -> ViewLoss:
-        view = super().loss(sample, target, background, step)
-        if sample.update == "static" or not self.schedule.deforms(step):
+    def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
+        view = super().loss(frame, target, background, step)
+        if not self.schedule.deforms(step):
             return view
-        displacement = self.model.pose(sample.t).means - self.model.gaussians.means
+        displacement = self.model.pose(frame.t).means - self.model.gaussians.means
         return view._replace(loss=view.loss + MOTION_WEIGHT * displacement.abs().mean())
 
 

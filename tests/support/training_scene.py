@@ -40,12 +40,11 @@ FEW = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90"]
 MLP = MLPConfig(width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8, time_features=4)
 PLANE = PlaneConfig(features=4, resolution=6, time_resolution=5, width=8)
 SMALL_MODEL = ModelConfig(sh_degree=1, layers=(MLP, MLP), embedding_dim=4)
-MOTION_BASES = ModelConfig(
+SPLINES = ModelConfig(
     sh_degree=1, support=NodesConfig(num_nodes=4), layers=(SplineConfig(num_knots=8),), embedding_dim=0
 )
 MODELS = {
     "mlp": SMALL_MODEL,
-    "motion bases": MOTION_BASES,
     "mlp on nodes": dataclasses.replace(SMALL_MODEL, support=NodesConfig(num_nodes=6)),
     "mixed on nodes": dataclasses.replace(
         SMALL_MODEL, support=NodesConfig(num_nodes=6), layers=(SplineConfig(num_knots=8), PLANE, MLP)
@@ -67,7 +66,7 @@ def small_config(**changes: Any) -> TrainConfig:
 
 def parameter_groups(gaussians: CanonicalGaussians) -> list[ParamGroup]:
     """One group per attribute, all with one rate."""
-    return [ParamGroup(name, [p], constant(1e-3), "static") for name, p in gaussians.named_parameters()]
+    return [ParamGroup(name, [p], constant(1e-3)) for name, p in gaussians.named_parameters()]
 
 
 def with_moments(gaussians: CanonicalGaussians, schedule: Schedule) -> RowSurgery:

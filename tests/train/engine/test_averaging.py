@@ -15,7 +15,7 @@ from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.viewer.snapshot import snapshot_of_training
 from tests.support.training_scene import (
-    MOTION_BASES,
+    SPLINES,
     StopAfter,
     assert_same_bits,
     small_config,
@@ -28,13 +28,13 @@ pytestmark = pytest.mark.slow
 
 STEPS, BEGINS, KEPT = 24, 18, 3
 CONFIG = small_config(
-    model=MOTION_BASES,
+    model=SPLINES,
     window_full_fraction=0.5,
     refine_stop_fraction=BEGINS / STEPS,
     ema_fraction=KEPT / STEPS,
     eval_every=0,
 )
-AS_THE_PRESET = CONFIG.updated(
+WINDOW_LAST = CONFIG.updated(
     batch_size=2, window_full_fraction=BEGINS / STEPS, refine_stop_fraction=0.5, eps2d_init=0.4
 )
 
@@ -76,7 +76,7 @@ def test_it_is_evaluated_shown_and_saved(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_curve")
-@pytest.mark.parametrize("config", [CONFIG, AS_THE_PRESET], ids=["density control last", "windows last"])
+@pytest.mark.parametrize("config", [CONFIG, WINDOW_LAST], ids=["density control last", "window last"])
 @pytest.mark.parametrize("stop", [BEGINS, BEGINS + 1, BEGINS + 5])
 def test_resuming_changes_no_bit_of_it(data: Path, tmp_path: Path, stop: int, config: TrainConfig) -> None:
     fit(config, data, tmp_path / "whole")

@@ -56,7 +56,7 @@ def test_steps_that_the_clock_passes_over_take_effect_once(data: Path, monkeypat
     placed: list[int] = []
     place = NodesSupport.on_deform_start
     monkeypatch.setattr(NodesSupport, "on_deform_start", lambda *given: placed.append(1) or place(*given))
-    trainer = Trainer(small_config(model=MODELS["mlp on nodes"], reseed_fraction=0.0), load_scene(data))
+    trainer = Trainer(small_config(model=MODELS["mlp on nodes"]), load_scene(data))
     sizes, steps = [trainer.system.size], trainer.schedule.num_steps
     while trainer.step_count < steps:
         trainer.step(min(5, steps - trainer.step_count))

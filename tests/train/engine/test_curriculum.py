@@ -1,7 +1,5 @@
-"""The order of images and the parameters that they update: passes, the time window, kinds of samples."""
+"""The order of images: passes and the time window."""
 
-from collections import Counter
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_train.datasets import SceneData, load_scene
-from msdgs_train.engine.curriculum import MIN_NEW_FRAME_DISTANCE, NEW_FRAME_BORDER, TrainingSample, WindowCurriculum
-from msdgs_train.engine.gradients import average_gradients
-from msdgs_train.engine.optimizer import NEW_FRAME_LR_MULTIPLIER, step_with_new_frames
+from msdgs_train.datasets import Frame, SceneData, load_scene
+from msdgs_train.engine.curriculum import MIN_NEW_FRAME_DISTANCE, NEW_FRAME_BORDER, WindowCurriculum
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.spline import SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
-from msdgs_train.systems import gaussian_splatting as system_module
-from tests.support.training_scene import MODELS, MOTION_BASES, small_config, splatting, trained, write_scene
+from tests.support.training_scene import SPLINES, small_config, trained, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +24,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneData:
 PHASES = {"static_fraction": 0.1, "static_window_fraction": 0.1, "window_full_fraction": 0.6}
 
 
-def samples(scene: SceneData, numbers: range, **changes: Any) -> list[TrainingSample]:
+def frames_drawn(scene: SceneData, numbers: range, **changes: Any) -> list[Frame]:
     """Some of a run of 1,000 steps: 100 on all images, 100 around the middle, then up to step 600."""
-    schedule = Schedule.from_config(small_config(**{**PHASES, "steps": 1000, "window_start_widths": (0.1,), **changes}))
+    schedule = Schedule.from_config(small_config(**{**PHASES, "steps": 1000, "window_start_width": 0.1, **changes}))
     curriculum = WindowCurriculum(schedule, scene.splits["train"], scene.time_range)
     generator = torch.Generator().manual_seed(0)
     return [curriculum.next(number, number // schedule.config.run.batch_size, generator) for number in numbers]
@@ -43,166 +38,61 @@ def distance(scene: SceneData, t: float) -> float:
 
 
 def test_every_image_once_a_pass(scene: SceneData) -> None:
-    names = [sample.frame.name for sample in samples(scene, range(82), window_full_fraction=0.0)]
+    names = [frame.name for frame in frames_drawn(scene, range(82), window_full_fraction=0.0)]
     assert len(set(names[:41])) == len(set(names[41:])) == 41
     assert names[:41] != names[41:]
 
 
-def test_first_and_last_all_images_update_everything(scene: SceneData) -> None:
-    drawn = samples(scene, range(1000))
+def test_first_and_last_are_all_images(scene: SceneData) -> None:
+    drawn = frames_drawn(scene, range(1000))
     for part in (drawn[:100], drawn[600:]):
-        assert {sample.frame.name for sample in part} == {frame.name for frame in scene.splits["train"]}
-        assert {sample.update for sample in part} == {"all"}
+        assert {frame.name for frame in part} == {frame.name for frame in scene.splits["train"]}
 
 
-@pytest.mark.parametrize(("starts", "batch_size"), [((0.1,), 1), ((0.1,), 2), ((0.1, 0.3), 1), ((0.1, 0.3, 0.2), 1)])
-def test_windows_grow_from_the_middle_one_after_the_other(
-    scene: SceneData, starts: tuple[float, ...], batch_size: int
-) -> None:
-    """Each takes an equal part of the steps 200 to 600; motion-only samples are at the border."""
-    edges = np.linspace(200, 600, len(starts) + 1)
+@pytest.mark.parametrize("batch_size", [1, 2])
+def test_the_window_grows_from_the_middle(scene: SceneData, batch_size: int) -> None:
+    """In the steps 200 to 600; every other image is at the border."""
     numbers = range(600 * batch_size)
-    drawn = samples(scene, numbers, window_start_widths=starts, batch_size=batch_size)
-    for number, sample in zip(numbers, drawn, strict=True):
+    for number, frame in zip(numbers, frames_drawn(scene, numbers, batch_size=batch_size), strict=True):
         step = number // batch_size
         if step < 100:
             continue
-        part = np.searchsorted(edges[1:], step, side="right")
-        window = np.interp(step, edges[part : part + 2], (starts[part], 0.5)) + 1e-9
-        assert (distance(scene, sample.frame.t) <= window) == (sample.update != "static")
-        assert distance(scene, sample.t) <= window
-        if sample.update == "motion":
-            assert step >= 200
+        window = np.interp(step, (200, 600), (0.1, 0.5)) + 1e-9
+        assert distance(scene, frame.t) <= window
+        if number % 2 and step >= 200:
             outermost = max(d for f in scene.splits["train"] if (d := distance(scene, f.t)) <= window)
             border = max(window - NEW_FRAME_BORDER, MIN_NEW_FRAME_DISTANCE * window)
-            assert distance(scene, sample.frame.t) >= min(outermost, border) - 2e-9
-
-
-TWO_WINDOWS = {"window_start_widths": (0.1, 0.3), "window_full_fraction": 0.9, "steps": 2000}
-
-
-@pytest.mark.parametrize(
-    ("numbers", "changes", "updates"),
-    [
-        (range(200, 560), {}, {"all": 90, "motion": 180, "static": 90}),
-        (range(400, 1120), {"batch_size": 2}, {"all": 180, "motion": 360, "static": 180}),
-        (range(200, 560), {"new_frames_motion_only": False}, {"all": 270, "static": 90}),
-        (range(200, 560), {"outside_frames_static_only": False}, {"all": 180, "motion": 180}),
-        (range(480, 800), TWO_WINDOWS, {"all": 80, "motion": 160, "static": 80}),
-        (range(1101, 1800), TWO_WINDOWS, {"all": 699}),
-    ],
-)
-def test_kinds_of_samples_while_a_window_grows(
-    scene: SceneData, numbers: range, changes: dict[str, Any], updates: dict[str, int]
-) -> None:
-    assert Counter(sample.update for sample in samples(scene, numbers, **changes)) == updates
-
-
-def test_samples_of_one_step_differ(scene: SceneData) -> None:
-    drawn = samples(scene, range(400, 404), batch_size=2)
-    assert [sample.update for sample in drawn] == ["static", "motion", "all", "motion"]
-
-
-def test_the_second_window_draws_its_images_uniformly(scene: SceneData) -> None:
-    drawn = Counter(sample.frame.name for sample in samples(scene, range(1101, 1800), **TWO_WINDOWS))
-    times = [drawn[frame.name] for frame in scene.splits["train"] if distance(scene, frame.t) <= 0.3]
-    assert max(times) - min(times) <= 2
-
-
-def test_second_window_keeps_the_motions_of_the_first(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    extrapolated = []
-    monkeypatch.setattr(SplineLayer, "on_window", lambda _, before, after: extrapolated.append((before, after)))
-    trained(small_config(model=MOTION_BASES, window_start_widths=(0.1, 0.2), steps=50, **PHASES), scene, 50)
-    assert extrapolated == [(pytest.approx(0.1 + 0.04 * k), pytest.approx(0.14 + 0.04 * k)) for k in range(9)]
+            assert distance(scene, frame.t) >= min(outermost, border) - 2e-9
 
 
 def test_a_single_time_leaves_no_window_empty(tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path, train=1))
-    assert {sample.frame.name for sample in samples(scene, range(1000))} == {scene.splits["train"][0].name}
+    assert {frame.name for frame in frames_drawn(scene, range(1000))} == {scene.splits["train"][0].name}
 
 
-@pytest.mark.parametrize("name", ["mlp", "mixed on nodes"])
-def test_a_sample_changes_only_parameters_of_its_roles(scene: SceneData, name: str) -> None:
-    model = MODELS[name]
-    trainer = trained(small_config(model=model, refine_every_fraction=0.0, steps=100, **PHASES), scene, 22)
-    groups, seen = trainer.system.parameter_groups(), set()
-    for _ in range(12):
-        before = [(group.role, p, p.detach().clone()) for group in groups for p in group.params]
-        views = trainer._render_and_backward(trainer.system.parameter_groups())
-        average_gradients(groups, views)
-        trainer.optimizer.step()
-        trainer.step_count += 1
-        trainer.optimizer_steps += 1
-        changed = {role for role, p, old in before if not torch.equal(p, old)}
-        (update,) = [view.sample.update for view in views]
-        roles = {group.role for group in groups}
-        assert changed == (roles if update == "all" else {update})
-        seen.add(update)
-    assert seen == {"all", "motion", "static"}
-    names = {role: {group.name for group in groups if group.role == role} for role in ("static", "motion", "binding")}
-    canonical = {"means", "log_scales", "raw_quats", "raw_opacities", "sh_dc", "sh_rest"}
-    assert names["static"] == canonical | {"modulation", "embeddings"}
-    assert all(name.startswith("layers.") for name in names["motion"])
-    assert names["binding"] == ({"skinning_logits"} if model.support.moves_nodes else set())
-
-
-def test_curves_take_larger_steps_at_new_frames_but_stretches_do_not(scene: SceneData) -> None:
-    config = small_config(model=MOTION_BASES, steps=100, refine_every_fraction=0.0, **PHASES)
-    trainer = trained(config, scene, 25)
-    (layer,) = splatting(trainer).model.deformation
-    assert isinstance(layer, SplineLayer)
-    curves = {"transls": layer.transls, "rots": layer.rots, "stretches": layer.stretches}
-    (view,) = views = trainer._render_and_backward(trainer.system.parameter_groups())
-    assert view.sample.update == "motion"
-    read, _ = layer.knots_at(torch.tensor(view.sample.t))
-    average_gradients(trainer.system.parameter_groups(), views)
-    start = deepcopy((splatting(trainer).model.state_dict(), trainer.optimizer.state_dict()))
-    before = {name: curve.detach().clone() for name, curve in curves.items()}
-    trainer.optimizer.step()
-    steps = {name: curve.detach() - before[name] for name, curve in curves.items()}
-    splatting(trainer).model.load_state_dict(start[0])
-    trainer.optimizer.load_state_dict(start[1])
-    step_with_new_frames(trainer.optimizer, trainer.system.new_frame_rows([view.sample.t]))
-    for name, curve in curves.items():
-        times = torch.ones(len(curve))
-        times[read] = 1.0 if name == "stretches" else NEW_FRAME_LR_MULTIPLIER
-        assert steps[name][read].abs().max() > 0
-        torch.testing.assert_close(
-            curve.detach() - before[name], steps[name] * times[:, None, None], rtol=1e-4, atol=1e-6
-        )
-
-
-def test_the_loss_depends_on_the_sample(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """New frames have larger steps and pooled L1; temporal smoothness is for the others, local rigidity for all."""
-    drawn, larger, pooled, smooth, rigid = [], [], [], [], []
-    next_sample = WindowCurriculum.next
-    monkeypatch.setattr(WindowCurriculum, "next", lambda *args: drawn.append(next_sample(*args)) or drawn[-1])
-    monkeypatch.setattr(SplineLayer, "new_frame_rows", lambda _, times: larger.extend(times) or [])
-    monkeypatch.setattr(system_module, "pooled_l1", lambda *images: pooled.append(images) or 0.0)
+def test_regularizers_begin_with_the_deformation(scene: SceneData, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, smooth, rigid = [], [], []
+    following = WindowCurriculum.next
+    monkeypatch.setattr(WindowCurriculum, "next", lambda *args: drawn.append(following(*args)) or drawn[-1])
     monkeypatch.setattr(SplineLayer, "temporal_smoothness", lambda _, t: smooth.append(float(t)) or 0.0)
     monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, motions: rigid.append(motions) or 0.0)
-    trained(small_config(model=MOTION_BASES, steps=100, pooled_l1_weight=1.0, **PHASES), scene, 40)
-    deformed = [sample for sample in drawn[20:] if sample.update != "static"]
-    new, others = ([s.t for s in deformed if (s.update == "motion") == is_new] for is_new in (True, False))
-    assert larger == new != []
-    assert len(pooled) == len(new)
-    assert smooth == pytest.approx(others)
-    assert len(rigid) == len(deformed)
+    trained(small_config(model=SPLINES, steps=100, **PHASES), scene, 40)
+    assert smooth == pytest.approx([frame.t for frame in drawn[20:]])
+    assert len(rigid) == len(drawn[20:])
 
 
 def test_phases_follow_each_other_and_cover_the_run() -> None:
-    two = small_config(**PHASES, steps=1000, window_start_widths=(0.1, 0.3))
-    assert [tuple(phase) for phase in Schedule.from_config(two).phases()] == [
+    config = small_config(**PHASES, steps=1000)
+    assert [tuple(phase) for phase in Schedule.from_config(config).phases()] == [
         ("static, all images", 0, 100),
         ("static, first time window", 100, 200),
-        ("time window grows from 0.1", 200, 400),
-        ("time window grows from 0.3", 400, 600),
+        ("growing time window", 200, 600),
         ("all times", 600, 1000),
     ]
-    whole = two.updated(window_full_fraction=0.0)
+    whole = config.updated(window_full_fraction=0.0)
     assert [tuple(phase) for phase in Schedule.from_config(whole).phases()] == [
         ("static, all images", 0, 100),
         ("all times", 100, 1000),
     ]
-    static = two.updated(model=ModelConfig(layers=(), embedding_dim=0))
+    static = config.updated(model=ModelConfig(layers=(), embedding_dim=0))
     assert [tuple(phase) for phase in Schedule.from_config(static).phases()] == [("static, all images", 0, 1000)]

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from msdgs_train.datasets import load_scene
-from msdgs_train.engine.curriculum import TrainingSample
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.systems.base import Target
@@ -27,8 +26,7 @@ def test_alpha_is_penalized_where_the_image_is_transparent(data: Path) -> None:
     with_weight, without = (
         GaussianSplatting(Schedule.from_config(small_config(empty_weight=weight)), scene) for weight in (WEIGHT, 0.0)
     )
-    sample = TrainingSample(frame, frame.t, "all")
-    losses = [system.loss(sample, target, white, 0).loss.item() for system in (with_weight, without)]
+    losses = [system.loss(frame, target, white, 0).loss.item() for system in (with_weight, without)]
     posed = without.model.pose(frame.t, deform=False, sh_degree=0)
     alpha = rasterize(*posed, frame.camera, white)[1].detach().double().numpy()
     expected = WEIGHT * ((1 - rgba[:, :, 3] / 255) * alpha).mean()

@@ -92,10 +92,10 @@ def test_each_preset_trains(name: str, data: Path) -> None:
     ("field", "value"),
     [
         ("steps", 0), ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
-        ("mse_fraction", 1.1), ("pooled_l1_weight", -1.0), ("ema_fraction", -0.1),
+        ("mse_fraction", 1.1), ("empty_weight", -1.0), ("ema_fraction", -0.1),
         ("max_gaussians", 10), ("background", "green"), ("minutes", 0.0), ("refine_every_fraction", -0.1),
         ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),
-        *(("window_start_widths", starts) for starts in ((), [0.6], [-0.1], [float("nan")], ["0.1"], [True], 0.1)),
+        *(("window_start_width", start) for start in (0.6, -0.1, float("nan"), "0.1", True)),
     ],
 )  # fmt: skip
 def test_settings_out_of_range_are_named(field: str, value: object) -> None:
@@ -104,7 +104,7 @@ def test_settings_out_of_range_are_named(field: str, value: object) -> None:
 
 
 def test_settings_survive_json_and_unknown_ones_are_refused() -> None:
-    config = small_config(background="random", size=24, window_start_widths=(0.1, 0.3, 0.3))
+    config = small_config(background="random", size=24, window_start_width=0.1)
     assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
     for strange in ({"color": 1}, {"run": {"color": 1}}):
         with pytest.raises(InvalidInput, match="`color`"):

@@ -219,6 +219,8 @@ def test_flip_is_nvidias(data: Path, run: Path) -> None:
     assert 0.01 < scores.flip < 1
     assert_close(scores.flip, evaluator.evaluate(target, rgb, "LDR")[1], "flip.relative")
     assert perceptual_metrics().metrics["flip"](torch.from_numpy(target), torch.from_numpy(target)) == 0
+    (last,) = evaluate_run(run, brief=True).models
+    assert (last.mean.psnr, last.mean.flip) == (evaluation.models[0].mean.psnr, None)
 
 
 @pytest.mark.usefixtures("_clean")

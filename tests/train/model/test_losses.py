@@ -10,7 +10,7 @@ from torchmetrics.functional.image import peak_signal_noise_ratio, structural_si
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.evaluation.metrics import MAX_PSNR, ImageMetrics, image_metrics, mean_metrics, psnr
-from msdgs_train.losses.photometric import MSE_SCALE, masked_l1, photometric_loss, pooled_l1
+from msdgs_train.losses.photometric import MSE_SCALE, photometric_loss
 from msdgs_train.losses.ssim import RADIUS, ssim
 from tests.support.tolerances import assert_close, tolerance
 
@@ -79,40 +79,6 @@ def test_shapes_that_disagree_are_refused() -> None:
             photometric_loss(rgb, other, 0.8)
     with pytest.raises(InvalidInput, match="`rgb`"):
         ssim(rgb[..., 0], target[..., 0])
-
-
-def test_pixels_that_moving_objects_left_do_not_train_static_parts() -> None:
-    target = torch.full((20, 30, 3), 0.5)
-    rgb = (target + 0.1).requires_grad_()
-    with torch.no_grad():
-        rgb[4, 5] += 0.3
-    loss = masked_l1(rgb, target, 0.8)
-    (gradient,) = torch.autograd.grad(loss, [rgb])
-    elsewhere = torch.ones(20, 30, dtype=torch.bool)
-    elsewhere[2:7, 3:8] = False
-    assert torch.equal(gradient.any(dim=2), elsewhere)
-    assert float(loss.detach()) == pytest.approx(0.8 * 0.1 * float(elsewhere.double().mean()))
-
-
-def _spot(left: torch.Tensor) -> torch.Tensor:
-    """[40, 60, 3] a soft spot 3 pixels wide, `left` of which is its column."""
-    rows, columns = torch.arange(40.0)[:, None], torch.arange(60.0)
-    return torch.exp(-((rows - 20) ** 2 + (columns - left) ** 2) / 2).expand(3, -1, -1).permute(1, 2, 0)
-
-
-def test_pooled_l1_has_a_gradient_at_large_displacements() -> None:
-    """L1 of single pixels has no gradient for a spot that is twelve pixels off."""
-    target, place = _spot(torch.tensor(30.0)), torch.tensor(42.0, requires_grad=True)
-    (by_pixels,) = torch.autograd.grad(photometric_loss(_spot(place), target, 1.0), [place])
-    (by_blocks,) = torch.autograd.grad(pooled_l1(_spot(place), target), [place])
-    assert abs(float(by_pixels)) < 1e-6
-    assert float(by_blocks) > 1e-4
-
-
-def test_blocks_larger_than_the_image() -> None:
-    rgb, target = torch.full((3, 5, 3), 0.75), torch.full((3, 5, 3), 0.5)
-    assert float(pooled_l1(rgb, target)) == pytest.approx(3 * 0.25)
-    assert float(pooled_l1(target, target)) == 0.0
 
 
 def test_psnr_is_that_of_torchmetrics() -> None:

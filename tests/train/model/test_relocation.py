@@ -73,7 +73,7 @@ def setup(count: int = 100, **changes: Any) -> tuple[CanonicalGaussians, RowSurg
 def test_low_opacity_gaussians_are_relocated_to_others() -> None:
     gaussians, surgery, control = setup()
     before = {name: p.detach().clone() for name, p in gaussians.named_parameters()}
-    assert control.relocate(surgery, 1_000) == (10, 5)
+    assert control.relocate(surgery) == (10, 5)
     assert len(gaussians) == 105
     places = {tuple(mean.tolist()): i for i, mean in enumerate(before["means"])}
     origins = torch.tensor([places[tuple(mean.tolist())] for mean in gaussians.means.detach()])
@@ -99,7 +99,7 @@ def test_opaque_ones_are_drawn_more_often() -> None:
         gaussians.raw_opacities[:900] = math.log(0.01 / 0.99)
         gaussians.raw_opacities[900:] = math.log(0.9 / 0.1)
     means = gaussians.means.detach()[900:].clone()
-    control.relocate(surgery, 1_000)
+    control.relocate(surgery)
     added = gaussians.means.detach()[1000:]
     assert len(added) == 50
     near_opaque = sum(bool((means == mean).all(dim=1).any()) for mean in added)
@@ -111,7 +111,7 @@ def test_never_more_than_the_budget_and_all_of_it_in_the_end(budget: int, rounds
     gaussians, surgery, control = setup(max_gaussians=budget)
     counts = []
     for _ in range(rounds):
-        control.relocate(surgery, 1_000)
+        control.relocate(surgery)
         counts.append(len(gaussians))
     assert counts == sorted(counts)
     assert max(counts) <= budget
@@ -122,7 +122,7 @@ def test_a_transparent_scene_is_not_changed() -> None:
     gaussians, surgery, control = setup()
     with torch.no_grad():
         gaussians.raw_opacities.fill_(-9.0)
-    assert control.relocate(surgery, 1_000) == (0, 0)
+    assert control.relocate(surgery) == (0, 0)
     assert len(gaussians) == 100
 
 
