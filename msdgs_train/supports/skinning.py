@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from msdgs_serve.threads import run_parallel, split_evenly
+from msdgs_serve.rasterizer.projection import part_range
+from msdgs_serve.threads import run_parallel
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.supports.skinning_kernels import DELTAS, skin_backward, skin_forward
 
@@ -35,7 +36,7 @@ class _Skin(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
         arrays = [to_array(tensor) for tensor in tensors]
         deltas = np.empty((len(arrays[0]), DELTAS), arrays[0].dtype)
-        run_parallel(skin_forward, [(*arrays, *rows, deltas) for rows in split_evenly(len(deltas), PARTS)])
+        run_parallel(skin_forward, [(*arrays, *rows, deltas) for rows in _parts(len(deltas))])
         return torch.from_numpy(deltas).to(tensors[0].device)
 
     @staticmethod
@@ -43,7 +44,7 @@ class _Skin(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         arrays = means, quats, weights, _, motions = [to_array(tensor) for tensor in ctx.saved_tensors]
         own = [np.empty_like(array) for array in (means, quats, weights)]
-        parts = split_evenly(len(means), PARTS) or [(0, 0)]
+        parts = _parts(len(means))
         sums = np.zeros((len(parts), *motions.shape), motions.dtype)
         grad_deltas = to_array(grad)
         run_parallel(
@@ -53,3 +54,8 @@ class _Skin(torch.autograd.Function):
             torch.from_numpy(array).to(grad.device) for array in (*own, sums.sum(axis=0))
         )
         return of_means, of_quats, of_weights, None, of_motions
+
+
+def _parts(count: int) -> list[tuple[int, int]]:
+    """Ranges of rows, whole vectors of 16 but for the last."""
+    return [part_range(part, PARTS, count) for part in range(PARTS)]

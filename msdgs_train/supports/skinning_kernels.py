@@ -12,11 +12,21 @@ import math
 
 import numpy as np
 
+from msdgs_serve.rasterizer.exponential import log2
 from msdgs_serve.rasterizer.geometry import rotation_columns
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.projection_backward import quaternion_gradient
-from msdgs_serve.rasterizer.vector_memory import load, store
-from msdgs_serve.rasterizer.vectors import fma, spread, sums_of
+from msdgs_serve.rasterizer.vector_memory import (
+    load,
+    load_columns,
+    load_four_columns,
+    load_triples,
+    store,
+    store_columns,
+    store_rows,
+)
+from msdgs_serve.rasterizer.vector_types import NUM_LANES, Vector
+from msdgs_serve.rasterizer.vectors import filled, fma, maximum, select, spread, square_root, sums_of
 from msdgs_serve.scene.quaternion import MIN_NORM
 
 MAX_NEAREST = 8
@@ -45,18 +55,29 @@ def skin_forward(
 
     Args: means [N, 3], quats [N, 4], weights and ids [N, F] of nodes, motions [M, MOTION].
     """
-    blended, flat = np.empty(MOTION, means.dtype), motions.reshape(-1)
-    for n in range(np.uint64(start), np.uint64(stop)):
-        _blend(weights, ids, flat, n, blended)
-        matrix, rot, _ = _parts(blended)
-        mean, quat = (means[n, 0], means[n, 1], means[n, 2]), (quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
-        moved, rotated = _times(matrix, mean), _product(rot, quat)
-        axes = rotation_columns(*quat)
-        for i in range(3):
-            deltas[n, i] = moved[i] + blended[OFFSET + i] - mean[i]
-            deltas[n, 3 + i] = 0.5 * math.log(max(_square(_times(matrix, axes[i])), MIN_STRETCH**2))
-        for i in range(4):
-            deltas[n, 6 + i] = rotated[i] - quat[i]
+    flat, blended = motions.reshape(-1), np.empty((NUM_LANES, MOTION), means.dtype)
+    for first in range(start, stop, NUM_LANES):
+        _blend(weights, ids, flat, first, blended)
+        matrix, offset, rot, _ = _parts(blended)
+        mean, quat = load_triples(means, first), load_four_columns(quats, first, 0)
+        moved, rotated, axes = _times(matrix, mean), _product(rot, quat), rotation_columns(*quat)
+        store_columns(
+            deltas,
+            first,
+            0,
+            (
+                moved[0] + offset[0] - mean[0],
+                moved[1] + offset[1] - mean[1],
+                moved[2] + offset[2] - mean[2],
+                _log_length(_times(matrix, axes[0])),
+                _log_length(_times(matrix, axes[1])),
+                _log_length(_times(matrix, axes[2])),
+                rotated[0] - quat[0],
+                rotated[1] - quat[1],
+                rotated[2] - quat[2],
+                rotated[3] - quat[3],
+            ),
+        )
 
 
 @kernel
@@ -75,70 +96,120 @@ def skin_backward(
     grad_motions: np.ndarray,
 ) -> None:
     """Add the gradients of rows `start` to `stop` to `grad_motions`, and write those of the rows themselves."""
-    blended, grads, dots = np.empty(MOTION, means.dtype), np.empty(MOTION, means.dtype), np.empty(16, means.dtype)
-    products, flat, grad_flat = (
-        np.zeros(MAX_NEAREST * MOTION, means.dtype),
-        motions.reshape(-1),
-        grad_motions.reshape(-1),
-    )
-    g = grad_deltas
-    for n in range(np.uint64(start), np.uint64(stop)):
-        _blend(weights, ids, flat, n, blended)
-        matrix, rot, norm = _parts(blended)
-        mean, quat = (means[n, 0], means[n, 1], means[n, 2]), (quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
-        grad_mean, grad_quat = (g[n, 0], g[n, 1], g[n, 2]), (g[n, 6], g[n, 7], g[n, 8], g[n, 9])
+    flat, blended = motions.reshape(-1), np.empty((NUM_LANES, MOTION), means.dtype)
+    grad_rows, scratch = np.empty((NUM_LANES, MOTION), means.dtype), np.zeros(2 * MAX_NEAREST * MOTION, means.dtype)
+    for first in range(start, stop, NUM_LANES):
+        _blend(weights, ids, flat, first, blended)
+        matrix, _, rot, norm = _parts(blended)
+        mean, quat = load_triples(means, first), load_four_columns(quats, first, 0)
         axes = rotation_columns(*quat)
-        grad_axis_0, grad_axis_1, grad_axis_2 = (
-            _grad_stretched(matrix, axes[0], g[n, 3]),
-            _grad_stretched(matrix, axes[1], g[n, 4]),
-            _grad_stretched(matrix, axes[2], g[n, 5]),
+        grad_mean, grad_stretch, grad_quat = _grad_columns(grad_deltas, first)
+        grad_axes = (
+            _grad_log_length(_times(matrix, axes[0]), grad_stretch[0]),
+            _grad_log_length(_times(matrix, axes[1]), grad_stretch[1]),
+            _grad_log_length(_times(matrix, axes[2]), grad_stretch[2]),
         )
-        for i in range(3):
-            for j in range(3):
-                grads[3 * i + j] = (
-                    grad_mean[i] * mean[j]
-                    + grad_axis_0[i] * axes[0][j]
-                    + grad_axis_1[i] * axes[1][j]
-                    + grad_axis_2[i] * axes[2][j]
-                )
-            grads[OFFSET + i] = grad_mean[i]
         transposed = _transposed(matrix)
-        grad_back = _times(transposed, grad_mean)
-        for i in range(3):
-            grad_means[n, i] = grad_back[i] - grad_mean[i]
-        grad_axes = _times(transposed, grad_axis_0), _times(transposed, grad_axis_1), _times(transposed, grad_axis_2)
-        grad_quat_axes = quaternion_gradient(*quat, grad_axes)
-        grad_quat_rotated = _product(_conjugate(rot), grad_quat)
+        back = _times(transposed, grad_mean)
+        store_columns(grad_means, first, 0, (back[0] - grad_mean[0], back[1] - grad_mean[1], back[2] - grad_mean[2]))
+        grad_axes_before = (
+            _times(transposed, grad_axes[0]),
+            _times(transposed, grad_axes[1]),
+            _times(transposed, grad_axes[2]),
+        )
+        by_axes, by_product = quaternion_gradient(*quat, grad_axes_before), _product(_conjugate(rot), grad_quat)
+        store_columns(
+            grad_quats,
+            first,
+            0,
+            (
+                by_axes[0] + by_product[0] - grad_quat[0],
+                by_axes[1] + by_product[1] - grad_quat[1],
+                by_axes[2] + by_product[2] - grad_quat[2],
+                by_axes[3] + by_product[3] - grad_quat[3],
+            ),
+        )
         grad_rot = _product(grad_quat, _conjugate(quat))
         radial = rot[0] * grad_rot[0] + rot[1] * grad_rot[1] + rot[2] * grad_rot[2] + rot[3] * grad_rot[3]
-        for i in range(4):
-            grad_quats[n, i] = grad_quat_axes[i] + grad_quat_rotated[i] - grad_quat[i]
-            grads[ROT + i] = (grad_rot[i] - rot[i] * radial) / norm
-        grad = load(grads, 0)
-        for k in range(np.uint64(weights.shape[1])):
-            row = np.uint64(ids[n, k]) * np.uint64(MOTION)
-            store(products, k * np.uint64(MOTION), grad * load(flat, row))
-            store(grad_flat, row, fma(spread(weights[n, k]), grad, load(grad_flat, row)))
-        store(dots, 0, sums_of(_eight(products)))
-        for k in range(np.uint64(weights.shape[1])):
-            grad_weights[n, k] = dots[k]
+        store_rows(
+            grad_rows,
+            0,
+            _outer_sums(0, grad_mean, mean, grad_axes, axes)
+            + _outer_sums(1, grad_mean, mean, grad_axes, axes)
+            + _outer_sums(2, grad_mean, mean, grad_axes, axes)
+            + grad_mean
+            + (
+                (grad_rot[0] - rot[0] * radial) / norm,
+                (grad_rot[1] - rot[1] * radial) / norm,
+                (grad_rot[2] - rot[2] * radial) / norm,
+                (grad_rot[3] - rot[3] * radial) / norm,
+            ),
+        )
+        _to_nodes(first, stop, grad_rows, weights, ids, flat, scratch, grad_weights, grad_motions.reshape(-1))
 
 
 @inlined_kernel
-def _blend(weights: np.ndarray, ids: np.ndarray, motions: np.ndarray, n: np.uint64, blended: np.ndarray) -> None:
-    total = spread(weights.dtype.type(0))
-    for k in range(np.uint64(weights.shape[1])):
-        total = fma(spread(weights[n, k]), load(motions, np.uint64(ids[n, k]) * np.uint64(MOTION)), total)
-    store(blended, 0, total)
+def _to_nodes(
+    first: int,
+    stop: int,
+    grad_rows: np.ndarray,
+    weights: np.ndarray,
+    ids: np.ndarray,
+    motions: np.ndarray,
+    scratch: np.ndarray,
+    grad_weights: np.ndarray,
+    grad_motions: np.ndarray,
+) -> None:
+    """Add the gradients of 16 blended motions to those of the nodes, and write those of the weights."""
+    dots = np.uint64(MAX_NEAREST * MOTION)
+    for lane in range(np.uint64(min(NUM_LANES, stop - first))):
+        n, grad = np.uint64(first) + lane, load(grad_rows.reshape(-1), lane * np.uint64(MOTION))
+        for k in range(np.uint64(weights.shape[1])):
+            row = np.uint64(ids[n, k]) * np.uint64(MOTION)
+            store(scratch, k * np.uint64(MOTION), grad * load(motions, row))
+            store(grad_motions, row, fma(spread(weights[n, k]), grad, load(grad_motions, row)))
+        store(scratch, dots, sums_of(_eight(scratch)))
+        for k in range(np.uint64(weights.shape[1])):
+            grad_weights[n, k] = scratch[dots + k]
+
+
+@inlined_kernel
+def _blend(weights: np.ndarray, ids: np.ndarray, motions: np.ndarray, first: int, blended: np.ndarray) -> None:
+    """Write the weighted sums of the motions of 16 Gaussians, [16, MOTION]; past the last one it is repeated."""
+    flat, last = blended.reshape(-1), np.uint64(len(weights) - 1)
+    for lane in range(np.uint64(NUM_LANES)):
+        n, total = min(np.uint64(first) + lane, last), spread(weights.dtype.type(0))
+        for k in range(np.uint64(weights.shape[1])):
+            total = fma(spread(weights[n, k]), load(motions, np.uint64(ids[n, k]) * np.uint64(MOTION)), total)
+        store(flat, lane * np.uint64(MOTION), total)
 
 
 @inlined_kernel
 def _parts(blended: np.ndarray) -> tuple:
-    """The matrix [3][3] of a blended motion, its unit quaternion, and the norm before."""
-    b = blended
-    norm = max(math.sqrt(b[12] * b[12] + b[13] * b[13] + b[14] * b[14] + b[15] * b[15]), b.dtype.type(MIN_NORM))
+    """The matrices [3][3] of blended motions, offsets, unit quaternions, and the norms before."""
+    b = load_columns(blended, 0)
+    norm = square_root(b[12] * b[12] + b[13] * b[13] + b[14] * b[14] + b[15] * b[15])
+    norm = maximum(norm, filled(MIN_NORM, norm))
     rot = (b[12] / norm, b[13] / norm, b[14] / norm, b[15] / norm)
-    return ((b[0], b[1], b[2]), (b[3], b[4], b[5]), (b[6], b[7], b[8])), rot, norm
+    return ((b[0], b[1], b[2]), (b[3], b[4], b[5]), (b[6], b[7], b[8])), (b[9], b[10], b[11]), rot, norm
+
+
+@inlined_kernel
+def _grad_columns(grads: np.ndarray, first: int) -> tuple:
+    """The columns of 16 rows of [N, DELTAS]: means 3, logarithms of scales 3, quaternions 4."""
+    a, b, c = load_four_columns(grads, first, 0), load_four_columns(grads, first, 4), load_four_columns(grads, first, 6)
+    return (a[0], a[1], a[2]), (a[3], b[0], b[1]), c
+
+
+@inlined_kernel
+def _outer_sums(i: int, grad_mean: tuple, mean: tuple, grad_axes: tuple, axes: tuple) -> tuple:
+    """Row i of the gradient of the matrices: the sum of outer products of gradients and the vectors that they moved."""
+    g, g0, g1, g2 = grad_mean[i], grad_axes[0][i], grad_axes[1][i], grad_axes[2][i]
+    return (
+        g * mean[0] + g0 * axes[0][0] + g1 * axes[1][0] + g2 * axes[2][0],
+        g * mean[1] + g0 * axes[0][1] + g1 * axes[1][1] + g2 * axes[2][1],
+        g * mean[2] + g0 * axes[0][2] + g1 * axes[1][2] + g2 * axes[2][2],
+    )
 
 
 @inlined_kernel
@@ -157,17 +228,23 @@ def _transposed(m: tuple) -> tuple:
 
 
 @inlined_kernel
-def _square(v: tuple) -> float:
+def _square(v: tuple) -> Vector:
     return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
 
 
 @inlined_kernel
-def _grad_stretched(matrix: tuple, axis: tuple, grad: float) -> tuple:
-    """The gradient in c = A R_j of log |c|, `grad` · c / |c|²; 0 if |c| is clamped."""
-    c = _times(matrix, axis)
-    square = _square(c)
-    factor = grad / square if square > MIN_STRETCH**2 else 0 * square
-    return factor * c[0], factor * c[1], factor * c[2]
+def _log_length(v: tuple) -> Vector:
+    """log max(|v|, MIN_STRETCH)."""
+    square = _square(v)
+    return 0.5 * math.log(2) * log2(maximum(square, filled(MIN_STRETCH**2, square)))
+
+
+@inlined_kernel
+def _grad_log_length(v: tuple, grad: Vector) -> tuple:
+    """`grad` · v / |v|², or 0 where |v| is clamped."""
+    square = _square(v)
+    factor = select(square > filled(MIN_STRETCH**2, square), grad / square, filled(0, square))
+    return factor * v[0], factor * v[1], factor * v[2]
 
 
 @inlined_kernel
