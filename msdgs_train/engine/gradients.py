@@ -35,4 +35,5 @@ def average_gradients(groups: Sequence[ParamGroup], views: Sequence[ViewGradient
     seed gives the same bits."""
     for parameter in (p for group in groups for p in group.params):
         known = [view.gradients[id(parameter)] for view in views if id(parameter) in view.gradients]
-        parameter.grad = sum(known[1:], known[0]) / len(known) if known else None
+        mean = known[0] if len(known) == 1 else sum(known[1:], known[0]) / len(known) if known else None
+        parameter.grad = None if mean is None else mean.contiguous()  # fused Adam takes any gradient for a dense one

@@ -1,8 +1,16 @@
 """The photometric loss, L = λ L1 + (1 − λ) D-SSIM (equation 13)."""
 
-from torch import Tensor
+import math
+from typing import Any
 
-from msdgs_train.losses.ssim import check_pair, ssim
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers.arrays import to_array
+from msdgs_train.losses.kernels import TAPS, error_sums, loss_gradient, ssim_sum_and_derivatives
 
 MSE_SCALE = 4.0
 """Factor of MSE, at which it equals L1 for an error of 0.25."""
@@ -18,10 +26,45 @@ def photometric_loss(rgb: Tensor, target: Tensor, l1_weight: float, mse_fraction
         mse_fraction: fraction of MSE; 0 is equation 13, 1 is `MSE_SCALE` times the mean squared error.
     """
     check_pair(rgb, target)
-    error = rgb - target
-    loss = l1_weight * error.abs().mean()
-    if l1_weight < 1.0:
-        loss = loss + (1 - l1_weight) * (1 - ssim(rgb, target))
-    if mse_fraction == 0.0:
-        return loss
-    return (1 - mse_fraction) * loss + mse_fraction * MSE_SCALE * error.square().mean()
+    rest = 1 - mse_fraction
+    return _Photometric.apply(rgb, target, rest * l1_weight, mse_fraction * MSE_SCALE, rest * (1 - l1_weight))
+
+
+def ssim(rgb: Tensor, target: Tensor) -> Tensor:
+    """Return the mean structural similarity, a scalar, differentiable in `rgb`.
+
+    Window 11, σ = 1.5, data range 1, and zeros beyond the border, as the 3D Gaussian projects compute it.
+    """
+    check_pair(rgb, target)
+    return 1 - _Photometric.apply(rgb, target, 0.0, 0.0, 1.0)
+
+
+def check_pair(rgb: Tensor, target: Tensor) -> None:
+    """Raise `InvalidInput` unless both are images [H, W, 3] of one shape and dtype."""
+    if rgb.ndim != 3 or rgb.shape[-1] != 3 or math.prod(rgb.shape) == 0:
+        raise InvalidInput("rgb", "of shape [H, W, 3], not empty", tuple(rgb.shape))
+    if target.shape != rgb.shape or target.dtype != rgb.dtype:
+        raise InvalidInput(
+            "target", f"{rgb.dtype} of shape {tuple(rgb.shape)}", f"{target.dtype} {tuple(target.shape)}"
+        )
+
+
+class _Photometric(torch.autograd.Function):
+    """The weighted sum of L1, MSE and 1 − SSIM."""
+
+    @staticmethod
+    def forward(ctx: Any, rgb: Tensor, target: Tensor, l1: float, mse: float, dssim: float) -> Tensor:
+        x, y = (to_array(image).reshape(len(image), -1) for image in (rgb, target))
+        taps = TAPS.astype(x.dtype)
+        absolute, square = error_sums(x, y)
+        similarity, derivatives = ssim_sum_and_derivatives(x, y, taps) if dssim else (0.0, np.empty((0, 0, 0), x.dtype))
+        ctx.kept = (x, y, taps, derivatives, (l1 / x.size, 2 * mse / x.size, -dssim / x.size), rgb.shape, rgb.device)
+        total = (l1 * absolute + mse * square - dssim * similarity) / x.size + dssim
+        return torch.tensor(total, dtype=rgb.dtype, device=rgb.device)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        *arrays, factors, shape, device = ctx.kept
+        gradient = loss_gradient(*arrays, tuple(float(grad) * factor for factor in factors))
+        return torch.from_numpy(gradient).reshape(shape).to(device), None, None, None, None

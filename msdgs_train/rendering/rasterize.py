@@ -78,7 +78,7 @@ class _Rasterize(torch.autograd.Function):
         splats = project(Gaussians(*map(_array, gaussians)), camera, options)
         tiles = bin_into_tiles(splats, camera.width, camera.height)
         frame = composite(splats, tiles, camera.width, camera.height, _array(background), options)
-        info.radii = torch.from_numpy(splats.extents.max(axis=1, initial=0))
+        info.radii = torch.from_numpy(np.maximum(splats.extents[:, 0], splats.extents[:, 1]))
         image = torch.from_numpy(frame.rgb)
         # saved as tensors: autograd then notices if one is written to before the backward pass
         ctx.save_for_backward(*gaussians, image)

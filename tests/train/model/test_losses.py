@@ -10,8 +10,8 @@ from torchmetrics.functional.image import peak_signal_noise_ratio, structural_si
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.evaluation.metrics import MAX_PSNR, ImageMetrics, image_metrics, mean_metrics, psnr
-from msdgs_train.losses.photometric import MSE_SCALE, photometric_loss
-from msdgs_train.losses.ssim import RADIUS, ssim
+from msdgs_train.losses.kernels import RADIUS
+from msdgs_train.losses.photometric import MSE_SCALE, photometric_loss, ssim
 from tests.support.tolerances import assert_close, tolerance
 
 
