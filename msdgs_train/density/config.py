@@ -14,6 +14,8 @@ class DensityConfig(Checked):
 
     init_num_pts: int = 8_000
     """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
+    init_min_views: float = 0.0
+    """Random Gaussians start where at least this fraction of the cameras sees them."""
     max_gaussians: int = 10_000
     """Upper bound of the number of Gaussians; those with the largest gradients are densified first."""
     density_strategy: Literal["gradient", "mcmc"] = "gradient"
@@ -31,6 +33,9 @@ class DensityConfig(Checked):
     """gradient: one with a larger scale than this fraction of the scene's scale is split, a smaller one is cloned."""
     prune_opa: float = 0.005
     """Gaussians of a lower opacity are removed, or relocated."""
+    prune_unseen_passes: float = 0.0
+    """gradient: Gaussians that contribute to no pixel in so many passes over the cameras are removed, and those outside
+    an image whose border is empty all around; 0: never."""
     prune_scale3d: float = 0.1
     """gradient: Gaussians larger than this fraction of the scene's scale are removed after a reset of opacities."""
     reset_every_fraction: float = 0.0
@@ -47,9 +52,10 @@ class DensityConfig(Checked):
     def __post_init__(self) -> None:
         self.require_counts("init_num_pts", "max_gaussians")
         self.require_fractions("refine_start_fraction", "refine_every_fraction", "refine_stop_fraction")
-        self.require_fractions("reset_every_fraction", "prune_opa")
+        self.require_fractions("reset_every_fraction", "prune_opa", "init_min_views")
         self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
-        self.require_weights("noise_lr", *(n for n in ("opacity_reg", "scale_reg") if getattr(self, n) is not None))
+        self.require_weights("noise_lr", "prune_unseen_passes")
+        self.require_weights(*(n for n in ("opacity_reg", "scale_reg") if getattr(self, n) is not None))
         self.require(("max_gaussians",), "init_num_pts or more", lambda v: v >= self.init_num_pts)
         self.require(("density_strategy",), "gradient or mcmc", lambda v: v in ("gradient", "mcmc"))
 

@@ -22,6 +22,8 @@ from msdgs_train.layers.quaternions import rotate
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this factor."""
 RESET_OPACITY = 0.01
+MIN_PATIENCE = 40
+"""Images of the cameras, drawn at random, that count as one pass at least."""
 
 
 class DensityChange(NamedTuple):
@@ -40,20 +42,29 @@ class GradientStrategy:
     scene_scale: float  # radius of the cameras' positions, scene units
     gradients: Tensor  # [N] sums of norms
     counts: Tensor  # [N] images in which each was drawn
+    unseen: Tensor  # [N] images since each contributed to a pixel; infinite once it was outside of the whole scene
+    patience: float  # images after which a Gaussian that contributes to none is removed; 0: never
+    is_rig: bool  # cameras that stand still: a time window has images of all of them
     generator: torch.Generator
 
     @classmethod
-    def start(cls, schedule: Schedule, scene_scale: float, count: int) -> "GradientStrategy":
-        """A new strategy for `count` Gaussians."""
+    def start(cls, schedule: Schedule, scene_scale: float, count: int, views: int, is_rig: bool) -> "GradientStrategy":
+        """A new strategy for `count` Gaussians and so many cameras."""
+        patience = schedule.config.density.prune_unseen_passes * max(views, MIN_PATIENCE)
         generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
-        return cls(schedule, scene_scale, torch.zeros(count), torch.zeros(count), generator)
+        gradients, counts, unseen = torch.zeros(3, count)
+        return cls(schedule, scene_scale, gradients, counts, unseen, patience, is_rig, generator)
 
-    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Add one image: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn."""
+    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
+        """Add one image: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn; `shows_all`
+        if nothing of the scene is outside the image."""
         drawn = radii > 0
         norms = torch.hypot(means2d_grads[:, 0] * (0.5 * width), means2d_grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
+        self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
+        if shows_all and self.patience:
+            self.unseen[~drawn] = torch.inf
 
     @property
     def config(self) -> DensityConfig:
@@ -66,6 +77,8 @@ class GradientStrategy:
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """`densify` and `reset_opacities` when they are due."""
+        if not self.is_rig and self.schedule.window(steps.stop - 1) < 0.5:
+            self.unseen[self.unseen.isfinite()] = 0  # images outside the window may show what those inside don't
         if any(map(self.schedule.refines_at, steps)):
             self.densify(surgery, steps[-1])
         if any(map(self.schedule.resets_at, steps)):
@@ -73,11 +86,11 @@ class GradientStrategy:
 
     def state(self) -> tuple[Tensor, ...]:
         """The accumulated gradients."""
-        return self.gradients, self.counts
+        return self.gradients, self.counts, self.unseen
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:
         """Continue from it."""
-        self.gradients, self.counts = state
+        self.gradients, self.counts, self.unseen = state
 
     def densify(self, surgery: RowSurgery, step: int) -> DensityChange:
         """Clone small and split large Gaussians of large gradients, remove low-opacity and huge ones, and reset."""
@@ -91,8 +104,9 @@ class GradientStrategy:
             added = {name: torch.cat([p[cloned], halves[name]]) for name, p in gaussians.named_parameters()}
             kept = torch.nonzero(~pruned & ~(chosen & large))[:, 0]
             surgery.replace_rows(kept, added)
-        count = len(kept) + len(cloned) + 2 * len(split)
-        self.gradients, self.counts = torch.zeros(count), torch.zeros(count)
+        count = len(cloned) + 2 * len(split)
+        self.unseen = torch.cat([self.unseen[kept], torch.zeros(count)])
+        self.gradients, self.counts = torch.zeros(2, len(kept) + count)
         return DensityChange(len(cloned), len(split), int(pruned.sum()))
 
     def reset_opacities(self, surgery: RowSurgery) -> None:
@@ -102,6 +116,8 @@ class GradientStrategy:
 
     def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
         pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
+        if self.patience:
+            pruned |= self.unseen > self.patience
         if 0 < self.schedule.reset_every < step:
             pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.scene_scale
         if bool(pruned.all()):  # a scene that is wholly transparent keeps its Gaussians and may recover

@@ -48,7 +48,7 @@ class MCMCStrategy:
         """A new strategy, with a generator of its own."""
         return cls(schedule, torch.Generator().manual_seed(schedule.config.run.seed + 1))
 
-    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
         """Unused: relocation depends on opacities."""
 
     def state(self) -> tuple[Tensor, ...]:

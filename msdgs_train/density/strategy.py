@@ -17,8 +17,9 @@ class DensityStrategy(Protocol):
         """All of its randomness."""
         ...
 
-    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Accumulate one view: gradients [N, 2] in pixels, radii [N] that are 0 if a Gaussian was not drawn."""
+    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
+        """Accumulate one view: gradients [N, 2] in pixels, radii [N] that are 0 if a Gaussian was not drawn;
+        `shows_all` if nothing of the scene is outside the image."""
         ...
 
     def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:

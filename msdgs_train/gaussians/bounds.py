@@ -22,6 +22,21 @@ def scene_scale(cameras: Sequence[Camera]) -> float:
     return 1.1 * float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
 
 
+def distinct_cameras(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras without repeated positions and directions, such as those of a video camera that stands still."""
+    return list({camera.camera_to_world.tobytes(): camera for camera in cameras}.values())
+
+
+def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """[N] number of the cameras that have each point, [N, 3], in their image."""
+    counts = np.zeros(len(points), np.int64)
+    for camera in cameras:
+        pixels, depths = camera.project(points)
+        inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
+        counts += inside.all(axis=1) & (depths > 0)
+    return counts
+
+
 def scene_bounds(
     pose: Callable[[float], PosedGaussians], time_range: tuple[float, float], scene_half_size: float
 ) -> list[list[float]]:

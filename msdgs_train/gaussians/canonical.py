@@ -1,7 +1,7 @@
 """The canonical Gaussians: their parameters before deformation and activation."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -27,6 +27,10 @@ class GaussianRows(NamedTuple):
     sh_dc: Tensor
     sh_rest: Tensor
     attributes: dict[str, Tensor]
+
+
+MAX_DRAWS = 16
+"""Random points per Gaussian, of which those in view are kept."""
 
 
 class CanonicalGaussians(nn.Module):
@@ -108,10 +112,18 @@ class CanonicalGaussians(nn.Module):
         sh_degree: int,
         seed: int,
         attributes: Mapping[str, Attribute] = NO_ATTRIBUTES,
+        in_view: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> Self:
-        """`count` Gaussians of random colors, uniform in the cube [-scene_half_size, scene_half_size]³."""
+        """`count` Gaussians of random colors, uniform in the cube [-scene_half_size, scene_half_size]³.
+
+        With `in_view`, [N, 3] → [N] bool, only where it is true, unless it hardly ever is.
+        """
         generator = torch.Generator().manual_seed(seed)
-        points = (2 * torch.rand(count, 3, generator=generator) - 1) * scene_half_size
+        points = 2 * torch.rand(count * (1 if in_view is None else MAX_DRAWS), 3, generator=generator) - 1
+        points = points * scene_half_size
+        if in_view is not None:
+            found = points[torch.from_numpy(in_view(points.numpy()))]
+            points = (found if len(found) >= count else points)[:count]
         colors = torch.rand(count, 3, generator=generator)
         return cls.from_points(points, colors, sh_degree, generator, attributes)
 

@@ -13,10 +13,10 @@ class LossConfig(Checked):
     """Weight of 1 − SSIM; the weight of L1 is 1 minus this (λ in equation 13)."""
     mse_fraction: float = 0.0
     """Fraction of the loss that is replaced by MSE, which emphasizes large errors, such as those of motion."""
-    empty_weight: float = 0.0
-    """Weight of alpha where the image is transparent: without it, Gaussians of the background's color appear there as
-    fog in other views."""
+    alpha_weight: float = 0.0
+    """Weight of L1 between alpha and the image's, if any pixel of it is transparent: without it, Gaussians of the
+    background's color appear as fog in other views."""
 
     def __post_init__(self) -> None:
         self.require_fractions("ssim_lambda", "mse_fraction")
-        self.require_weights("empty_weight")
+        self.require_weights("alpha_weight")

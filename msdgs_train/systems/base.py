@@ -24,9 +24,16 @@ class Target(NamedTuple):
         return cls(torch.from_numpy(composite(rgba, background.numpy())), torch.from_numpy(rgba[:, :, 3].copy()))
 
     @property
-    def transparency(self) -> Tensor:
-        """[H, W], 1 − alpha in [0, 1]."""
-        return 1 - self.alpha.float() / 255
+    def shows_all(self) -> bool:
+        """Whether the border is transparent all around, so that nothing of the scene is outside the image."""
+        a = self.alpha
+        return not bool(a[0].any() or a[-1].any() or a[:, 0].any() or a[:, -1].any())
+
+    def alpha_error(self, alpha: Tensor) -> Tensor:
+        """Mean absolute difference of a rendering's alpha, [H, W] in [0, 1], or 0 if the image is opaque."""
+        if bool((self.alpha == 255).all()):
+            return alpha.new_zeros(())
+        return (alpha - self.alpha * (1 / 255)).abs().mean()
 
 
 class ViewLoss(NamedTuple):
@@ -36,6 +43,7 @@ class ViewLoss(NamedTuple):
     rgb: Tensor  # [H, W, 3]
     clamped_scales: int = 0  # Gaussians a scale of which was clamped
     screen: Any = None  # results of the backward pass for `after_step`
+    shows_all: bool = False  # nothing of the scene is outside the image
 
 
 class System(Protocol):

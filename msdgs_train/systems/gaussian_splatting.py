@@ -16,7 +16,7 @@ from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.averaging import WeightAverage
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
-from msdgs_train.gaussians.bounds import camera_entry, scene_bounds, scene_scale
+from msdgs_train.gaussians.bounds import camera_entry, distinct_cameras, scene_bounds, scene_scale, views_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
 from msdgs_train.gaussians.scale_space import count_clamped
@@ -39,10 +39,13 @@ class GaussianSplatting:
         self.schedule, self.config, self.scene = schedule, config, scene
         self.scene_half_size = config.data.scene_half_size or scene.scene_half_size
         self._model = _new_model(schedule, scene, SceneBounds(self.scene_half_size, scene.time_range))
-        scale = scene_scale([frame.camera for frame in scene.splits["train"]]) or self.scene_half_size
-        is_mcmc = config.density.density_strategy == "mcmc"
+        cameras = [frame.camera for frame in scene.splits["train"]]
+        scale, views = scene_scale(cameras) or self.scene_half_size, len(distinct_cameras(cameras))
+        is_mcmc, is_rig = config.density.density_strategy == "mcmc", 2 * views <= len(cameras)
         self.density: DensityStrategy = (
-            MCMCStrategy.start(schedule) if is_mcmc else GradientStrategy.start(schedule, scale, self.size)
+            MCMCStrategy.start(schedule)
+            if is_mcmc
+            else GradientStrategy.start(schedule, scale, self.size, views, is_rig)
         )
         self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
 
@@ -88,15 +91,16 @@ class GaussianSplatting:
         rgb, alpha, info = rasterize(*posed, frame.camera, background, self._options(step + 1))
         loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
         loss = loss + self._regularizers(posed, motions, frame.t)
-        if c.empty_weight:
-            loss = loss + c.empty_weight * (target.transparency * alpha).mean()
-        return ViewLoss(loss, rgb, count_clamped(self.config.model.scale_space, posed.scales), info)
+        if c.alpha_weight:
+            loss = loss + c.alpha_weight * target.alpha_error(alpha)
+        clamped = count_clamped(self.config.model.scale_space, posed.scales)
+        return ViewLoss(loss, rgb, clamped, info, target.shows_all)
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
         for frame, view in views:
             if view.screen.means2d_grads is not None:
-                camera = frame.camera
-                self.density.accumulate(view.screen.means2d_grads, view.screen.radii, camera.width, camera.height)
+                size = frame.camera.width, frame.camera.height
+                self.density.accumulate(view.screen.means2d_grads, view.screen.radii, *size, view.shows_all)
         self.density.after_step(RowSurgery(self.model.gaussians, optimizer), steps)
         if self.schedule.averages_at(steps.stop - 1):
             self.average.add(self.model, len(steps))
@@ -175,7 +179,10 @@ def _new_model(schedule: Schedule, scene: SceneData, bounds: SceneBounds) -> Dyn
     if scene.points is not None and len(scene.points):
         gaussians = CanonicalGaussians.from_sparse_points(scene.points, scene.point_colors, count, *rest)
     else:
-        gaussians = CanonicalGaussians.random_in_cube(count, bounds.scene_half_size, *rest)
+        cameras = distinct_cameras([frame.camera for frame in scene.splits["train"]])
+        least = schedule.config.density.init_min_views * len(cameras)
+        in_view = (lambda points: views_of(points, cameras) >= least) if least else None
+        gaussians = CanonicalGaussians.random_in_cube(count, bounds.scene_half_size, *rest, in_view)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return DynamicGaussians(config, gaussians, bounds)

@@ -1,4 +1,4 @@
-"""Alpha where an image is transparent is part of the loss."""
+"""Alpha of images is part of the loss."""
 
 from pathlib import Path
 
@@ -17,19 +17,19 @@ from tests.support.training_scene import small_config
 WEIGHT = 3.0
 
 
-def test_alpha_is_penalized_where_the_image_is_transparent(data: Path) -> None:
+def test_alpha_is_compared_with_that_of_the_image(data: Path) -> None:
     scene = load_scene(data)
     frame, white = scene.splits["train"][0], torch.ones(3)
     rgba = frame.load_rgba().copy()
     rgba[: len(rgba) // 2, :, 3] = np.arange(rgba.shape[1])
     target = Target.over(rgba, white)
     with_weight, without = (
-        GaussianSplatting(Schedule.from_config(small_config(empty_weight=weight)), scene) for weight in (WEIGHT, 0.0)
+        GaussianSplatting(Schedule.from_config(small_config(alpha_weight=weight)), scene) for weight in (WEIGHT, 0.0)
     )
     losses = [system.loss(frame, target, white, 0).loss.item() for system in (with_weight, without)]
     posed = without.model.pose(frame.t, deform=False, sh_degree=0)
     alpha = rasterize(*posed, frame.camera, white)[1].detach().double().numpy()
-    expected = WEIGHT * ((1 - rgba[:, :, 3] / 255) * alpha).mean()
+    expected = WEIGHT * np.abs(rgba[:, :, 3] / 255 - alpha).mean()
     assert expected > 0.01
     assert losses[0] - losses[1] == pytest.approx(expected, rel=10 * tolerance("float32.relative"))
 
@@ -38,4 +38,16 @@ def test_a_target_is_the_image_over_the_background() -> None:
     rgba = np.array([[[255, 0, 0, 255], [255, 0, 0, 0]]], np.uint8)
     target = Target.over(rgba, torch.tensor([0.0, 0.0, 1.0]))
     assert target.rgb.tolist() == [[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]
-    assert target.transparency.tolist() == [[0.0, 1.0]]
+    assert float(target.alpha_error(torch.tensor([[0.5, 0.25]]))) == pytest.approx(0.375)
+    opaque = Target.over(rgba[:, :1], torch.zeros(3))
+    assert float(opaque.alpha_error(torch.zeros(1, 1))) == 0
+
+
+def test_an_image_with_an_empty_border_shows_everything() -> None:
+    rgba = np.zeros((5, 6, 4), np.uint8)
+    rgba[1:-1, 1:-1, 3] = 255
+    assert Target.over(rgba, torch.zeros(3)).shows_all
+    for place in ((0, 3), (4, 3), (2, 0), (2, 5)):
+        cut = rgba.copy()
+        cut[(*place, 3)] = 1
+        assert not Target.over(cut, torch.zeros(3)).shows_all

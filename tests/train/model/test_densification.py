@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from msdgs_train.density.gradient import SPLIT_SHRINK, GradientStrategy
+from msdgs_train.density.gradient import MIN_PATIENCE, SPLIT_SHRINK, GradientStrategy
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
@@ -21,7 +21,7 @@ def _setup(count: int = 6, **changes: Any) -> tuple[CanonicalGaussians, RowSurge
     gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, 0, schedule.config.model.attributes())
     with torch.no_grad():
         gaussians.log_scales.fill_(math.log(0.001))
-    return gaussians, with_moments(gaussians, schedule), GradientStrategy.start(schedule, EXTENT, count)
+    return gaussians, with_moments(gaussians, schedule), GradientStrategy.start(schedule, EXTENT, count, 5, False)
 
 
 def _schedule(**changes: Any) -> Schedule:
@@ -31,14 +31,14 @@ def _schedule(**changes: Any) -> Schedule:
 def _accumulate(control: GradientStrategy, pixels: list[float]) -> None:
     """A gradient for each, in NDC units at 2 × 2 pixels."""
     grads = torch.tensor(pixels)
-    control.accumulate(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), 2, 2)
+    control.accumulate(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), 2, 2, False)
 
 
 def test_gradients_are_scaled_to_ndc_and_averaged_over_where_drawn() -> None:
     _, _, control = _setup(2)
     grads = torch.tensor([[0.3, 0.4], [1.0, 1.0]])
-    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20)
-    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20)
+    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20, False)
+    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20, False)
     assert torch.allclose(control.gradients, torch.tensor([10.0, 0.0]))
     assert control.counts.tolist() == [2.0, 0.0]
 
@@ -78,6 +78,33 @@ def test_low_opacity_gaussians_are_pruned_at_once_and_huge_ones_after_a_reset() 
     assert control.densify(surgery, 8).pruned == 1
     assert control.densify(surgery, 12).pruned == 1
     assert moment_rows(surgery, "means") == [3, 4, 5, 6]
+
+
+def test_gaussians_that_no_image_shows_are_removed() -> None:
+    gaussians, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.0, refine_every_fraction=0.0)
+    seen, nothing = torch.tensor([[1e-6, 0.0]] * 4 + [[0.0, 0.0]] * 2), torch.tensor([1.0] * 5 + [0.0])
+    for _ in range(round(1.5 * MIN_PATIENCE)):
+        control.accumulate(seen, nothing, 2, 2, False)
+        control.after_step(surgery, range(1, 2))
+    assert control.densify(surgery, 4).pruned == 0
+    control.accumulate(seen, nothing, 2, 2, False)
+    assert control.densify(surgery, 4).pruned == 2
+    drawn = torch.tensor([1.0, 1.0, 0.0, 1.0])
+    control.accumulate(seen[:4], drawn, 2, 2, True)
+    control.accumulate(seen[:4], torch.ones(4), 2, 2, True)
+    assert control.densify(surgery, 4).pruned == 1, "one that was outside of an image that shows everything"
+    assert len(gaussians) == 3
+
+
+def test_a_growing_window_may_hide_gaussians() -> None:
+    for is_rig, pruned in ((False, 0), (True, 6)):
+        _, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.9, refine_every_fraction=0.0)
+        control.is_rig = is_rig
+        for _ in range(2 * MIN_PATIENCE):
+            control.accumulate(torch.zeros(6, 2), torch.ones(6), 2, 2, False)
+            control.after_step(surgery, range(12, 13))
+        assert int(control._to_prune(surgery.gaussians, 12).sum()) == 0
+        assert int((control.unseen > control.patience).sum()) == pruned
 
 
 def test_a_transparent_scene_is_not_changed() -> None:

@@ -3,10 +3,13 @@
 import json
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from msdgs_serve.scene import Camera
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.gaussians.bounds import distinct_cameras, views_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians, neighbor_distances
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -236,6 +239,19 @@ def test_random_start_fills_the_cube_and_repeats():
     assert 1.2 < a.means.abs().max() <= 1.3
     assert torch.allclose(a.raw_opacities.sigmoid(), torch.tensor(0.1))
     assert torch.equal(a.log_scales[:, 0].exp().log(), a.log_scales[:, 2].exp().log())
+
+
+def test_random_start_in_view_of_cameras():
+    target, up = np.zeros(3), np.array([0.0, 1.0, 0.0])
+    cameras = [Camera.from_look_at(np.array(eye), target, up, 20, 20, 20.0) for eye in ((0, 0, -4.0), (4.0, 0, 0))]
+    made = [
+        CanonicalGaussians.random_in_cube(500, 1.3, 0, 1, in_view=lambda points, n=n: views_of(points, cameras) >= n)
+        for n in (1, 2, 3)
+    ]
+    views = [views_of(gaussians.means.detach().numpy(), cameras) for gaussians in made]
+    assert [int(counts.min()) for counts in views] == [1, 2, 0], "anywhere if no point is in view"
+    assert [len(gaussians) for gaussians in made] == [500] * 3
+    assert len(distinct_cameras([*cameras, cameras[0].resized(10, 10)])) == 2
 
 
 @pytest.mark.parametrize("spread", ["uniform", "clustered", "plane", "line"])
