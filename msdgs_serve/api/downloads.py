@@ -1,5 +1,6 @@
 """Scene files as responses: compressed if the client takes that, read in threads piece by piece."""
 
+import math
 from collections.abc import AsyncIterator
 from urllib.parse import quote
 
@@ -30,6 +31,7 @@ class SceneFileResponse(StreamingResponse):
     ) -> None:
         """`reading` limits the threads that read and compress."""
         self._contents, self._source, self._reading = contents, contents.file, reading
+        self._left = math.inf if compressed else contents.size
         if compressed:
             headers = headers | {"Content-Encoding": ZSTD}
             self._source = zstandard.ZstdCompressor().stream_reader(contents.file, contents.size)
@@ -42,7 +44,9 @@ class SceneFileResponse(StreamingResponse):
             await super().__call__(scope, receive, send)
 
     async def _pieces(self) -> AsyncIterator[bytes]:
-        while piece := await anyio.to_thread.run_sync(self._read, limiter=self._reading):
+        # the last byte ends a response of known length: the file may change from then on
+        while self._left and (piece := await anyio.to_thread.run_sync(self._read, limiter=self._reading)):
+            self._left -= len(piece)
             yield piece
 
     def _read(self) -> bytes:
