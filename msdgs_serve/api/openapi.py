@@ -18,6 +18,11 @@ from msdgs_serve.video import VIDEO_FORMATS
 Responses = dict[int | str, dict[str, Any]]
 Examples = dict[str, dict[str, Any]]
 
+
+def _headers(meanings: dict[str, str]) -> dict[str, Any]:
+    return {name: {"description": text, "schema": {"type": "string"}} for name, text in meanings.items()}
+
+
 IMAGE_RESPONSE: Responses = {
     200: {
         "description": "The frame, or a ZIP file of frames at several times",
@@ -25,17 +30,16 @@ IMAGE_RESPONSE: Responses = {
             media_type: {"schema": {"type": "string", "format": "binary"}}
             for media_type in (*(traits.media_type for traits in FORMATS.values()), "application/zip")
         },
-        "headers": {
-            name: {"description": text, "schema": {"type": "string"}}
-            for name, text in {
+        "headers": _headers(
+            {
                 "ETag": "ETag of scene file and request",
                 "Server-Timing": "milliseconds by stage: queue, pose (cached or not), draw, encode",
                 "Msdgs-Scene": "the scene's name, percent-encoded",
                 "Msdgs-Plan": "how the scene's motion is computed",
                 "Msdgs-Error": "PSNR in dB of the file's worst frame against the full model, if measured",
                 "Msdgs-Channels": "channels of the file, in order",
-            }.items()
-        },
+            }
+        ),
     }
 }
 NOT_MODIFIED: Responses = {304: {"description": "The client has this version"}}
@@ -43,14 +47,13 @@ FILE_RESPONSE: Responses = {
     200: {
         "description": "The file",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
-        "headers": {
-            name: {"description": text, "schema": {"type": "string"}}
-            for name, text in {
+        "headers": _headers(
+            {
                 "ETag": "SHA-256 of the file, weak if it is compressed",
                 "Content-Encoding": "`zstd`, if the client takes it",
                 "Content-Disposition": "with the file's name",
-            }.items()
-        },
+            }
+        ),
     }
 }
 BATCH_RESPONSE: Responses = {

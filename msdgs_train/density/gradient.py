@@ -62,9 +62,10 @@ class GradientStrategy:
         norms = torch.hypot(means2d_grads[:, 0] * (0.5 * width), means2d_grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
-        self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
-        if shows_all and self.patience:
-            self.unseen[~drawn] = torch.inf
+        if self.patience:
+            self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
+            if shows_all:
+                self.unseen[~drawn] = torch.inf
 
     @property
     def config(self) -> DensityConfig:
@@ -77,7 +78,7 @@ class GradientStrategy:
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """`densify` and `reset_opacities` when they are due."""
-        if not self.is_rig and self.schedule.window(steps.stop - 1) < 0.5:
+        if self.patience and not self.is_rig and self.schedule.window(steps.stop - 1) < 0.5:
             self.unseen[self.unseen.isfinite()] = 0  # images outside the window may show what those inside don't
         if any(map(self.schedule.refines_at, steps)):
             self.densify(surgery, steps[-1])

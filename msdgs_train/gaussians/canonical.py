@@ -14,6 +14,8 @@ from msdgs_train.supports.base import Attribute
 
 INITIAL_OPACITY = 0.1
 MIN_NEIGHBOR_DISTANCE = 1e-7  # scene units; coincident points still get a scale above 0
+MAX_DRAWS = 16
+"""Random points per Gaussian, of which those in view are kept."""
 NO_ATTRIBUTES: Mapping[str, Attribute] = {}
 
 
@@ -27,10 +29,6 @@ class GaussianRows(NamedTuple):
     sh_dc: Tensor
     sh_rest: Tensor
     attributes: dict[str, Tensor]
-
-
-MAX_DRAWS = 16
-"""Random points per Gaussian, of which those in view are kept."""
 
 
 class CanonicalGaussians(nn.Module):

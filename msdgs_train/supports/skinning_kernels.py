@@ -32,8 +32,7 @@ from msdgs_serve.scene.quaternion import MIN_NORM
 MAX_NEAREST = 8
 """Nodes that a Gaussian follows, at most."""
 MOTION = 16
-OFFSET, ROT = 9, 12
-"""First columns of the offset and of the quaternion of a motion; the matrix is before them."""
+"""Numbers of a motion: matrix 9, offset 3, quaternion 4."""
 MIN_STRETCH = 0.05
 """Lower bound of the factor by which the axes of a Gaussian are stretched."""
 DELTAS = 10

@@ -1,5 +1,6 @@
 """Systems of Gaussians with any support and any chain of layers; published ones differ in their settings."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,11 @@ class GaussianSplatting:
         config = schedule.config
         self.schedule, self.config, self.scene = schedule, config, scene
         self.scene_half_size = config.data.scene_half_size or scene.scene_half_size
-        self._model = _new_model(schedule, scene, SceneBounds(self.scene_half_size, scene.time_range))
         cameras = [frame.camera for frame in scene.splits["train"]]
-        scale, views = scene_scale(cameras) or self.scene_half_size, len(distinct_cameras(cameras))
+        distinct = distinct_cameras(cameras)
+        bounds = SceneBounds(self.scene_half_size, scene.time_range)
+        self._model = _new_model(schedule, scene, bounds, distinct)
+        scale, views = scene_scale(cameras) or self.scene_half_size, len(distinct)
         is_mcmc, is_rig = config.density.density_strategy == "mcmc", 2 * views <= len(cameras)
         self.density: DensityStrategy = (
             MCMCStrategy.start(schedule)
@@ -172,14 +175,15 @@ class GaussianSplatting:
         return total
 
 
-def _new_model(schedule: Schedule, scene: SceneData, bounds: SceneBounds) -> DynamicGaussians:
+def _new_model(
+    schedule: Schedule, scene: SceneData, bounds: SceneBounds, cameras: Sequence[Camera]
+) -> DynamicGaussians:
     config, attributes = schedule.config.model, schedule.config.model.attributes()
     count, seed = schedule.config.density.init_num_pts, schedule.config.run.seed
     rest = (config.sh_degree, seed, attributes)
     if scene.points is not None and len(scene.points):
         gaussians = CanonicalGaussians.from_sparse_points(scene.points, scene.point_colors, count, *rest)
     else:
-        cameras = distinct_cameras([frame.camera for frame in scene.splits["train"]])
         least = schedule.config.density.init_min_views * len(cameras)
         in_view = (lambda points: views_of(points, cameras) >= least) if least else None
         gaussians = CanonicalGaussians.random_in_cube(count, bounds.scene_half_size, *rest, in_view)
