@@ -21,16 +21,18 @@ class Synthetic:
     size: int = 128
     """Width and height of the images in pixels."""
     train_frames: int = 64
-    """Training images, at evenly spaced times, from all around."""
+    """Training images of each camera, at evenly spaced times."""
     test_frames: int = 12
     """Held-out images, at intermediate times, from one smooth turn around the scene."""
+    cameras: int | None = None
+    """Fixed cameras that see each time together; one camera that is elsewhere at each time if not given."""
     seed: int = 0
     """Seed of the camera positions."""
 
     def execute(self) -> int:
         from msdgs_train.datasets.synthetic.generate import generate
 
-        with frame_progress(self.train_frames + self.test_frames) as progress:
+        with frame_progress(self.train_frames * (self.cameras or 1) + self.test_frames) as progress:
             generate(**asdict(self), progress=progress)
         console.print(f"made {self.out}; next: msdgs-train fit {self.out} runs/first", soft_wrap=True)
         return 0

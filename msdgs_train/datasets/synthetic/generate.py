@@ -2,7 +2,7 @@
 
 On a static, tiled ground a ball bounces fast and is squashed at contact, a striped ring tumbles, a dotted jelly
 squashes, twists and bends, and a pendulum on a thin rod swings in a frame of thin bars. As in D-NeRF there is one image
-per time, each from another camera. The same arguments give the same bytes.
+per time, each from another camera, or fixed cameras all see each time. The same arguments give the same bytes.
 """
 
 import json
@@ -50,6 +50,7 @@ def generate(
     size: int = 128,
     train_frames: int = 64,
     test_frames: int = 12,
+    cameras: int | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -60,13 +61,18 @@ def generate(
 
     The arguments are the options of `msdgs-train synthetic`; `progress` is called with (done, total) after every image.
     """
-    for name, value, least in (("train_frames", train_frames, 1), ("test_frames", test_frames, 0)):
-        if value < least:
+    for name, value, least in (
+        ("train_frames", train_frames, 1),
+        ("test_frames", test_frames, 0),
+        ("cameras", cameras, 1),
+    ):
+        if value is not None and value < least:
             raise InvalidInput(name, f"{least} or more", value)
     if not 1 <= size <= MAX_SIZE:
         raise InvalidInput("size", f"in [1, {MAX_SIZE}] pixels", size)
-    splits = {"train": training_views(train_frames, size, seed), "test": held_out_views(test_frames, size, seed)}
-    total, done = train_frames + test_frames, 0
+    train = rig_views(train_frames, cameras, size, seed) if cameras else training_views(train_frames, size, seed)
+    splits = {"train": train, "test": held_out_views(test_frames, size, seed)}
+    total, done = len(train) + test_frames, 0
     thumbnails = []
     with _replaced_when_complete(Path(out)) as folder:
         for split, views in splits.items():
@@ -80,17 +86,20 @@ def generate(
                     progress(done, total)
             _write_json(folder / f"transforms_{split}.json", _transforms(split, views))
         _write_json(folder / TRAJECTORIES, trajectories(POINTS_PER_OBJECT, np.linspace(0, 1, TRAJECTORY_TIMES), seed))
-        write_png(folder / CONTACT_SHEET, _contact_sheet(thumbnails[:train_frames]))
+        write_png(folder / CONTACT_SHEET, _contact_sheet(thumbnails[: len(train)]))
 
 
 def training_views(count: int, size: int, seed: int) -> list[View]:
     """Return one camera per time, over the upper hemisphere; successive cameras are far apart, as in D-NeRF."""
-    shift = np.random.default_rng(seed).uniform(size=2)
-    across, up = ((shift + np.arange(count)[:, None] * R2_SEQUENCE) % 1).T
-    low, high = math.sin(math.radians(LOWEST)), math.sin(math.radians(HIGHEST))
-    elevations = np.degrees(np.arcsin(low + up * (high - low)))  # uniform in area
+    azimuths, elevations = _directions(count, seed)
+    return _views(size, azimuths, elevations, np.linspace(0, 1, count))
+
+
+def rig_views(count: int, cameras: int, size: int, seed: int) -> list[View]:
+    """Return `count` times, each seen by the same cameras over the upper hemisphere."""
+    azimuths, elevations = _directions(cameras, seed)
     times = np.linspace(0, 1, count)
-    return _views(size, 360 * across, elevations, times)
+    return _views(size, np.tile(azimuths, count), np.tile(elevations, count), np.repeat(times, cameras))
 
 
 def held_out_views(count: int, size: int, seed: int) -> list[View]:
@@ -98,6 +107,14 @@ def held_out_views(count: int, size: int, seed: int) -> list[View]:
     parts = (np.arange(count) + 0.5) / max(count, 1)
     shift = np.random.default_rng(seed).uniform()
     return _views(size, 360 * (shift + parts), np.full(count, TEST_ELEVATION), parts)
+
+
+def _directions(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths and elevations in degrees, even in area over the upper hemisphere."""
+    shift = np.random.default_rng(seed).uniform(size=2)
+    across, up = ((shift + np.arange(count)[:, None] * R2_SEQUENCE) % 1).T
+    low, high = math.sin(math.radians(LOWEST)), math.sin(math.radians(HIGHEST))
+    return 360 * across, np.degrees(np.arcsin(low + up * (high - low)))
 
 
 def _views(size: int, azimuths: np.ndarray, elevations: np.ndarray, times: np.ndarray) -> list[View]:

@@ -214,6 +214,15 @@ def test_layout(folder: Path, scene: SceneData):
     assert (folder / "contact_sheet.png").exists()
 
 
+def test_fixed_cameras_see_each_time_together(tmp_path: Path):
+    generate(tmp_path / "a", size=8, train_frames=3, test_frames=1, cameras=2)
+    frames = load_scene(tmp_path / "a").splits["train"]
+    assert [frame.t for frame in frames] == [0, 0, 0.5, 0.5, 1, 1]
+    positions = np.array([frame.camera.position for frame in frames]).reshape(3, 2, 3)
+    assert_close(positions, np.broadcast_to(positions[:1], positions.shape), "rotation")
+    assert np.linalg.norm(positions[0, 0] - positions[0, 1]) > 1
+
+
 def test_written_trajectories_are_the_motion(folder: Path):
     content = json.loads((folder / "trajectories.json").read_text())
     assert {point["object"] for point in content["points"]} == set(OBJECTS)
