@@ -1,1 +1,1 @@
-"""Imports and exports: `imported_formats`, `splat_transform`, `paper_sized`."""
+"""Imports and exports: `imported_formats`, `nodes`, `paper_sized`."""

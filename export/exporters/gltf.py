@@ -13,7 +13,7 @@ from msdgs_serve.scene.spherical_harmonics import SH_C0
 
 EXTENSION = "KHR_gaussian_splatting"
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
-FLOAT, BYTE, POINTS = 5126, 5121, 0
+FLOAT, BYTE, POINTS, VERTICES = 5126, 5121, 0, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 COLUMNS = {name: columns for columns, name in TYPES.items()}
 PRIMITIVE = {
@@ -39,7 +39,7 @@ def write_gltf(file: Path, gaussians: Gaussians) -> None:
     accessors, views, parts, at = [], [], [], 0
     for name, values in attributes.items():
         part = np.ascontiguousarray(values, values.dtype if values.dtype == np.uint8 else "<f4")
-        views.append({"buffer": 0, "byteOffset": at, "byteLength": part.nbytes})
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": part.nbytes, "target": VERTICES})
         accessors.append(_accessor(name, part, len(views) - 1))
         parts.append(part.tobytes())
         at += part.nbytes

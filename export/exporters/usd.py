@@ -12,6 +12,9 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 
 FRAMES_PER_SECOND = 24
+EXTENT = 3.0
+"""Standard deviations of a Gaussian within the extent."""
+
 PRIM = "/Splats"
 """Also the default prim."""
 
@@ -29,6 +32,7 @@ def write_usd(
     usd, vol, geom, vt = _modules(file)
     stage = usd.Stage.CreateInMemory()
     geom.SetStageUpAxis(stage, geom.Tokens.y)
+    geom.SetStageMetersPerUnit(stage, geom.LinearUnits.meters)
     field = vol.ParticleField3DGaussianSplat.Define(stage, PRIM)
     prim = field.GetPrim()
     stage.SetDefaultPrim(prim)
@@ -39,6 +43,7 @@ def write_usd(
             "positions": vt.Vec3fArray.FromNumpy(as_float32(means)),
             "orientations": vt.QuatfArray.FromNumpy(as_float32(quats[:, [1, 2, 3, 0]])),
             "scales": vt.Vec3fArray.FromNumpy(as_float32(g.scales)),
+            "extent": vt.Vec3fArray.FromNumpy(_extent(means, g.scales)),
         }
         for name, values in samples.items():
             prim.GetAttribute(name).Set(values, *([number] if len(times) > 1 else []))
@@ -53,6 +58,12 @@ def write_usd(
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(len(times) - 1)
     stage.Export(str(file))
+
+
+def _extent(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """[2, 3] corners of a box around all Gaussians."""
+    radii = EXTENT * scales.max(axis=1, keepdims=True)
+    return as_float32(np.stack([(means - radii).min(axis=0), (means + radii).max(axis=0)]))
 
 
 def read_usd(file: Path) -> Callable[[int], Gaussians]:

@@ -19,12 +19,13 @@ ALLOWED_SKIPS = {
 
 
 class Lack(NamedTuple):
-    """The beginning of a reason, the untested part, and the Debian or Python package that it needs."""
+    """The beginning of a reason, the untested part, and the Debian or Python package or make target that it needs."""
 
     reason: str
     untested: str
     debian: str = ""
     python: str = ""
+    make: str = ""
 
 
 LACKS = (
@@ -32,6 +33,7 @@ LACKS = (
     Lack("there is no prometheus to run", "the dashboard's queries", debian="prometheus"),
     Lack("needs strace", "which files native code opens", debian="strace"),
     Lack("kubernetes-validate isn't installed", "the Kubernetes manifests", python="kubernetes-validate"),
+    Lack("no tests/export/node/node_modules", "written files in other programs", make="tests/export/node/node_modules"),
 )
 
 
@@ -46,8 +48,11 @@ def not_tested(reasons: list[str]) -> str:
     lacking = [lack for lack, count in counts.items() if count]
     if not lacking:
         return ""
-    debian = " ".join(lack.debian for lack in lacking if lack.debian)
-    python = " ".join(lack.python for lack in lacking if lack.python)
-    commands = [f"apt-get install {debian}"] * bool(debian) + [f"pip install {python}"] * bool(python)
+    needed = {
+        "apt-get install": [lack.debian for lack in lacking if lack.debian],
+        "pip install": [lack.python for lack in lacking if lack.python],
+        "make": [lack.make for lack in lacking if lack.make],
+    }
+    commands = [" ".join((command, *names)) for command, names in needed.items() if names]
     what = ", ".join(f"{lack.untested} ({counts[lack]})" for lack in lacking)
     return f"Not tested on this machine: {what}. To test it: {' && '.join(commands)}"
