@@ -80,7 +80,7 @@ def _read_input(
 def _encode(graph: GraphBuilder, name: str, value: str, frequency_matrix: torch.Tensor) -> str:
     """Positional encoding: value, sines and cosines side by side."""
     phases = graph.node(
-        "MatMul", [value, graph.constant(f"{name}.octaves", to_numpy(frequency_matrix))], f"{name}.phases"
+        "MatMul", [value, graph.constant(f"{name}.frequencies", to_numpy(frequency_matrix))], f"{name}.phases"
     )
     sines = graph.node("Sin", [phases], f"{name}.sines")
     cosines = graph.node("Cos", [phases], f"{name}.cosines")

@@ -70,10 +70,10 @@ def project_points(view: View, x: Vector, y: Vector, z: Vector) -> tuple:
         growth = 1 + tt * (3 * k[0] + tt * (5 * k[1] + tt * (7 * k[2] + tt * (9 * k[3]))))
         u, v = view.fx * rho * x / radius, view.fy * rho * y / radius
         per_distance = growth / (square + z * z)
-        outwards, around = z * per_distance / square, rho / (radius * square)
-        mixed = x * y * (outwards - around)
-        xx = x * x * outwards + (square - x * x) * around
-        yy = y * y * outwards + (square - y * y) * around
+        radial, tangential = z * per_distance / square, rho / (radius * square)
+        mixed = x * y * (radial - tangential)
+        xx = x * x * radial + (square - x * x) * tangential
+        yy = y * y * radial + (square - y * y) * tangential
         jacobian = (
             (view.fx * xx, view.fx * mixed, -view.fx * x * per_distance),
             (view.fy * mixed, view.fy * yy, -view.fy * y * per_distance),

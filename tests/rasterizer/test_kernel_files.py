@@ -31,7 +31,7 @@ print(double(21.0), len(double.stats.cache_misses))
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kernels")
     (folder / "package").mkdir()
     (folder / "package" / "caller.py").write_text(KERNEL)
@@ -39,16 +39,16 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def compiled(room: Path) -> Path:
+def compiled(folder: Path) -> Path:
     """Return a cache that one process has filled and another one has used."""
-    assert call(room, room / "cache") == (42.0, True)
-    assert call(room, room / "cache") == (42.0, False)
-    return room / "cache"
+    assert call(folder, folder / "cache") == (42.0, True)
+    assert call(folder, folder / "cache") == (42.0, False)
+    return folder / "cache"
 
 
-def call(room: Path, cache: Path | str) -> tuple[float, bool]:
+def call(folder: Path, cache: Path | str) -> tuple[float, bool]:
     """Return the kernel's result in a new process, and whether that process compiled it."""
-    value, misses = run_python(CALL, room, NUMBA_CACHE_DIR=str(cache)).split()
+    value, misses = run_python(CALL, folder, NUMBA_CACHE_DIR=str(cache)).split()
     return float(value), misses != "0"
 
 
@@ -68,27 +68,27 @@ def flip(contents: bytes) -> bytes:
     ids=["index cut", "index empty", "code cut", "code empty", "code flipped", "code missing"],
 )
 def test_a_damaged_file_is_compiled_again_and_replaced(
-    room: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes] | None
+    folder: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes] | None
 ):
     cache = tmp_path / "cache"
     shutil.copytree(compiled, cache)
     (file,) = cache.rglob(f"*.double-*{suffix}")
     file.write_bytes(damage(file.read_bytes())) if damage else file.unlink()
-    assert call(room, cache) == (42.0, True)
-    assert call(room, cache) == (42.0, False)
+    assert call(folder, cache) == (42.0, True)
+    assert call(folder, cache) == (42.0, False)
 
 
-def test_a_folder_that_cannot_be_written_is_no_obstacle(room: Path, tmp_path: Path):
+def test_a_folder_that_cannot_be_written_is_no_obstacle(folder: Path, tmp_path: Path):
     (tmp_path / "file").touch()
     assert not is_writable(tmp_path / "file" / "cache")
-    assert call(room, tmp_path / "file" / "cache") == (42.0, True)
+    assert call(folder, tmp_path / "file" / "cache") == (42.0, True)
 
 
-def test_nothing_that_can_be_written_is_no_obstacle(room: Path, tmp_path: Path):
+def test_nothing_that_can_be_written_is_no_obstacle(folder: Path, tmp_path: Path):
     (tmp_path / "file").touch()
     value = run_python(
         "import tempfile; tempfile.tempdir = '/nonexistent'\n" + CALL.replace(", len(double.stats.cache_misses)", ""),
-        room,
+        folder,
         NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"),
     )
     assert float(value) == 42.0
@@ -165,10 +165,10 @@ EDITS = {  # sources of a kernel in `package` besides its own file
 
 def test_machine_code_follows_every_source(tmp_path: Path):
     shutil.copytree(ROOT / "msdgs_serve", tmp_path / "msdgs_serve", ignore=shutil.ignore_patterns("__pycache__"))
-    room = tmp_path / "package"
-    room.mkdir()
-    (room / "caller.py").write_text(CALLER_OF_OTHERS)
-    (room / "constants.py").write_text("FACTOR = 1.0\n")
+    folder = tmp_path / "package"
+    folder.mkdir()
+    (folder / "caller.py").write_text(CALLER_OF_OTHERS)
+    (folder / "constants.py").write_text("FACTOR = 1.0\n")
 
     expected, compiled = call(tmp_path, tmp_path / "cache")
     assert compiled
