@@ -9,12 +9,13 @@ import hashlib
 import io
 import json
 import os
-import platform
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
+
+from llvmlite.binding import get_host_cpu_name
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run, require_unique
@@ -156,7 +157,7 @@ def measure(run: Run, scene: BenchScene) -> Row:
     metrics = final_metrics(run) or {}
     row = dict(zip(KEY, key_of(run), strict=True)) | {
         "date": date.today().isoformat(),
-        "machine": f"{platform.machine()} {os.cpu_count()} cores",
+        "machine": f"{get_host_cpu_name()} {os.cpu_count()} cores",
         "seconds": f"{metrics['seconds']:.0f}",
         "optimizer_steps": str(metrics["optimizer_steps"]),
         "gaussians": str(metrics["gaussians"]),

@@ -1,12 +1,13 @@
 """A training run in its folder: steps, evaluations, checkpoints, metrics and renderings."""
 
 import contextlib
+import fcntl
 import json
 import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import IO, Literal, NamedTuple
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import SceneData, load_scene
@@ -18,6 +19,7 @@ from msdgs_train.engine.run_record import (
     BEST,
     CHECKPOINT,
     FINAL_METRICS,
+    LOCK,
     MODEL,
     Best,
     RunRecord,
@@ -59,6 +61,7 @@ class RunState:
     log: MetricsLog
     record: RunRecord
     seconds: float  # trained before
+    lock: IO[bytes]  # held while this process trains
 
 
 def fit(
@@ -78,7 +81,7 @@ def fit(
     may not change, and `ExtraMissing` if tensorboard isn't installed.
     """
     state = prepare(config, data, run, resume=resume, tensorboard=tensorboard)
-    with contextlib.closing(state.log):
+    with contextlib.closing(state.log), state.lock:
         return Run(state, observer or Observer()).execute()
 
 
@@ -93,6 +96,7 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
     trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold))
     seconds = trainer.load_checkpoint(folder / CHECKPOINT) if resume else 0.0
     folder.mkdir(parents=True, exist_ok=True)
+    lock = _locked(folder)
     write_config(folder, config)
     best = _best_so_far(folder, trainer.scene) if resume else None
     if best is None:
@@ -100,7 +104,18 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
     record = RunRecord(data.absolute(), best)
     write_record(folder, record)
     log = MetricsLog(folder, keep_until=trainer.step_count, tensorboard=tensorboard)
-    return RunState(folder, trainer, log, record, seconds)
+    return RunState(folder, trainer, log, record, seconds, lock)
+
+
+def _locked(folder: Path) -> IO[bytes]:
+    """A file that is locked until it is closed or the process ends; refused if another process trains in the folder."""
+    file = (folder / LOCK).open("wb")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise InvalidInput("run", "a folder in which no other process trains", folder) from None
+    return file
 
 
 class Run:

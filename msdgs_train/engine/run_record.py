@@ -14,6 +14,7 @@ CHECKPOINT = "checkpoint.pt"
 MODEL = "model.pt"
 BEST = "best.pt"
 FINAL_METRICS = "metrics.json"
+LOCK = ".lock"
 
 
 class RunInvalid(MsdgsError):

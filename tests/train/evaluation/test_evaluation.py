@@ -14,14 +14,15 @@ import pytest
 import torch
 
 from msdgs_serve.rasterizer import GSPLAT, rasterize
-from msdgs_serve.scene import Gaussians
+from msdgs_serve.scene import Gaussians, InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_train.cli import main as cli
 from msdgs_train.datasets import Frame, load_scene
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.metrics_log import read_metrics, to_bytes
-from msdgs_train.engine.run import fit
+from msdgs_train.engine.run import Observer, fit
+from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation import evaluate as evaluation_module
 from msdgs_train.evaluation import report as evaluation_report
 from msdgs_train.evaluation.evaluate import evaluate_run
@@ -112,6 +113,23 @@ def test_without_val_the_best_is_chosen_on_test(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_curve")
+class _SecondRun(Observer):
+    """Starts another run in the same folder."""
+
+    def __init__(self, data: Path, run: Path) -> None:
+        self.data, self.run = data, run
+
+    def on_train_start(self, trainer: Trainer) -> None:
+        with pytest.raises(InvalidInput, match="`run` must be a folder in which no other process trains"):
+            fit(small_config(steps=2), self.data, self.run)
+
+
+def test_two_runs_do_not_share_a_folder(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert fit(small_config(steps=2), data, run, observer=_SecondRun(data, run)).status == "finished"
+    assert fit(small_config(steps=3), data, run, resume=True).status == "finished"
+
+
 def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = fit(small_config(steps=3), data, run).best
