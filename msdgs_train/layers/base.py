@@ -50,6 +50,10 @@ class LayerConfig:
         """A new layer, with zero deltas; `num_points` is the number of control nodes, None if it moves Gaussians."""
         raise NotImplementedError
 
+    def for_rig(self, num_times: int) -> "LayerConfig":
+        """These settings for a scene of fixed cameras, each of which has captured about `num_times` times."""
+        return self
+
     def check(self, field: str, moves_nodes: bool) -> None:
         """Raise `InvalidInput` naming `field.SETTING` if a size is out of range, or the layer can't move such points,
         control nodes or Gaussians."""

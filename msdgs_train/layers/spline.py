@@ -5,7 +5,7 @@ control nodes these are Shape of Motion's motion bases (Wang et al. 2024) on spl
 fewer of them than of rigid ones.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -17,6 +17,7 @@ from msdgs_train.layers.deformation import DeformationLayer, LayerStep
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.quaternions import multiply, unit
 
+NUM_KNOTS, MAX_KNOTS = 36, 120
 ROTATION_WEIGHT = 0.3
 """Scene units per unit of quaternions and of stretches in temporal smoothness."""
 
@@ -26,8 +27,9 @@ class SplineConfig(LayerConfig):
     """Sizes and learning rates of a spline layer."""
 
     kind: ClassVar[str] = "spline"
-    num_knots: int = 36
-    """Intervals of a spline over the time range of the scene."""
+    num_knots: int = 0
+    """Intervals of a spline over the time range of the scene; 0: 36, or with fixed cameras one per captured time, if
+    that is more, up to 120."""
     affine: bool = True
     """Nodes have stretch tensors; otherwise their motion is rigid."""
     lr_init: float = 6e-4
@@ -39,10 +41,13 @@ class SplineConfig(LayerConfig):
 
     def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "SplineLayer":
         assert num_points is not None  # `check` refuses Gaussians
-        return SplineLayer(self, num_points, bounds.time_range)
+        return SplineLayer(replace(self, num_knots=self.num_knots or NUM_KNOTS), num_points, bounds.time_range)
+
+    def for_rig(self, num_times: int) -> "SplineConfig":
+        return self if self.num_knots else replace(self, num_knots=min(max(num_times, NUM_KNOTS), MAX_KNOTS))
 
     def check(self, field: str, moves_nodes: bool) -> None:
-        check_size(f"{field}.num_knots", self.num_knots)
+        check_size(f"{field}.num_knots", self.num_knots, least=0)
         if not moves_nodes:
             raise InvalidInput(field, "of another kind, or with --model.support nodes: curves are of nodes", self.kind)
 

@@ -37,14 +37,17 @@ class GaussianSplatting:
 
     def __init__(self, schedule: Schedule, scene: SceneData) -> None:
         config = schedule.config
-        self.schedule, self.config, self.scene = schedule, config, scene
         self.scene_half_size = config.data.scene_half_size or scene.scene_half_size
         cameras = [frame.camera for frame in scene.splits["train"]]
         distinct = distinct_cameras(cameras)
-        bounds = SceneBounds(self.scene_half_size, scene.time_range)
-        self._model = _new_model(schedule, scene, bounds, distinct)
         scale, views = scene_scale(cameras) or self.scene_half_size, len(distinct)
         is_mcmc, is_rig = config.density.density_strategy == "mcmc", 2 * views <= len(cameras)
+        if is_rig and views > 1:
+            config = config.updated(layers=[layer.for_rig(len(cameras) // views) for layer in config.model.layers])
+            schedule = schedule._replace(config=config)
+        self.schedule, self.config, self.scene = schedule, config, scene
+        bounds = SceneBounds(self.scene_half_size, scene.time_range)
+        self._model = _new_model(schedule, scene, bounds, distinct)
         self.density: DensityStrategy = (
             MCMCStrategy.start(schedule)
             if is_mcmc

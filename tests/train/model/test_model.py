@@ -176,7 +176,7 @@ def test_what_nodes_cannot_change_is_refused(field: str):
         ("features", PlaneConfig(features=0)),
         ("multires", PlaneConfig(multires=())),
         ("multires", PlaneConfig(multires=(1, 0))),
-        ("num_knots", SplineConfig(num_knots=0)),
+        ("num_knots", SplineConfig(num_knots=-1)),
     ],
 )
 def test_impossible_sizes_are_refused_by_layer_and_name(setting: str, layer: LayerConfig):

@@ -1,15 +1,22 @@
 """Spline layers: curves, initialization, extrapolation beyond the time window, and temporal smoothness."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from msdgs_train.datasets import Frame, SceneData
+from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.spline import SplineConfig, SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
+from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from tests.support.models import NODES, SPLINE, random_model
 from tests.support.reference_deformation import plain_step
+from tests.support.scenes import front_camera
 from tests.support.tolerances import assert_close, tolerance
+from tests.support.training_scene import SPLINES, small_config
 
 EXACT = tolerance("rotation")
 
@@ -71,3 +78,14 @@ def test_rigid_motions_stay_rigid() -> None:
     assert isinstance(model.support, NodesSupport)
     matrices = model.support.motions(model.deformation, model.support.nodes, time(0.3))[:, :9].view(-1, 3, 3).detach()
     assert float((matrices @ matrices.transpose(1, 2) - torch.eye(3)).abs().max()) <= EXACT
+
+
+@pytest.mark.parametrize(("cameras", "times", "knots"), [(1, 50, 36), (2, 50, 50), (3, 10, 36), (2, 130, 120)])
+def test_splines_follow_each_time_that_fixed_cameras_capture(cameras: int, times: int, knots: int) -> None:
+    poses = [np.eye(4) + np.eye(4, k=3) * index for index in range(cameras)]
+    views = [replace(front_camera(), camera_to_world=pose) for pose in poses]
+    frames = [Frame(f"{i}_{k}", view, i / times, Path()) for i in range(times) for k, view in enumerate(views)]
+    layers = (SplineConfig(), SplineConfig(num_knots=5))
+    schedule = Schedule.from_config(small_config(model=replace(SPLINES, layers=layers)))
+    model = GaussianSplatting(schedule, SceneData({"train": frames}, 1.0)).model
+    assert [layer.num_knots for layer in model.config.layers if isinstance(layer, SplineConfig)] == [knots, 5]
