@@ -1,4 +1,4 @@
-"""Metadata of a scene file (contract `msdgs/1`): the `metadata_props`, checked on reading."""
+"""Metadata of a scene file (`CONTRACTS`): the `metadata_props`, checked on reading."""
 
 import json
 import re
@@ -12,7 +12,8 @@ from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_serve.scene.plain_json import parse
 
-CONTRACT = "msdgs/1"
+CONTRACTS = CONTRACT, CHANGING_CONTRACT = "msdgs/1", "msdgs/2"
+"""The second has opacities or SH that depend on time. Files that have neither are of the first."""
 MAX_NUMBER = 1e9
 """Limit of times, coordinates and pixels: beyond any sensible value, within single precision."""
 MAX_LIST = 1000
@@ -199,7 +200,7 @@ def _sha256(value: Any) -> str:
 
 
 _READERS: dict[str, Callable[[Any], Any]] = {
-    "contract": _one_of(CONTRACT),
+    "contract": _one_of(*CONTRACTS),
     "layers": _words,
     "plan": _word,
     "time_range": _time_range,

@@ -88,7 +88,7 @@ def test_a_missing_field_is_named(tmp_path: Path, field: str):
 
 
 UNUSABLE = {
-    "contract": ['"msdgs/2"'],
+    "contract": ['"msdgs/3"'],
     "layers": ['["mlp", 3]'],
     "time_range": ["[1, 0]", "[0, NaN]", "[0, 0.5, 1]"],
     "bounds": ["[[0, 0, 0]]", "[[1, 0, 0], [0, 1, 1]]"],

@@ -23,6 +23,12 @@ MODELS: dict[str, dict[str, Any]] = {
 }
 PLANS = ("network", "prefix:1", "int8", "lowrank:4", "lowrank:0.05", "keyframes:8", "keyframes:0.05")
 
+BY_HAND: dict[str, dict[str, Any]] = {
+    "without steps": {},
+    "with steps": {"steps": True},
+    "opacities and colors that change": {"changing": ("opacities", "sh")},
+}
+
 COUNT = 20
 """Gaussians of each scene."""
 
@@ -51,8 +57,5 @@ def _of_sequences() -> Iterator[tuple[str, bytes]]:
 def _by_hand() -> Iterator[tuple[str, bytes]]:
     """Written without the exporter, in another version of the operator set, with nodes for constant outputs."""
     with TemporaryDirectory() as folder:
-        for steps in (False, True):
-            yield (
-                f"by hand, {'with' if steps else 'without'} steps",
-                write_scene(Path(folder) / "scene.onnx", steps=steps).read_bytes(),
-            )
+        for name, changes in BY_HAND.items():
+            yield f"by hand, {name}", write_scene(Path(folder) / "scene.onnx", **changes).read_bytes()

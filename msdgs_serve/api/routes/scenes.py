@@ -154,7 +154,7 @@ async def add_scene(
             uploads.added(upload)
     except SceneFileInvalid as error:
         service.log_rejected_upload(name, error)
-        detail = f"The file violates the contract msdgs/1: `{error.field}` {error.problem}"
+        detail = f"The file violates its contract: `{error.field}` {error.problem}"
         raise RequestRejected(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
