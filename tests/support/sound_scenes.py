@@ -48,9 +48,13 @@ def _exported() -> Iterator[tuple[str, bytes]]:
 
 
 def _of_sequences() -> Iterator[tuple[str, bytes]]:
-    for name, counts in (("blended frames", (COUNT, COUNT)), ("switched frames", (COUNT, COUNT - 1))):
-        frames = tuple(some_gaussians(count) for count in counts)
-        sequence = Frames(frames, 0, "dilate", blended=name == "blended frames")
+    for name, counts, seed in (
+        ("blended frames", (COUNT, COUNT), 0),
+        ("blended frames of other colors", (COUNT, COUNT), 1),
+        ("switched frames", (COUNT, COUNT - 1), 0),
+    ):
+        frames = tuple(some_gaussians(count, seed=i * seed) for i, count in enumerate(counts))
+        sequence = Frames(frames, 0, "dilate", blended=name.startswith("blended"))
         yield name, sequence_scene(sequence, "0" * 64).SerializeToString()
 
 
