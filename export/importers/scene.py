@@ -113,8 +113,13 @@ def write_imported(
 
 def note_left_out(file: Path, lost: Sequence[dict[str, Any]]) -> None:
     """Prepend entries to `left_out` of a scene file."""
+    changed_metadata(file, left_out=[*lost, *properties(onnx.load(file))["left_out"]])
+
+
+def changed_metadata(file: Path, **changes: Any) -> None:
+    """Change metadata of a scene file."""
     contents = onnx.load(file)
-    set_properties(contents, left_out=[*lost, *properties(contents)["left_out"]])
+    set_properties(contents, **changes)
     with replacing(file) as temporary:
         temporary.write_bytes(contents.SerializeToString())
 

@@ -74,8 +74,9 @@ class Frames:
 
     def _differ(self, name: str, most: float = 0.0) -> np.ndarray:
         """[N] whether an array of a Gaussian differs by more than `most` from that of the first frame."""
-        first, *rest = (getattr(frame, name).reshape(len(frame), -1) for frame in self.gaussians)
-        return np.any([(np.abs(array - first) > most).any(axis=1) for array in rest], axis=0)
+        first, *rest = (getattr(frame, name) for frame in self.gaussians)
+        columns = tuple(range(1, first.ndim))
+        return np.any([(np.abs(array - first) > most).any(axis=columns) for array in rest], axis=0)
 
 
 def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], object] = lambda: None) -> Frames:

@@ -65,6 +65,12 @@ class BakedScene:
         """What depends on time, in the order of `DeformationSession.pose`."""
         return (*MOVING_OUTPUTS, *self.changing)
 
+    @property
+    def static(self) -> tuple[FloatArray, ...]:
+        """The static Gaussians' values of `posed_outputs`."""
+        appearance = (getattr(self, name) for name in self.changing)
+        return (self.static_means, self.static_quats, self.static_scales, *appearance)
+
     def __len__(self) -> int:
         return self.moving_count + self.static_count
 
@@ -99,11 +105,9 @@ class BakedScene:
 
     def gaussians(self, *posed: FloatArray) -> Gaussians:
         """Return all Gaussians at one time, from the `posed_outputs` of the moving ones."""
-        constant = (self.static_means, self.static_quats, self.static_scales)
-        static = (*constant, *(getattr(self, name) for name in self.changing))
         if not self.moving_count:
-            posed = static
+            posed = self.static
         elif self.static_count:
-            posed = tuple(np.concatenate(pair) for pair in zip(posed, static, strict=True))
+            posed = tuple(np.concatenate(pair) for pair in zip(posed, self.static, strict=True))
         arrays = {"opacities": self.opacities, "sh": self.sh} | dict(zip(self.posed_outputs, posed, strict=True))
         return Gaussians(**arrays)

@@ -69,11 +69,14 @@ class SceneMetadata:
     package_version: str
     checkpoint_sha256: str  # of the model file
     eps2d: float = 0.3  # px², as trained
+    duration: float | None = None  # of the time range, seconds; None: unknown
 
     def to_properties(self) -> dict[str, str]:
         """Return the `metadata_props` of a file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         values["cameras"] = [camera.to_plain() for camera in self.cameras]
+        if self.duration is None:
+            del values["duration"]
         return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}
 
     @classmethod
@@ -193,6 +196,12 @@ def _eps2d(value: Any) -> float:
     return number
 
 
+def _duration(value: Any) -> float:
+    if (number := _number(value)) <= 0:
+        raise ValueError(f"{value} isn't above 0")
+    return number
+
+
 def _sha256(value: Any) -> str:
     if not re.fullmatch("[0-9a-f]{64}", _text(value)):
         raise ValueError(f"{_shown(value)} isn't a SHA-256 in lower-case hexadecimal")
@@ -215,4 +224,5 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "package_version": _word,
     "checkpoint_sha256": _sha256,
     "eps2d": _eps2d,
+    "duration": _duration,
 }

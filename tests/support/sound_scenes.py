@@ -20,6 +20,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "spline on nodes": {"layers": ("spline",), "support": NODES},
     "mixed on nodes": {"layers": ("plane", "spline", "mlp"), "support": NODES, "weights": False, "embedding_dim": 0},
     "static": {"layers": ()},
+    **{f"all heads of {kind}": {"layers": (kind,), "opacity_head": True, "sh_head": True} for kind in ("mlp", "plane")},
 }
 PLANS = ("network", "prefix:1", "int8", "lowrank:4", "lowrank:0.05", "keyframes:8", "keyframes:0.05")
 
@@ -42,7 +43,7 @@ def sound_scenes() -> dict[str, bytes]:
 def _exported() -> Iterator[tuple[str, bytes]]:
     for name, config in MODELS.items():
         baked = bake(random_model(COUNT, **config), SCENE, "0" * 64)
-        for plan in PLANS if config["layers"] else PLANS[:1]:
+        for plan in PLANS if config["layers"] and not baked.scene.changing else PLANS[:1]:
             if plan != "int8" or "mlp" in config["layers"]:  # other layers have no product of width × width
                 yield f"{name} {plan}", build(plan, baked).SerializeToString()
 

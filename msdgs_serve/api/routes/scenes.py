@@ -220,6 +220,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         gaussians=counts,
         sh_degree=metadata.sh_degree,
         time_range=metadata.time_range,
+        duration=metadata.duration,
         bounds=(list(low), list(high)),
         background=metadata.background,
         antialiasing=metadata.antialiasing,
