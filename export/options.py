@@ -11,7 +11,7 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Turn a trained model into one self-contained ONNX scene file (contract msdgs/1, described in docs/contract.md).
+    """Turn a trained model into one self-contained ONNX scene file (docs/contract.md).
 
     Ways to compute the motion (plans) are tried together with pruning: removing what is invisible in rendered frames.
     Frames of each candidate are compared with those of the exact network in float64, and timed. The fastest whose worst
@@ -68,6 +68,8 @@ class ExportOptions:
     """Keep all arrays in float32 instead of fewer bits."""
     tolerance: float = 1e-4
     """Largest relative error of poses that the plan `network` may have against the model's layers."""
+    duration: float | None = None
+    """Seconds that the scene's time range lasts, which the file then says: the web page plays it at that speed."""
     times: int = 50
     """The number of times at which these are compared."""
 

@@ -9,6 +9,8 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
 
 from export.command_line import Console, run, tyro
 from export.options import ExportOptions
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.metadata import MAX_NUMBER
 
 
 def main(options: ExportOptions) -> int:
@@ -17,12 +19,17 @@ def main(options: ExportOptions) -> int:
     def exported(console: Console) -> None:
         with console.status("loading torch and onnxruntime"):
             from export.importers.command import model_or_import  # slow to import: not before --help
+            from export.importers.scene import changed_metadata
             from export.jobs.command import export
             from export.measure.stability import MIN_PSNR
+        if options.duration is not None and not 0 < options.duration <= MAX_NUMBER:
+            raise InvalidInput("duration", "seconds above 0", options.duration)
         min_psnr = None if options.keep_float32 else options.min_psnr or MIN_PSNR
         with model_or_import(options.model, options.format, options.scene_file, console, min_psnr) as model:
             if model is not None:
                 export(model, options, console)
+        if options.duration is not None:
+            changed_metadata(options.scene_file, duration=options.duration)
 
     return run(exported, f"stopped; {options.scene_file} is unchanged")
 

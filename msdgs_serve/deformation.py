@@ -9,14 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT, BakedScene
+from msdgs_serve.scene.baked import APPEARANCE, OPTIONAL_INPUT, BakedScene, appearance_problem, constant_outputs
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.scene.scene_file import CHUNK, SceneFile, read_scene_file
 from msdgs_serve.threads import run_parallel, sharing_cores, thread_count
 
-_SIZES = {"means": 3, "quats": 4, "scales": 3}
 _MAX_DETAILS = 500
 
 
@@ -39,7 +38,7 @@ class DeformationSession:
             contents: of the file, if they are in memory already.
             limits: of the graph's cost.
 
-        Raises `SceneFileInvalid` naming the field if the file isn't a complete, finite `msdgs/1` scene.
+        Raises `SceneFileInvalid` naming the field if the file isn't a complete, finite scene.
         """
         self.path = Path(path)
         self._file = self.path.name
@@ -49,7 +48,7 @@ class DeformationSession:
         del contents  # `scene_file` has copies of all large arrays
         self.cost = scene_file.cost
         self._steps, self._outputs, self._selected = scene_file.steps, scene_file.outputs, scene_file.selected
-        self._takes_ids = scene_file.takes_ids
+        self._takes_ids, self._posed = scene_file.takes_ids, scene_file.posed
         self._chunk = max(scene_file.moving_count, 1) if scene_file.poses_all else CHUNK
         self.scene = self._read_scene(scene_file)
         self._session = self._open(scene_file.graph, thread_count() if scene_file.poses_all else 1)
@@ -71,11 +70,9 @@ class DeformationSession:
         if not 0 <= steps <= self.max_steps:
             raise InvalidInput("steps", f"in [0, {self.max_steps}], the scene's layers", steps)
 
-    def pose(
-        self, t: float, ids: npt.ArrayLike | None = None, steps: float | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def pose(self, t: float, ids: npt.ArrayLike | None = None, steps: float | None = None) -> tuple[FloatArray, ...]:
         """Return means [M, 3], unit wxyz quaternions [M, 4] and scales [M, 3] of the moving Gaussians `ids`, [M], or
-        all.
+        all, and if they depend on time, opacities [M] and SH [M, C, 3].
 
         `steps` is the number of layers to apply, with a fraction of the last one if it isn't an integer; None for all.
 
@@ -87,8 +84,8 @@ class DeformationSession:
         ids = None if ids is None else self._checked_ids(ids)
         with sharing_cores():
             posed = self._pose_selected(t, ids, steps) if self._selected else self._pose_all(t, ids, steps)
-        self._check_finite(t, posed)
-        return posed["means"], posed["quats"], posed["scales"]
+        self._check_values(t, posed)
+        return tuple(posed.values())
 
     def gaussians(self, t: float, steps: float | None = None) -> Gaussians:
         """Return all Gaussians at time `t`, the posed moving ones and the static ones."""
@@ -109,11 +106,11 @@ class DeformationSession:
     def _pose_selected(self, t: float, ids: npt.NDArray[np.int64] | None, steps: float | None) -> dict[str, FloatArray]:
         """Poses by a graph that selects the ids, chunk by chunk."""
         every = np.arange(self.scene.moving_count) if ids is None else ids
-        posed = {name: np.empty((len(every), _SIZES[name]), np.float32) for name in MOVING_OUTPUTS}
+        posed = {name: np.empty((len(every), *row), np.float32) for name, row in self._posed.items()}
 
         def run(start: int, stop: int) -> None:
             outputs = self._run(t, every[start:stop], steps)
-            for name, output in zip(MOVING_OUTPUTS, outputs, strict=True):
+            for name, output in zip(posed, outputs, strict=True):
                 expected = posed[name][start:stop]
                 if output.shape != expected.shape:
                     raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
@@ -125,9 +122,9 @@ class DeformationSession:
     def _pose_all(self, t: float, ids: npt.NDArray[np.int64] | None, steps: float | None) -> dict[str, FloatArray]:
         """Poses by a graph of all Gaussians, one per row, and of more rows if it needs a multiple of some length."""
         if ids is not None and not len(ids):
-            return {name: np.empty((0, _SIZES[name]), np.float32) for name in MOVING_OUTPUTS}
+            return {name: np.empty((0, *row), np.float32) for name, row in self._posed.items()}
         rows = slice(self.scene.moving_count) if ids is None else ids
-        outputs = zip(MOVING_OUTPUTS, self._run(t, np.arange(0), steps), strict=True)
+        outputs = zip(self._posed, self._run(t, np.arange(0), steps), strict=True)
         return {name: output[rows] for name, output in outputs}
 
     def _checked_time(self, t: float) -> float:
@@ -145,9 +142,12 @@ class DeformationSession:
             raise InvalidInput("ids", f"in [0, {self.scene.moving_count}), the moving Gaussians", got)
         return array.astype(np.int64)
 
-    def _check_finite(self, t: float, posed: dict[str, FloatArray]) -> None:
+    def _check_values(self, t: float, posed: dict[str, FloatArray]) -> None:
         for name, array in posed.items():
-            if not np.isfinite(array).all():
+            if name in APPEARANCE:
+                if problem := appearance_problem(name, array):
+                    raise SceneFileInvalid(self._file, name, f"{problem} at t = {t}")
+            elif not np.isfinite(array).all():
                 bad = int(np.count_nonzero(~np.isfinite(array).all(axis=1)))
                 raise SceneFileInvalid(self._file, name, f"is NaN or infinite for {bad:,} Gaussians at t = {t}")
 
@@ -162,8 +162,9 @@ class DeformationSession:
         if scene_file.constant_graph is not None:
             session = self._open(scene_file.constant_graph, 1)
             arrays |= zip(scene_file.computed, self._call(session, scene_file.computed, {}), strict=True)
-        ordered = [arrays[name] for name in CONSTANT_OUTPUTS]
-        return BakedScene(scene_file.metadata, scene_file.moving_count, *ordered).validate(self._file)
+        ordered = [arrays[name] for name in constant_outputs(scene_file.changing)]
+        scene = BakedScene(scene_file.metadata, scene_file.moving_count, *ordered, changing=scene_file.changing)
+        return scene.validate(self._file)
 
     def _open(self, model: bytes, threads: int) -> ort.InferenceSession:
         options = ort.SessionOptions()
@@ -178,9 +179,10 @@ class DeformationSession:
 
     def _check_sample(self, t: float) -> None:
         sample = slice(min(self.scene.moving_count, 64))
-        posed = self.pose(t, np.arange(sample.stop))
+        posed = dict(zip(self._posed, self.pose(t, np.arange(sample.stop)), strict=True))
+        constant = {name: getattr(self.scene, name)[sample] for name in APPEARANCE}
         with self.as_scene_file_error(t):
-            Gaussians(*posed, self.scene.opacities[sample], self.scene.sh[sample]).validate()
+            Gaussians(**(constant | posed)).validate()
 
     def _run(self, t: float, ids: npt.NDArray[np.int64], steps: float | None = None) -> list[FloatArray]:
         inputs: dict[str, np.ndarray] = {"t": np.array([t], np.float32)}

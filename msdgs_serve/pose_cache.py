@@ -28,7 +28,7 @@ class CacheUse:
 class PoseCache:
     """A least-recently-used cache of at most `capacity` bytes of posed Gaussians. Safe to use from several threads.
 
-    Opacities and colors are shared with the scene and don't count.
+    Opacities and colors that don't depend on time are shared with the scene and don't count.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -102,6 +102,8 @@ class PoseCache:
 
 def _own_bytes(gaussians: Gaussians, session: DeformationSession) -> int:
     """Return the bytes of the arrays that are not shared with the scene."""
-    if gaussians.means is session.scene.static_means:
+    scene = session.scene
+    if gaussians.means is scene.static_means:
         return 0
-    return gaussians.means.nbytes + gaussians.quats.nbytes + gaussians.scales.nbytes
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    return sum(array.nbytes for array in arrays if array is not scene.opacities and array is not scene.sh)

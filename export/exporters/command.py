@@ -112,6 +112,7 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
             temporary,
             lambda t: of_the_moment(session.gaussians(t), metadata.plan),
             times,
+            session.scene.changing,
             lambda: progress.advance(task),
         )
         shown = read_usd(temporary)

@@ -18,16 +18,21 @@ EXTENT = 3.0
 PRIM = "/Splats"
 """Also the default prim."""
 
+HARMONICS = "radiance:sphericalHarmonics"
+_NAMES = {"opacities": "opacities", "sh": f"{HARMONICS}Coefficients"}
+
 
 def write_usd(
     file: Path,
     gaussians: Callable[[float], Gaussians],
     times: Sequence[float],
+    changing: Sequence[str] = (),
     on_frame: Callable[[], object] = lambda: None,
 ) -> None:
     """Write the Gaussians at some times as frames 0, 1, …, or one time without samples. float32, activated; y is up.
 
-    Opacities and SH are those of the first time. Raises `InvalidInput` if OpenUSD or its schema is missing.
+    Opacities and SH are those of the first time unless they are `changing`. Raises `InvalidInput` if OpenUSD or its
+    schema is missing.
     """
     usd, vol, geom, vt = _modules(file)
     stage = usd.Stage.CreateInMemory()
@@ -45,13 +50,18 @@ def write_usd(
             "scales": vt.Vec3fArray.FromNumpy(as_float32(g.scales)),
             "extent": vt.Vec3fArray.FromNumpy(_extent(means, g.scales)),
         }
+        appearance = {
+            "opacities": vt.FloatArray.FromNumpy(as_float32(g.opacities)),
+            "sh": vt.Vec3fArray.FromNumpy(as_float32(sh).reshape(-1, 3)),
+        }
+        samples |= {_NAMES[name]: values for name, values in appearance.items() if name in changing}
         for name, values in samples.items():
             prim.GetAttribute(name).Set(values, *([number] if len(times) > 1 else []))
         if not number:
-            harmonics = "radiance:sphericalHarmonics"
-            prim.GetAttribute("opacities").Set(vt.FloatArray.FromNumpy(as_float32(g.opacities)))
-            prim.GetAttribute(f"{harmonics}Degree").Set(g.sh_degree)
-            prim.GetAttribute(f"{harmonics}Coefficients").Set(vt.Vec3fArray.FromNumpy(as_float32(sh).reshape(-1, 3)))
+            prim.GetAttribute(f"{HARMONICS}Degree").Set(g.sh_degree)
+            for name, values in appearance.items():
+                if name not in changing:
+                    prim.GetAttribute(_NAMES[name]).Set(values)
         on_frame()
     if len(times) > 1:
         stage.SetTimeCodesPerSecond(FRAMES_PER_SECOND)
@@ -71,13 +81,13 @@ def read_usd(file: Path) -> Callable[[int], Gaussians]:
     usd, *_ = _modules(file)
     stage = usd.Stage.Open(str(file))  # prims are valid as long as it exists
 
-    def read(name: str, frame: int = 0) -> np.ndarray:
+    def read(name: str, frame: int) -> np.ndarray:
         return np.array(stage.GetDefaultPrim().GetAttribute(name).Get(frame))
 
     def shown(frame: int) -> Gaussians:
-        degree = stage.GetDefaultPrim().GetAttribute("radiance:sphericalHarmonicsDegree").Get()
-        means, opacities = read("positions", frame), read("opacities")
-        sh = read("radiance:sphericalHarmonicsCoefficients").reshape(len(means), (degree + 1) ** 2, 3)
+        degree = stage.GetDefaultPrim().GetAttribute(f"{HARMONICS}Degree").Get()
+        means, opacities = read("positions", frame), read(_NAMES["opacities"], frame)
+        sh = read(_NAMES["sh"], frame).reshape(len(means), (degree + 1) ** 2, 3)
         quats = read("orientations", frame)[:, [3, 0, 1, 2]]
         means, quats, sh = (as_float32(array) for array in from_right_up_back(means, quats, sh))
         return Gaussians(means, quats, as_float32(read("scales", frame)), as_float32(opacities), sh).validate()

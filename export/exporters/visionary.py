@@ -39,21 +39,36 @@ def visionary_model(scene_file: Path) -> onnx.ModelProto:
     graph = GraphBuilder()
     rows = []
     if scene.moving_count:
-        _moving(graph, source.graph)
-        rows.append(_packed(graph, scene.opacities[: scene.moving_count]))
+        _moving(graph, source.graph, scene.posed_outputs)
+        rows.append(_packed(graph, scene))
     count = len(scene)
     padding = -count % MULTIPLE
     rest = np.concatenate([_packed_static(scene), np.zeros((padding, COLUMNS), np.float32)])
     rows.append(graph.constant("static_rows", rest))
     graph.node("Concat", rows, GAUSSIANS, axis=0)
-    colors = np.zeros((count + padding, COLOR_COLUMNS), np.float16)
-    colors[:count, : 3 * scene.sh.shape[1]] = scene.sh.reshape(count, -1)
-    graph.node("Identity", [graph.constant("harmonics", colors)], COLORS)
+    stored, columns = len(scene.sh), 3 * scene.sh.shape[1]
+    colors = np.zeros((stored + padding, COLOR_COLUMNS), np.float16)
+    colors[:stored, :columns] = scene.sh.reshape(stored, columns)
+    harmonics = graph.constant("harmonics", colors)
+    if "sh" in scene.changing:
+        graph.node("Concat", [_moving_colors(graph, scene), harmonics], COLORS, axis=0)
+    else:
+        graph.node("Identity", [harmonics], COLORS)
     graph.node("Identity", [graph.constant("count", np.array([count], np.int32))], COUNT)
     return _model(graph, count + padding)
 
 
-def _moving(graph: GraphBuilder, source: onnx.GraphProto) -> None:
+def _moving_colors(graph: GraphBuilder, scene: BakedScene) -> str:
+    """[M, 48] in float16, from `sh`."""
+    columns = 3 * scene.sh.shape[1]
+    rows = graph.node("Reshape", ["sh", graph.constant("sh.rows", np.array([-1, columns]))], "sh.flat")
+    if columns < COLOR_COLUMNS:
+        rest = graph.constant("sh.rest", np.zeros((scene.moving_count, COLOR_COLUMNS - columns), np.float32))
+        rows = graph.node("Concat", [rows, rest], "sh.padded", axis=1)
+    return graph.node("Cast", [rows], "sh.half", to=TensorProto.FLOAT16)
+
+
+def _moving(graph: GraphBuilder, source: onnx.GraphProto, outputs: tuple[str, ...]) -> None:
     """Copy the nodes of a scene's graph that depend on time, its input `t` as `time`; all others become constants."""
     known = {each.name: numpy_helper.to_array(each) for each in source.initializer}
     changing, nodes = {"t"}, list[NodeProto]()
@@ -62,7 +77,7 @@ def _moving(graph: GraphBuilder, source: onnx.GraphProto) -> None:
             changing |= set(node.output)
             nodes.append(node)
     static = [node for node in source.node if node not in nodes]
-    needed = {name for node in nodes for name in node.input} | {"means", "quats", "scales"}
+    needed = {name for node in nodes for name in node.input} | {*outputs}
     known |= _computed(static, source, sorted(needed & {name for node in static for name in node.output}))
     for name in sorted(needed & set(known)):
         values = known[name]
@@ -91,8 +106,8 @@ def _computed(nodes: list[NodeProto], source: onnx.GraphProto, names: list[str])
     return dict(zip(names, session.run(names, {}), strict=True))  # type: ignore[arg-type]
 
 
-def _packed(graph: GraphBuilder, opacities: np.ndarray) -> str:
-    """[M, 10] position, opacity and covariance R S Sᵀ Rᵀ, from `means`, `quats` and `scales`."""
+def _packed(graph: GraphBuilder, scene: BakedScene) -> str:
+    """[M, 10] position, opacity and covariance R S Sᵀ Rᵀ, from `means`, `quats`, `scales` and changing `opacities`."""
     first, second, matrix_of = _quadratic()
     monomials = graph.node("Mul", [_take(graph, "quats", first), _take(graph, "quats", second)], "quats.monomials")
     matrix = graph.node("MatMul", [monomials, graph.constant("quats.to_matrix", matrix_of)], "rotation")
@@ -101,7 +116,10 @@ def _packed(graph: GraphBuilder, opacities: np.ndarray) -> str:
     right = _take(graph, axes, [3 * j + k for _, j in PAIRS for k in range(3)])
     sums = graph.constant("covariance.sums", np.kron(np.eye(6), np.ones((3, 1))).astype(np.float32))
     covariances = graph.node("MatMul", [graph.node("Mul", [left, right], "covariance.terms"), sums], "covariance")
-    column = graph.constant("opacity", np.ascontiguousarray(opacities[:, None], np.float32))
+    if "opacities" in scene.changing:
+        column = graph.node("Reshape", ["opacities", graph.constant("opacity.column", np.array([-1, 1]))], "opacity")
+    else:
+        column = graph.constant("opacity", scene.opacities[: scene.moving_count, None])
     return graph.node("Concat", ["means", column, covariances], "moving_rows", axis=1)
 
 
@@ -134,7 +152,7 @@ def _packed_static(scene: BakedScene) -> np.ndarray:
     axes = to_matrix(scene.static_quats.astype(np.float64)) * scene.static_scales[:, None, :]
     covariances = axes @ axes.transpose(0, 2, 1)
     kept = np.stack([covariances[:, i, j] for i, j in PAIRS], axis=1)
-    opacities = scene.opacities[scene.moving_count :, None]
+    opacities = scene.opacities[len(scene.opacities) - scene.static_count :, None]
     return np.concatenate([scene.static_means, opacities, kept], axis=1).astype(np.float32)
 
 

@@ -17,7 +17,7 @@ from export.plans.base import BASELINE
 from export.plans.registry import build
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
+from msdgs_serve.scene.baked import CONTRACT, MOVING_OUTPUTS, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
@@ -94,11 +94,11 @@ def write_imported(
 
     `rows` are the rows of the scene that `expected` returns. The largest differences are stored in the metadata: of
     means relative to the half diagonal of the bounds or, further out, to the largest coordinate; of entries of rotation
-    matrices; of scales relative to a Gaussian's largest. Raises `SceneFileInvalid`.
+    matrices; of scales relative to a Gaussian's largest; of opacities and SH that change. Raises `SceneFileInvalid`.
     """
 
     def measured(session: DeformationSession) -> dict[str, Any]:
-        worst = {"means": 0.0, "quats": 0.0, "scales": 0.0}
+        worst = dict.fromkeys(session.scene.posed_outputs, 0.0)
         for t in times:
             for name, error in _differences(session, expected(t), t, rows(t)).items():
                 worst[name] = max(worst[name], error)
@@ -113,22 +113,30 @@ def write_imported(
 
 def note_left_out(file: Path, lost: Sequence[dict[str, Any]]) -> None:
     """Prepend entries to `left_out` of a scene file."""
+    changed_metadata(file, left_out=[*lost, *properties(onnx.load(file))["left_out"]])
+
+
+def changed_metadata(file: Path, **changes: Any) -> None:
+    """Change metadata of a scene file."""
     contents = onnx.load(file)
-    set_properties(contents, left_out=[*lost, *properties(contents)["left_out"]])
+    set_properties(contents, **changes)
     with replacing(file) as temporary:
         temporary.write_bytes(contents.SerializeToString())
 
 
 def _differences(session: DeformationSession, expected: Gaussians, t: float, rows: slice) -> dict[str, float]:
-    means, quats, scales = (getattr(session.gaussians(t), name)[rows] for name in ("means", "quats", "scales"))
+    got = session.gaussians(t)
+    means, quats, scales = (getattr(got, name)[rows] for name in MOVING_OUTPUTS)
     size = half_diagonal(session.scene.metadata.bounds)
     far = np.maximum(np.abs(expected.means.astype(np.float64)).max(axis=1, initial=0), size)
     rotated = np.abs(to_matrix(quats.astype(np.float64)) - to_matrix(expected.quats.astype(np.float64)))
     largest = expected.scales.max(axis=1, initial=0).astype(np.float64)
+    changes = {name: np.abs(getattr(got, name)[rows] - getattr(expected, name)) for name in session.scene.changing}
     return {
         "means": float((np.abs(means - expected.means).max(axis=1) / far).max(initial=0)),
         "quats": float(rotated.max(initial=0)),
         "scales": float((np.abs(scales - expected.scales).max(axis=1) / largest).max(initial=0)),
+        **{name: float(values.max(initial=0)) for name, values in changes.items()},
     }
 
 

@@ -1,13 +1,14 @@
 """A folder of numbered splat files, one per frame, to a moving scene.
 
-If the n-th Gaussian of a frame is the n-th of the next, and only poses differ, frames are blended: they are points of a
-cubic spline, plan `keyframes`. Otherwise frames are switched: the scene holds the Gaussians of all frames, and a graph
-shows those of the frame nearest in time. Opacities are constants of a scene file, so Gaussians of other frames are
-moved far below the scene and scaled down to the smallest size, plan `frames`.
+If the n-th Gaussian of a frame is the n-th of the next, frames are blended: they are points of a cubic spline, plan
+`keyframes`. Otherwise frames are switched: the scene holds the Gaussians of all frames, and a graph shows those of the
+frame nearest in time. Opacities are constants of such a scene, so Gaussians of other frames are moved far below it and
+scaled down to the smallest size, plan `frames`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +23,17 @@ from export.importers.splats.base import Splats
 from export.importers.splats.formats import read_splats
 from export.jobs.bake import Baked, Moving
 from export.measure.poses import half_diagonal
-from export.plans.scene_graph import activated, finished, new_graph
+from export.plans.scene_graph import activated, changing_output, finished, new_graph
+from export.trajectories.poses import POSE
 from export.trajectories.sampling import give_one_sign
 from export.trajectories.splines import design
 from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
-from msdgs_serve.scene.baked import BakedScene
+from msdgs_serve.scene.baked import APPEARANCE, MOVING_OUTPUTS, BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.scale_space import MIN_SCALE
 
 CONSTANT = 0.02
-"""Opacities and SH coefficients may differ by this between frames that are blended: two steps of 8 bits."""
+"""Opacities and SH coefficients that differ by no more between frames are those of the first: two steps of 8 bits."""
 
 APART = 3.0
 """Largest growth of the distance to the nearest neighbor in the next frame, for 90 % of the Gaussians."""
@@ -57,6 +59,24 @@ class Frames:
     def times(self) -> list[float]:
         """The times of the frames."""
         return np.linspace(0, 1, len(self.gaussians)).tolist()
+
+    @cached_property
+    def changing(self) -> tuple[str, ...]:
+        """Those of opacities and SH that depend on time if frames are blended."""
+        return tuple(name for name in APPEARANCE if self._differ(name, CONSTANT).any())
+
+    @cached_property
+    def parts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the Gaussians that move or change, and of those that are the same in all frames."""
+        moves = np.any([self._differ(name) for name in MOVING_OUTPUTS], axis=0)
+        moves = np.any([moves, *(self._differ(name, CONSTANT) for name in self.changing)], axis=0)
+        return np.flatnonzero(moves), np.flatnonzero(~moves)
+
+    def _differ(self, name: str, most: float = 0.0) -> np.ndarray:
+        """[N] whether an array of a Gaussian differs by more than `most` from that of the first frame."""
+        first, *rest = (getattr(frame, name) for frame in self.gaussians)
+        columns = tuple(range(1, first.ndim))
+        return np.any([(np.abs(array - first) > most).any(axis=columns) for array in rest], axis=0)
 
 
 def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], object] = lambda: None) -> Frames:
@@ -94,7 +114,7 @@ def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:
 def posed(sequence: Frames, number: int) -> Gaussians:
     """The Gaussians of one frame in the order of the scene, without those of other frames if they are switched."""
     g = sequence.gaussians[number]
-    return _rows(g, np.concatenate(_parts(sequence))) if sequence.blended else g
+    return _rows(g, np.concatenate(sequence.parts)) if sequence.blended else g
 
 
 def shown_rows(sequence: Frames, number: int) -> slice:
@@ -128,9 +148,6 @@ def _why_not_blended(frames: tuple[Gaussians, ...], dropped: bool) -> str | None
     for number, frame in enumerate(frames[1:], start=1):
         if len(frame) != len(first):
             return f"frame 0 has {len(first):,} Gaussians, frame {number} {len(frame):,}"
-        for name in ("opacities", "sh"):
-            if np.abs(getattr(frame, name) - getattr(first, name)).max() > CONSTANT:
-                return f"{name} change, by frame {number}, and a scene file holds them as constants"
     for number in range(len(frames) - 1):
         if not _neighbors_stay(frames[number].means, frames[number + 1].means):
             return f"the n-th Gaussian of frame {number} isn't the n-th of the next"
@@ -149,39 +166,46 @@ def _neighbors_stay(now: np.ndarray, later: np.ndarray) -> bool:
     return float(np.quantile(then / np.maximum(own, 1e-3 * size), 0.9)) <= APART
 
 
-def _parts(sequence: Frames) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the Gaussians that move, and of those that are the same in all frames."""
-    first = sequence.gaussians[0]
-    moves = np.zeros(len(first), bool)
-    for frame in sequence.gaussians[1:]:
-        for name in ("means", "quats", "scales"):
-            moves |= (getattr(frame, name) != getattr(first, name)).any(axis=1)
-    return np.flatnonzero(moves), np.flatnonzero(~moves)
-
-
 def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     frames = sequence.gaussians
-    moving, static = _parts(sequence)
+    moving, static = sequence.parts
     first, count = frames[0], len(frames)
     metadata = metadata_of(np.concatenate([f.means for f in frames]), first.sh_degree, sha256, sequence.antialiasing)
-    order = np.concatenate([moving, static])
+    changing, order = sequence.changing, np.concatenate([moving, static])
+    stored = {name: getattr(first, name)[static if name in changing else order] for name in APPEARANCE}
     scene = BakedScene(
         replace(metadata, plan=f"keyframes:{count + 2}"),
         len(moving),
         first.means[static],
         first.quats[static],
         first.scales[static],
-        first.opacities[order],
-        first.sh[order],
+        **stored,
+        changing=changing,
     ).validate("the imported sequence")
-    poses = np.stack([np.concatenate([f.means, f.scales, f.quats], axis=1)[moving] for f in frames], axis=1)
+    poses = np.stack([_columns(f, changing)[moving] for f in frames], axis=1)
     give_one_sign(poses)
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
     baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving]), ())
     graph = new_graph(baked)
-    stored = GriddedPoses(((np.arange(len(control)), StoredPoses.of(control)),))
-    activated(graph, of_ids(graph, stored, metadata.time_range))
+    posed = of_ids(graph, GriddedPoses(((np.arange(len(control)), StoredPoses.of(control)),)), metadata.time_range)
+    if changing:
+        widths = {"opacities": 1, "sh": first.sh[0].size}
+        names = [f"ids.{name}" for name in changing]
+        posed, *_ = graph.split(posed, ["ids.pose", *names], [POSE, *(widths[name] for name in changing)])
+    activated(graph, posed)
+    for name in changing:
+        rows = f"ids.{name}"
+        if name == "opacities":  # splines overshoot
+            limits = [graph.constant(f"{rows}.{n}", np.array(v, np.float32)) for n, v in (("min", 0), ("max", 1))]
+            rows = graph.node("Clip", [rows, *limits], f"{rows}.inside")
+        changing_output(graph, scene, name, rows)
     return finished(graph, baked, f"keyframes:{count + 2}")
+
+
+def _columns(frame: Gaussians, changing: tuple[str, ...]) -> np.ndarray:
+    """[N, 10 or more] what depends on time."""
+    appearance = (getattr(frame, name).reshape(len(frame), -1) for name in changing)
+    return np.concatenate([frame.means, frame.scales, frame.quats, *appearance], axis=1)
 
 
 def _through(count: int) -> np.ndarray:

@@ -38,6 +38,8 @@ class Moving:
     quats: FloatArray  # [M, 4] wxyz, unit
     modulation: dict[str, FloatArray] = field(default_factory=dict)
     """By head: factors of its deltas (equation 12), [M, 3] or [M, 4]."""
+    appearance: dict[str, FloatArray] = field(default_factory=dict)
+    """What is changing: logits of `opacities`, [M, 1], and `sh`, [M, C, 3]."""
     attributes: dict[str, np.ndarray] = field(default_factory=dict)  # stored by the support per Gaussian
     baked_attributes: dict[str, np.ndarray] = field(default_factory=dict)  # as a graph reads it: `Support.baked`
 
@@ -64,24 +66,23 @@ class Baked:
 def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Baked:
     """Evaluate everything that doesn't depend on time in float32. The model isn't changed.
 
-    Without deformation layers, or without Gaussians, the whole scene is static. Raises `ModelNotExportable` for parts
-    that `msdgs/1` can't hold.
+    Without deformation layers, or without Gaussians, the whole scene is static. Raises `ModelNotExportable`.
     """
-    _refuse_heads(model)
     with torch.no_grad():
         canonical = model.pose(info.time_range[0], deform=False)
         moves = bool(len(model.deformation)) and len(model.gaussians) > 0
         moving = _moving(model) if moves else Moving.none()
     layers = tuple(model.deformation) if moves else ()
     kinds = tuple(layer.kind for layer in layers)
+    appearance = {"opacities": to_numpy(canonical.opacities), "sh": to_numpy(canonical.sh)}
     scene = BakedScene(
         _metadata(model, info, kinds, checkpoint_sha256),
         moving_count=len(moving),
         static_means=to_numpy(canonical.means[len(moving) :]),
         static_quats=to_numpy(canonical.quats[len(moving) :]),
         static_scales=to_numpy(canonical.scales[len(moving) :]),
-        opacities=to_numpy(canonical.opacities),
-        sh=to_numpy(canonical.sh),
+        **{name: values[len(moving) if name in moving.appearance else 0 :] for name, values in appearance.items()},
+        changing=tuple(moving.appearance),
     )
     return Baked(scene.validate("the baked scene"), moving, layers, model.support)
 
@@ -90,11 +91,13 @@ def _moving(model: DynamicGaussians) -> Moving:
     g = model.gaussians
     stored = {name: values for name, values in g.attributes.items() if name != EMBEDDINGS}
     factors = {} if model.modulation is None else model.modulation(g.attributes[EMBEDDINGS]).present()
+    appearance = {"opacities": g.raw_opacities[:, None], "sh": torch.cat([g.sh_dc, g.sh_rest], dim=1)}
     return Moving(
         to_numpy(g.means),
         to_numpy(g.log_scales),
         to_numpy(unit_or_identity(g.raw_quats)),
         {head: to_numpy(values) for head, values in factors.items()},
+        {name: to_numpy(appearance[name]) for name in changing_outputs(model)},
         {name: to_array(values) for name, values in stored.items()},
         model.support.baked(stored),
     )
@@ -133,10 +136,7 @@ def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
         raise ModelNotExportable(f"a camera of the model's scene can't be used: {error}") from error
 
 
-def _refuse_heads(model: DynamicGaussians) -> None:
-    for option, stored in (("opacity_head", "opacities"), ("sh_head", "sh")):
-        if getattr(model.config, option) and len(model.deformation):
-            raise ModelNotExportable(
-                f"model.{option} is on, so `{stored}` change with time, but {CONTRACT} stores constants; "
-                "train without that head to export"
-            )
+def changing_outputs(model: DynamicGaussians) -> tuple[str, ...]:
+    """Those of opacities and SH that depend on time."""
+    heads = {"opacities": model.config.opacity_head, "sh": model.config.sh_head}
+    return tuple(name for name, is_on in heads.items() if is_on and len(model.deformation))

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from export.jobs.bake import Baked
+from export.jobs.bake import Baked, changing_outputs
 from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames, RenderedError
 from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
-from export.plans.registry import build, plan_of
+from export.plans.registry import build, check_appearance, plan_of
 from export.progress import Track, no_progress
 from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
 from export.pruning.mask import bake_pruned, in_spatial_order, rows, unpruned, with_sh_degree
@@ -168,6 +168,7 @@ class ExportJob:
     def candidate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> Candidate:
         """Write a scene file. Raises `InvalidInput` for a plan that this scene can't have, `PlanUnsafe` for one whose
         round-off would be visible."""
+        check_appearance(plan, changing_outputs(self.model))
         self.stability.require(plan)
         model = self.pruned(pruning_db)
         if sh_degree is not None:
@@ -201,18 +202,16 @@ class ExportJob:
         return self._pruned[None]
 
     def _worst_db(self, mask: PruningMask, pruned: PrunedModel) -> float:
-        """PSNR of the worst evaluation frame of a pruned model. If its network is complete, moving Gaussians take the
-        poses of the exact frames, and no layer is run again."""
-        layers_changed = mask.moves.any() and mask.network != full_mask(self.model).network
+        """PSNR of the worst evaluation frame of a pruned model. If its network is complete and only poses depend on
+        time, moving Gaussians take those of the exact frames, and no layer is run again."""
+        changes = mask.network != full_mask(self.model).network or changing_outputs(self.model)
+        layers_run = mask.moves.any() and changes
         moving = mask.ids[: len(pruned.moving.gaussians)]
 
         def pose(t: float) -> Gaussians:
-            moved = posed(pruned.moving, t) if layers_changed else rows(self.exact.kept(t), moving, 0)
-            static = pruned.static
-            colors = rows(self.exact.kept(t), mask.ids, mask.sh_degree)
-            parts = ("means", "quats", "scales")
-            arrays = [np.concatenate([getattr(moved, part), getattr(static, part)]) for part in parts]
-            return Gaussians(*(a.astype(np.float32) for a in (*arrays, colors.opacities, colors.sh)))
+            moved = posed(pruned.moving, t) if layers_run else rows(self.exact.kept(t), moving, mask.sh_degree)
+            pairs = zip(vars(moved).values(), vars(pruned.static).values(), strict=True)
+            return Gaussians(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
 
         return self.exact.measure(pose, pruned.ids).psnr_worst
 

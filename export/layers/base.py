@@ -7,10 +7,11 @@ import torch
 
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.layers.base import HEAD_COLUMNS, Heads
+from msdgs_train.layers.base import HEAD_COLUMNS, PAPER_HEADS, Heads
 from msdgs_train.layers.deformation import DeformationLayer
 
 HEADS = tuple(HEAD_COLUMNS)
+"""The heads of poses. Others, of opacities and SH, are named as the outputs of a scene file."""
 
 
 class ModelNotExportable(MsdgsError):
@@ -56,9 +57,9 @@ class FieldLayerExport:
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
         """The outputs of the heads `used`, times the step weight, if the layer predicts one, and the gate."""
-        has_weight = cast(Heads, inputs.layer.outputs).weight
-        rows = output_rows(used, has_weight)
-        return weighted(graph, inputs, self.outputs(graph, inputs, rows), len(rows), has_weight)
+        heads = heads_of(inputs.layer)
+        rows = output_rows(used, heads)
+        return weighted(graph, inputs, self.outputs(graph, inputs, rows), len(rows), heads.weight)
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Add the nodes of the field. Returns these output columns, [P, len(rows)]; the logit of the weight is last, if
@@ -66,11 +67,16 @@ class FieldLayerExport:
         raise NotImplementedError
 
 
-def output_rows(used: list[str], has_weight: bool) -> np.ndarray:
+def heads_of(layer: DeformationLayer) -> Heads:
+    """The heads of a layer; those of poses if it doesn't name them."""
+    return cast(Heads, getattr(layer, "outputs", PAPER_HEADS))
+
+
+def output_rows(used: list[str], heads: Heads) -> np.ndarray:
     """Indices of the outputs of the heads `used`, then of the weight."""
-    columns = np.arange(HEAD_COLUMNS[HEADS[-1]].stop + 1)
-    deltas = [columns[HEAD_COLUMNS[head]] for head in used]
-    return np.concatenate([*deltas, columns[-1:]] if has_weight else deltas)
+    columns = np.arange(sum(heads.sizes))
+    deltas = [columns[heads.columns[head]] for head in used]
+    return np.concatenate([*deltas, columns[-1:]] if heads.weight else deltas)
 
 
 def weighted(graph: GraphBuilder, inputs: LayerInputs, outputs: str, columns: int, has_weight: bool) -> str:

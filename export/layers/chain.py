@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from export.layers import export_of
-from export.layers.base import HEADS, LayerInputs
+from export.layers.base import HEADS, LayerInputs, heads_of
 from export.layers.graph import GraphBuilder
 from msdgs_train.layers.deformation import DeformationLayer
 
@@ -16,7 +16,7 @@ STRETCH_COLUMNS = 6
 def used_heads(layers: Sequence[DeformationLayer]) -> list[str]:
     """Heads that change anything in any of the layers; at least one."""
     inert = [export_of(layer).inert_heads(layer) for layer in layers]
-    return [head for head in HEADS if any(head not in heads for heads in inert)] or ["means"]
+    return [head for head in heads_of(layers[0]).columns if any(head not in heads for heads in inert)] or ["means"]
 
 
 def summed_deltas(
@@ -29,7 +29,8 @@ def summed_deltas(
     num_nodes: int | None = None,
 ) -> dict[str, str]:
     """Deltas of points, [P, 3], by head; on control nodes scales have six columns."""
-    widths = {"means": 3, "scales": 3 if num_nodes is None else STRETCH_COLUMNS, "quats": 4}
+    widths = {name: columns.stop - columns.start for name, columns in heads_of(layers[0]).columns.items()}
+    widths |= {} if num_nodes is None else {"scales": STRETCH_COLUMNS}
     total, moved, parts = "", points, dict[str, str]()
     for k, layer in enumerate(layers, start=1):
         name, export = f"layer{k}", export_of(layer)

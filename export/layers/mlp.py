@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import torch
 
-from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, zero
+from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, heads_of, zero
 from export.layers.graph import GraphBuilder, to_numpy
 from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.mlp import MLPLayer
@@ -21,10 +21,8 @@ class MLPExport(FieldLayerExport):
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose rows of the last Linear are all 0."""
-        heads = cast(MLPLayer, layer).heads
-        return frozenset(
-            n for n, rows in HEAD_COLUMNS.items() if not (heads.weight[rows].any() or heads.bias[rows].any())
-        )
+        heads, columns = cast(MLPLayer, layer).heads, heads_of(layer).columns
+        return frozenset(n for n, rows in columns.items() if not (heads.weight[rows].any() or heads.bias[rows].any()))
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
         """Set these rows of the last Linear to 0."""

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from onnx import TensorProto
 
-from export.layers.base import HEADS, FieldLayerExport, LayerInputs, zero
+from export.layers.base import HEADS, FieldLayerExport, LayerInputs, heads_of, zero
 from export.layers.graph import GraphBuilder, to_numpy
 from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
@@ -25,7 +25,7 @@ class PlaneExport(FieldLayerExport):
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose Linear is all 0."""
-        heads = zip(HEADS, cast(PlaneLayer, layer).heads, strict=False)  # the head of the weight comes last
+        heads = zip(heads_of(layer).columns, cast(PlaneLayer, layer).heads, strict=False)  # the weight's comes last
         return frozenset(name for name, head in heads if not any(p.any() for p in head.parameters()))
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -51,22 +51,23 @@ def half_diagonal(bounds: object) -> float:
     return max(float(np.linalg.norm(high - low)) / 2, 1e-30)
 
 
-def pose_errors(got: Gaussians, expected: Gaussians, scene_size: float) -> dict[str, np.ndarray]:
+def pose_errors(
+    got: Gaussians, expected: Gaussians, scene_size: float, outputs: Sequence[str] = MOVING_OUTPUTS
+) -> dict[str, np.ndarray]:
     """[M] the largest error of each Gaussian, by output; infinite if `got` is NaN or infinite.
 
     Means: relative to the scene's half diagonal or, further out, to the largest coordinate. Quaternions: absolute.
-    Scales: relative to the Gaussian's largest scale, or to `SMALLEST_VISIBLE` of the scene.
+    Scales: relative to the Gaussian's largest scale, or to `SMALLEST_VISIBLE` of the scene. Opacities and SH: absolute.
     """
     sizes = {
         "means": np.maximum(np.abs(expected.means).max(axis=1), scene_size),
-        "quats": 1.0,
+        **dict.fromkeys(("quats", "opacities", "sh"), 1.0),
         "scales": np.maximum(expected.scales.max(axis=1), SMALLEST_VISIBLE * scene_size),
     }
     with np.errstate(invalid="ignore", over="ignore"):
-        errors = {
-            name: np.abs(getattr(got, name).astype(np.float64) - getattr(expected, name)).max(axis=1) / sizes[name]
-            for name in MOVING_OUTPUTS
-        }
+        differences = {n: np.abs(getattr(got, n).astype(np.float64) - getattr(expected, n)) for n in outputs}
+        largest = {name: values.max(axis=tuple(range(1, values.ndim))) for name, values in differences.items()}
+        errors = {name: values / sizes[name] for name, values in largest.items()}
     return {name: np.where(np.isfinite(values), values, math.inf) for name, values in errors.items()}
 
 

@@ -72,7 +72,8 @@ class ExactFrames:
                 on_frame()
 
     def kept(self, t: float) -> Gaussians:
-        """All Gaussians at one of the views' times; quaternions and scales rounded to float32."""
+        """All Gaussians at one of the views' times; quaternions and scales rounded to float32, opacities and SH of the
+        first time."""
         return self._poses[t]
 
     def measure(

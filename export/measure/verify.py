@@ -10,7 +10,7 @@ import numpy as np
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed
 from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.baked import MOVING_OUTPUTS
+from msdgs_serve.scene.baked import APPEARANCE
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -60,7 +60,8 @@ def verify(
     double, count, size = copy.deepcopy(model).double(), len(model.gaussians), half_diagonal(stated.bounds)
     stride = max(1, math.ceil(count / GAUSSIANS_PER_TIME))
     distances, unstable, unstable_worst = [], np.zeros(count, bool), 0.0
-    worst: dict[str, dict[str, float]] = {p: dict.fromkeys(MOVING_OUTPUTS, 0.0) for p in ("float64", "float32")}
+    outputs = session.scene.posed_outputs
+    worst: dict[str, dict[str, float]] = {p: dict.fromkeys(outputs, 0.0) for p in ("float64", "float32")}
     _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # constants under every plan
     for i, t in enumerate(times_to_verify(*stated.time_range, times)):
         ids = np.arange(i % stride, count, stride)
@@ -68,11 +69,11 @@ def verify(
         got = _posed_by_file(session, t, ids)
         _give_sign_of(poses["float64"].quats, got.quats)
         distances.append(_distances(got, poses["float64"]))
-        own = largest_error(pose_errors(poses["float32"], poses["float64"], size))
+        own = largest_error(pose_errors(poses["float32"], poses["float64"], size, outputs))
         stable = own <= UNSTABLE * tolerance
         unstable[ids[~stable]] = True
         for precision, reference in poses.items():
-            for name, errors in pose_errors(got, reference, size).items():
+            for name, errors in pose_errors(got, reference, size, outputs).items():
                 unstable_worst = max(unstable_worst, float(errors[~stable].max(initial=0)))
                 error = float(errors[stable].max(initial=0))
                 worst[precision][name] = max(worst[precision][name], error)
@@ -92,12 +93,13 @@ def verify(
 
 def differences(got: DeformationSession, expected: DeformationSession) -> dict[str, float]:
     """The largest errors of all Gaussians of a file against another of the same scene, at a few times, by output."""
-    worst: dict[str, float] = dict.fromkeys(MOVING_OUTPUTS, 0.0)
+    outputs = expected.scene.posed_outputs
+    worst: dict[str, float] = dict.fromkeys(outputs, 0.0)
     bounds = expected.scene.metadata.bounds
     for t in times_to_verify(*expected.scene.metadata.time_range, DIFFERENCE_TIMES):
         pose, reference = got.gaussians(t), expected.gaussians(t)
         _give_sign_of(reference.quats, pose.quats)
-        for name, errors in pose_errors(pose, reference, half_diagonal(bounds)).items():
+        for name, errors in pose_errors(pose, reference, half_diagonal(bounds), outputs).items():
             worst[name] = max(worst[name], float(errors.max(initial=0)))
     return worst
 
@@ -147,15 +149,14 @@ def _posed_by_file(session: DeformationSession, t: float, ids: np.ndarray) -> Ga
     scene = session.scene
     moving = ids[ids < scene.moving_count]
     static = ids[ids >= scene.moving_count] - scene.moving_count
-    statics = (scene.static_means[static], scene.static_quats[static], scene.static_scales[static])
-    parts = zip(session.pose(t, moving), statics, strict=True)
-    means, quats, scales = (np.concatenate(pair) for pair in parts)
-    return Gaussians(means, quats, scales, scene.opacities[ids], scene.sh[ids])
+    parts = zip(scene.posed_outputs, session.pose(t, moving), scene.static, strict=True)
+    posed = {name: np.concatenate([now, constant[static]]) for name, now, constant in parts}
+    return Gaussians(**posed, **{name: getattr(scene, name)[ids] for name in APPEARANCE if name not in posed})
 
 
 def _check_opacities_and_sh(session: DeformationSession, model: DynamicGaussians, tolerance: float) -> None:
     expected = posed(model, session.scene.metadata.time_range[0], deform=False)
-    for name in ("opacities", "sh"):
+    for name in (name for name in APPEARANCE if name not in session.scene.changing):
         reference = getattr(expected, name)
         got = getattr(session.scene, name)[: len(reference)]
         if not np.allclose(got, reference, rtol=tolerance, atol=tolerance):

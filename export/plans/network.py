@@ -8,9 +8,10 @@ import onnx
 from onnx import TensorProto
 
 from export.jobs.bake import Baked
+from export.layers.base import heads_of
 from export.layers.graph import GraphBuilder
 from export.plans.base import Plan
-from export.plans.scene_graph import finished, new_graph, unit_quats
+from export.plans.scene_graph import changing_output, finished, new_graph, unit_quats
 from export.supports import Layout, SupportInputs, support_export_of
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import InvalidInput
@@ -48,6 +49,12 @@ def _deform(graph: GraphBuilder, baked: Baked, layout: Layout | None) -> None:
         _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space, poses["scales"])
         raw_quats = graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats
         unit_quats(graph, raw_quats, poses["quats"])
+        for name, values in moving.appearance.items():
+            deltas = parts.get(name)
+            if deltas and name == "sh" and heads_of(baked.layers[0]).sh > values.shape[1]:  # bands were pruned
+                columns = graph.constant("sh.columns", np.arange(values[0].size))
+                deltas = graph.node("Gather", [deltas, columns], "sh.deltas", axis=1)
+            changing_output(graph, baked.scene, name, _appearance(graph, rows, name, values, deltas))
     rows.put_in_order(poses)
 
 
@@ -89,6 +96,14 @@ def _modulated(graph: GraphBuilder, rows: _Rows, part: str, factors: np.ndarray 
         return deltas
     name = f"{part.removesuffix('s')}_modulation"
     return graph.node("Mul", [rows.of(name, factors), deltas], f"{name}.applied")
+
+
+def _appearance(graph: GraphBuilder, rows: _Rows, name: str, values: np.ndarray, deltas: str | None) -> str:
+    """Opacities, [M, 1], or SH, [M, 3 C], plus their deltas."""
+    canonical = rows.of(f"canonical_{name}", values.reshape(len(values), -1))
+    if deltas is not None:
+        canonical = graph.node("Add", [canonical, deltas], f"{name}.moved")
+    return graph.node("Sigmoid", [canonical], f"{name}.activated") if name == "opacities" else canonical
 
 
 def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_space: str, output: str) -> None:

@@ -1,6 +1,7 @@
 """The plans by name, and the scene file of a plan."""
 
 import re
+from collections.abc import Collection
 
 import onnx
 
@@ -46,6 +47,14 @@ def plan_of(text: str | PlanSpec) -> Plan:
     return PLANS[parse(text).name]
 
 
+def check_appearance(plan: str | PlanSpec, changing: Collection[str]) -> None:
+    """Raise `InvalidInput` for a plan that can't hold opacities or SH which are `changing`."""
+    if changing and plan_of(plan).fitted:
+        layered = ", ".join(each.name for each in PLANS.values() if not each.fitted)
+        changes = f"this model's {' and '.join(changing)} change with time"
+        raise InvalidInput("plan", f"one that runs layers ({layered}), since {changes}", str(plan))
+
+
 def _exists(spec: PlanSpec) -> bool:
     plan = PLANS.get(spec.name)
     if plan is None:
@@ -65,4 +74,5 @@ def build(plan: str | PlanSpec, baked: Baked, trajectories: Trajectories | None 
     spec = parse(plan)
     if not len(baked.moving):
         return static_graph(baked, str(spec))
+    check_appearance(spec, baked.scene.changing)
     return PLANS[spec.name].build(baked, spec, lambda: trajectories or Trajectories(baked))

@@ -9,7 +9,8 @@ from onnx import TensorProto
 
 from export.jobs.bake import Baked
 from export.layers.graph import GraphBuilder
-from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
+from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, CONTRACT, BakedScene, constant_outputs
+from msdgs_serve.scene.metadata import CHANGING_CONTRACT
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.gaussians.scale_space import MIN_SCALE
 
@@ -24,7 +25,8 @@ def new_graph(baked: Baked) -> GraphBuilder:
 def finished(
     graph: GraphBuilder, baked: Baked, plan: str, error_bound: dict[str, Any] | None = None
 ) -> onnx.ModelProto:
-    """The scene file of a graph that computes `means`, `quats` and `scales`, or holds them as constants.
+    """The scene file of a graph that computes `means`, `quats`, `scales` and what is `changing`, or holds them as
+    constants.
 
     `error_bound` of a fitted plan is `measured_error` until the file is measured.
     """
@@ -32,8 +34,9 @@ def finished(
     has_ids = "ids" in graph.constants
     count: int | str = "M" if has_ids and scene.moving_count else scene.moving_count
     outputs: dict[str, list[int | str]] = {"means": [count, 3], "quats": [count, 4], "scales": [count, 3]}
-    for name in CONSTANT_OUTPUTS:
-        array = getattr(scene, name)
+    outputs |= {name: [count, *getattr(scene, name).shape[1:]] for name in scene.changing}
+    for name, stored in zip(constant_outputs(scene.changing), CONSTANT_OUTPUTS, strict=True):
+        array = getattr(scene, stored)
         graph.constant(name, array)
         outputs[name] = list(array.shape)
     inputs: dict[str, tuple[int, list[int | str]]] = {"t": (TensorProto.FLOAT, [1])}
@@ -41,9 +44,9 @@ def finished(
         inputs["ids"] = (TensorProto.INT64, ["M"])
     if "steps" in graph.constants:
         inputs["steps"] = (TensorProto.FLOAT, [1])
-    return graph.model(
-        inputs, outputs, replace(scene.metadata, plan=plan, measured_error=error_bound or {}).to_properties()
-    )
+    contract = CHANGING_CONTRACT if scene.changing else CONTRACT
+    metadata = replace(scene.metadata, contract=contract, plan=plan, measured_error=error_bound or {})
+    return graph.model(inputs, outputs, metadata.to_properties())
 
 
 def static_graph(baked: Baked, plan: str) -> onnx.ModelProto:
@@ -59,6 +62,12 @@ def activated(graph: GraphBuilder, pose: str) -> None:
     graph.split(pose, ["means", "raw_scales", "raw_quats"], [3, 3, 4])
     graph.node("Max", ["raw_scales", graph.constant("scales.min", np.array(MIN_SCALE, np.float32))], "scales")
     unit_quats(graph, "raw_quats")
+
+
+def changing_output(graph: GraphBuilder, scene: BakedScene, name: str, rows: str) -> None:
+    """Add the output `opacities` or `sh` of activated values, [M, 1] or [M, 3 C]."""
+    shape = graph.constant(f"{name}.shape", np.array([-1, *getattr(scene, name).shape[1:]], np.int64))
+    graph.node("Reshape", [rows, shape], name)
 
 
 def unit_quats(graph: GraphBuilder, raw: str, output: str = "quats") -> None:

@@ -1,16 +1,19 @@
 """The basis of pruning: the visibility of each Gaussian, its motion in pixels, and frames to compare."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import torch
 
+from export.jobs.bake import changing_outputs
 from export.measure.frames import compare, render
 from export.measure.poses import operations, posed
 from export.measure.views import View
 from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_network
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
+from msdgs_serve.scene.baked import APPEARANCE
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -36,8 +39,8 @@ class Poses:
         """The Gaussians at one of the times."""
         if t not in self._at:
             g = posed(self._model, t)
-            shared = next(iter(self._at.values()), g)
-            self._at[t] = Gaussians(g.means, g.quats, g.scales, shared.opacities, shared.sh)
+            shared, changing = next(iter(self._at.values()), g), changing_outputs(self._model)
+            self._at[t] = replace(g, **{name: getattr(shared, name) for name in APPEARANCE if name not in changing})
         return self._at[t]
 
     @cached_property
@@ -92,15 +95,12 @@ class PruningStatistics:
         """PSNR in dB of the worst selection frame, or of the first that is under `min_db`."""
         poses, worst = self.poses(mask.network), np.inf
         moving, static = np.flatnonzero(mask.moves), np.flatnonzero(mask.kept & ~mask.moves)
-        colors = rows(self._whole[1].static, mask.ids, mask.sh_degree)
-        standing = rows(poses.static if len(static) else self._whole[1].static, static, 0)
-        constants = standing.means, standing.quats, standing.scales
+        standing = rows(poses.static if len(static) else self._whole[1].static, static, mask.sh_degree)
         for i in list(self._order):
             view = self._views[i]
-            at = poses.at(view.t)
-            changing = at.means[moving], at.quats[moving], at.scales[moving]
-            means, quats, scales = (np.concatenate(pair) for pair in zip(changing, constants, strict=True))
-            drawn = Gaussians(means, quats, scales, colors.opacities, colors.sh)
+            changing = rows(poses.at(view.t), moving, mask.sh_degree)
+            pairs = zip(vars(changing).values(), vars(standing).values(), strict=True)
+            drawn = Gaussians(*(np.concatenate(pair) for pair in pairs))
             frame = render(drawn, view.camera, self.background, self.model.rasterizer)
             worst = min(worst, compare(frame, self._frames[i]).psnr)
             if worst < min_db:
@@ -110,15 +110,21 @@ class PruningStatistics:
         return worst
 
     def motion(self, network: NetworkMask) -> FloatArray:
-        """[N] largest displacement of the ends of a Gaussian's axes from its mean pose, pixels."""
+        """[N] largest displacement of the ends of a Gaussian's axes from its mean pose, pixels. A change of all of its
+        opacity or color counts as one."""
         poses = self.poses(network)
-        mean_axes = half_axes(poses.static)
-        furthest = np.zeros(len(poses.static), np.float32)
+        mean_axes, mean = half_axes(poses.static), poses.static
+        furthest, changed = np.zeros((2, len(mean)), np.float32)
         for at in map(poses.at, poses.times):
             moved = np.linalg.norm(at.means - poses.static.means, axis=1)
             rotated = np.linalg.norm(half_axes(at) - mean_axes, axis=1).max(axis=1, initial=0)
             np.maximum(furthest, moved + rotated, out=furthest)
-        return furthest * self.pixels_per_unit(poses.static.means)
+            if not changing_outputs(self.model):
+                continue
+            faded = np.abs(at.opacities - mean.opacities) / np.maximum(mean.opacities, GSPLAT.alpha_min)
+            colored = np.abs(at.sh - mean.sh).sum(axis=1).max(axis=1, initial=0)
+            np.maximum(changed, faded + colored, out=changed)
+        return furthest * self.pixels_per_unit(mean.means) + changed
 
     def change(self, network: NetworkMask, smaller: NetworkMask) -> float:
         """Mean displacement in pixels of a few Gaussians at a few times if part of a network is removed, weighted by
@@ -179,7 +185,8 @@ def half_axes(gaussians: Gaussians) -> FloatArray:
 
 
 def mean_pose(poses: list[Gaussians]) -> Gaussians:
-    """Mean poses over time: of means, of logarithms of scales, and of quaternions in one hemisphere."""
+    """Mean poses over time: of means, of logarithms of scales, of quaternions in one hemisphere, and if they change, of
+    opacities, and of SH weighted by opacity."""
     first = poses[0]
     quats = np.zeros_like(first.quats)
     for pose in poses:
@@ -189,4 +196,10 @@ def mean_pose(poses: list[Gaussians]) -> Gaussians:
     quats = np.where(norms < MIN_NORM, first.quats, quats / np.maximum(norms, MIN_NORM)).astype(np.float32)
     means = np.asarray(np.mean([pose.means for pose in poses], axis=0, dtype=np.float64), np.float32)
     log_scales = np.mean([np.log(pose.scales) for pose in poses], axis=0, dtype=np.float64)
-    return Gaussians(means, quats, np.exp(log_scales).astype(np.float32), first.opacities, first.sh)
+    opacities, sh = first.opacities, first.sh
+    if any(pose.opacities is not opacities or pose.sh is not sh for pose in poses):
+        total = np.sum([pose.opacities for pose in poses], axis=0, dtype=np.float64)
+        weighted = sum(pose.opacities[:, None, None] * pose.sh.astype(np.float64) for pose in poses)
+        opacities = np.asarray(total / len(poses), np.float32)
+        sh = np.asarray(weighted / np.maximum(total, 1e-30)[:, None, None], np.float32)
+    return Gaussians(means, quats, np.exp(log_scales).astype(np.float32), opacities, sh)

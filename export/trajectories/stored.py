@@ -8,7 +8,6 @@ import numpy.typing as npt
 from onnx import TensorProto
 
 from export.layers.graph import GraphBuilder
-from export.trajectories.poses import POSE
 from export.trajectories.splines import time_weights
 
 LEVELS = 2**15 - 1
@@ -16,7 +15,8 @@ LEVELS = 2**15 - 1
 
 @dataclass(frozen=True)
 class StoredPoses:
-    """Control points [M, n, 10] as integers; each column of each Gaussian has its own range.
+    """Control points [M, n, 10] as integers; each column of each Gaussian has its own range. More columns are of
+    opacities and SH.
 
     The resolution is 1/65,534 of the range of a Gaussian's motion; that of float16 is 1/2,048 of the largest value.
     """
@@ -68,7 +68,7 @@ def at_time(graph: GraphBuilder, poses: GriddedPoses, time_range: tuple[float, f
     counts = [stored.points.shape[1] for _, stored in poses.grids]
     cells, weights = time_weights(graph, "poses.clock", time_range, counts)
     neighbors = graph.constant("poses.neighbours", np.arange(4, dtype=np.int64))
-    shape = graph.constant("poses.shape", np.array([-1, POSE], np.int64))
+    shape = graph.constant("poses.shape", np.array([-1, poses.grids[0][1].points.shape[2]], np.int64))
     parts = []
     for g, (_, stored) in enumerate(poses.grids):
         name, which = f"poses.grid{g}", graph.constant(f"poses.grid{g}.which", np.array([g], np.int64))

@@ -76,7 +76,7 @@ VIDEO_RESPONSE: Responses = {
 SCENE_BODY = {
     "requestBody": {
         "required": True,
-        "description": "a scene file, contract `msdgs/1`",
+        "description": "a scene file, contract `msdgs/1` or `msdgs/2`",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }

@@ -370,6 +370,7 @@ class SceneDetail(SceneEntry):
     gaussians: GaussianCounts
     sh_degree: int
     time_range: tuple[float, float]
+    duration: float | None = Field(description="of the time range, seconds, if the scene says so")
     bounds: tuple[list[float], list[float]] = Field(description="two corners of a box, world")
     background: tuple[float, float, float] = Field(description="sRGB-encoded")
     antialiasing: str

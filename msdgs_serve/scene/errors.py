@@ -31,7 +31,7 @@ class SceneNotFound(MsdgsError, KeyError):
 
 
 class SceneFileInvalid(MsdgsError):
-    """A scene file violates contract `msdgs/1`: a part is missing, invalid or contradictory."""
+    """A scene file violates its contract: a part is missing, invalid or contradictory."""
 
     def __init__(self, file: str, field: str, problem: str, details: str = "") -> None:
         """`details` are for logs only, such as a library's message."""

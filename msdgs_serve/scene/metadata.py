@@ -1,4 +1,4 @@
-"""Metadata of a scene file (contract `msdgs/1`): the `metadata_props`, checked on reading."""
+"""Metadata of a scene file (`CONTRACTS`): the `metadata_props`, checked on reading."""
 
 import json
 import re
@@ -12,7 +12,8 @@ from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_serve.scene.plain_json import parse
 
-CONTRACT = "msdgs/1"
+CONTRACTS = CONTRACT, CHANGING_CONTRACT = "msdgs/1", "msdgs/2"
+"""The second has opacities or SH that depend on time. Files that have neither are of the first."""
 MAX_NUMBER = 1e9
 """Limit of times, coordinates and pixels: beyond any sensible value, within single precision."""
 MAX_LIST = 1000
@@ -68,11 +69,14 @@ class SceneMetadata:
     package_version: str
     checkpoint_sha256: str  # of the model file
     eps2d: float = 0.3  # px², as trained
+    duration: float | None = None  # of the time range, seconds; None: unknown
 
     def to_properties(self) -> dict[str, str]:
         """Return the `metadata_props` of a file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         values["cameras"] = [camera.to_plain() for camera in self.cameras]
+        if self.duration is None:
+            del values["duration"]
         return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}
 
     @classmethod
@@ -192,6 +196,12 @@ def _eps2d(value: Any) -> float:
     return number
 
 
+def _duration(value: Any) -> float:
+    if (number := _number(value)) <= 0:
+        raise ValueError(f"{value} isn't above 0")
+    return number
+
+
 def _sha256(value: Any) -> str:
     if not re.fullmatch("[0-9a-f]{64}", _text(value)):
         raise ValueError(f"{_shown(value)} isn't a SHA-256 in lower-case hexadecimal")
@@ -199,7 +209,7 @@ def _sha256(value: Any) -> str:
 
 
 _READERS: dict[str, Callable[[Any], Any]] = {
-    "contract": _one_of(CONTRACT),
+    "contract": _one_of(*CONTRACTS),
     "layers": _words,
     "plan": _word,
     "time_range": _time_range,
@@ -214,4 +224,5 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "package_version": _word,
     "checkpoint_sha256": _sha256,
     "eps2d": _eps2d,
+    "duration": _duration,
 }

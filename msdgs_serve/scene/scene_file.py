@@ -1,13 +1,14 @@
-"""Read a scene file (contract `msdgs/1`) from bytes, and check all of it before any part runs."""
+"""Read a scene file from bytes, and check all of it before any part runs."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, MOVING_OUTPUTS, OPTIONAL_INPUT
+from msdgs_serve.scene.baked import APPEARANCE, OPTIONAL_INPUT, constant_outputs
 from msdgs_serve.scene.errors import SceneFileInvalid
-from msdgs_serve.scene.metadata import SceneMetadata
+from msdgs_serve.scene.metadata import CONTRACT, SceneMetadata
 from msdgs_serve.scene.onnx import (
     UNLIMITED,
     GraphLimits,
@@ -22,6 +23,7 @@ from msdgs_serve.scene.onnx import (
 )
 from msdgs_serve.scene.onnx.model import FLOAT, INT64, Port, element_name
 from msdgs_serve.scene.onnx.shapes import IDS, Shape, fixed, text
+from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 
 CHUNK = 2048
 """Gaussians per call of a graph that runs layers on Gaussians. The largest activation of a call is CHUNK × width."""
@@ -36,8 +38,6 @@ _INPUTS: Mapping[str, tuple[int, Shape]] = {
     "ids": (INT64, (IDS,)),
     OPTIONAL_INPUT: (FLOAT, fixed([1])),
 }
-_COLUMNS = {"means": 3, "quats": 4, "scales": 3}
-_POSED_BYTES = 4 * sum(_COLUMNS.values())
 _CHUNK_VALUES = 1 << 22
 """Values that are checked at a time, to bound the memory of the checks."""
 
@@ -61,17 +61,23 @@ class SceneFile:
     steps: float | None  # the default input; None if the plan doesn't run layers
     takes_ids: bool  # whether the graph has the input `ids`
     poses_all: bool  # whether a call computes all Gaussians in any case
-    outputs: tuple[str, ...]  # those of `graph` with the values of MOVING_OUTPUTS
+    posed: Mapping[str, tuple[int, ...]]  # outputs that depend on time, and the shape of a row of each
+    outputs: tuple[str, ...]  # those of `graph` with the values of `posed`
     selected: bool  # whether rows of the outputs are those of the input `ids`; otherwise row i is of Gaussian i
-    constants: Mapping[str, np.ndarray]  # those of CONSTANT_OUTPUTS that are stored directly
+    constants: Mapping[str, np.ndarray]  # those of `constant_outputs` that are stored directly
     graph: bytes  # computes `outputs` from the inputs of the contract, which have no defaults
-    constant_graph: bytes | None  # computes the remaining CONSTANT_OUTPUTS, without inputs
+    constant_graph: bytes | None  # computes the remaining `constant_outputs`, without inputs
     cost: SceneCost
+
+    @property
+    def changing(self) -> tuple[str, ...]:
+        """Opacities and SH, if they depend on time."""
+        return tuple(name for name in self.posed if name in APPEARANCE)
 
     @property
     def computed(self) -> list[str]:
         """Names of the outputs of `constant_graph`."""
-        return [name for name in CONSTANT_OUTPUTS if name not in self.constants]
+        return [name for name in constant_outputs(self.changing) if name not in self.constants]
 
 
 def read_scene_file(contents: bytes, file: str, limits: GraphLimits) -> SceneFile:
@@ -92,27 +98,30 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
     inputs = _inputs(model)
     takes_ids = "ids" in inputs
     moving_count, steps = _default_ids(model) if takes_ids else _rows(model), _default_steps(model)
-    returned = moving_count * _POSED_BYTES
+    posed = _posed(model, metadata)
+    returned = moving_count * sum(4 * math.prod(row) for row in posed.values())
     poses_all = not takes_ids or steps is None or _poses_all(model, inputs, moving_count)
     ids = moving_count if poses_all else min(CHUNK, moving_count)
     calls = -(-moving_count // max(ids, 1))
     values, cost = infer(model, inputs, limits, ids, calls, returned)
-    _check_outputs(model, values, moving_count, takes_ids)
+    constant = constant_outputs(posed)
+    _check_outputs(model, values, moving_count, takes_ids, posed, constant)
     _check_count(moving_count + values["static_means"].shape[0].fixed, limits)
     constants = {}
-    for name in CONSTANT_OUTPUTS:
+    for name in constant:
         stored = values[name].constant
         if stored is not None:
             constants[name] = stored.array().copy()  # aligned, and doesn't keep the whole file in memory
-    computed = [name for name in CONSTANT_OUTPUTS if name not in constants]
-    rows = _before_selection(model, values, moving_count) if poses_all else None
-    outputs = rows or MOVING_OUTPUTS
+    computed = [name for name in constant if name not in constants]
+    rows = _before_selection(model, values, moving_count, tuple(posed)) if poses_all else None
+    outputs = rows or tuple(posed)
     return SceneFile(
         metadata,
         moving_count,
         steps,
         takes_ids,
         poses_all,
+        posed,
         outputs,
         rows is None,
         constants,
@@ -128,7 +137,9 @@ def _poses_all(model: Model, inputs: Mapping[str, Value], moving_count: int) -> 
     return every < PER_ID_FACTOR * one
 
 
-def _before_selection(model: Model, values: Mapping[str, Value], moving_count: int) -> tuple[str, ...] | None:
+def _before_selection(
+    model: Model, values: Mapping[str, Value], moving_count: int, names: tuple[str, ...]
+) -> tuple[str, ...] | None:
     """The names of the poses of all Gaussians, row i of Gaussian i, from which the last nodes of a graph select the
     ids, or the first rows. None if it has the input `ids` and its last nodes do something else.
 
@@ -138,8 +149,8 @@ def _before_selection(model: Model, values: Mapping[str, Value], moving_count: i
         return None
     makers, rows = {node.outputs[0]: node for node in model.nodes}, []
     takes_ids = "ids" in model.inputs
-    otherwise, operator = (None, "Gather") if takes_ids else (MOVING_OUTPUTS, "Split")
-    for name in MOVING_OUTPUTS:
+    otherwise, operator = (None, "Gather") if takes_ids else (names, "Split")
+    for name in names:
         node = makers.get(name)
         if node is None or node.operator != operator or node.attributes.get("axis", 0):
             return otherwise
@@ -227,21 +238,37 @@ def _check_count(gaussians: int, limits: GraphLimits) -> None:
         raise ModelInvalid("ids", f"and `static_means` are {gaussians:,} Gaussians; the limit is {limits.gaussians:,}")
 
 
-def _check_outputs(model: Model, values: Mapping[str, Value], moving_count: int, takes_ids: bool) -> None:
-    for name in (*MOVING_OUTPUTS, *CONSTANT_OUTPUTS):
+def _posed(model: Model, metadata: SceneMetadata) -> dict[str, tuple[int, ...]]:
+    """The outputs that depend on time, and the shape of a row of each."""
+    posed: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (3,)}
+    if metadata.contract != CONTRACT:
+        appearance = {"opacities": (), "sh": (sh_coefficients(metadata.sh_degree), 3)}
+        posed |= {name: row for name, row in appearance.items() if f"static_{name}" in model.outputs}
+    return posed
+
+
+def _check_outputs(
+    model: Model,
+    values: Mapping[str, Value],
+    moving_count: int,
+    takes_ids: bool,
+    posed: Mapping[str, tuple[int, ...]],
+    constant: tuple[str, ...],
+) -> None:
+    for name in (*posed, *constant):
         if name not in model.outputs or name not in values:
             raise ModelInvalid(name, "is missing from the outputs")
         declared, element = model.outputs[name].element, values[name].element
         if (declared, element) != (FLOAT, FLOAT):
             wrong = declared if declared != FLOAT else element
             raise ModelInvalid(name, f"is {element_name(wrong)}, not float32")
-    for name in CONSTANT_OUTPUTS:
+    for name in constant:
         if values[name].varies:
             raise ModelInvalid(name, "depends on an input, but must be constant")
         if not values[name].shape:
             raise ModelInvalid(name, "is a single number")
-    for name, columns in _COLUMNS.items():
-        every = fixed([moving_count, columns])
-        shapes = [every] if not takes_ids else [(IDS, *fixed([columns]))] + ([] if moving_count else [every])
+    for name, row in posed.items():
+        every = fixed([moving_count, *row])
+        shapes = [every] if not takes_ids else [(IDS, *fixed(row))] + ([] if moving_count else [every])
         if values[name].shape not in shapes:
             raise ModelInvalid(name, f"has shape {text(values[name].shape)}, not {text(shapes[0])}")

@@ -10,7 +10,7 @@ export function showFacts(list, scene) {
     ["Deformation", scene.layers.join(", then ") || "none"],
     ["Plan", scene.plan],
     ["Error", largestError(scene.measured_error)],
-    ["Time", scene.time_range.map(Number).join(" to ")],
+    ["Time", scene.time_range.map(Number).join(" to ") + (scene.duration ? `, ${scene.duration} s` : "")],
     ["Cameras", number.format(scene.cameras.length)],
     ["Left out", scene.left_out.map(({ what, count }) => `${what}: ${number.format(count)}`).join("; ")],
     ["SHA-256", scene.sha256.slice(0, 12)],

@@ -47,6 +47,7 @@ async function open(name, look = {}) {
   const isAnother = state.scene?.name !== name;
   state.scene = scene;
   state.player.range = scene.time_range;
+  state.player.duration = scene.duration;
   if (isAnother) {
     state.camera = new Camera(scene.view);
     state.camera.aspect = stage.aspect();

@@ -1,12 +1,13 @@
 // Playback of the scene's time.
 
-const RUN_SECONDS = 4; // for the whole time range at speed 1
+const RUN_SECONDS = 4; // for the whole time range at speed 1, if the scene doesn't say how long it lasts
 const TIME_STEPS = 240; // distinct times during playback, whose poses the service caches
 export const SPEEDS = [0.25, 0.5, 1, 2];
 
 export class Player {
   constructor() {
     this.range = [0, 1];
+    this.duration = null; // of the range, seconds
     this.place = 0; // fraction of the time range
     this.playing = false;
     this.loop = true;
@@ -45,7 +46,7 @@ export class Player {
 
   /** Advance playback by some seconds. */
   advance(seconds) {
-    this.exact += (seconds * this.speed) / RUN_SECONDS;
+    this.exact += (seconds * this.speed) / (this.duration ?? RUN_SECONDS);
     if (this.exact >= 1 && !this.loop) {
       this.place = 1;
       this.playing = false;

@@ -42,9 +42,9 @@ class ModelConfig:
     scale_space: ScaleSpace = "log"
     """`log`: deltas are added to logarithms of scales; `linear`: to the scales, as in DeformGS."""
     opacity_head: bool = False
-    """Layers also change opacities, before the sigmoid. Such a model can't be exported yet."""
+    """Layers also change opacities, before the sigmoid. Only plans that run layers can hold such a model."""
     sh_head: bool = False
-    """Layers also change colors, as SH coefficients. Such a model can't be exported yet."""
+    """Layers also change colors, as SH coefficients. Only plans that run layers can hold such a model."""
     eps2d: float = 0.3
     """Dilation of projected covariances, px²; 0.3 in 3D Gaussian Splatting. A smaller one sharpens small structures;
     other renderers, which add 0.3, then draw the model blurrier."""

@@ -4,6 +4,7 @@ A new kind is one file: a frozen dataclass that derives from `LayerConfig`, a mo
 `DeformationLayer`, and a line that registers the first in `layers.registry`.
 """
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
@@ -27,6 +28,13 @@ class Heads(NamedTuple):
     def sizes(self) -> tuple[int, ...]:
         """Columns of means, scales, quats, opacity, SH, and the logit of the weight; 0 for an absent output."""
         return (3, 3, 4, int(self.opacity), 3 * self.sh, int(self.weight))
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Columns of the deltas of each head that is there, by name."""
+        ends = list(itertools.accumulate(self.sizes, initial=0))
+        spans = zip((*HEAD_COLUMNS, "opacities", "sh"), ends, ends[1:], strict=False)
+        return {name: slice(start, stop) for name, start, stop in spans if stop > start}
 
 
 PAPER_HEADS = Heads()

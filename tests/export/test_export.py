@@ -12,10 +12,12 @@ import onnx
 import pytest
 import torch
 
-from export.jobs.bake import ModelNotExportable, bake, starting_cameras
+from export.jobs.bake import bake, starting_cameras
 from export.layers.graph import GraphBuilder
 from export.measure.verify import VerificationFailed, times_to_verify, verify
+from export.options import ExportOptions
 from export.plans.registry import build
+from export.to_onnx import main as to_onnx
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.datasets import load_scene
@@ -27,6 +29,8 @@ from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
 from msdgs_train.systems.registry import preset, systems
 from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model, saved
 from tests.support.processes import ROOT
+from tests.support.service import serving
+from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import shrunk, write_scene
 
@@ -60,6 +64,10 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
         (300, {"layers": (replace(MLP, depth=4, skip=3),) * 2}, 300),
         (300, {"layers": (replace(PLANE, multires=(1, 2), resolution=6),) * 2}, 300),
         (300, {"sh_degree": 0}, 300),
+        (300, {"layers": ("mlp", "plane"), "opacity_head": True}, 300),
+        (300, {"layers": ("plane", "mlp"), "opacity_head": True, "sh_head": True, "sh_degree": 2}, 300),
+        (300, {"layers": ("mlp",), "weights": False, "sh_head": True, "sh_degree": 0}, 300),
+        (0, {"opacity_head": True, "sh_head": True}, 0),
         (300, {"support": replace(NODES, num_nodes=12), "layers": (replace(SPLINE, num_knots=5),)}, 300),
         (300, {"support": replace(NODES, num_nodes=3), "layers": ("spline", "plane", "mlp"), "embedding_dim": 0}, 300),
         (300, {"support": NODES, "layers": ("mlp", "mlp"), "modulation_targets": ("quats", "means")}, 300),
@@ -89,6 +97,20 @@ def test_every_kind_of_model_exports(tmp_path: Path, count: int, changes: dict[s
         np.testing.assert_allclose(got, want, rtol=0, atol=bound)
 
 
+@pytest.mark.parametrize("of", ["model", "splats"])
+def test_the_seconds_of_a_scene_are_stored_if_they_are_given(tmp_path: Path, of: str):
+    file = tmp_path / "frame_1.ply"
+    if of == "splats":
+        file.write_bytes(ply_bytes(inria_columns(some_gaussians(20))))
+    model = saved(tmp_path, random_model(5, layers=())) if of == "model" else file
+    options = ExportOptions(model, tmp_path / "scene.onnx", quick=True, duration=2.5, keep_float32=True)
+    assert to_onnx(options) == 0
+    assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.duration == 2.5
+    assert to_onnx(replace(options, duration=0)) == 1
+    with serving(tmp_path / "scene.onnx") as client:
+        assert client.get("/scenes/scene").json()["duration"] == 2.5
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("data") / "scene")
@@ -105,13 +127,6 @@ def test_each_preset_exports(name: str, data: Path, tmp_path: Path):
     for field in ("means", "quats", "scales"):
         want = getattr(posed, field).detach().numpy()
         np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))
-
-
-@pytest.mark.parametrize("option", ["opacity_head", "sh_head"])
-def test_heads_that_the_contract_has_no_place_for_are_refused_by_name(tmp_path: Path, option: str):
-    with pytest.raises(ModelNotExportable, match=f"model.{option}"):
-        export_scene(saved(tmp_path, random_model(**{option: True})), tmp_path / "scene.onnx")
-    assert not (tmp_path / "scene.onnx").exists()
 
 
 def test_embeddings_and_their_network_are_gone(scene_file: Path, model: DynamicGaussians):

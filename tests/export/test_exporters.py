@@ -20,7 +20,7 @@ from export.exporters.gltf import EXTENSION, read_gltf
 from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
-from export.importers.sequence import read_sequence, sequence_scene
+from export.importers.sequence import Frames, read_sequence, sequence_scene
 from export.importers.splats.formats import read_splats
 from export.jobs.bake import bake
 from export.options import ConvertOptions
@@ -171,6 +171,37 @@ def test_a_failed_conversion_keeps_the_old_file(tmp_path: Path):
         run(scene, out, min_psnr=99.5)
     assert out.read_text() == "old"
     assert LOSSLESS > LOSSY >= 45
+
+
+@pytest.mark.parametrize("of", ["network", "sequence"])
+def test_opacities_and_colors_that_change_are_those_of_each_time(tmp_path: Path, of: str):
+    scene = tmp_path / "scene.onnx"
+    if of == "network":
+        scene_file(tmp_path, sh_degree=1, opacity_head=True, sh_head=True)
+    else:
+        frames = tuple(some_gaussians(300, seed=seed) for seed in (0, 1, 2))
+        scene.write_bytes(sequence_scene(Frames(frames, 0, "dilate", True), "0" * 64).SerializeToString())
+    session = DeformationSession(scene)
+    assert session.scene.changing == ("opacities", "sh")
+    early, late = session.gaussians(0.4), session.gaussians(1.0)
+    assert np.abs(late.opacities - early.opacities).max() > 0.001
+    for name, read in (("a.ply", lambda file: read_splats(file).gaussians), ("a.glb", read_gltf)):
+        run(scene, tmp_path / name, t=0.4)
+        assert_same(read(tmp_path / name), early)
+    run(scene, tmp_path / "a.spz", t=0.4)  # compares images
+    run(scene, tmp_path / "a.visionary.onnx")
+    shown = visionary_of(tmp_path / "a.visionary.onnx")
+    for t in (0.0, 0.4, 1.0):
+        got, expected = shown(t), session.gaussians(t)
+        assert np.abs(got.opacities - expected.opacities).max() <= tolerance("splat_values")
+        assert np.abs(got.sh[:, :4] - expected.sh).max() <= tolerance("visionary.sh")
+    usd = pytest.importorskip("pxr.Usd")
+    run(scene, tmp_path / "a.usdc", frames=5)
+    for frame in range(5):
+        assert_same(read_usd(tmp_path / "a.usdc")(frame), session.gaussians(frame / 4))
+    assert (
+        len(usd.Stage.Open(str(tmp_path / "a.usdc")).GetDefaultPrim().GetAttribute("opacities").GetTimeSamples()) == 5
+    )
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import os
 import struct
 import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -256,6 +257,34 @@ def test_frames_that_correspond_are_blended(tmp_path: Path, count: int):
     early, late = (session.gaussians(t).means[0] for t in (0.0, 1 / (count - 1)))
     between = session.gaussians(0.5 / (count - 1)).means[0]
     assert np.linalg.norm(between - (early + late) / 2) < 0.5 * np.linalg.norm(late - early)
+
+
+@pytest.mark.parametrize("changing", [("opacities",), ("sh",), ("opacities", "sh")])
+def test_frames_whose_gaussians_fade_and_change_color_are_blended(tmp_path: Path, changing: tuple[str, ...]):
+    frames, rng = moving_frames(4), np.random.default_rng(0)
+    for i, frame in enumerate(frames):
+        fading = frame.opacities.copy()
+        fading[95:195] *= np.float32((1e-6, 1, 0.4, 1e-6)[i])  # some move, others change in their place
+        sh = frame.sh.copy()
+        sh[100:195] += rng.normal(0, 0.3, (95, 1, 3)).astype(np.float32)
+        frames[i] = replace(frame, **{n: v for n, v in {"opacities": fading, "sh": sh}.items() if n in changing})
+    folder = write_frames(tmp_path / "f", frames)
+    session = scene_of(folder)
+    scene = session.scene
+    assert (scene.metadata.contract, scene.metadata.plan, scene.changing) == ("msdgs/2", "keyframes:6", changing)
+    assert (scene.moving_count, scene.static_count) == (195, 5)
+    assert max(scene.metadata.measured_error[name] for name in scene.posed_outputs) <= tolerance("stored_frame")
+    for i, frame in enumerate(frames):
+        got = drawn(session.gaussians(i / 3)).clip(0, 1)
+        assert psnr(got, drawn(frame).clip(0, 1)) >= tolerance("splat_file_db")
+    for t in np.linspace(0, 1, 31).tolist():
+        session.gaussians(t).validate()
+
+
+def test_a_color_that_changes_by_less_than_two_steps_is_constant(tmp_path: Path):
+    frames = [replace(f, sh=f.sh + np.float32(0.005 * i)) for i, f in enumerate(moving_frames(3))]
+    scene = scene_of(write_frames(tmp_path / "f", frames)).scene
+    assert (scene.metadata.contract, scene.changing, scene.static_count) == ("msdgs/1", (), 10)
 
 
 def shuffled(frames: list[Gaussians]) -> list[Gaussians]:

@@ -2,11 +2,11 @@
 
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 from rich.console import Console
@@ -18,14 +18,15 @@ from export.importers.errors import ImportFailed
 from export.importers.runs import base
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
-from export.jobs.write import properties
+from export.jobs.bake import bake
 from export.measure.poses import posed
 from export.options import ExportOptions
+from export.plans.registry import build
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import load_model
+from msdgs_train.gaussians.model_file import SceneInfo, load_model
 from msdgs_train.layers.plane import PlaneConfig
 from tests.support import foreign_runs as foreign
 from tests.support.foreign_runs import COUNT, SWITCHES, State
@@ -122,35 +123,41 @@ def test_deltas_that_are_switched_off_are_zero(tmp_path: Path):
     assert not torch.equal(early.means, late.means)
 
 
-def test_changing_opacities_and_colors_are_averaged_and_the_cost_is_reported(tmp_path: Path):
-    state = foreign.fourdgs_state()
-    model, (lost,) = imported(
-        foreign.write_fourdgs(tmp_path / "run", state, SWITCHES + ", no_do=False, no_dshs=False"), "4dgs"
+@pytest.mark.parametrize("on", [("no_do",), ("no_dshs",), ("no_do", "no_dshs")])
+def test_opacities_and_colors_that_change_are_theirs_and_exported(tmp_path: Path, on: tuple[str, ...]):
+    state, means = foreign.fourdgs_state(), stored()[0]
+    state["deformation_net.opacity_deform.3.weight"] *= 10  # most Gaussians appear and disappear
+    run = foreign.write_fourdgs(tmp_path / "run", state, SWITCHES + "".join(f", {switch}=False" for switch in on))
+    model, lost = imported(run, "4dgs")
+    assert lost == []
+    (tmp_path / "scene.onnx").write_bytes(build("network", bake(model, SceneInfo(), "0" * 64)).SerializeToString())
+    session, g = DeformationSession(tmp_path / "scene.onnx"), some_gaussians(COUNT, 3)
+    changing = tuple(name for name, switch in (("opacities", "no_do"), ("sh", "no_dshs")) if switch in on)
+    assert (session.scene.metadata.contract, session.scene.changing) == ("msdgs/2", changing)
+    model = model.double()
+    for t in (0.0, 0.37, 0.95, 1.0):
+        theirs = foreign.fourdgs_deltas(state, means, t)
+        logits = torch.from_numpy(g.opacities).double().logit()
+        opacities = (logits + ("no_do" in on) * theirs["opacity"][:, 0]).sigmoid()
+        sh = torch.from_numpy(g.sh).double() + ("no_dshs" in on) * theirs["shs"].reshape(COUNT, 16, 3)
+        for got in (posed(model, t), session.gaussians(t)):
+            assert np.abs(got.opacities - opacities.numpy()).max() < tolerance("import.network")
+            assert np.abs(got.sh - sh.numpy()).max() < tolerance("import.network")
+
+
+def test_a_run_whose_gaussians_fade_is_exported_by_plans_that_run_layers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run = foreign.write_fourdgs(
+        tmp_path / "run", foreign.fourdgs_state((1,)), SWITCHES + ", no_do=False, no_dshs=False"
     )
-    g = some_gaussians(COUNT, 3)
-    means, logits = torch.from_numpy(g.means), torch.from_numpy(g.opacities).double().logit()
-    theirs = [foreign.fourdgs_deltas(state, means, float(t)) for t in np.linspace(0, 1, 401)]
-    opacities = torch.stack([(logits + d["opacity"][:, 0]).sigmoid() for d in theirs])
-    with torch.no_grad():
-        held = model.pose(0.5)
-    assert (held.opacities - opacities.mean(dim=0)).abs().max() < tolerance("import.mean_over_time")
-    sh = torch.stack([torch.from_numpy(g.sh).double() + d["shs"].reshape(COUNT, 16, 3) for d in theirs])
-    mean = (opacities[..., None, None] * sh).sum(dim=0) / opacities.sum(dim=0)[:, None, None]
-    assert (held.sh - mean).abs().max() < tolerance("import.mean_over_time")
-    assert lost["count"] == COUNT
-    for plane in (2, 4, 5):  # most Gaussians appear and disappear
-        state[f"deformation_net.grid.grids.0.{plane}"] *= torch.linspace(0, 1.5, foreign.TIME)[:, None]
-    state["deformation_net.opacity_deform.3.weight"] *= 300
-    _, (more,) = imported(foreign.write_fourdgs(tmp_path / "more", state, SWITCHES + ", no_do=False"), "4dgs")
-    assert more["worst_frame_db"] < min(lost["worst_frame_db"], 40)
-
-
-def test_a_run_is_exported_and_lists_static_appearance(tmp_path: Path):
-    run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)), SWITCHES + ", no_do=False, no_dshs=True")
-    assert to_onnx(ExportOptions(run, tmp_path / "scene.onnx", quick=True, times=3)) == 0
-    assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.layers == ("plane",)
-    left_out = {each["rule"]: each for each in properties(onnx.load(tmp_path / "scene.onnx"))["left_out"]}
-    assert "opacities and colors" in left_out["static_appearance"]["what"]
+    options = ExportOptions(run, tmp_path / "scene.onnx", quick=True, times=3)
+    assert to_onnx(options) == 0
+    scene = DeformationSession(tmp_path / "scene.onnx").scene
+    assert (scene.metadata.layers, scene.changing) == (("plane",), ("opacities", "sh"))
+    assert max(scene.metadata.measured_error[name] for name in scene.changing) <= tolerance("export.relative")
+    assert to_onnx(replace(options, plan="keyframes")) == 1
+    assert "`plan` must be one that runs layers (network, prefix, int8)" in capsys.readouterr().err
 
 
 def assert_refused(run: Path, kind: str, message: str):

@@ -22,6 +22,7 @@ from msdgs_serve.scene.baked import BakedScene
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
+from msdgs_train.layers.mlp import MLPLayer
 from tests.support.images import psnr
 from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model, saved
 from tests.support.tolerances import tolerance
@@ -188,6 +189,27 @@ def test_unusual_scenes_are_pruned_and_written(tmp_path: Path, count: int, chang
     exported = write_scene(tmp_path / "s.onnx", contents, candidate.pruned.moving, rendered=error.to_plain(), times=4)
     assert exported.measured_error["rendered"]["psnr_worst"] == error.psnr_worst
     assert exported.moving_count + exported.static_count == len(candidate.pruned.ids)
+
+
+def test_gaussians_that_appear_later_are_kept_and_those_that_never_change_are_static(tmp_path: Path):
+    model = moving_object(opacity_head=True, sh_head=True)
+    layer = model.deformation.layers[0]
+    with torch.no_grad():
+        assert isinstance(layer, MLPLayer)
+        layer.heads.weight[1].zero_()  # nothing moves
+        layer.heads.weight[layer.outputs.columns["opacities"], :2] = torch.tensor([4.0, -4.0])  # 8 t, times 1 / 2
+        model.gaussians.raw_opacities[GROUND:] = -6.0
+        model.gaussians.sh_dc[:GROUND] *= 0.5
+    job = job_of(tmp_path, model)
+    candidate = job.candidate("network", 50.0)
+    scene, means = candidate.session.scene, job.model.gaussians.means[candidate.pruned.ids]
+    assert (scene.changing, scene.metadata.sh_degree) == (("opacities", "sh"), 0)
+    assert (means[: scene.moving_count, 0] > OBJECT_X).all()
+    assert 0.5 * OBJECT < scene.moving_count <= OBJECT
+    assert job.error(candidate).psnr_worst >= 50
+    assert independent_worst_db(candidate, job.model, SCENE) >= 50
+    exported = write_scene(tmp_path / "s.onnx", onnx.load(candidate.path), candidate.pruned.moving, times=4)
+    assert exported.measured_error["opacities"] <= tolerance("export.relative")
 
 
 @pytest.mark.parametrize("kind", ["spline", "mlp", "plane"])

@@ -1,5 +1,6 @@
-"""Tiny scene files, contract `msdgs/1`, written without the exporter."""
+"""Tiny scene files, written without the exporter."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from msdgs_serve.scene import Camera
-from msdgs_serve.scene.baked import CONTRACT, SceneCamera, SceneMetadata
+from msdgs_serve.scene.baked import CONTRACT, SceneCamera, SceneMetadata, constant_outputs
 from msdgs_serve.scene.camera import orbit
+from msdgs_serve.scene.metadata import CHANGING_CONTRACT
 
 Color = tuple[float, float, float]
 RED: Color = (1.0, 0.0, 0.0)
@@ -49,11 +51,21 @@ def level_camera(size: int = 64) -> Camera:
     return Camera.from_fov(orbit(np.zeros(3), 5.0, 0, 0, UP), size, size, 40.0)
 
 
+OPACITY = 0.95
+
+
 def write_scene(
-    path: Path, *, static_color: Color = RED, moving: bool = True, steps: bool = False, **changes: Any
+    path: Path,
+    *,
+    static_color: Color = RED,
+    moving: bool = True,
+    steps: bool = False,
+    changing: Sequence[str] = (),
+    **changes: Any,
 ) -> Path:
     """A ball at the origin, `static_color`, and if `moving` a green one that goes from (0, 0, -1) to (0, 0, 1); with
-    `steps` by a layer that may be applied in part."""
+    `steps` by a layer that may be applied in part. What is `changing` of its `opacities` and `sh` is 1 - t of what it
+    was, contract `msdgs/2`."""
     count = int(moving)
     constants = {
         "base": np.array([[0, 0, -1]], np.float32)[:count],
@@ -65,9 +77,12 @@ def write_scene(
         "all_static_means": np.zeros((1, 3), np.float32),
         "all_static_quats": np.array([[1, 0, 0, 0]], np.float32),
         "all_static_scales": np.full((1, 3), 0.15, np.float32),
-        "all_opacities": np.full(count + 1, 0.95, np.float32),
-        "all_sh": np.concatenate([_constant_color(GREEN)[:count], _constant_color(static_color)]),
+        "all_opacities": np.full(count + 1, OPACITY, np.float32),
+        "all_sh": np.concatenate([constant_color(GREEN)[:count], constant_color(static_color)]),
     }
+    for name in changing:
+        constants["whole"] = np.ones(1, np.float32)
+        constants[f"moving_{name}"], constants[f"all_static_{name}"] = np.split(constants.pop(f"all_{name}"), [count])
     nodes = [
         helper.make_node("Gather", ["base", "ids"], ["at_rest"]),
         helper.make_node("Gather", ["velocity", "ids"], ["velocities"]),
@@ -77,9 +92,14 @@ def write_scene(
         helper.make_node("Gather", ["moving_quats", "ids"], ["quats"]),
         helper.make_node("Gather", ["moving_scales", "ids"], ["scales"]),
     ]
-    fixed = ("static_means", "static_quats", "static_scales", "opacities", "sh")
+    nodes += [helper.make_node("Sub", ["whole", "t"], ["left"])] if changing else []
+    for name in changing:
+        nodes.append(helper.make_node("Gather", [f"moving_{name}", "ids"], [f"first_{name}"]))
+        nodes.append(helper.make_node("Mul", [f"first_{name}", "left"], [name]))
+    fixed = constant_outputs(changing)
     nodes += [helper.make_node("Identity", [f"all_{name}"], [name]) for name in fixed]
     outputs = {"means": ["M", 3], "quats": ["M", 4], "scales": ["M", 3]}
+    outputs |= {name: ["M", *constants[f"moving_{name}"].shape[1:]] for name in changing}
     outputs |= {name: list(constants[f"all_{name}"].shape) for name in fixed}
     graph = helper.make_graph(
         nodes,
@@ -93,11 +113,12 @@ def write_scene(
         [numpy_helper.from_array(array, name) for name, array in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
-    helper.set_model_props(model, metadata(**changes).to_properties())
+    contract = {"contract": CHANGING_CONTRACT} if changing else {}
+    helper.set_model_props(model, metadata(**(contract | changes)).to_properties())
     onnx.save(model, path)
     return path
 
 
-def _constant_color(color: tuple[float, float, float]) -> np.ndarray:
+def constant_color(color: tuple[float, float, float]) -> np.ndarray:
     """[1, 1, 3]: the same color from every direction."""
     return ((np.array(color) - 0.5) / SH_DC).astype(np.float32).reshape(1, 1, 3)

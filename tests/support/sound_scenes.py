@@ -20,8 +20,15 @@ MODELS: dict[str, dict[str, Any]] = {
     "spline on nodes": {"layers": ("spline",), "support": NODES},
     "mixed on nodes": {"layers": ("plane", "spline", "mlp"), "support": NODES, "weights": False, "embedding_dim": 0},
     "static": {"layers": ()},
+    **{f"all heads of {kind}": {"layers": (kind,), "opacity_head": True, "sh_head": True} for kind in ("mlp", "plane")},
 }
 PLANS = ("network", "prefix:1", "int8", "lowrank:4", "lowrank:0.05", "keyframes:8", "keyframes:0.05")
+
+BY_HAND: dict[str, dict[str, Any]] = {
+    "without steps": {},
+    "with steps": {"steps": True},
+    "opacities and colors that change": {"changing": ("opacities", "sh")},
+}
 
 COUNT = 20
 """Gaussians of each scene."""
@@ -36,23 +43,24 @@ def sound_scenes() -> dict[str, bytes]:
 def _exported() -> Iterator[tuple[str, bytes]]:
     for name, config in MODELS.items():
         baked = bake(random_model(COUNT, **config), SCENE, "0" * 64)
-        for plan in PLANS if config["layers"] else PLANS[:1]:
+        for plan in PLANS if config["layers"] and not baked.scene.changing else PLANS[:1]:
             if plan != "int8" or "mlp" in config["layers"]:  # other layers have no product of width × width
                 yield f"{name} {plan}", build(plan, baked).SerializeToString()
 
 
 def _of_sequences() -> Iterator[tuple[str, bytes]]:
-    for name, counts in (("blended frames", (COUNT, COUNT)), ("switched frames", (COUNT, COUNT - 1))):
-        frames = tuple(some_gaussians(count) for count in counts)
-        sequence = Frames(frames, 0, "dilate", blended=name == "blended frames")
+    for name, counts, seed in (
+        ("blended frames", (COUNT, COUNT), 0),
+        ("blended frames of other colors", (COUNT, COUNT), 1),
+        ("switched frames", (COUNT, COUNT - 1), 0),
+    ):
+        frames = tuple(some_gaussians(count, seed=i * seed) for i, count in enumerate(counts))
+        sequence = Frames(frames, 0, "dilate", blended=name.startswith("blended"))
         yield name, sequence_scene(sequence, "0" * 64).SerializeToString()
 
 
 def _by_hand() -> Iterator[tuple[str, bytes]]:
     """Written without the exporter, in another version of the operator set, with nodes for constant outputs."""
     with TemporaryDirectory() as folder:
-        for steps in (False, True):
-            yield (
-                f"by hand, {'with' if steps else 'without'} steps",
-                write_scene(Path(folder) / "scene.onnx", steps=steps).read_bytes(),
-            )
+        for name, changes in BY_HAND.items():
+            yield f"by hand, {name}", write_scene(Path(folder) / "scene.onnx", **changes).read_bytes()

@@ -127,12 +127,8 @@ TABLE = (
     ),
     Row("damaged_file.megabytes", 8.0, "beside twice the sound file's: what the allocator keeps from call to call"),
     Row("import.network", 1e-5, "a network of 8 layers in float32, its sums in another order"),
-    Row(
-        "import.mean_over_time",
-        2e-3,
-        "a mean over 41 times against one over 401 of a piecewise linear function of 12 nodes",
-    ),
     Row("visionary.relative", 2e-5, "products of float32 rotations and scales, relative to the largest covariance"),
+    Row("visionary.sh", 2e-3, "float16 of coefficients up to 3"),
     # datasets
     Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
     Row("composite_of_8bit", 1.001 / 255, "half a step of color and half a step of alpha, each rounded once"),

@@ -2,24 +2,17 @@
 
 The rasterizer of Deformable-3D-Gaussians doesn't normalize quaternions: if the norm isn't 1, the matrix is no rotation
 and shears the Gaussian, and the sign of a scale is lost in its square. The result is still an ellipsoid.
-
-Opacities and colors that change with time are replaced by their means, since a scene file stores constants.
 """
-
-from dataclasses import replace
 
 import numpy as np
 import torch
 
 from export.importers.runs.base import Loss
-from export.importers.splats.base import as_float32, logit
 from export.measure.frames import compare, render
-from export.measure.poses import in_float64, posed
-from export.measure.rendered_error import ExactFrames
+from export.measure.poses import posed
 from export.measure.views import cameras_of, selection_views
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import from_matrix
-from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.scale_space import MIN_SCALE, activated_scales
@@ -27,9 +20,6 @@ from msdgs_train.layers.quaternions import unit_or_identity
 
 FRAMES = 12
 """Number of frames that are compared, each of another camera and time."""
-
-TIMES = 41
-"""Number of times over which opacities and colors are averaged."""
 
 
 def quaternion_fidelity(model: DynamicGaussians, info: SceneInfo) -> Loss:
@@ -72,40 +62,3 @@ def _unnormalized_matrices(quats: torch.Tensor) -> torch.Tensor:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-
-
-def static_appearance(model: DynamicGaussians, info: SceneInfo) -> tuple[DynamicGaussians, Loss]:
-    """The model without its heads of opacity and SH, with mean opacities, and mean colors weighted by opacity."""
-    opacities, sh = _means(model, info.time_range)
-    tensors = dict(model.gaussians.named_parameters()) | {
-        "raw_opacities": torch.from_numpy(as_float32(logit(opacities.numpy()))),
-        "sh_dc": sh[:, :1].float(),
-        "sh_rest": sh[:, 1:].float(),
-    }
-    static = DynamicGaussians(
-        replace(model.config, opacity_head=False, sh_head=False),
-        CanonicalGaussians(**{name: tensor.detach().clone() for name, tensor in tensors.items()}),
-    )
-    kept = {name for name in static.state_dict() if not name.startswith("gaussians.")}
-    static.load_state_dict({n: v for n, v in model.state_dict().items() if n in kept}, strict=False)
-    views = selection_views(cameras_of(info), info.time_range, FRAMES)
-    exact = ExactFrames(in_float64(model), len(model.gaussians), views, info.background, model.rasterizer)
-    error = exact.measure(lambda t: posed(static, t), np.arange(len(model.gaussians)))
-    what = "changes of opacities and colors with time, replaced by their means"
-    note = (
-        f"opacities and colors that change with time are replaced by their means: frames are {error.psnr_mean:.1f} dB "
-        f"from the run's, the worst of {error.frames} {error.psnr_worst:.1f} dB"
-    )
-    return static, Loss("static_appearance", what, len(model.gaussians), error.psnr_worst, note)
-
-
-@torch.no_grad()
-def _means(model: DynamicGaussians, time_range: tuple[float, float]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Means over time of opacities, [N], and of SH coefficients, [N, C, 3]; float64."""
-    opacities, sh = torch.zeros(()), torch.zeros(())
-    for t in np.linspace(*time_range, TIMES):
-        at = model.pose(float(t))
-        opacity = at.opacities.double()
-        opacities = opacities + opacity / TIMES
-        sh = sh + (opacity / TIMES)[:, None, None] * at.sh.double()
-    return opacities, sh / opacities.clamp_min(1e-30)[:, None, None]

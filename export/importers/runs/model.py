@@ -12,9 +12,8 @@ import torch
 from rich.console import Console
 
 from export.importers.errors import ImportFailed
-from export.importers.runs.base import Loss, RunImporter
+from export.importers.runs.base import RunImporter
 from export.importers.runs.deformgs import DeformGSImporter
-from export.importers.runs.fidelity import static_appearance
 from export.importers.runs.fourdgs import FourDGSImporter
 from export.importers.runs.state import RunFolder
 from export.importers.scene import metadata_of
@@ -68,17 +67,12 @@ def write_model(run: Path, file_format: str, output: Path, console: Console) -> 
         cameras=_cameras(run / "cameras.json") or [camera.to_plain() for camera in metadata.cameras],
     )
     console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
-    losses: list[Loss | None] = []
     with console.status("comparing frames"), _usable(run):
-        if model.config.opacity_head or model.config.sh_head:
-            model, loss = static_appearance(model, info)
-            losses.append(loss)
-        losses.append(importer.fidelity(model, info))
+        loss = importer.fidelity(model, info)
     save_model(output, model, info, iteration)
-    found = [loss for loss in losses if loss is not None]
-    for note in [*notes, *(loss.note for loss in found)]:
+    for note in [*notes, *([loss.note] if loss else [])]:
         console.print(note, markup=False)
-    return [loss.left_out() for loss in found]
+    return [loss.left_out()] if loss else []
 
 
 @contextmanager

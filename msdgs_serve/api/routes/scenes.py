@@ -154,7 +154,7 @@ async def add_scene(
             uploads.added(upload)
     except SceneFileInvalid as error:
         service.log_rejected_upload(name, error)
-        detail = f"The file violates the contract msdgs/1: `{error.field}` {error.problem}"
+        detail = f"The file violates its contract: `{error.field}` {error.problem}"
         raise RequestRejected(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
@@ -220,6 +220,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         gaussians=counts,
         sh_degree=metadata.sh_degree,
         time_range=metadata.time_range,
+        duration=metadata.duration,
         bounds=(list(low), list(high)),
         background=metadata.background,
         antialiasing=metadata.antialiasing,
