@@ -3,7 +3,7 @@
 
 PYTHON ?= python3
 TORCH_INDEX ?=
-SCENE ?= examples/toybench.onnx
+SCENE ?= examples/toys.onnx
 PORT ?= 8000
 ONCE ?=
 ARGS ?=

@@ -259,7 +259,7 @@ def check_uploads(url: str) -> None:
     """A scene is added, rendered and deleted with a key that permits it; a damaged file is refused."""
     (container,) = containers("render")
     check_rights(container, "/tmp", "/uploads")
-    whole = (ROOT / "examples" / "toybench.onnx").read_bytes()
+    whole = (ROOT / "examples" / "toys.onnx").read_bytes()
     expect(frame(url, 0.5).status == 401, "frames need a key")
     before = frame(url, 0.5, headers=CAN_READ).body
     expect(upload(url, whole, CAN_READ) == 403, "a key with the scope `read` can't upload")
@@ -308,7 +308,7 @@ def frame(
     url: str,
     t: float,
     *,
-    scene: str = "toybench",
+    scene: str = "toys",
     size: int = 64,
     azimuth: int = 30,
     headers: dict[str, str] | None = None,
@@ -326,7 +326,7 @@ def upload(url: str, contents: bytes, headers: dict[str, str] = CAN_WRITE) -> in
 def post(url: str, t: float, azimuth: int, request_id: str) -> Response:
     """Request a frame by POST."""
     camera = {"type": "orbit", "azimuth": azimuth, "elevation": 20}
-    body = {"scene": "toybench", "camera": camera, "t": t, "width": 64, "height": 64}
+    body = {"scene": "toys", "camera": camera, "t": t, "width": 64, "height": 64}
     headers = {"Content-Type": "application/json", "X-Request-ID": request_id}
     return ask(urllib.request.Request(f"{url}/render", json.dumps(body).encode(), headers))
 

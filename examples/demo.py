@@ -1,6 +1,6 @@
 """Serve a scene, ask for one frame of it over HTTP and keep the service up. Needs what serving needs, and no torch.
 
-python examples/demo.py examples/toybench.onnx
+python examples/demo.py examples/toys.onnx
 """
 
 import argparse

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-SCENE = Path(__file__).resolve().parents[2] / "examples" / "toybench.onnx"
+SCENE = Path(__file__).resolve().parents[2] / "examples" / "toys.onnx"
 """The default scene. Its time range is [0, 1], as these benchmarks require."""
 
 

@@ -37,7 +37,7 @@ class Scaling:
     """Replay a trace of requests, scenes and times with frequency 1 / rank, on services of one core each, and simulate
     the same trace.
 
-    python -m benchmarks.service.scaling examples/toybench.onnx
+    python -m benchmarks.service.scaling examples/toys.onnx
 
     Seconds per frame are those of one client; in turns with it, four clients of another such service give a rate. If
     the simulation is off by more than 15 % of this rate, nothing is extrapolated and the exit status is 1. Otherwise a

@@ -14,7 +14,7 @@ from tests.support.images import decode
 from tests.support.processes import ROOT
 
 PACKAGES = {"msdgs_serve", "msdgs_train"}
-SCENE = ROOT / "examples" / "toybench.onnx"
+SCENE = ROOT / "examples" / "toys.onnx"
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("packaging")]  # one worker, so that pip runs once
 
@@ -88,7 +88,7 @@ def test_it_serves_a_scene(environment: Path, monkeypatch: pytest.MonkeyPatch, t
     for name in set(os.environ) - set(clean_environment()):
         monkeypatch.delenv(name)
     with serving(SCENE, 0, environment) as url:
-        scene = get(f"{url}/scenes/toybench")
+        scene = get(f"{url}/scenes/toys")
         camera = {"type": "orbit", "azimuth": 30, "elevation": 25}
         png = render(url, {"camera": camera, "t": sum(scene["time_range"]) / 2, "width": 48, "height": 32})
     pixels, _ = decode(png, "png")

@@ -243,7 +243,7 @@ print(json.dumps([precompiled, compiled()]))
 
 
 def test_frames_need_no_kernel_beyond_those_compiled_ahead() -> None:
-    precompiled, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toybench.onnx"))
+    precompiled, after = json.loads(run_python(FRAMES, ROOT / "examples" / "toys.onnx"))
     assert precompiled["msdgs_serve.rasterizer.projection._project_parts"]
     assert precompiled["msdgs_serve.rasterizer.compositing._composite_tiles"]
     assert after == precompiled

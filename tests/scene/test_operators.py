@@ -17,7 +17,7 @@ from tests.support.hostile_scenes import beside_the_scene
 from tests.support.sound_scenes import sound_scenes
 
 CONTRACT = Path(__file__).parents[2] / "docs" / "contract.md"
-EXAMPLE = Path(__file__).parents[2] / "examples" / "toybench.onnx"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "toys.onnx"
 SCENES = {**sound_scenes(), "example": EXAMPLE.read_bytes()}
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from tests.support.processes import chromium, wait_until_still
 from tests.support.service import serving
 
-SCENE = Path("examples/toybench.onnx")
+SCENE = Path("examples/toys.onnx")
 DESKTOP = {"viewport": {"width": 1280, "height": 800}}
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 AT = "t=0.6&at=30,20,3.4,0,0,0"

@@ -42,7 +42,7 @@ from msdgs_serve.store import SceneStatus, SceneStore
 
 MAX_REASON = 300
 
-SceneName = Annotated[Name, Path(description="name of a scene, see `GET /scenes`", examples=["toybench"])]
+SceneName = Annotated[Name, Path(description="name of a scene, see `GET /scenes`", examples=["toys"])]
 NewName = Annotated[Name, Query(description="printable text without separators", examples=["walk"])]
 Sha256 = Annotated[
     str | None, Query(pattern="^[0-9a-f]{64}$", description="SHA-256 of the file, which is checked if given")
