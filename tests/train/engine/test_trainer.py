@@ -93,7 +93,7 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
     assert names == {
         "config.json", "run.json", "metrics.jsonl", "metrics.json", "curve.png", "checkpoint.pt", "model.pt", "best.pt",
-        "renders/test_r_000.png", "renders/test_r_001.png", "renders/val_r_000.png",
+        ".lock", "renders/test_r_000.png", "renders/test_r_001.png", "renders/val_r_000.png",
     }  # fmt: skip
     first, *_, last = [line for line in read_metrics(run) if line["kind"] == "eval" and line["split"] == "test"]
     assert last["psnr"] > first["psnr"] > 12

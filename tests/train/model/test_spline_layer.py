@@ -80,7 +80,7 @@ def test_rigid_motions_stay_rigid() -> None:
     assert float((matrices @ matrices.transpose(1, 2) - torch.eye(3)).abs().max()) <= EXACT
 
 
-@pytest.mark.parametrize(("cameras", "times", "knots"), [(1, 50, 36), (2, 50, 50), (3, 10, 36), (2, 130, 120)])
+@pytest.mark.parametrize(("cameras", "times", "knots"), [(1, 50, 0), (2, 50, 50), (3, 10, 36), (2, 130, 120)])
 def test_splines_follow_each_time_that_fixed_cameras_capture(cameras: int, times: int, knots: int) -> None:
     poses = [np.eye(4) + np.eye(4, k=3) * index for index in range(cameras)]
     views = [replace(front_camera(), camera_to_world=pose) for pose in poses]
