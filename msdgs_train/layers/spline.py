@@ -18,6 +18,7 @@ from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.quaternions import multiply, unit
 
 NUM_KNOTS, MAX_KNOTS = 36, 120
+"""Limits of the intervals that follow the captured times."""
 ROTATION_WEIGHT = 0.3
 """Scene units per unit of quaternions and of stretches in temporal smoothness."""
 

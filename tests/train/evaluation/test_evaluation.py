@@ -112,7 +112,6 @@ def test_without_val_the_best_is_chosen_on_test(tmp_path: Path) -> None:
     assert (outcome.best.split, outcome.best.psnr >= outcome.metrics["test"].psnr) == ("test", True)
 
 
-@pytest.mark.usefixtures("no_curve")
 class _SecondRun(Observer):
     """Starts another run in the same folder."""
 
@@ -124,12 +123,14 @@ class _SecondRun(Observer):
             fit(small_config(steps=2), self.data, self.run)
 
 
+@pytest.mark.usefixtures("no_curve")
 def test_two_runs_do_not_share_a_folder(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert fit(small_config(steps=2), data, run, observer=_SecondRun(data, run)).status == "finished"
     assert fit(small_config(steps=3), data, run, resume=True).status == "finished"
 
 
+@pytest.mark.usefixtures("no_curve")
 def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = fit(small_config(steps=3), data, run).best
