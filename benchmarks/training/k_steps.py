@@ -25,7 +25,8 @@ from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.systems.registry import DEFAULT, preset
 
 NUM_LAYERS = (1, 2, 4, 10)
-SCENES = ("toybench_200", "toybench_slow_200", "lego_200")
+SCENES_FILE = Path(__file__).with_name("k_steps.toml")
+SCENES = ("toybench_100", "toybench_slow_100", "lego_100")
 CHAIN, WIDE = "K layers", "1 layer of as many parameters"
 UNWEIGHTED, MODULATED = "K layers, w = 1", "K layers, modulated"
 FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED)
@@ -52,7 +53,7 @@ def main(
         data: The folder that holds the datasets of `msdgs-train bench`.
         out: The folder of runs, table and figure.
         csv: The file with a row per finished run; OUT/k_steps.csv if not given.
-        scenes: Scenes of `msdgs-train bench`.
+        scenes: Scenes of k_steps.toml, which are 100 pixels wide.
         seeds: One run per seed.
         minutes: CPU time of each run.
         jobs: Runs in parallel, no more than the machine has cores.
@@ -62,7 +63,7 @@ def main(
         return self_test()
     csv = csv or out / "k_steps.csv"
     try:
-        found = read_scenes(data, short=False, names=scenes)
+        found = read_scenes(data, short=False, names=scenes, file=SCENES_FILE)
         budget = Budget(steps=None, minutes=minutes, time="cpu").settings()
         runs = make_bench_runs({name: c.updated(**budget) for name, c in systems().items()}, found, seeds, out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
