@@ -1,4 +1,4 @@
-"""Whether K deformation layers pay: chains on control nodes beside one layer of as many parameters, for equal time."""
+"""Whether K deformation layers pay: chains on control nodes beside one layer of as many parameters."""
 
 import dataclasses
 import io
@@ -38,7 +38,8 @@ def main(
     csv: Path | None = None,
     scenes: tuple[str, ...] = SCENES,
     seeds: tuple[int, ...] = (0, 1, 2),
-    minutes: float = 2.0,
+    steps: int = 2500,
+    minutes: float | None = None,
     jobs: int = 1,
     check: bool = False,
 ) -> int:
@@ -47,7 +48,8 @@ def main(
 
     python -m benchmarks.training.k_steps --data data --csv docs/data/k_steps.csv
 
-    Each run has one thread and the same CPU time. Runs that have a row in the file are not trained again.
+    Each run has one thread, and as many steps or as much CPU time as the others. The bits of a run of a number of steps
+    don't depend on what else the machine does. Runs that have a row in the file are not trained again.
 
     Args:
         data: The folder that holds the datasets of `msdgs-train bench`.
@@ -55,7 +57,8 @@ def main(
         csv: The file with a row per finished run; OUT/k_steps.csv if not given.
         scenes: Scenes of k_steps.toml, which are 100 pixels wide.
         seeds: One run per seed.
-        minutes: CPU time of each run.
+        steps: Optimizer steps of each run.
+        minutes: CPU time of each run, instead of steps.
         jobs: Runs in parallel, no more than the machine has cores.
         check: Test this benchmark: widths give equal parameters, and figure and table show what a file holds.
     """
@@ -64,7 +67,7 @@ def main(
     csv = csv or out / "k_steps.csv"
     try:
         found = read_scenes(data, short=False, names=scenes, file=SCENES_FILE)
-        budget = Budget(steps=None, minutes=minutes, time="cpu").settings()
+        budget = Budget(steps if minutes is None else None, minutes, time="cpu").settings() | {"eval_every": 0}
         runs = make_bench_runs({name: c.updated(**budget) for name, c in systems().items()}, found, seeds, out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
             complete = train_and_measure(runs, found, csv, jobs, on_end)

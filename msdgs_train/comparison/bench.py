@@ -86,7 +86,8 @@ def make_bench_runs(
 def key_of(run: Run) -> tuple[str, ...]:
     """The values of `KEY`, which tell the rows of a CSV file apart."""
     config = run.config.run
-    shared = f"{config.minutes:g}", config.time, str(config.threads)
+    minutes = "" if config.minutes is None else f"{config.minutes:g}"
+    shared = minutes, config.time, str(config.threads)
     return run.scene, run.system, str(run.seed), *shared, _digest(run.config)
 
 
