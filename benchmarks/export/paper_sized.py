@@ -171,6 +171,7 @@ def main(
     console.print(machine(), markup=False)
     torch.set_num_threads(threads)
     try:
+        output.parent.mkdir(parents=True, exist_ok=True)
         small, info, _ = load_model(model)
         if count < len(small.gaussians):
             raise InvalidInput("count", f"{len(small.gaussians):,} or more, the model's Gaussians", count)

@@ -230,6 +230,6 @@ class ExportJob:
         for known_layers, known, sampled in self._sampled:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
                 return sampled.some(np.searchsorted(known, ids))
-        sampled = Trajectories(baked, self.progress)
+        sampled = Trajectories(baked, self.progress, [camera for _, camera in self.cameras])
         self._sampled = [*self._sampled[1 - SAMPLED_KEPT :], (layers, ids, sampled)]
         return sampled

@@ -8,6 +8,7 @@ import numpy as np
 
 from export.measure.verify import times_to_verify
 from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.metadata import SceneMetadata
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MIN_CAMERAS = 4
@@ -36,6 +37,14 @@ def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[s
     cameras = [(f"training {i}", camera) for i, camera in enumerate(training)]
     cameras = cameras or [(str(stored["name"]), _camera(stored)) for stored in info.cameras]
     return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
+
+
+def cameras_of_file(metadata: SceneMetadata) -> list[Camera]:
+    """The cameras of a scene file; more are added if too few."""
+    info = SceneInfo(
+        bounds=[list(corner) for corner in metadata.bounds], cameras=[c.to_plain() for c in metadata.cameras]
+    )
+    return [camera for _, camera in cameras_of(info)]
 
 
 def evaluation_views(

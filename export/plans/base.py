@@ -16,26 +16,16 @@ if TYPE_CHECKING:
 BASELINE = "network"
 """The plan that computes the model itself in float32; all others are compared with it."""
 
-DEFAULT_PIXELS = 0.1
-"""Error bound of a fitted plan whose name has no size."""
-
 
 @dataclass(frozen=True)
 class PlanSpec:
-    """The parsed name of a plan: `prefix:2` is ("prefix", 2), `lowrank:0.05` ("lowrank", None, 0.05)."""
+    """The parsed name of a plan: `prefix:2` is ("prefix", 2)."""
 
     name: str
     count: int | None = None
-    pixels: float | None = None
 
     def __str__(self) -> str:
-        size = self.count if self.pixels is None else self.pixels
-        return self.name if size is None else f"{self.name}:{size}"
-
-    @property
-    def max_pixels(self) -> float | None:
-        """Error bound of a fitted plan, pixels of the scene's nearest camera; None if `count` is its size."""
-        return None if self.count is not None else self.pixels or DEFAULT_PIXELS
+        return self.name if self.count is None else f"{self.name}:{self.count}"
 
 
 @dataclass(frozen=True)
@@ -54,6 +44,6 @@ class Plan:
     counts: range | None = None
     """Allowed counts; None: it has no size."""
     fitted: bool = False
-    """Whether it is fitted to float64 trajectories and may have an error bound; others run layers for each frame."""
+    """Whether it is fitted to float64 trajectories; others run layers for each frame."""
     speedup: float = 1.0
     """Speed of its layers relative to float32."""

@@ -22,13 +22,11 @@ def new_graph(baked: Baked) -> GraphBuilder:
     return graph
 
 
-def finished(
-    graph: GraphBuilder, baked: Baked, plan: str, error_bound: dict[str, Any] | None = None
-) -> onnx.ModelProto:
+def finished(graph: GraphBuilder, baked: Baked, plan: str, fitted: dict[str, Any] | None = None) -> onnx.ModelProto:
     """The scene file of a graph that computes `means`, `quats`, `scales` and what is `changing`, or holds them as
     constants.
 
-    `error_bound` of a fitted plan is `measured_error` until the file is measured.
+    `fitted` is what a fitted plan says of its error.
     """
     scene = baked.scene
     has_ids = "ids" in graph.constants
@@ -45,7 +43,9 @@ def finished(
     if "steps" in graph.constants:
         inputs["steps"] = (TensorProto.FLOAT, [1])
     contract = CHANGING_CONTRACT if scene.changing else CONTRACT
-    metadata = replace(scene.metadata, contract=contract, plan=plan, measured_error=error_bound or {})
+    metadata = replace(
+        scene.metadata, contract=contract, plan=plan, measured_error={"fitted": fitted} if fitted else {}
+    )
     return graph.model(inputs, outputs, metadata.to_properties())
 
 

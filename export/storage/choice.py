@@ -34,16 +34,21 @@ def _bits(kind: Callable[[int], Pack], *bits: int) -> dict[str, Pack]:
 
 GROUPS = {
     "static means": Group(r"static_means", _bits(in_range, 16)),
-    "means": Group(r"canonical_means", _bits(in_range, 16)),
+    "means": Group(r"canonical_means|mean\.means", _bits(in_range, 16)),
     "static quats": Group(r"static_quats", _bits(directions, 8, 16)),
     "quats": Group(r"canonical_quats", _bits(directions, 8, 16)),
     "static scales": Group(r"static_scales", _bits(logarithms, 8, 16)),
     "scales": Group(r"canonical_log_scales", _bits(in_range, 8, 16)),
+    "mean scales": Group(r"mean\.scales", _bits(logarithms, 8, 16)),
+    "mean quats": Group(r"mean\.quats", _bits(in_range, 8, 16)),
     "opacities": Group(r"(static_)?opacities", _bits(lambda bits: fractions(bits, 1.0), 8, 16)),
     "sh": Group(r"((static|canonical)_)?sh", _bits(in_range, 8, 16)),
     "modulation": Group(r"\w+_modulation", _bits(in_range, 8, 16)),
     "skinning weights": Group(r"skinning\.weight\d+", _bits(lambda bits: fractions(bits, 0.5), 8, 16)),
     "curves and planes": Group(r"layer\d+\.(table|space|time)", _bits(in_range, 8, 16)),
+    "functions of time": Group(r"functions\.control", _bits(in_range, 8, 16)),
+    "leading coefficients": Group(r"coefficients\d+\.leading", _bits(in_range, 8, 16)),
+    "coefficients": Group(r"coefficients\d+\.rest", _bits(in_range, 8, 16)),
     "network": Group(r"layer\d+\..*weight.*", _bits(in_range, 8, 16)),
     "other": Group(r".*", _bits(in_range, 16)),
 }

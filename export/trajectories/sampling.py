@@ -11,8 +11,9 @@ network of the paper's size needs ten seconds per time in float64, one to two in
 
 import copy
 import hashlib
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +21,11 @@ import numpy.typing as npt
 from export.jobs.bake import Baked
 from export.progress import Track, no_progress
 from export.trajectories.poses import MEANS, POSE, QUATS, SCALES, ExactPoses, Poses, SinglePoses, pixel
+from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import SceneFileInvalid
 
-COARSE, USUAL, FINEST = 64, 512, 2048
-"""Numbers of intervals between samples: of all Gaussians, of comparisons with fits, and of the fastest Gaussians."""
+COARSE, FINEST = 64, 2048
+"""Numbers of intervals between samples: of all Gaussians, and of the fastest."""
 
 RESOLVED = 0.1
 """Largest error of a cubic between samples, pixels."""
@@ -41,18 +43,20 @@ MEMORY = 2 * 2**30
 
 Samples = npt.NDArray[np.floating]  # [M, T, 10] means, linear scales, unit quaternions of one sign along time
 Ids = npt.NDArray[np.int64]
+Made = TypeVar("Made")
 
 
 class Trajectories:
     """Samples of one baked scene, used by all plans that are fitted to them."""
 
-    def __init__(self, baked: Baked, track: Track = no_progress) -> None:
+    def __init__(self, baked: Baked, track: Track = no_progress, cameras: Sequence[Camera] = ()) -> None:
+        """`cameras` show how visible errors are; by default those of the scene."""
         self.exact = ExactPoses(baked)
         self.count = self.exact.count
         self.time_range = baked.scene.metadata.time_range
         self.pixel = pixel(baked)
         self._ids = np.arange(self.count)  # in the arrays below
-        self._track = track
+        self.track = track
         self._on_time = track(f"{self.count:,} trajectories", COARSE + 1 + PROBES)
         self._probe_parts = np.arange(1, PROBES + 1) * (np.sqrt(5) - 1) / 2 % 1
         self._sampler, self._probes = self._probed(baked)
@@ -60,7 +64,8 @@ class Trajectories:
         give_one_sign(samples)
         self._levels = {COARSE: (self._ids, samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
-        self._fewest: dict[float, npt.NDArray[np.int64]] = {}  # by pixels
+        self.scene, self.cameras, self._whole = baked.scene, cameras, self
+        self._made: dict[Callable[[Trajectories], Any], Any] = {}
         self._misses = np.zeros(self.count)  # scene units, error of cubics at the finest level
         self.rotation_weights = _rotation_weights(samples, self.pixel)
         self._refine()
@@ -77,10 +82,6 @@ class Trajectories:
         """Gaussians that move faster than their finest sampling resolves."""
         return np.flatnonzero(self._misses[self._ids] > RESOLVED * self.pixel)
 
-    def checks(self, ids: Ids) -> npt.NDArray[np.int64]:
-        """[M] the number of evenly spread times at which fits are compared with each of these Gaussians."""
-        return np.maximum(self._depth[self._ids[ids]], USUAL) + 1
-
     def on_grid(self, times: int, ids: Ids) -> Samples:
         """[M, T, 10] poses at T = 2ⁿ + 1 evenly spread times, interpolated by cubics between samples."""
         ids = self._ids[ids]
@@ -94,28 +95,16 @@ class Trajectories:
             got[rows] = values[:, :: (values.shape[1] - 1) // (times - 1)]
         return got
 
-    def error_bound(self, errors: npt.NDArray[np.float64], own: int) -> dict[str, Any]:
-        """The error bound of a fitted plan, given each Gaussian's largest error in scene units."""
-        resolved = np.delete(errors, self.unresolved)
-        return {
-            "fitted": {
-                "error": float(resolved.max(initial=0)),
-                "pixel": self.pixel,
-                "own_poses": own,
-                "too_fast": len(self.unresolved),
-                "too_fast_part": len(self.unresolved) / max(self.count, 1),
-                "error_too_fast": float(errors[self.unresolved].max(initial=0)),
-            }
-        }
+    @property
+    def rows(self) -> Ids:
+        """[M] indices of these Gaussians among those that were sampled."""
+        return self._ids
 
-    def fewest_poses(self, most: float, ids: Ids) -> npt.NDArray[np.int64]:
-        """[M] the number of control points that each needs to be within `most` pixels, if another plan has found it, or
-        0."""
-        return self._fewest[most][self._ids[ids]] if most in self._fewest else np.zeros(len(ids), np.int64)
-
-    def remember_poses(self, most: float, ids: Ids, counts: npt.NDArray[np.int64]) -> None:
-        """Store numbers of control points for other plans with the same error bound."""
-        self._fewest.setdefault(most, np.zeros_like(self._depth))[self._ids[ids]] = counts
+    def once(self, make: "Callable[[Trajectories], Made]") -> Made:
+        """What `make` returns for all Gaussians that were sampled; made once, whichever part of them asks."""
+        if make not in self._made:
+            self._made[make] = make(self._whole)
+        return self._made[make]
 
     def distances(self, ids: Ids, differences: np.ndarray) -> npt.NDArray[np.float64]:
         """[M] the largest of differences from poses, [M, T, 10], in scene units.
@@ -137,7 +126,7 @@ class Trajectories:
                 break
             work -= len(fast) * (level // 2) * self.exact.operations
             coarse = samples[np.searchsorted(ids, fast)]
-            self._on_time = self._track("fast trajectories, sampled more densely", level // 2)
+            self._on_time = self.track("fast trajectories, sampled more densely", level // 2)
             between = self._sampled(fast, np.linspace(*self.time_range, level + 1)[1::2])
             fine = _with_between(coarse, between)
             give_one_sign(fine)

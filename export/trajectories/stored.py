@@ -1,4 +1,4 @@
-"""Spline control points of poses in 16 bits, and the part of a graph that blends four of them for each Gaussian."""
+"""Spline control points of poses in 8 or 16 bits, and the part of a graph that blends four of them per Gaussian."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,29 +10,31 @@ from onnx import TensorProto
 from export.layers.graph import GraphBuilder
 from export.trajectories.splines import time_weights
 
-LEVELS = 2**15 - 1
-
 
 @dataclass(frozen=True)
 class StoredPoses:
     """Control points [M, n, 10] as integers; each column of each Gaussian has its own range. More columns are of
     opacities and SH.
 
-    The resolution is 1/65,534 of the range of a Gaussian's motion; that of float16 is 1/2,048 of the largest value.
+    In 16 bits the resolution is 1/65,534 of the range of a Gaussian's motion; that of float16 is 1/2,048 of the largest
+    value.
     """
 
-    points: npt.NDArray[np.int16]  # [M, n, 10]
+    points: npt.NDArray[np.int16] | npt.NDArray[np.uint8]  # [M, n, 10]
     steps: npt.NDArray[np.float32]  # [M, 10]
     middles: npt.NDArray[np.float32]  # [M, 10]
 
     @classmethod
-    def of(cls, control: np.ndarray) -> "StoredPoses":
-        """Rounded from control points, [M, n, 10]."""
+    def of(cls, control: np.ndarray, bits: int = 16) -> "StoredPoses":
+        """Rounded from control points, [M, n, 10], to 8 or 16 bits."""
+        most = 2 ** (bits - 1) - 1
         low, high = control.min(axis=1), control.max(axis=1)
         middles = ((low + high) / 2).astype(np.float32)
-        steps = np.maximum(np.maximum(high - middles, middles - low) / LEVELS, 1e-30).astype(np.float32)
-        points = np.round((control - middles[:, None]) / steps[:, None])
-        return cls(points.clip(-LEVELS, LEVELS).astype(np.int16), steps, middles)
+        steps = np.maximum(np.maximum(high - middles, middles - low) / most, 1e-30).astype(np.float32)
+        points = np.round((control - middles[:, None]) / steps[:, None]).clip(-most, most)
+        if bits == 8:  # unsigned: graphs cast no int8
+            return cls((points + most).astype(np.uint8), steps, middles - most * steps)
+        return cls(points.astype(np.int16), steps, middles)
 
     @classmethod
     def joined(cls, parts: Sequence["StoredPoses"]) -> "StoredPoses":
@@ -56,7 +58,7 @@ class GriddedPoses:
     @property
     def order(self) -> npt.NDArray[np.int64]:
         """[H] indices of the Gaussians in the order of the grids."""
-        return np.concatenate([rows for rows, _ in self.grids])
+        return np.concatenate([np.empty(0, np.int64), *(rows for rows, _ in self.grids)])
 
 
 def at_time(graph: GraphBuilder, poses: GriddedPoses, time_range: tuple[float, float]) -> str:

@@ -112,7 +112,7 @@ def rows_of(case: str) -> list[Row]:
         quantity = f"float32 frames at other times, {seen} of {len(model.gaussians)} Gaussians in them"
         return [*rows, measured(name, quantity, psnr, "stability.accepted_db")]
     row = refused(name, lambda: report.require("network"), "float", quantity="float32 plan")
-    if not report.broken and report.refusal("lowrank:8") is not None:
+    if not report.broken and report.refusal("compact:50") is not None:
         row = row._replace(verdict="fails: the remedy is refused, too")
     return [*rows, row]
 

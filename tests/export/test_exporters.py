@@ -205,7 +205,7 @@ def test_opacities_and_colors_that_change_are_those_of_each_time(tmp_path: Path,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plan", ["network", "lowrank:8", "lowrank:1", "keyframes:7", "keyframes"])
+@pytest.mark.parametrize("plan", ["network", "compact:30", "compact:60"])
 def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str):
     scene = scene_file(tmp_path, plan)
     run(scene, tmp_path / "a.visionary.onnx")
@@ -237,7 +237,7 @@ def test_visionary_scene_stands_upright_about_what_its_cameras_look_at(tmp_path:
     np.testing.assert_allclose(matrix @ view.target + asset["transform"]["position"], 0, atol=1e-12)
 
 
-@pytest.mark.parametrize("plan", ["network", "lowrank:8", "keyframes:7"])
+@pytest.mark.parametrize("plan", ["network", "compact:50"])
 def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
     """Visionary needs opset 17 only, no functions or control flow, finite constants of these types, empty padding."""
     model = visionary_model(scene_file(tmp_path, plan))
@@ -263,7 +263,7 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
     [
         ("network", "a.mp4", r"msdgs-render"),
         ("network", "a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd, .onnx or .visionary.onnx"),
-        ("int8", "a.visionary.onnx", r"--plan lowrank"),
+        ("int8", "a.visionary.onnx", r"--plan compact:55"),
     ],
 )
 def test_what_cannot_be_written_is_refused_with_an_alternative(tmp_path: Path, plan: str, out: str, message: str):

@@ -156,7 +156,7 @@ def test_a_run_whose_gaussians_fade_is_exported_by_plans_that_run_layers(
     scene = DeformationSession(tmp_path / "scene.onnx").scene
     assert (scene.metadata.layers, scene.changing) == (("plane",), ("opacities", "sh"))
     assert max(scene.metadata.measured_error[name] for name in scene.changing) <= tolerance("export.relative")
-    assert to_onnx(replace(options, plan="keyframes")) == 1
+    assert to_onnx(replace(options, plan="compact:50")) == 1
     assert "`plan` must be one that runs layers (network, prefix, int8)" in capsys.readouterr().err
 
 

@@ -62,33 +62,12 @@ FAST = {
 
 
 @pytest.mark.parametrize("name", FAST)
-@pytest.mark.parametrize("plan", ["keyframes:5", "keyframes", "lowrank:2", "lowrank"])
-def test_a_fast_motion_that_a_coarse_sampling_misses_is_caught(sampled, tmp_path: Path, name: str, plan: str):
+def test_a_fast_motion_that_a_coarse_sampling_misses_is_followed(sampled, tmp_path: Path, name: str):
     baked, trajectories = sampled(of_first(FAST[name]))
-    (tmp_path / "scene.onnx").write_bytes(build(plan, baked, trajectories).SerializeToString())
+    (tmp_path / "scene.onnx").write_bytes(build("compact:70", baked, trajectories).SerializeToString())
     session = DeformationSession(tmp_path / "scene.onnx")
     off = max(abs(session.pose(t, [0])[0][0, 0] - FAST[name](t)) for t in np.linspace(0, 1, 401))
-    # either its own poses follow the motion, or the metadata count it as too fast
-    fitted = session.scene.metadata.measured_error["fitted"]
-    stated = fitted["error_too_fast"] if 0 in trajectories.unresolved else fitted["error"]
-    assert off <= tolerance("between_samples.factor") * (stated + tolerance("stored_pose") * trajectories.pixel)
     assert off < tolerance("fast_motion")
-
-
-@pytest.mark.parametrize("plan", ["keyframes:0.05", "lowrank:0.05"])
-def test_amplitudes_far_apart_keep_the_same_error(sampled, tmp_path: Path, plan: str):
-    sizes = np.logspace(-4, 2, COUNT)
-
-    def motion(t: float) -> np.ndarray:
-        return np.stack([sizes * np.sin(7 * t + np.arange(COUNT)), 0 * sizes, sizes * t], axis=1)
-
-    baked, trajectories = sampled(motion)
-    (tmp_path / "scene.onnx").write_bytes(build(plan, baked, trajectories).SerializeToString())
-    session = DeformationSession(tmp_path / "scene.onnx")
-    for t in np.linspace(0.013, 0.987, 9):
-        off = np.linalg.norm(session.pose(t)[0] - motion(float(np.float32(t))), axis=1)
-        resolution = tolerance("float32.relative") * sizes  # for float32 poses and times
-        assert (off <= 0.05 * trajectories.pixel * tolerance("between_samples.factor") + 10 * resolution).all()
 
 
 @pytest.mark.parametrize("how", ["refused", "overflows", "a hundredth of a pixel off"])

@@ -137,12 +137,12 @@ def test_an_unsafe_plan_is_refused_and_an_old_file_stays(tmp_path: Path):
     model = stability_stiff.CASES["K = 16"]()
     output = tmp_path / "scene.onnx"
     output.write_bytes(b"an older scene")
-    with pytest.raises(PlanUnsafe, match=r"`network`.*float32.*dB.*`lowrank` or `keyframes`"):
+    with pytest.raises(PlanUnsafe, match=r"`network`.*float32.*dB.*`compact`"):
         export_scene(saved(tmp_path, model), output)
     assert output.read_bytes() == b"an older scene"
     report = assess(model, SCENE, times=3)
     assert all(report.refusal(plan) for plan in ("prefix:3", "int8"))
-    assert not any(report.refusal(plan) for plan in ("lowrank:8", "keyframes:20"))
+    assert not any(report.refusal(plan) for plan in ("compact:50", "compact:70"))
 
 
 def test_the_command_prints_writes_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -162,7 +162,7 @@ def test_the_command_flags_a_model_that_overflows(tmp_path: Path, capsys: pytest
     code = main(saved(tmp_path, model), tmp_path / "out.json", tmp_path / "out.png", times=2)
     assert code == UNSTABLE
     assert "unstable in float32" in capsys.readouterr().out
-    assert "lowrank" in json.loads((tmp_path / "out.json").read_text())["verdict"]
+    assert "compact" in json.loads((tmp_path / "out.json").read_text())["verdict"]
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "nodes": {"layers": ("spline", "mlp"), "support": NODES, "noise": 0.02, "embedding_dim": 0},
     "still": {"layers": ()},
 }
-PLANS = ("network", "prefix:1", "int8", "lowrank:4", "lowrank", "keyframes:9", "keyframes")
+PLANS = ("network", "prefix:1", "int8", "compact:40", "compact:60")
 
 
 @pytest.mark.parametrize(

@@ -78,14 +78,14 @@ def compared(psnr: float, **others: Any) -> dict[str, Any]:
 
 def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
     write_scene(tmp_path / "walk.onnx", **compared(60))
-    write_scene(tmp_path / "walk.fast.onnx", **compared(40, plan="lowrank:1"))
+    write_scene(tmp_path / "walk.fast.onnx", **compared(40, plan="compact:40"))
     write_scene(tmp_path / "walk.slow.onnx", **compared(50, plan="int8"))
     write_scene(tmp_path / "walk.other.onnx", **compared(70, checkpoint_sha256="1" * 64))
     write_scene(tmp_path / "plain.onnx")
     (tmp_path / "walk.broken.onnx").write_bytes(b"no scene")
     points = [
         {"plan": plan, "error": {"psnr_worst": psnr}, "milliseconds": {"total": {"min": milliseconds}}}
-        for plan, psnr, milliseconds in (("network", 60, 20.0), ("lowrank:1", 40, 5.0), ("int8", 50, 30.0))
+        for plan, psnr, milliseconds in (("network", 60, 20.0), ("compact:40", 40, 5.0), ("int8", 50, 30.0))
     ]
     report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": points}
     (tmp_path / "walk.report.json").write_text(json.dumps(report))
@@ -95,7 +95,7 @@ def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
             assert (answer.status_code, answer.headers["Msdgs-Scene"]) == (200, name)
             assert answer.headers["Msdgs-Error"] == error
         link = client.get(f"/render?scene=walk&min_psnr=30&t=0.5&width={SIZE}&height={SIZE}")
-        assert (link.headers["Msdgs-Scene"], link.headers["Msdgs-Plan"]) == ("walk.fast", "lowrank:1")
+        assert (link.headers["Msdgs-Scene"], link.headers["Msdgs-Plan"]) == ("walk.fast", "compact:40")
         for scene, min_psnr in (("walk", 65), ("plain", 10), ("walk", -1)):
             check_problem(post(client, scene=scene, min_psnr=min_psnr), 422, "min_psnr")
         assert "Msdgs-Error" not in post(client, scene="plain").headers

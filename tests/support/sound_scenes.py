@@ -22,7 +22,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "static": {"layers": ()},
     **{f"all heads of {kind}": {"layers": (kind,), "opacity_head": True, "sh_head": True} for kind in ("mlp", "plane")},
 }
-PLANS = ("network", "prefix:1", "int8", "lowrank:4", "lowrank:0.05", "keyframes:8", "keyframes:0.05")
+PLANS = ("network", "prefix:1", "int8", "compact:40", "compact:60")
 
 BY_HAND: dict[str, dict[str, Any]] = {
     "without steps": {},

@@ -88,7 +88,19 @@ TABLE = (
     Row("stored_scale", 1e-5, "logarithms up to 18, and the exponential, in float32"),
     Row("stored_16bit", 1e-3, "half a step of a range of 3 is 2e-5; a network without high frequencies multiplies it"),
     Row("stored_8bit", 5e-2, "half a step of a range of 3 is 6e-3; multiplied as 16 bits are"),
-    Row("between_samples.factor", 2.0, "times a bound at samples: between them a cubic's error may double"),
+    Row(
+        "hutchinson.relative",
+        0.2,
+        "2,000 random signs: a standard deviation of 0.03 of each entry, and some clamped pixels",
+    ),
+    Row(
+        "visible_error.relative",
+        0.05,
+        "means over 257 times instead of 1,025, of motion up to the Nyquist rate of either",
+    ),
+    Row(
+        "compact.predicted_db", 7.0, "errors of Gaussians are taken as independent; those of 12 nodes' followers aren't"
+    ),
     Row("int8.relative", 0.3, "of the largest motion; 8 bits are 0.4 % of a range, layers multiply it, AVX2 saturates"),
     Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),
     Row("cubic_between", 1e-5, "fourth derivative 1,296 · h⁴ · 3/128 with h = 1/64, more at the ends"),

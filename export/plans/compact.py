@@ -1,0 +1,155 @@
+"""Plan `compact:d`: motion in few bytes, with a predicted error of d dB in frames.
+
+Each Gaussian takes as many coefficients of shared functions of time, or control points of a spline of its own, as are
+worth their bytes: a choice with the fewest bytes within the squared error of d dB (a Lagrangian of both). A frame is
+one product per number of coefficients.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+from onnx import TensorProto
+
+from export.jobs.bake import Baked
+from export.layers.graph import GraphBuilder
+from export.plans.base import Plan, PlanSpec
+from export.plans.scene_graph import activated, finished
+from export.trajectories.levels import LEADING, OWN, RANKS, Errors, Levels, sizes
+from export.trajectories.poses import MEANS, POSE, QUATS, SCALES
+from export.trajectories.sampling import Ids, Trajectories
+from export.trajectories.splines import time_weights
+from export.trajectories.stored import GriddedPoses, StoredPoses, at_time
+
+BISECTIONS = 30
+PRICES = -24.0, 3.0
+"""Decimal logarithms between which the price of a byte is searched: the squared error that it must save."""
+
+CHEAPER = 10.0
+"""The price is divided by this while too few Gaussians have been tried with splines of their own."""
+
+Indices = npt.NDArray[np.int64]
+
+
+class Choice(NamedTuple):
+    """What each of M Gaussians stores."""
+
+    ranks: Indices  # [M] coefficients; -1: a spline of its own
+    own: Indices  # [M] index in `OWN`; -1: none
+    errors: Errors  # [M] what each adds to the squared error of a frame
+
+
+def compact(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.ModelProto:
+    """The scene with a predicted motion error of `spec.count` dB, or the smallest there is."""
+    levels, rows = trajectories.once(Levels), trajectories.rows
+    choice = chosen(levels, rows, 10 ** (-(spec.count or 0) / 10))
+    graph, time_range = GraphBuilder(), baked.scene.metadata.time_range
+    ranks = [int(rank) for rank in np.unique(choice.ranks) if rank > 0]
+    own = _own_poses(levels, rows, choice)
+    parts = _products(graph, levels, rows, choice, ranks, time_range) if ranks else []
+    parts += [at_time(graph, own, time_range)] if len(own) else []
+    parts.append(graph.constant("motion.none", np.zeros((1, POSE), np.float32)))  # of all others
+    moved = graph.node("Concat", parts, "motion.parts", axis=0)
+    order = np.concatenate([*(np.flatnonzero(choice.ranks == rank) for rank in ranks), own.order])
+    places = np.full(len(rows), len(order), np.int32)
+    places[order] = np.arange(len(order), dtype=np.int32)
+    indices = graph.node("Cast", [graph.constant("motion.places", places)], "motion.rows", to=TensorProto.INT64)
+    columns = {"mean.means": MEANS, "mean.scales": SCALES, "mean.quats": QUATS}
+    means = [graph.constant(name, levels.means[rows][:, part]) for name, part in columns.items()]
+    mean = graph.node("Concat", means, "mean.poses", axis=1)
+    activated(graph, graph.node("Add", [graph.node("Gather", [moved, indices], "motion.of_each"), mean], "poses"))
+    psnr = -10 * math.log10(max(float(choice.errors.sum()), 1e-10))
+    fitted = {"psnr": psnr, "own_poses": len(own), "too_fast": len(trajectories.unresolved)}
+    return finished(graph, baked, str(spec), fitted)
+
+
+def chosen(levels: Levels, rows: Ids, allowed: float) -> Choice:
+    """The choice with the fewest bytes whose squared errors sum to `allowed` at most, or the smallest sum.
+
+    Splines of their own are tried for Gaussians that pay more than such a spline costs, by the price of a byte.
+    """
+    ranks, costs, every = levels.num_ranks, sizes(levels.num_ranks), np.arange(len(rows))
+    errors = np.full((len(costs), len(rows)), np.inf)
+    errors[:ranks] = levels.errors[:, rows]
+    picked, price = _fewest_bytes(errors, costs, levels, allowed)
+    while True:
+        for level in ranks + np.argsort(costs[ranks:], kind="stable"):
+            paid = (errors + price * costs[:, None]).min(axis=0)
+            tried = np.flatnonzero((paid > price * costs[level]) & np.isinf(errors[level]))
+            _, errors[level, tried] = levels.own(rows[tried], *OWN[level - ranks])
+        picked, _ = _fewest_bytes(errors, costs, levels, allowed)
+        price /= CHEAPER
+        if errors[picked, every].sum() <= allowed or price < 10 ** PRICES[0]:
+            break
+    is_own = picked >= ranks
+    counts = np.array(RANKS)[picked.clip(0, ranks - 1)]
+    return Choice(np.where(is_own, -1, counts), np.where(is_own, picked - ranks, -1), errors[picked, every])
+
+
+def _fewest_bytes(
+    errors: Errors, costs: npt.NDArray[np.float64], levels: Levels, allowed: float
+) -> tuple[Indices, float]:
+    """[M] levels, and the price of a byte by which they are chosen; functions are stored up to the highest rank."""
+    found = []
+    every = np.arange(errors.shape[1])
+    for top in range(levels.num_ranks):
+        among = np.r_[: top + 1, levels.num_ranks : len(costs)]
+        low, high = PRICES
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            picked = among[_cheapest(errors[among], costs[among], 10**middle)]
+            low, high = (middle, high) if errors[picked, every].sum() <= allowed else (low, middle)
+        picked = among[_cheapest(errors[among], costs[among], 10**low)]
+        error, size = errors[picked, every].sum(), costs[picked].sum() + RANKS[top] * levels.bytes_per_function
+        found.append(((error > allowed, error if error > allowed else size), picked, 10**low))
+    _, picked, price = min(found, key=lambda each: each[0])
+    return picked, price
+
+
+def _cheapest(errors: Errors, costs: npt.NDArray[np.float64], price: float) -> Indices:
+    return (errors + price * costs[:, None]).argmin(axis=0)
+
+
+def _products(
+    graph: GraphBuilder, levels: Levels, rows: Ids, choice: Choice, ranks: list[int], time_range: tuple[float, float]
+) -> list[str]:
+    """Displacements of the Gaussians of each rank from their mean poses: coefficients times functions at `t`."""
+    name = "functions"
+    cells, weights = time_weights(graph, f"{name}.clock", time_range, [levels.knots])
+    near = graph.node("Add", [cells, graph.constant(f"{name}.neighbors", np.arange(4, dtype=np.int64))], f"{name}.near")
+    control = levels.functions[:, : ranks[-1]].reshape(levels.knots, -1)
+    control = graph.node("Gather", [graph.constant(f"{name}.control", control), near], f"{name}.points")
+    shape = graph.constant(f"{name}.shape", np.array([-1, POSE], np.int64))
+    functions = graph.node("Reshape", [graph.node("MatMul", [weights, control], f"{name}.flat"), shape], f"{name}.now")
+    parts = []
+    for rank in ranks:
+        name, values = f"coefficients{rank}", levels.coefficients[rows[choice.ranks == rank], :rank]
+        stored = [graph.constant(f"{name}.leading", values[:, :LEADING])]
+        stored += [graph.constant(f"{name}.rest", values[:, LEADING:])] if rank > LEADING else []
+        first = graph.constant(f"{name}.first", np.arange(rank, dtype=np.int64))
+        factors = [graph.node("Concat", stored, name, axis=1), graph.node("Gather", [functions, first], f"{name}.now")]
+        parts.append(graph.node("MatMul", factors, f"{name}.moved"))
+    return parts
+
+
+def _own_poses(levels: Levels, rows: Ids, choice: Choice) -> GriddedPoses:
+    """Splines of their own, relative to the mean poses."""
+    grids = []
+    for index in np.unique(choice.own[choice.own >= 0]):
+        ids, (count, bits) = np.flatnonzero(choice.own == index), OWN[index]
+        control, _ = levels.own(rows[ids], count, bits)
+        grids.append((ids, StoredPoses.of(control, bits)))
+    return GriddedPoses(tuple(grids))
+
+
+COMPACT = Plan(
+    "compact",
+    "compact:d, motion with a predicted error of d dB, 20 to 90",
+    "#a463f2",
+    lambda baked, spec, sample: compact(baked, spec, sample()),
+    candidates=lambda layers: ["compact:60", "compact:56", "compact:52", "compact:46", "compact:40"],
+    counts=range(20, 91),
+    fitted=True,
+)

@@ -1,0 +1,154 @@
+"""Levels of detail of trajectories: how many bytes each takes, and how visible its error is.
+
+A pose is its mean over time plus r coefficients of the Gaussian times the first r of the functions of time that all
+Gaussians share, or plus a spline of its own. A function has all ten numbers of a pose. Functions are the singular
+vectors of all trajectories, weighted by how visible their errors are.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cholesky, eigh, solve_triangular
+
+from export.measure.views import cameras_of_file
+from export.trajectories.poses import MEANS, POSE, QUATS, SCALES
+from export.trajectories.sampling import COARSE, Ids, Samples, Trajectories
+from export.trajectories.sensitivity import PASSES, sensitivities
+from export.trajectories.splines import along_time, design, fitting, samples_for
+from export.trajectories.stored import StoredPoses
+
+RANKS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+"""Numbers of coefficients."""
+
+LEADING = 8
+"""The first coefficients may be stored in 16 bits while all others are in 8."""
+
+OWN = tuple((count, bits) for bits in (8, 16) for count in (7, 11, 19, 35, 67, 131, 259, 515))
+"""Control points of a spline of one Gaussian, and bits of each of their numbers."""
+
+KNOTS = (35, 67, 131)
+"""Numbers of control points of shared functions."""
+
+ENOUGH = 10 ** (-56 / 10)
+"""Functions have the fewest control points with which they alone would add this squared error to a frame."""
+
+SAMPLED = 2048
+"""Number of Gaussians by which these are chosen."""
+
+FEWEST_TIMES = 257
+"""Times at which trajectories are compared, or more if that is less than four between two control points."""
+
+PEAKS = 2.0
+"""Errors over time count by a mean of this power, so that short errors count more. Measured: with 1 files of the same
+PSNR on 48 frames are 15 % smaller, and brief motion is lost; with 4 they are 10 % larger."""
+
+CHUNK = 1024
+"""Gaussians that are compared at a time, fewer at more times."""
+
+Errors = npt.NDArray[np.float64]
+
+
+def sizes(num_ranks: int = len(RANKS)) -> npt.NDArray[np.float64]:
+    """[L] bytes of a Gaussian at each level: of the first ranks, and of all splines of its own."""
+    ranks = [rank + min(rank, LEADING) for rank in RANKS[:num_ranks]]
+    return np.array([*ranks, *(POSE * (count * bits // 8 + 8) for count, bits in OWN)], float)
+
+
+class Levels:
+    """The levels of all Gaussians of one set of trajectories."""
+
+    def __init__(self, trajectories: Trajectories) -> None:
+        self._trajectories = trajectories
+        self._every = np.arange(trajectories.count)
+        cameras = trajectories.cameras or cameras_of_file(trajectories.scene.metadata)
+        on_pass = trajectories.track("visibility of errors", PASSES)
+        forms = sensitivities(trajectories.scene, trajectories.on_grid(COARSE + 1, self._every), cameras, on_pass)
+        self.roots = _square_roots(forms)
+        """[M, 10, 10] A: an error e of a pose adds |Aᵀ e|² to the mean squared error of a frame."""
+        some = self._every[:: -(-len(self._every) // SAMPLED)]
+        share = len(some) / len(self._every)
+        enough = (n for n in KNOTS[:-1] if self._fitted(some, n)[1].sum() <= ENOUGH * share)
+        self.knots = next(enough, KNOTS[-1])
+        variances = np.einsum("mcc->mc", forms)
+        totals = [max(float(variances[:, part].mean()), 1e-30) for part in (MEANS, SCALES, QUATS)]
+        units = np.repeat(np.sqrt(np.array(totals) / totals[0]).clip(1e-6, 1e6), (3, 3, 4)).astype(np.float32)
+        self._decompose(units, np.sqrt(variances[:, MEANS].mean(axis=1)))
+
+    @property
+    def num_ranks(self) -> int:
+        """The number of ranks that there are functions for."""
+        return len(self.errors)
+
+    @property
+    def bytes_per_function(self) -> float:
+        """Bytes of one function."""
+        return 2 * POSE * self.knots
+
+    def own(self, ids: Ids, count: int, bits: int) -> tuple[Samples, Errors]:
+        """[M, n, 10] control points of some Gaussians, relative to their mean poses, and their errors."""
+        return self._fitted(ids, count, bits, self.means[ids])
+
+    def _decompose(self, units: npt.NDArray[np.float32], visible: npt.NDArray[np.float32]) -> None:
+        """Find functions, coefficients and errors, with `units` of poses, [10], and weights of Gaussians, [M]."""
+        every, knots = self._every, self.knots
+        control, _ = self._fitted(every, knots)
+        matrix = design(knots, FEWEST_TIMES)
+        self.means = along_time(matrix.mean(axis=0, keepdims=True).astype(np.float32), control)[:, 0]
+        """[M, 10] mean poses."""
+        control -= self.means[:, None]
+        root = cholesky(matrix.T @ matrix / len(matrix))  # of a squared mean over time
+        rows = (along_time(root.astype(np.float32), control) * units).reshape(len(every), -1)
+        gram = np.zeros((knots * POSE,) * 2)
+        for ids in np.array_split(every, -(-len(every) // CHUNK)):
+            weighted = rows[ids] * visible[ids, None]
+            gram += weighted.T @ weighted
+        number = min(RANKS[-1], len(every), len(gram))
+        functions = eigh(gram, subset_by_index=(len(gram) - number, len(gram) - 1))[1][:, ::-1].astype(np.float32)
+        self.coefficients = rows @ functions
+        """[M, R]"""
+        in_poses = solve_triangular(root, functions.reshape(knots, -1)).reshape(knots, POSE, number) / units[:, None]
+        self.functions = np.ascontiguousarray(in_poses.transpose(0, 2, 1), np.float32)
+        """[n, R, 10] control points of the functions, the most important first."""
+        ranks = [rank for rank in RANKS if rank <= number]
+        self.errors = np.empty((len(ranks), len(every)))
+        """[ranks, M] what each adds to the squared error of a frame."""
+        shown = np.tensordot(matrix.astype(np.float32), self.functions, axes=1).transpose(1, 0, 2)  # [R, T, 10]
+        for ids in self._chunks(len(every), FEWEST_TIMES):
+            got = self.means[ids, None] - self._trajectories.on_grid(FEWEST_TIMES, ids)
+            for level, (before, rank) in enumerate(zip([0, *ranks], ranks, strict=False)):
+                got += np.tensordot(self.coefficients[ids, before:rank], shown[before:rank], axes=1)
+                self.errors[level, ids] = self._visible(ids, got)
+
+    def _fitted(
+        self, ids: Ids, count: int, bits: int | None = None, means: np.ndarray | None = None
+    ) -> tuple[Samples, Errors]:
+        """[M, n, 10] control points of Gaussians, relative to `means` if given, and errors [M], with rounding to
+        `bits`."""
+        control, errors = np.empty((len(ids), count, POSE), np.float32), np.empty(len(ids))
+        times = max(2 * samples_for(count) - 1, FEWEST_TIMES)
+        matrix, shown = (
+            make(count, n).astype(np.float32) for make, n in ((fitting, samples_for(count)), (design, times))
+        )
+        for places in self._chunks(len(ids), times):
+            samples = self._trajectories.on_grid(times, ids[places])
+            if means is not None:
+                samples -= means[places, None]
+            control[places] = along_time(matrix, samples[:, :: (times - 1) // (samples_for(count) - 1)])
+            stored = control[places] if bits is None else StoredPoses.of(control[places], bits).control()
+            errors[places] = self._visible(ids[places], along_time(shown, stored) - samples)
+        return control, errors
+
+    def _visible(self, ids: Ids, differences: Samples) -> Errors:
+        """[M] squared errors of frames by differences of poses, [M, T, 10]: a mean over time of power `PEAKS`."""
+        errors = np.square(differences @ self.roots[ids]).sum(axis=2, dtype=np.float64)
+        return (errors**PEAKS).mean(axis=1) ** (1 / PEAKS)
+
+    def _chunks(self, count: int, times: int) -> Iterator[Ids]:
+        yield from np.array_split(np.arange(count), max(-(-count * times // (CHUNK * FEWEST_TIMES)), 1))
+
+
+def _square_roots(forms: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """[M, 10, 10] matrices A with A Aᵀ = W."""
+    values, vectors = np.linalg.eigh(forms)
+    return (vectors * np.sqrt(np.maximum(values, 0))[:, None]).astype(np.float32)

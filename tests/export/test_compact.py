@@ -1,0 +1,122 @@
+"""Levels of detail of trajectories against slow and obvious computations in float64."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from export.jobs.bake import bake
+from export.measure.views import cameras_of
+from export.plans.compact import chosen
+from export.trajectories import sensitivity
+from export.trajectories.levels import LEADING, OWN, PEAKS, RANKS, Levels, sizes
+from export.trajectories.sampling import Trajectories
+from export.trajectories.sensitivity import sensitivities
+from export.trajectories.splines import design
+from export.trajectories.stored import StoredPoses
+from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.scene.gaussians import Gaussians
+from tests.support.models import SCENE, random_model
+from tests.support.tolerances import assert_close, tolerance
+
+COUNT = 30
+INVISIBLE = 1e-10
+"""Squared errors below this, -100 dB, are those of float32."""
+
+
+@pytest.fixture(scope="module")
+def trajectories() -> Trajectories:
+    return Trajectories(bake(random_model(COUNT, layers=("mlp",), noise=0.05), SCENE, "0" * 64))
+
+
+@pytest.fixture(scope="module")
+def levels(trajectories: Trajectories) -> Levels:
+    return Levels(trajectories)
+
+
+def test_sensitivities_are_squared_differences_of_frames(monkeypatch: pytest.MonkeyPatch, trajectories: Trajectories):
+    monkeypatch.setattr(sensitivity, "PASSES", 2000)
+    (_, camera), *_ = cameras_of(SCENE)
+    scene, samples = trajectories.scene, np.repeat(trajectories.on_grid(65, np.arange(COUNT))[:, :1], 2, axis=1)
+    found = sensitivities(scene, samples, [camera])
+
+    def frame(poses: np.ndarray) -> np.ndarray:
+        g = Gaussians(
+            poses[:, :3], poses[:, 6:], poses[:, 3:6], *(a.astype(float) for a in (scene.opacities, scene.sh))
+        )
+        return rasterize(g, camera, background=scene.metadata.background).rgb
+
+    poses, step = samples[:, 0].astype(np.float64), 1e-5
+    base = frame(poses)
+    most = np.einsum("mcc->m", found).argsort()[-3:]
+    for i, column in itertools.product(most, range(6)):
+        moved = poses.copy()
+        moved[i, column] += step
+        want = np.square((frame(moved) - base) / step).mean()
+        assert found[i, column, column] == pytest.approx(want, rel=tolerance("hutchinson.relative"))
+    radial = np.einsum("mc,mcd,md->m", poses[:, 6:], found[:, 6:, 6:], poses[:, 6:])
+    assert np.abs(radial).max() <= tolerance("float32.relative") * np.abs(found).max()
+
+
+def test_errors_of_levels_are_those_of_poses_rebuilt_from_what_is_stored(trajectories: Trajectories, levels: Levels):
+    ids = np.arange(COUNT)
+    samples = trajectories.on_grid(1025, ids).astype(np.float64)
+    roots = levels.roots.astype(np.float64)
+
+    def error(control: np.ndarray) -> np.ndarray:
+        got = np.einsum("tn,mnc->mtc", design(control.shape[1], 1025), control) + levels.means[:, None]
+        squares = np.square(np.einsum("mtc,mcd->mtd", got - samples, roots)).sum(axis=2)
+        return (squares**PEAKS).mean(axis=1) ** (1 / PEAKS)
+
+    for level, rank in enumerate(rank for rank in RANKS if rank <= COUNT):
+        control = np.einsum("mr,nrc->mnc", levels.coefficients[:, :rank], levels.functions[:, :rank].astype(float))
+        assert_close(levels.errors[level], error(control), "visible_error.relative")
+    assert (np.diff(levels.errors.sum(axis=1)) < 0).all()
+    for count, bits in OWN[:3] + OWN[-3:-1]:
+        control, errors = levels.own(ids, count, bits)
+        want = error(StoredPoses.of(control, bits).control().astype(float))
+        assert_close(np.maximum(errors, INVISIBLE), np.maximum(want, INVISIBLE), "visible_error.relative")
+
+
+def test_the_choice_keeps_the_error_and_no_gaussian_could_give_up_bytes_for_less(levels: Levels):
+    rows, costs = np.arange(COUNT), sizes(levels.num_ranks)
+    totals = []
+    for db in (30, 45, 60):
+        choice = chosen(levels, rows, 10 ** (-db / 10))
+        assert choice.errors.sum() <= 10 ** (-db / 10)
+        is_own = choice.own >= 0
+        assert (is_own == (choice.ranks < 0)).all()
+        totals.append(
+            sum(POSE_BYTES[index] for index in choice.own[is_own])
+            + sum(rank + min(rank, LEADING) for rank in choice.ranks[~is_own])
+        )
+        np.testing.assert_array_equal(
+            choice.errors[~is_own], levels.errors[[RANKS.index(r) for r in choice.ranks[~is_own]], rows[~is_own]]
+        )
+    assert totals == sorted(totals)
+    assert costs[0] == 0
+
+
+POSE_BYTES = [10 * (count * bits // 8 + 8) for count, bits in OWN]
+
+
+def test_an_unreachable_error_gives_the_smallest(levels: Levels):
+    best = chosen(levels, np.arange(COUNT), 0.0)
+    assert (best.own >= 0).any()
+    assert best.errors.sum() < chosen(levels, np.arange(COUNT), 1e-7).errors.sum()
+
+
+def test_a_part_of_the_gaussians_takes_the_levels_of_all(trajectories: Trajectories):
+    some = trajectories.some(np.array([3, 5, 20]))
+    assert some.once(Levels) is trajectories.once(Levels)
+    np.testing.assert_array_equal(some.rows, [3, 5, 20])
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_stored_poses_are_off_by_half_a_step(bits: int):
+    control = np.random.default_rng(0).standard_normal((5, 9, 10)) * np.logspace(-3, 3, 10)
+    stored = StoredPoses.of(control, bits)
+    assert stored.points.dtype == (np.uint8 if bits == 8 else np.int16)
+    steps = np.ptp(control, axis=1) / (2**bits - 2)
+    off = np.abs(stored.control() - control).max(axis=1)
+    assert (off <= 0.5 * steps + tolerance("float32.relative") * np.abs(control).max(axis=1)).all()
