@@ -1,8 +1,8 @@
 """Plan `compact:d`: motion in few bytes, with a predicted error of d dB in frames.
 
-Each Gaussian takes as many coefficients of shared functions of time, or control points of a spline of its own, as are
-worth their bytes: a choice with the fewest bytes within the squared error of d dB (a Lagrangian of both). A frame is
-one product per number of coefficients.
+Each Gaussian stores coefficients of shared functions of time, or control points of a spline of its own: how many is
+decided by rate-distortion optimization, the fewest bytes within the squared error of d dB. A frame is one product per
+number of coefficients.
 """
 
 import math
@@ -24,11 +24,11 @@ from export.trajectories.splines import time_weights
 from export.trajectories.stored import GriddedPoses, StoredPoses, at_time
 
 BISECTIONS = 30
-PRICES = -24.0, 3.0
-"""Decimal logarithms between which the price of a byte is searched: the squared error that it must save."""
+LOG_MULTIPLIERS = -24.0, 3.0
+"""Decimal logarithms between which the Lagrange multiplier is searched, squared error per byte."""
 
-CHEAPER = 10.0
-"""The price is divided by this while too few Gaussians have been tried with splines of their own."""
+DIVISOR = 10.0
+"""The multiplier is divided by this while too few Gaussians have been tried with splines of their own."""
 
 Indices = npt.NDArray[np.int64]
 
@@ -68,20 +68,20 @@ def compact(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.Mo
 def chosen(levels: Levels, rows: Ids, allowed: float) -> Choice:
     """The choice with the fewest bytes whose squared errors sum to `allowed` at most, or the smallest sum.
 
-    Splines of their own are tried for Gaussians that pay more than such a spline costs, by the price of a byte.
+    Splines of their own are tried for Gaussians whose Lagrangian is above that of the spline's bytes alone.
     """
-    ranks, costs, every = levels.num_ranks, sizes(levels.num_ranks), np.arange(len(rows))
-    errors = np.full((len(costs), len(rows)), np.inf)
+    ranks, rates, every = levels.num_ranks, sizes(levels.num_ranks), np.arange(len(rows))
+    errors = np.full((len(rates), len(rows)), np.inf)
     errors[:ranks] = levels.errors[:, rows]
-    picked, price = _fewest_bytes(errors, costs, levels, allowed)
+    picked, multiplier = _fewest_bytes(errors, rates, levels, allowed)
     while True:
-        for level in ranks + np.argsort(costs[ranks:], kind="stable"):
-            paid = (errors + price * costs[:, None]).min(axis=0)
-            tried = np.flatnonzero((paid > price * costs[level]) & np.isinf(errors[level]))
+        for level in ranks + np.argsort(rates[ranks:], kind="stable"):
+            lagrangian = (errors + multiplier * rates[:, None]).min(axis=0)
+            tried = np.flatnonzero((lagrangian > multiplier * rates[level]) & np.isinf(errors[level]))
             _, errors[level, tried] = levels.own(rows[tried], *OWN[level - ranks])
-        picked, _ = _fewest_bytes(errors, costs, levels, allowed)
-        price /= CHEAPER
-        if errors[picked, every].sum() <= allowed or price < 10 ** PRICES[0]:
+        picked, _ = _fewest_bytes(errors, rates, levels, allowed)
+        multiplier /= DIVISOR
+        if errors[picked, every].sum() <= allowed or multiplier < 10 ** LOG_MULTIPLIERS[0]:
             break
     is_own = picked >= ranks
     counts = np.array(RANKS)[picked.clip(0, ranks - 1)]
@@ -89,27 +89,27 @@ def chosen(levels: Levels, rows: Ids, allowed: float) -> Choice:
 
 
 def _fewest_bytes(
-    errors: Errors, costs: npt.NDArray[np.float64], levels: Levels, allowed: float
+    errors: Errors, rates: npt.NDArray[np.float64], levels: Levels, allowed: float
 ) -> tuple[Indices, float]:
-    """[M] levels, and the price of a byte by which they are chosen; functions are stored up to the highest rank."""
+    """[M] levels, and the multiplier by which they are chosen; functions are stored up to the highest rank."""
     found = []
     every = np.arange(errors.shape[1])
     for top in range(levels.num_ranks):
-        among = np.r_[: top + 1, levels.num_ranks : len(costs)]
-        low, high = PRICES
+        among = np.r_[: top + 1, levels.num_ranks : len(rates)]
+        low, high = LOG_MULTIPLIERS
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
-            picked = among[_cheapest(errors[among], costs[among], 10**middle)]
+            picked = among[_minimal(errors[among], rates[among], 10**middle)]
             low, high = (middle, high) if errors[picked, every].sum() <= allowed else (low, middle)
-        picked = among[_cheapest(errors[among], costs[among], 10**low)]
-        error, size = errors[picked, every].sum(), costs[picked].sum() + RANKS[top] * levels.bytes_per_function
+        picked = among[_minimal(errors[among], rates[among], 10**low)]
+        error, size = errors[picked, every].sum(), rates[picked].sum() + RANKS[top] * levels.bytes_per_function
         found.append(((error > allowed, error if error > allowed else size), picked, 10**low))
-    _, picked, price = min(found, key=lambda each: each[0])
-    return picked, price
+    _, picked, multiplier = min(found, key=lambda each: each[0])
+    return picked, multiplier
 
 
-def _cheapest(errors: Errors, costs: npt.NDArray[np.float64], price: float) -> Indices:
-    return (errors + price * costs[:, None]).argmin(axis=0)
+def _minimal(errors: Errors, rates: npt.NDArray[np.float64], multiplier: float) -> Indices:
+    return (errors + multiplier * rates[:, None]).argmin(axis=0)
 
 
 def _products(

@@ -11,7 +11,7 @@ import onnx
 from onnx import TensorProto, numpy_helper
 
 from export.layers.graph import GraphBuilder
-from export.storage.kinds import Pack, directions, fractions, in_range, logarithms
+from export.storage.kinds import Pack, directions, fractions, in_range, logarithms, low_rank
 
 MIN_VALUES = 256
 """Arrays of fewer values stay float32: the nodes that unfold them would take as many bytes."""
@@ -45,7 +45,11 @@ GROUPS = {
     "sh": Group(r"((static|canonical)_)?sh", _bits(in_range, 8, 16)),
     "modulation": Group(r"\w+_modulation", _bits(in_range, 8, 16)),
     "skinning weights": Group(r"skinning\.weight\d+", _bits(lambda bits: fractions(bits, 0.5), 8, 16)),
-    "curves and planes": Group(r"layer\d+\.(table|space|time)", _bits(in_range, 8, 16)),
+    "splines": Group(
+        r"layer\d+\.table",
+        {f"rank {rank}": low_rank(rank) for rank in (12, 16, 24, 32, 48)} | _bits(in_range, 16),
+    ),
+    "planes": Group(r"layer\d+\.(space|time)", _bits(in_range, 8, 16)),
     "functions of time": Group(r"functions\.control", _bits(in_range, 8, 16)),
     "leading coefficients": Group(r"coefficients\d+\.leading", _bits(in_range, 8, 16)),
     "coefficients": Group(r"coefficients\d+\.rest", _bits(in_range, 8, 16)),

@@ -67,6 +67,26 @@ def directions(bits: int) -> Pack:
     return pack
 
 
+def low_rank(rank: int) -> Pack:
+    """[n, C] as a product of the first singular vectors, 8 of them in 16 bits: control points of splines over time, of
+    which most move little or alike."""
+
+    def pack(graph: GraphBuilder, name: str, values: np.ndarray) -> str:
+        over_time, sizes, columns = np.linalg.svd(values.astype(np.float64), full_matrices=False)
+        parts = []
+        for bits, part in ((16, slice(0, min(8, rank))), (8, slice(8, rank))):
+            if len(columns[part]):
+                parts.append(in_range(bits)(graph, f"{name}.in{bits}", columns[part].T))
+        factors = (over_time * sizes)[:, :rank].T.astype(np.float32)
+        product = [graph.node("Concat", parts, f"{name}.columns", axis=1), graph.constant(f"{name}.times", factors)]
+        first = graph.constant(f"{name}.axis", np.zeros(1, np.int64))
+        product = graph.node("Unsqueeze", [graph.node("MatMul", product, f"{name}.product"), first], f"{name}.whole")
+        turned = graph.node("Transpose", [product], f"{name}.turned", perm=[0, 2, 1])
+        return graph.node("Squeeze", [turned, first], name)
+
+    return pack
+
+
 def _lowest(bits: int) -> int:
     """The lowest integer of these bits; 16 are signed, since graphs cast no uint16."""
     return 0 if bits == 8 else -(1 << 15)

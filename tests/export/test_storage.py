@@ -20,7 +20,7 @@ from export.layers.graph import GraphBuilder
 from export.options import ConvertOptions, ExportOptions
 from export.plans.registry import build
 from export.storage.choice import COARSEST, GROUPS, fewest_bytes, packed, smallest_error
-from export.storage.kinds import Pack, directions, fractions, in_range, logarithms
+from export.storage.kinds import Pack, directions, fractions, in_range, logarithms, low_rank
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
@@ -72,6 +72,18 @@ def test_each_kind_is_off_by_half_a_step(bits: int, count: int):
     got, _ = unfolded(directions(bits), quats)
     np.testing.assert_allclose(np.linalg.norm(got, axis=1), 1, atol=tolerance("float32.relative"))
     assert np.abs(got - quats).max() <= 2 / (2 ** (bits - 1) - 1)
+
+
+@pytest.mark.parametrize("rank", [1, 5, 8, 12, 40])
+def test_a_low_rank_leaves_out_the_smallest_singular_values(rank: int):
+    rng = np.random.default_rng(rank)
+    values = rng.normal(size=(30, 12)) @ (rng.normal(size=(12, 200)) * 0.5 ** np.arange(12)[:, None])
+    _, sizes, columns = np.linalg.svd(values, full_matrices=False)
+    got, stored = unfolded(low_rank(rank), values)
+    steps = np.ptp(columns, axis=1) / np.where(np.arange(len(columns)) < 8, 2**16 - 1, 2**8 - 1) / 2
+    rounding = (sizes * steps)[:rank].sum() + tolerance("float32.relative") * sizes[0]
+    assert np.abs(got - values).max() <= rounding + sizes[rank:].sum()
+    assert stored == 200 * max(2 * min(rank, 8), min(rank, 30) - 8)
 
 
 MODELS: dict[str, dict[str, Any]] = {
