@@ -145,7 +145,7 @@ def _visionary(session: DeformationSession, options: ConvertOptions, console: Co
         console.print("its anti-aliasing isn't in this format: thin parts are brighter")
     plan = PLANS.get(metadata.plan.partition(":")[0])
     if session.scene.moving_count and plan is not None and not plan.fitted:
-        console.print("a browser runs all layers every frame: to_onnx.py --plan compact:55 makes a faster scene")
+        console.print("a browser runs all layers every frame: to_onnx.py --plan compact:65 makes a faster scene")
     return f"{_megabytes(out)}, {worst:.1f} dB"
 
 

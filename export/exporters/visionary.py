@@ -35,7 +35,7 @@ def visionary_model(scene_file: Path) -> onnx.ModelProto:
     scene = DeformationSession(scene_file).scene
     source = onnx.load(scene_file)
     if any(node.op_type in QUANTIZED for node in source.graph.node):
-        raise InvalidInput("scene", "of another plan, for example compact: to_onnx.py --plan compact:55", "int8")
+        raise InvalidInput("scene", "of another plan, for example compact: to_onnx.py --plan compact:65", "int8")
     graph = GraphBuilder()
     rows = []
     if scene.moving_count:

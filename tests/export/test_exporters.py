@@ -263,7 +263,7 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
     [
         ("network", "a.mp4", r"msdgs-render"),
         ("network", "a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd, .onnx or .visionary.onnx"),
-        ("int8", "a.visionary.onnx", r"--plan compact:55"),
+        ("int8", "a.visionary.onnx", r"--plan compact:65"),
     ],
 )
 def test_what_cannot_be_written_is_refused_with_an_alternative(tmp_path: Path, plan: str, out: str, message: str):
