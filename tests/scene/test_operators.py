@@ -1,4 +1,4 @@
-"""The table of allowed operators is exactly what exporters emit and what docs/contract.md lists."""
+"""The table of allowed operators is exactly what exporters emit, or did, and what docs/contract.md lists."""
 
 import re
 from pathlib import Path
@@ -19,6 +19,8 @@ from tests.support.sound_scenes import sound_scenes
 CONTRACT = Path(__file__).parents[2] / "docs" / "contract.md"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "toys.onnx"
 SCENES = {**sound_scenes(), "example": EXAMPLE.read_bytes()}
+OLDER: dict[str, dict[str, set[Any]]] = {"ScatterND": {}}
+"""Operators of files that older exporters wrote, with plans that are gone."""
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -53,7 +55,7 @@ def emitted() -> dict[str, dict[str, set[Any]]]:
 
 
 def test_the_table_has_exactly_the_operators_of_exporters():
-    found = emitted()
+    found = emitted() | OLDER
     assert sorted(found) == sorted(OPERATORS)
     for name, operator in OPERATORS.items():
         assert found[name].keys() == operator.attributes.keys(), name
