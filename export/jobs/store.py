@@ -11,13 +11,12 @@ import onnx
 from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob, TargetNotReached
 from export.jobs.write import properties, set_properties
 from export.measure.rendered_error import ExactFrames, RenderedError
-from export.measure.views import cameras_of, evaluation_views
+from export.measure.views import cameras_of_file, evaluation_views
 from export.storage.choice import COARSEST, Stored, fewest_bytes, packed, smallest_error
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.evaluation.metrics import MAX_PSNR
-from msdgs_train.gaussians.model_file import SceneInfo
 
 PLAN_PART = 0.75
 """Of the squared error that a file may have, the part that plan and pruning may use."""
@@ -53,10 +52,7 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
 
     exact = session(contents)
     metadata = exact.scene.metadata
-    info = SceneInfo(
-        bounds=[list(corner) for corner in metadata.bounds], cameras=[c.to_plain() for c in metadata.cameras]
-    )
-    views = evaluation_views(cameras_of(info), metadata.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
+    views = evaluation_views(cameras_of_file(metadata), metadata.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
     if not exact.scene.moving_count:
         views = list({view.name: view for view in views}.values())
     ids = np.arange(len(exact.scene))

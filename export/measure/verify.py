@@ -75,7 +75,6 @@ def verify(
                     raise VerificationFailed(f"{problem}, allowed is {tolerance:g}")
         on_time()
     return {
-        **{name: entry for name, entry in stated.measured_error.items() if name == "fitted"},
         **_displacements(np.concatenate(distances, axis=1)),
         **worst["float64"],
         "against": "model in float64",

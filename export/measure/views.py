@@ -39,12 +39,10 @@ def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[s
     return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
 
 
-def cameras_of_file(metadata: SceneMetadata) -> list[Camera]:
-    """The cameras of a scene file; more are added if too few."""
-    info = SceneInfo(
-        bounds=[list(corner) for corner in metadata.bounds], cameras=[c.to_plain() for c in metadata.cameras]
-    )
-    return [camera for _, camera in cameras_of(info)]
+def cameras_of_file(metadata: SceneMetadata) -> list[tuple[str, Camera]]:
+    """The cameras of a scene file by name; more are added if too few."""
+    bounds = [list(corner) for corner in metadata.bounds]
+    return cameras_of(SceneInfo(bounds=bounds, cameras=[camera.to_plain() for camera in metadata.cameras]))
 
 
 def evaluation_views(

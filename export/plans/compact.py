@@ -5,7 +5,6 @@ decided by rate-distortion optimization, the fewest bytes within the squared err
 number of coefficients.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from export.trajectories.poses import MEANS, POSE, QUATS, SCALES
 from export.trajectories.sampling import Ids, Trajectories
 from export.trajectories.splines import time_weights
 from export.trajectories.stored import GriddedPoses, StoredPoses, at_time
+from msdgs_train.evaluation.metrics import psnr_from_mse
 
 BISECTIONS = 30
 LOG_MULTIPLIERS = -24.0, 3.0
@@ -30,21 +30,20 @@ LOG_MULTIPLIERS = -24.0, 3.0
 DIVISOR = 10.0
 """The multiplier is divided by this while too few Gaussians have been tried with splines of their own."""
 
-Indices = npt.NDArray[np.int64]
-
 
 class Choice(NamedTuple):
     """What each of M Gaussians stores."""
 
-    ranks: Indices  # [M] coefficients; -1: a spline of its own
-    own: Indices  # [M] index in `OWN`; -1: none
+    ranks: Ids  # [M] coefficients; -1: a spline of its own
+    own: Ids  # [M] index in `OWN`; -1: none
     errors: Errors  # [M] what each adds to the squared error of a frame
 
 
 def compact(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.ModelProto:
     """The scene with a predicted motion error of `spec.count` dB, or the smallest there is."""
     levels, rows = trajectories.once(Levels), trajectories.rows
-    choice = chosen(levels, rows, 10 ** (-(spec.count or 0) / 10))
+    assert spec.count is not None
+    choice = chosen(levels, rows, 10 ** (-spec.count / 10))
     graph, time_range = GraphBuilder(), baked.scene.metadata.time_range
     ranks = [int(rank) for rank in np.unique(choice.ranks) if rank > 0]
     own = _own_poses(levels, rows, choice)
@@ -60,8 +59,11 @@ def compact(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.Mo
     means = [graph.constant(name, levels.means[rows][:, part]) for name, part in columns.items()]
     mean = graph.node("Concat", means, "mean.poses", axis=1)
     activated(graph, graph.node("Add", [graph.node("Gather", [moved, indices], "motion.of_each"), mean], "poses"))
-    psnr = -10 * math.log10(max(float(choice.errors.sum()), 1e-10))
-    fitted = {"psnr": psnr, "own_poses": len(own), "too_fast": len(trajectories.unresolved)}
+    fitted = {
+        "psnr": psnr_from_mse(float(choice.errors.sum())),
+        "own_poses": len(own),
+        "too_fast": len(trajectories.unresolved),
+    }
     return finished(graph, baked, str(spec), fitted)
 
 
@@ -73,12 +75,13 @@ def chosen(levels: Levels, rows: Ids, allowed: float) -> Choice:
     ranks, rates, every = levels.num_ranks, sizes(levels.num_ranks), np.arange(len(rows))
     errors = np.full((len(rates), len(rows)), np.inf)
     errors[:ranks] = levels.errors[:, rows]
-    picked, multiplier = _fewest_bytes(errors, rates, levels, allowed)
+    # from what shared functions reach
+    _, multiplier = _fewest_bytes(errors, rates, levels, max(allowed, 2 * errors[ranks - 1].sum()))
     while True:
         for level in ranks + np.argsort(rates[ranks:], kind="stable"):
             lagrangian = (errors + multiplier * rates[:, None]).min(axis=0)
             tried = np.flatnonzero((lagrangian > multiplier * rates[level]) & np.isinf(errors[level]))
-            _, errors[level, tried] = levels.own(rows[tried], *OWN[level - ranks])
+            errors[level, tried] = levels.own_errors(rows[tried], level - ranks)
         picked, _ = _fewest_bytes(errors, rates, levels, allowed)
         multiplier /= DIVISOR
         if errors[picked, every].sum() <= allowed or multiplier < 10 ** LOG_MULTIPLIERS[0]:
@@ -88,27 +91,25 @@ def chosen(levels: Levels, rows: Ids, allowed: float) -> Choice:
     return Choice(np.where(is_own, -1, counts), np.where(is_own, picked - ranks, -1), errors[picked, every])
 
 
-def _fewest_bytes(
-    errors: Errors, rates: npt.NDArray[np.float64], levels: Levels, allowed: float
-) -> tuple[Indices, float]:
+def _fewest_bytes(errors: Errors, rates: npt.NDArray[np.float64], levels: Levels, allowed: float) -> tuple[Ids, float]:
     """[M] levels, and the multiplier by which they are chosen; functions are stored up to the highest rank."""
     found = []
     every = np.arange(errors.shape[1])
     for top in range(levels.num_ranks):
         among = np.r_[: top + 1, levels.num_ranks : len(rates)]
-        low, high = LOG_MULTIPLIERS
+        some, low, high = errors[among], *LOG_MULTIPLIERS
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
-            picked = among[_minimal(errors[among], rates[among], 10**middle)]
+            picked = among[_minimal(some, rates[among], 10**middle)]
             low, high = (middle, high) if errors[picked, every].sum() <= allowed else (low, middle)
-        picked = among[_minimal(errors[among], rates[among], 10**low)]
+        picked = among[_minimal(some, rates[among], 10**low)]
         error, size = errors[picked, every].sum(), rates[picked].sum() + RANKS[top] * levels.bytes_per_function
         found.append(((error > allowed, error if error > allowed else size), picked, 10**low))
     _, picked, multiplier = min(found, key=lambda each: each[0])
     return picked, multiplier
 
 
-def _minimal(errors: Errors, rates: npt.NDArray[np.float64], multiplier: float) -> Indices:
+def _minimal(errors: Errors, rates: npt.NDArray[np.float64], multiplier: float) -> Ids:
     return (errors + multiplier * rates[:, None]).argmin(axis=0)
 
 
@@ -139,8 +140,7 @@ def _own_poses(levels: Levels, rows: Ids, choice: Choice) -> GriddedPoses:
     grids = []
     for index in np.unique(choice.own[choice.own >= 0]):
         ids, (count, bits) = np.flatnonzero(choice.own == index), OWN[index]
-        control, _ = levels.own(rows[ids], count, bits)
-        grids.append((ids, StoredPoses.of(control, bits)))
+        grids.append((ids, StoredPoses.of(levels.own(rows[ids], count), bits)))
     return GriddedPoses(tuple(grids))
 
 
@@ -149,7 +149,7 @@ COMPACT = Plan(
     "compact:d, motion with a predicted error of d dB, 20 to 90",
     "#a463f2",
     lambda baked, spec, sample: compact(baked, spec, sample()),
-    candidates=lambda layers: ["compact:60", "compact:56", "compact:52", "compact:46", "compact:40"],
+    candidates=lambda layers: [f"compact:{db}" for db in (72, 66, 60, 56, 52, 46, 40)],
     counts=range(20, 91),
     fitted=True,
 )

@@ -136,7 +136,7 @@ def limits_met(model: DynamicGaussians, scales: list[np.ndarray]) -> dict[str, i
 
 
 def _remedy() -> str:
-    fitted = " or ".join(f"`{plan.name}`" for plan in PLANS.values() if plan.fitted)
+    fitted = " or ".join(f"`{plan.usage}`" for plan in PLANS.values() if plan.fitted)
     return f"a plan that is fitted to float64 poses: {fitted}"
 
 

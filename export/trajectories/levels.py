@@ -34,10 +34,10 @@ ENOUGH = 10 ** (-56 / 10)
 """Functions have the fewest control points with which they alone would add this squared error to a frame."""
 
 SAMPLED = 2048
-"""Number of Gaussians by which these are chosen."""
+"""Number of Gaussians by which `KNOTS` are chosen."""
 
 FEWEST_TIMES = 257
-"""Times at which trajectories are compared, or more if that is less than four between two control points."""
+"""Times at which trajectories are compared; more if they are sampled more densely, or if control points are closer."""
 
 PEAKS = 2.0
 """Errors over time count by a mean of this power, so that short errors count more. Measured: with 1 files of the same
@@ -49,7 +49,7 @@ CHUNK = 1024
 Errors = npt.NDArray[np.float64]
 
 
-def sizes(num_ranks: int = len(RANKS)) -> npt.NDArray[np.float64]:
+def sizes(num_ranks: int) -> npt.NDArray[np.float64]:
     """[L] bytes of a Gaussian at each level: of the first ranks, and of all splines of its own."""
     ranks = [rank + min(rank, LEADING) for rank in RANKS[:num_ranks]]
     return np.array([*ranks, *(POSE * (count * bits // 8 + 8) for count, bits in OWN)], float)
@@ -61,15 +61,16 @@ class Levels:
     def __init__(self, trajectories: Trajectories) -> None:
         self._trajectories = trajectories
         self._every = np.arange(trajectories.count)
-        cameras = trajectories.cameras or cameras_of_file(trajectories.scene.metadata)
+        cameras = trajectories.cameras or [camera for _, camera in cameras_of_file(trajectories.scene.metadata)]
         on_pass = trajectories.track("visibility of errors", PASSES)
         forms = sensitivities(trajectories.scene, trajectories.on_grid(COARSE + 1, self._every), cameras, on_pass)
         self.roots = _square_roots(forms)
         """[M, 10, 10] A: an error e of a pose adds |Aᵀ e|² to the mean squared error of a frame."""
         some = self._every[:: -(-len(self._every) // SAMPLED)]
         share = len(some) / len(self._every)
-        enough = (n for n in KNOTS[:-1] if self._fitted(some, n)[1].sum() <= ENOUGH * share)
+        enough = (n for n in KNOTS[:-1] if self._fit_errors(some, n).sum() <= ENOUGH * share)
         self.knots = next(enough, KNOTS[-1])
+        self._own = np.full((len(OWN), trajectories.count), np.nan)
         variances = np.einsum("mcc->mc", forms)
         totals = [max(float(variances[:, part].mean()), 1e-30) for part in (MEANS, SCALES, QUATS)]
         units = np.repeat(np.sqrt(np.array(totals) / totals[0]).clip(1e-6, 1e6), (3, 3, 4)).astype(np.float32)
@@ -85,27 +86,42 @@ class Levels:
         """Bytes of one function."""
         return 2 * POSE * self.knots
 
-    def own(self, ids: Ids, count: int, bits: int) -> tuple[Samples, Errors]:
-        """[M, n, 10] control points of some Gaussians, relative to their mean poses, and their errors."""
-        return self._fitted(ids, count, bits, self.means[ids])
+    def own(self, ids: Ids, count: int) -> Samples:
+        """[M, n, 10] control points of splines of some Gaussians, relative to their mean poses."""
+        control = np.empty((len(ids), count, POSE), np.float32)
+        for places, fitted, _, _ in self._fits(ids, count):
+            control[places] = fitted - self.means[ids[places], None]
+        return control
+
+    def own_errors(self, ids: Ids, level: int) -> Errors:
+        """[M] errors of some Gaussians with splines of one of the levels `OWN`; computed once."""
+        new = ids[np.isnan(self._own[level, ids])]
+        self._own[level, new] = self._fit_errors(new, *OWN[level])
+        return self._own[level, ids]
 
     def _decompose(self, units: npt.NDArray[np.float32], visible: npt.NDArray[np.float32]) -> None:
         """Find functions, coefficients and errors, with `units` of poses, [10], and weights of Gaussians, [M]."""
         every, knots = self._every, self.knots
-        control, _ = self._fitted(every, knots)
+        control = np.empty((len(every), knots, POSE), np.float32)
+        for places, fitted, _, _ in self._fits(every, knots):
+            control[places] = fitted
         matrix = design(knots, FEWEST_TIMES)
         self.means = along_time(matrix.mean(axis=0, keepdims=True).astype(np.float32), control)[:, 0]
         """[M, 10] mean poses."""
         control -= self.means[:, None]
         root = cholesky(matrix.T @ matrix / len(matrix))  # of a squared mean over time
-        rows = (along_time(root.astype(np.float32), control) * units).reshape(len(every), -1)
+        chunks = np.array_split(every, -(-len(every) // CHUNK))
+
+        def rows(ids: Ids) -> npt.NDArray[np.float32]:
+            return (along_time(root.astype(np.float32), control[ids]) * units).reshape(len(ids), -1)
+
         gram = np.zeros((knots * POSE,) * 2)
-        for ids in np.array_split(every, -(-len(every) // CHUNK)):
-            weighted = rows[ids] * visible[ids, None]
+        for ids in chunks:
+            weighted = rows(ids) * visible[ids, None]
             gram += weighted.T @ weighted
         number = min(RANKS[-1], len(every), len(gram))
         functions = eigh(gram, subset_by_index=(len(gram) - number, len(gram) - 1))[1][:, ::-1].astype(np.float32)
-        self.coefficients = rows @ functions
+        self.coefficients = np.concatenate([rows(ids) @ functions for ids in chunks])
         """[M, R]"""
         in_poses = solve_triangular(root, functions.reshape(knots, -1)).reshape(knots, POSE, number) / units[:, None]
         self.functions = np.ascontiguousarray(in_poses.transpose(0, 2, 1), np.float32)
@@ -113,39 +129,44 @@ class Levels:
         ranks = [rank for rank in RANKS if rank <= number]
         self.errors = np.empty((len(ranks), len(every)))
         """[ranks, M] what each adds to the squared error of a frame."""
-        shown = np.tensordot(matrix.astype(np.float32), self.functions, axes=1).transpose(1, 0, 2)  # [R, T, 10]
-        for ids in self._chunks(len(every), FEWEST_TIMES):
-            got = self.means[ids, None] - self._trajectories.on_grid(FEWEST_TIMES, ids)
+        for places, times in self._chunks(every, FEWEST_TIMES):
+            shown = np.tensordot(design(knots, times).astype(np.float32), self.functions, axes=1).transpose(1, 0, 2)
+            got = self.means[places, None] - self._trajectories.on_grid(times, places)
             for level, (before, rank) in enumerate(zip([0, *ranks], ranks, strict=False)):
-                got += np.tensordot(self.coefficients[ids, before:rank], shown[before:rank], axes=1)
-                self.errors[level, ids] = self._visible(ids, got)
+                got += np.tensordot(self.coefficients[places, before:rank], shown[before:rank], axes=1)
+                self.errors[level, places] = self._visible(places, got)
 
-    def _fitted(
-        self, ids: Ids, count: int, bits: int | None = None, means: np.ndarray | None = None
-    ) -> tuple[Samples, Errors]:
-        """[M, n, 10] control points of Gaussians, relative to `means` if given, and errors [M], with rounding to
-        `bits`."""
-        control, errors = np.empty((len(ids), count, POSE), np.float32), np.empty(len(ids))
-        times = max(2 * samples_for(count) - 1, FEWEST_TIMES)
-        matrix, shown = (
-            make(count, n).astype(np.float32) for make, n in ((fitting, samples_for(count)), (design, times))
-        )
-        for places in self._chunks(len(ids), times):
+    def _fit_errors(self, ids: Ids, count: int, bits: int | None = None) -> Errors:
+        """[M] errors of splines of some Gaussians, relative to their mean poses if rounded to `bits`."""
+        errors = np.empty(len(ids))
+        for places, control, samples, times in self._fits(ids, count):
+            means = 0 if bits is None else self.means[ids[places], None]
+            stored = control if bits is None else StoredPoses.of(control - means, bits).control()
+            shown = along_time(design(count, times).astype(np.float32), stored)
+            errors[places] = self._visible(ids[places], shown + means - samples)
+        return errors
+
+    def _fits(self, ids: Ids, count: int) -> Iterator[tuple[Ids, Samples, Samples, int]]:
+        """Places of some of the ids, control points of their splines, samples at evenly spread times, and their
+        number."""
+        fewest = samples_for(count)
+        matrix = fitting(count, fewest).astype(np.float32)
+        for places, times in self._chunks(ids, max(2 * fewest - 1, FEWEST_TIMES)):
             samples = self._trajectories.on_grid(times, ids[places])
-            if means is not None:
-                samples -= means[places, None]
-            control[places] = along_time(matrix, samples[:, :: (times - 1) // (samples_for(count) - 1)])
-            stored = control[places] if bits is None else StoredPoses.of(control[places], bits).control()
-            errors[places] = self._visible(ids[places], along_time(shown, stored) - samples)
-        return control, errors
+            yield places, along_time(matrix, samples[:, :: (times - 1) // (fewest - 1)]), samples, times
 
     def _visible(self, ids: Ids, differences: Samples) -> Errors:
         """[M] squared errors of frames by differences of poses, [M, T, 10]: a mean over time of power `PEAKS`."""
         errors = np.square(differences @ self.roots[ids]).sum(axis=2, dtype=np.float64)
         return (errors**PEAKS).mean(axis=1) ** (1 / PEAKS)
 
-    def _chunks(self, count: int, times: int) -> Iterator[Ids]:
-        yield from np.array_split(np.arange(count), max(-(-count * times // (CHUNK * FEWEST_TIMES)), 1))
+    def _chunks(self, ids: Ids, fewest: int) -> Iterator[tuple[Ids, int]]:
+        """Places of some of the ids, and the number of times at which these are compared: all of their samples."""
+        counts = np.maximum(self._trajectories.intervals(ids) + 1, fewest)
+        for times in np.unique(counts):
+            same = np.flatnonzero(counts == times)
+            for places in np.array_split(same, max(-(-len(same) * times // (CHUNK * FEWEST_TIMES)), 1)):
+                yield places, int(times)
 
 
 def _square_roots(forms: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

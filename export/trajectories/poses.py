@@ -65,7 +65,7 @@ def _double(array: np.ndarray) -> torch.Tensor:
 
 
 def pixel(baked: Baked) -> float:
-    """The unit of error bounds: size in scene units of a pixel of the nearest camera, at the middle of the moving
+    """The unit of errors: size in scene units of a pixel of the nearest camera, at the middle of the moving
     Gaussians. Without cameras, an image of 400 pixels spans the scene's bounds."""
     low, high = np.array(baked.scene.metadata.bounds)
     middle = np.median(baked.moving.means, axis=0) if len(baked.moving) else (low + high) / 2

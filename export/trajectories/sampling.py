@@ -64,7 +64,8 @@ class Trajectories:
         give_one_sign(samples)
         self._levels = {COARSE: (self._ids, samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
-        self.scene, self.cameras, self._whole = baked.scene, cameras, self
+        self.scene, self.cameras = baked.scene, cameras
+        self._whole: Trajectories | None = None  # of which these are a part
         self._made: dict[Callable[[Trajectories], Any], Any] = {}
         self._misses = np.zeros(self.count)  # scene units, error of cubics at the finest level
         self.rotation_weights = _rotation_weights(samples, self.pixel)
@@ -73,14 +74,17 @@ class Trajectories:
     def some(self, rows: Ids) -> "Trajectories":
         """Trajectories of some of the Gaussians; the samples are shared."""
         made = copy.copy(self)
-        made.count, made._ids = len(rows), self._ids[rows]
-        made.rotation_weights = self.rotation_weights[rows]
+        made.count, made._ids, made._whole = len(rows), self._ids[rows], self._whole or self
         return made
 
     @property
     def unresolved(self) -> Ids:
         """Gaussians that move faster than their finest sampling resolves."""
         return np.flatnonzero(self._misses[self._ids] > RESOLVED * self.pixel)
+
+    def intervals(self, ids: Ids) -> npt.NDArray[np.int64]:
+        """[M] numbers of intervals between the samples of each."""
+        return self._depth[self._ids[ids]]
 
     def on_grid(self, times: int, ids: Ids) -> Samples:
         """[M, T, 10] poses at T = 2ⁿ + 1 evenly spread times, interpolated by cubics between samples."""
@@ -103,7 +107,7 @@ class Trajectories:
     def once(self, make: "Callable[[Trajectories], Made]") -> Made:
         """What `make` returns for all Gaussians that were sampled; made once, whichever part of them asks."""
         if make not in self._made:
-            self._made[make] = make(self._whole)
+            self._made[make] = make(self._whole or self)
         return self._made[make]
 
     def distances(self, ids: Ids, differences: np.ndarray) -> npt.NDArray[np.float64]:
@@ -204,7 +208,7 @@ def give_one_sign(samples: Samples) -> None:
 def _rotation_weights(samples: Samples, pixel: float) -> npt.NDArray[np.float64]:
     """[M] scene units by which one unit of quaternion displaces the end of the longest axis.
 
-    At least a thousandth of a pixel, since plans divide by it.
+    At least a thousandth of a pixel.
     """
     scales = samples[..., SCALES].astype(np.float64)
     return np.maximum(2 * (scales.max(-1) - scales.min(-1)).max(1, initial=0), 1e-3 * pixel)

@@ -15,9 +15,6 @@ from scipy.linalg import solve
 
 from export.layers.graph import GraphBuilder
 
-MIN_CONTROL_POINTS = 4
-"""Control points of a spline with one interval."""
-
 
 @cache
 def design(count: int, samples: int) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Spline control points of poses in 8 or 16 bits, and the part of a graph that blends four of them per Gaussian."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +21,7 @@ class StoredPoses:
 
     points: npt.NDArray[np.int16] | npt.NDArray[np.uint8]  # [M, n, 10]
     steps: npt.NDArray[np.float32]  # [M, 10]
-    middles: npt.NDArray[np.float32]  # [M, 10]
+    middles: npt.NDArray[np.float32]  # [M, 10] the value of the integer 0
 
     @classmethod
     def of(cls, control: np.ndarray, bits: int = 16) -> "StoredPoses":
@@ -35,11 +34,6 @@ class StoredPoses:
         if bits == 8:  # unsigned: graphs cast no int8
             return cls((points + most).astype(np.uint8), steps, middles - most * steps)
         return cls(points.astype(np.int16), steps, middles)
-
-    @classmethod
-    def joined(cls, parts: Sequence["StoredPoses"]) -> "StoredPoses":
-        """Concatenate parts that have the same number of control points."""
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("points", "steps", "middles")))
 
     def control(self) -> np.ndarray:
         """[M, n, 10] the control points as a graph reads them."""

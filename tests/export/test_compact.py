@@ -1,22 +1,28 @@
 """Levels of detail of trajectories against slow and obvious computations in float64."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from export.jobs.bake import bake
+from export.measure.poses import posed
 from export.measure.views import cameras_of
 from export.plans.compact import chosen
+from export.plans.registry import build
+from export.pruning.mask import bake_pruned, full_mask, pruned
 from export.trajectories import sensitivity
-from export.trajectories.levels import LEADING, OWN, PEAKS, RANKS, Levels, sizes
+from export.trajectories.levels import OWN, PEAKS, RANKS, Levels, sizes
 from export.trajectories.sampling import Trajectories
 from export.trajectories.sensitivity import sensitivities
 from export.trajectories.splines import design
 from export.trajectories.stored import StoredPoses
+from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.gaussians import Gaussians
-from tests.support.models import SCENE, random_model
+from msdgs_train.gaussians.model import DynamicGaussians
+from tests.support.models import MLP, SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance
 
 COUNT = 30
@@ -24,9 +30,13 @@ INVISIBLE = 1e-10
 """Squared errors below this, -100 dB, are those of float32."""
 
 
+def made_model() -> DynamicGaussians:
+    return random_model(COUNT, layers=(replace(MLP, time_frequencies=2),), noise=0.02)
+
+
 @pytest.fixture(scope="module")
 def trajectories() -> Trajectories:
-    return Trajectories(bake(random_model(COUNT, layers=("mlp",), noise=0.05), SCENE, "0" * 64))
+    return Trajectories(bake(made_model(), SCENE, "0" * 64))
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +59,14 @@ def test_sensitivities_are_squared_differences_of_frames(monkeypatch: pytest.Mon
     poses, step = samples[:, 0].astype(np.float64), 1e-5
     base = frame(poses)
     most = np.einsum("mcc->m", found).argsort()[-3:]
-    for i, column in itertools.product(most, range(6)):
+    for i, column in itertools.product(most, range(10)):
+        direction = np.eye(10)[column]
+        if column >= 6:  # tangent to unit quaternions
+            direction[6:] -= poses[i, column] * poses[i, 6:]
         moved = poses.copy()
-        moved[i, column] += step
+        moved[i] += step * direction
         want = np.square((frame(moved) - base) / step).mean()
-        assert found[i, column, column] == pytest.approx(want, rel=tolerance("hutchinson.relative"))
+        assert direction @ found[i] @ direction == pytest.approx(want, rel=tolerance("hutchinson.relative"))
     radial = np.einsum("mc,mcd,md->m", poses[:, 6:], found[:, 6:, 6:], poses[:, 6:])
     assert np.abs(radial).max() <= tolerance("float32.relative") * np.abs(found).max()
 
@@ -72,32 +85,31 @@ def test_errors_of_levels_are_those_of_poses_rebuilt_from_what_is_stored(traject
         control = np.einsum("mr,nrc->mnc", levels.coefficients[:, :rank], levels.functions[:, :rank].astype(float))
         assert_close(levels.errors[level], error(control), "visible_error.relative")
     assert (np.diff(levels.errors.sum(axis=1)) < 0).all()
-    for count, bits in OWN[:3] + OWN[-3:-1]:
-        control, errors = levels.own(ids, count, bits)
-        want = error(StoredPoses.of(control, bits).control().astype(float))
-        assert_close(np.maximum(errors, INVISIBLE), np.maximum(want, INVISIBLE), "visible_error.relative")
+    for level in (0, 1, 2, len(OWN) - 2):
+        count, bits = OWN[level]
+        want = error(StoredPoses.of(levels.own(ids, count), bits).control().astype(float))
+        got = levels.own_errors(ids, level)
+        assert_close(np.maximum(got, INVISIBLE), np.maximum(want, INVISIBLE), "visible_error.relative")
 
 
-def test_the_choice_keeps_the_error_and_no_gaussian_could_give_up_bytes_for_less(levels: Levels):
-    rows, costs = np.arange(COUNT), sizes(levels.num_ranks)
+def test_the_choice_keeps_the_error_and_minimizes_a_lagrangian_of_errors_and_bytes(levels: Levels):
+    rows, rates = np.arange(COUNT), sizes(levels.num_ranks)
+    every = np.concatenate([levels.errors, [levels.own_errors(rows, level) for level in range(len(OWN))]])
     totals = []
     for db in (30, 45, 60):
         choice = chosen(levels, rows, 10 ** (-db / 10))
         assert choice.errors.sum() <= 10 ** (-db / 10)
-        is_own = choice.own >= 0
-        assert (is_own == (choice.ranks < 0)).all()
-        totals.append(
-            sum(POSE_BYTES[index] for index in choice.own[is_own])
-            + sum(rank + min(rank, LEADING) for rank in choice.ranks[~is_own])
-        )
-        np.testing.assert_array_equal(
-            choice.errors[~is_own], levels.errors[[RANKS.index(r) for r in choice.ranks[~is_own]], rows[~is_own]]
-        )
+        assert ((choice.own >= 0) == (choice.ranks < 0)).all()
+        picked = np.where(choice.own >= 0, levels.num_ranks + choice.own, np.searchsorted(RANKS, choice.ranks))
+        np.testing.assert_array_equal(choice.errors, every[picked, rows])
+        # some multiplier makes each Gaussian's level the best of those up to the highest rank
+        stored = np.r_[: np.searchsorted(RANKS, choice.ranks.max()) + 1, levels.num_ranks : len(rates)]
+        saved, added = choice.errors - every[stored], rates[stored, None] - rates[picked]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            multipliers = saved / added
+        assert np.where(added > 0, multipliers, -np.inf).max() <= np.where(added < 0, multipliers, np.inf).min()
+        totals.append(rates[picked].sum())
     assert totals == sorted(totals)
-    assert costs[0] == 0
-
-
-POSE_BYTES = [10 * (count * bits // 8 + 8) for count, bits in OWN]
 
 
 def test_an_unreachable_error_gives_the_smallest(levels: Levels):
@@ -106,10 +118,20 @@ def test_an_unreachable_error_gives_the_smallest(levels: Levels):
     assert best.errors.sum() < chosen(levels, np.arange(COUNT), 1e-7).errors.sum()
 
 
-def test_a_part_of_the_gaussians_takes_the_levels_of_all(trajectories: Trajectories):
-    some = trajectories.some(np.array([3, 5, 20]))
+def test_a_part_of_the_gaussians_takes_the_levels_of_all_and_keeps_its_order(trajectories: Trajectories):
+    ids, model = np.array([3, 5, 20]), made_model()
+    some = trajectories.some(ids)
     assert some.once(Levels) is trajectories.once(Levels)
-    np.testing.assert_array_equal(some.rows, [3, 5, 20])
+    mask = full_mask(model).without(kept=np.isin(np.arange(COUNT), ids))
+    baked = bake_pruned(pruned(model, mask, posed(model, 0.0, deform=False), []), SCENE, "0" * 64)
+    part, whole = (
+        DeformationSession("scene.onnx", contents=build("compact:90", *scene).SerializeToString())
+        for scene in ((baked, some), (bake(model, SCENE, "0" * 64), trajectories))
+    )
+    exact = posed(model, 0.3)
+    for got, want, name in zip(part.pose(0.3), whole.pose(0.3, ids), ("means", "quats", "scales"), strict=True):
+        assert np.abs(got - want).max() <= tolerance("compact.pose")
+        assert np.abs(got - getattr(exact, name)[ids]).max() <= tolerance("compact.pose")
 
 
 @pytest.mark.parametrize("bits", [8, 16])

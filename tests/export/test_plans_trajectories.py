@@ -58,6 +58,7 @@ FAST = {
     "between all coarse samples, on none": lambda t: np.sin(2 * np.pi * 64 * t),
     "a jump back and forth": lambda t: float(np.exp(-(((t - 0.505) / 0.004) ** 2))),
     "fast from the start": lambda t: np.sin(2 * np.pi * 40 * t),
+    "between all times of comparison, on none": lambda t: np.sin(2 * np.pi * 128 * t),
 }
 
 
