@@ -43,9 +43,8 @@ def verify(
     Only the plan `network` is held to `tolerance`; others are measured. The file may hold more Gaussians than the
     model, static ones after all others, which aren't compared. Errors of means are relative to the scene's half
     diagonal or, further out, to the largest coordinate; those of scales to the Gaussian's largest scale; those of
-    quaternions are absolute.
-    Raises `VerificationFailed` if one is above `tolerance` for a stable Gaussian.
-    Unstable Gaussians are evaluated in rendered frames, before a file is written.
+    quaternions are absolute. Raises `VerificationFailed` if one is above `tolerance` for a stable Gaussian. Unstable
+    Gaussians are evaluated in rendered frames, before a file is written.
     """
     stated = session.scene.metadata
     if stated.plan != BASELINE:

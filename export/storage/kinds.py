@@ -79,7 +79,7 @@ def low_rank(rank: int) -> Pack:
                 parts.append(in_range(bits)(graph, f"{name}.in{bits}", columns[part].T))
         factors = (over_time * sizes)[:, :rank].T.astype(np.float32)
         product = [graph.node("Concat", parts, f"{name}.columns", axis=1), graph.constant(f"{name}.times", factors)]
-        first = graph.constant(f"{name}.axis", np.zeros(1, np.int64))
+        first = graph.constant(f"{name}.axis", np.zeros(1, np.int64))  # files may turn arrays of three axes only
         product = graph.node("Unsqueeze", [graph.node("MatMul", product, f"{name}.product"), first], f"{name}.whole")
         turned = graph.node("Transpose", [product], f"{name}.turned", perm=[0, 2, 1])
         return graph.node("Squeeze", [turned, first], name)

@@ -68,7 +68,7 @@ class Trajectories:
         self._whole: Trajectories | None = None  # of which these are a part
         self._made: dict[Callable[[Trajectories], Any], Any] = {}
         self._misses = np.zeros(self.count)  # scene units, error of cubics at the finest level
-        self.rotation_weights = _rotation_weights(samples, self.pixel)
+        self._axes = _rotation_weights(samples, self.pixel)
         self._refine()
 
     def some(self, rows: Ids) -> "Trajectories":
@@ -110,13 +110,6 @@ class Trajectories:
             self._made[make] = make(self._whole or self)
         return self._made[make]
 
-    def distances(self, ids: Ids, differences: np.ndarray) -> npt.NDArray[np.float64]:
-        """[M] the largest of differences from poses, [M, T, 10], in scene units.
-
-        They are those of means, of scales, and of the end of the longest axis by a wrong rotation.
-        """
-        return distances(differences, self.rotation_weights[ids])
-
     def _refine(self) -> None:
         ids, samples = self._levels[COARSE]
         self._misses[:] = self._missed(ids, samples)
@@ -141,12 +134,12 @@ class Trajectories:
 
     def _missed(self, ids: Ids, samples: Samples) -> npt.NDArray[np.float64]:
         """[M] errors of cubics through every second sample at the others, and through all samples at the probes."""
-        between = self.distances(ids, _cubic_between(samples[:, ::2]) - samples[:, 1::2])
+        between = _distances(_cubic_between(samples[:, ::2]) - samples[:, 1::2], self._axes[ids])
         got = _cubic_at(samples, self._probe_parts)
         probes = self._probes[ids]
         flipped = np.einsum("mtc,mtc->mt", got[..., QUATS], probes[..., QUATS]) < 0
         probes[..., QUATS] *= np.where(flipped, -1, 1)[..., None].astype(probes.dtype)
-        return np.maximum(between, self.distances(ids, got - probes))
+        return np.maximum(between, _distances(got - probes, self._axes[ids]))
 
     def _probed(self, baked: Baked) -> tuple[ExactPoses | SinglePoses, Samples]:
         """The sampler of all other times, and the samples at the probes."""
@@ -170,7 +163,7 @@ class Trajectories:
         signs = np.where(np.einsum("mc,mc->m", single[:, QUATS], exact[:, QUATS]) < 0, -1, 1)
         single[:, QUATS] *= signs[:, None]
         weights = _rotation_weights(exact[:, None], self.pixel)
-        off = distances(single[:, None] - exact[:, None], weights)
+        off = _distances(single[:, None] - exact[:, None], weights)
         return bool((off <= FLOAT32_ENOUGH * self.pixel).all())
 
     def _sampled(self, ids: Ids, times: np.ndarray) -> Samples:
@@ -181,8 +174,9 @@ class Trajectories:
         return samples
 
 
-def distances(differences: np.ndarray, rotation_weights: np.ndarray) -> npt.NDArray[np.float64]:
-    """[M] the largest of differences from poses, [M, T, 10], as `Trajectories.distances` has it."""
+def _distances(differences: np.ndarray, rotation_weights: np.ndarray) -> npt.NDArray[np.float64]:
+    """[M] the largest of differences from poses, [M, T, 10], in scene units: of means, of scales, and of the end of the
+    longest axis by a wrong rotation."""
     squares = np.square(differences)
     rotations = squares[..., QUATS].sum(-1).max(-1) * rotation_weights**2
     moves = squares[..., MEANS].sum(-1).max(-1)
