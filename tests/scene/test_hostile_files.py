@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
+from onnx import TensorProto
 
 from msdgs_serve import deformation
 from msdgs_serve.deformation import DeformationSession
@@ -73,6 +75,16 @@ def with_empty_constant(*lengths: int) -> Callable[[onnx.ModelProto], bytes]:
     return with_more_in_the_graph(field(5, dims + field(2, 1) + field(8, b"x")))
 
 
+def with_listed(element: int, content: bytes, count: int = 1) -> Callable[[onnx.ModelProto], bytes]:
+    """Append a constant of so many numbers with this content."""
+    return with_more_in_the_graph(field(5, field(1, count) + field(2, element) + field(8, b"x") + content))
+
+
+def with_numbers(*numbers: int) -> bytes:
+    """Return `int32_data` of a constant."""
+    return field(5, b"".join(map(varint, numbers)))
+
+
 WIRE_TRICKS = {
     "a field that ONNX doesn't have": with_more(field(99, b"x")),
     "a second graph": with_more(field(7, b"")),
@@ -93,6 +105,17 @@ WIRE_TRICKS = {
     "10,000 nodes": with_more_in_the_graph(field(1, b"") * 10_000),
     "an empty array of huge lengths": with_empty_constant(0, 2**40, 2**40),
     "a negative length": with_empty_constant(2**64 - 1),
+    "a constant in bytes and in a list": with_listed(TensorProto.UINT8, with_numbers(7) + field(9, b"7")),
+    "two lists of a constant": with_listed(TensorProto.FLOAT, field(4, bytes(4)) + field(4, bytes(4))),
+    "floats in a list of integers": with_listed(TensorProto.FLOAT, with_numbers(7)),
+    "integers in a list of floats": with_listed(TensorProto.INT32, field(4, bytes(4))),
+    "a number of a list beyond uint8": with_listed(TensorProto.UINT8, with_numbers(256)),
+    "a negative number of a list of uint8": with_listed(TensorProto.UINT8, with_numbers(2**64 - 1)),
+    "a list that ends within a number": with_listed(TensorProto.UINT8, field(5, b"\x80")),
+    "a number of a list in one byte more": with_listed(TensorProto.UINT8, field(5, b"\x87\x00")),
+    "a list of floats that ends within one": with_listed(TensorProto.FLOAT, field(4, bytes(3))),
+    "a list of 65,537 numbers": with_listed(TensorProto.UINT8, with_numbers(*[1] * 65_537), 65_537),
+    "a list that isn't packed": with_listed(TensorProto.UINT8, field(5, 7)),
     "lengths whose product is zero in 64 bits": with_empty_constant(2**32, 2**32),
 }
 
@@ -101,6 +124,20 @@ WIRE_TRICKS = {
 def test_each_value_has_one_encoding(sound: onnx.ModelProto, what: str):
     with pytest.raises(ModelInvalid):
         read_model(WIRE_TRICKS[what](sound))
+
+
+@pytest.mark.parametrize(
+    ("element", "content", "want"),
+    [
+        (TensorProto.UINT8, with_numbers(0, 255), [0, 255]),
+        (TensorProto.INT8, with_numbers(127, 2**64 - 128), [127, -128]),
+        (TensorProto.INT32, with_numbers(2**31 - 1, 2**64 - 2**31), [2**31 - 1, -(2**31)]),
+        (TensorProto.FLOAT, field(4, np.array([0.1, -3], "<f4").tobytes()), np.array([0.1, -3], np.float32)),
+    ],
+)
+def test_lists_of_numbers_are_read(sound: onnx.ModelProto, element: int, content: bytes, want: list):
+    model = read_model(with_listed(element, content, 2)(sound))
+    np.testing.assert_array_equal(model.constants["x"].array(), want)
 
 
 def test_limits_of_cost_are_those_given(tmp_path: Path):

@@ -19,8 +19,6 @@ from tests.support.sound_scenes import sound_scenes
 CONTRACT = Path(__file__).parents[2] / "docs" / "contract.md"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "toys.onnx"
 SCENES = {**sound_scenes(), "example": EXAMPLE.read_bytes()}
-OLDER: dict[str, dict[str, set[Any]]] = {"ScatterND": {}}
-"""Operators of files that older exporters wrote, with plans that are gone."""
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -55,7 +53,7 @@ def emitted() -> dict[str, dict[str, set[Any]]]:
 
 
 def test_the_table_has_exactly_the_operators_of_exporters():
-    found = emitted() | OLDER
+    found = emitted()
     assert sorted(found) == sorted(OPERATORS)
     for name, operator in OPERATORS.items():
         assert found[name].keys() == operator.attributes.keys(), name

@@ -30,6 +30,9 @@ BY_HAND: dict[str, dict[str, Any]] = {
     "opacities and colors that change": {"changing": ("opacities", "sh")},
 }
 
+OLDER = Path(__file__).parents[1] / "scene" / "older"
+"""Files of older exporters."""
+
 COUNT = 20
 """Gaussians of each scene."""
 
@@ -37,7 +40,8 @@ COUNT = 20
 @cache
 def sound_scenes() -> dict[str, bytes]:
     """Scene files by name."""
-    return dict([*_exported(), *_of_sequences(), *_by_hand()])
+    older = ((f"older {path.stem}", path.read_bytes()) for path in sorted(OLDER.glob("*.onnx")))
+    return dict([*_exported(), *_of_sequences(), *_by_hand(), *older])
 
 
 def _exported() -> Iterator[tuple[str, bytes]]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from msdgs_serve.scene.onnx import schema
-from msdgs_serve.scene.onnx.wire import ModelInvalid, read_message
+from msdgs_serve.scene.onnx.wire import ModelInvalid, read_integers, read_message
 
 FLOAT, UINT8, INT8, INT16, INT32, INT64, BOOL = 1, 2, 3, 5, 6, 7, 9
 """Element types in onnx.proto."""
@@ -159,12 +159,28 @@ def _tensor(part: memoryview) -> Tensor:
     if element not in CONSTANT_ELEMENTS:
         known = ", ".join(element_name(each) for each in CONSTANT_ELEMENTS)
         raise ModelInvalid(name, f"is a constant of {element_name(element)}, not of {known}")
-    data, size = fields.get("raw_data", memoryview(b"")), DTYPES[element].itemsize
+    data, size = _contents(fields, element, name), DTYPES[element].itemsize
     if min(shape, default=0) < 0 or math.prod(max(length, 1) for length in shape) > schema.MAX_ELEMENTS:
         raise ModelInvalid(name, f"has the impossible shape {shape}")
     if len(data) != math.prod(shape) * size:
         raise ModelInvalid(name, f"of shape {shape} has {len(data):,} bytes")
     return Tensor(name, element, shape, data)
+
+
+def _contents(fields: dict[str, Any], element: int, name: str) -> memoryview:
+    """Bytes of a constant, which is stored as bytes or, as onnxruntime's quantizer does, as a list of numbers."""
+    stored = [key for key in ("raw_data", "float_data", "int32_data") if key in fields]
+    if len(stored) > 1:
+        raise ModelInvalid(name, f"is stored more than once: as {' and '.join(stored)}")
+    if ("float_data" in stored and element != FLOAT) or ("int32_data" in stored and element in (FLOAT, INT64)):
+        raise ModelInvalid(name, f"of {element_name(element)} is stored as {stored[0]}")
+    if "int32_data" not in stored:
+        return fields[stored[0]] if stored else memoryview(b"")  # packed floats are their bytes
+    numbers = np.array(read_integers(fields["int32_data"], schema.MAX_LISTED, f"constant `{name}`"), np.int64)
+    values = numbers.astype(DTYPES[element])
+    if (values != numbers).any():
+        raise ModelInvalid(name, f"has a number beyond {element_name(element)}")
+    return memoryview(values.tobytes())
 
 
 def _port(part: memoryview) -> Port:

@@ -14,6 +14,8 @@ MAX_OPERANDS = 64
 MAX_RANK = 8
 MAX_ELEMENTS = 1 << 40
 """Limit of elements of an array, counting lengths of 0 as 1: huge lengths of empty arrays overflow in libraries."""
+MAX_LISTED = 1 << 16
+"""Limit of numbers in a constant that is stored as a list of integers."""
 MAX_PROPERTIES = 64
 """Limit of metadata entries of the model or a part of it."""
 MAX_VALUE_INFOS = 8192
@@ -82,8 +84,8 @@ TENSOR: Schema = {
     1: Field("dims", Kind.INTEGER, max_count=MAX_RANK),
     2: Field("data_type", Kind.ENUM),
     3: Field("segment", Kind.REJECTED),
-    4: Field("float_data", Kind.REJECTED),
-    5: Field("int32_data", Kind.REJECTED),
+    4: Field("float_data", Kind.BYTES),
+    5: Field("int32_data", Kind.BYTES),
     6: Field("string_data", Kind.REJECTED),
     7: Field("int64_data", Kind.REJECTED),
     8: Field("name", Kind.NAME),

@@ -76,6 +76,17 @@ def read_message(message: memoryview, schema: Schema, name: str) -> dict[str, An
     return values
 
 
+def read_integers(packed: memoryview, max_count: int, name: str) -> list[int]:
+    """Return a packed list of int32 or int64. Raises `ModelInvalid` about `file`."""
+    numbers, position = [], 0
+    while position < len(packed):
+        if len(numbers) == max_count:
+            raise _invalid(f"{name} is a list of more than {max_count:,} numbers")
+        number, position = _varint(packed, position)
+        numbers.append(_signed(number))
+    return numbers
+
+
 def _value(message: memoryview, position: int, wire_type: int, field: Field, name: str) -> tuple[Any, int]:
     """Return the value at a position and the position of its end."""
     numeric = field.kind in (Kind.INTEGER, Kind.ENUM)
@@ -101,6 +112,10 @@ def _value(message: memoryview, position: int, wire_type: int, field: Field, nam
 def _number(value: int, field: Field, name: str) -> int:
     if field.kind is Kind.ENUM and value >= 1 << 31:
         raise _invalid(f"{name} has `{field.name}` {value}, not a {field.kind.value}")
+    return _signed(value)
+
+
+def _signed(value: int) -> int:
     return value - (1 << 64) if value >= 1 << 63 else value
 
 
