@@ -21,7 +21,7 @@ from msdgs_serve.scene.metadata import SceneCamera
 MAX_RELATIVE_COST = 4.0
 """A plan that runs layers isn't tried if its layers take this many times the whole frame of a plan within the error."""
 
-PRUNING_STEPS = (20.0, 10.0, 5.0, 2.0, -5.0, -10.0, -15.0)
+PRUNING_STEPS = (10.0, 5.0, 2.0, -5.0, -10.0, -15.0)
 """dB above or below `min_psnr` at which pruning is tried."""
 
 SMALLER_STEPS = (-20.0, -25.0)
@@ -159,6 +159,7 @@ class Sweep:
         self.estimates: list[QuickEstimate] = []
         self.baseline: QuickEstimate | None = None  # the whole network; None if it can't be run in float32
         self.refused: list[tuple[str, str]] = []
+        self._measured_errors: dict[Candidate, RenderedError] = {}  # of all frames
         views = job.exact.views
         self._timed = [views[len(views) * i // TIMED_VIEWS] for i in range(TIMED_VIEWS)]
 
@@ -202,7 +203,8 @@ class Sweep:
             return None  # pruning to another PSNR removed the same
         view, background = self._timed[0], self.job.info.background
         runs = [time_frame(candidate, view, background, time.process_time) for _ in range(1 + ESTIMATE_REPEATS)][1:]
-        error = self.job.error(candidate, every=ESTIMATE_STRIDE)
+        whole = plan == BASELINE and pruning_db is None  # each of its frames takes seconds, and all are needed
+        error = self._error(candidate) if whole else self.job.error(candidate, every=ESTIMATE_STRIDE)
         deformation, _, total = (min(run[part] for run in runs) for part in range(3))
         candidate.close()
         size = candidate.size if self.max_bytes is None else min_bytes(self.job, candidate)
@@ -238,7 +240,7 @@ class Sweep:
     def _reachable(self, estimate: QuickEstimate | None) -> None:
         if estimate is None or self.min_psnr is None:  # its layers can't be run in float32; fitted plans may work
             return
-        best = self.job.error(estimate.candidate)
+        best = self._error(estimate.candidate)
         if best.psnr_worst < self.min_psnr:
             raise TargetNotReached.psnr(best.psnr_worst, "the whole network in float32 reaches", self.min_psnr)
 
@@ -313,9 +315,15 @@ class Sweep:
         on_error = self.job.progress("all frames of the points", len(candidates))
         errors = []
         for candidate in candidates:
-            errors.append((candidate, self.job.error(candidate)))
+            errors.append((candidate, self._error(candidate)))
             on_error()
         return errors
+
+    def _error(self, candidate: Candidate) -> RenderedError:
+        """The error of all frames, measured once."""
+        if candidate not in self._measured_errors:
+            self._measured_errors[candidate] = self.job.error(candidate)
+        return self._measured_errors[candidate]
 
     def _images_psnr(self, candidate: Candidate) -> float | None:
         return self.job.images.psnr(candidate.session.gaussians, candidate.options) if self.job.images else None

@@ -5,16 +5,15 @@ Gaussians share, or plus a spline of its own. A function has all ten numbers of 
 vectors of all trajectories, weighted by how visible their errors are.
 """
 
+import weakref
 from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cholesky, eigh, solve_triangular
 
-from export.measure.views import cameras_of_file
 from export.trajectories.poses import MEANS, POSE, QUATS, SCALES
-from export.trajectories.sampling import COARSE, Ids, Samples, Trajectories
-from export.trajectories.sensitivity import PASSES, sensitivities
+from export.trajectories.sampling import Ids, Samples, Trajectories
 from export.trajectories.splines import along_time, design, fitting, samples_for
 from export.trajectories.stored import StoredPoses
 
@@ -59,19 +58,14 @@ class Levels:
     """The levels of all Gaussians of one set of trajectories."""
 
     def __init__(self, trajectories: Trajectories) -> None:
-        self._trajectories = trajectories
+        self._trajectories = weakref.proxy(trajectories)  # which keep what is made of them
         self._every = np.arange(trajectories.count)
-        cameras = trajectories.cameras or [camera for _, camera in cameras_of_file(trajectories.scene.metadata)]
-        on_pass = trajectories.track("visibility of errors", PASSES)
-        forms = sensitivities(trajectories.scene, trajectories.on_grid(COARSE + 1, self._every), cameras, on_pass)
-        self.roots = _square_roots(forms)
-        """[M, 10, 10] A: an error e of a pose adds |Aᵀ e|² to the mean squared error of a frame."""
         some = self._every[:: -(-len(self._every) // SAMPLED)]
         share = len(some) / len(self._every)
         enough = (n for n in KNOTS[:-1] if self._fit_errors(some, n).sum() <= ENOUGH * share)
         self.knots = next(enough, KNOTS[-1])
         self._own = np.full((len(OWN), trajectories.count), np.nan)
-        variances = np.einsum("mcc->mc", forms)
+        variances = np.einsum("mcc->mc", trajectories.forms)
         totals = [max(float(variances[:, part].mean()), 1e-30) for part in (MEANS, SCALES, QUATS)]
         units = np.repeat(np.sqrt(np.array(totals) / totals[0]).clip(1e-6, 1e6), (3, 3, 4)).astype(np.float32)
         self._decompose(units, np.sqrt(variances[:, MEANS].mean(axis=1)))
@@ -157,7 +151,7 @@ class Levels:
 
     def _visible(self, ids: Ids, differences: Samples) -> Errors:
         """[M] squared errors of frames by differences of poses, [M, T, 10]: a mean over time of power `PEAKS`."""
-        errors = np.square(differences @ self.roots[ids]).sum(axis=2, dtype=np.float64)
+        errors = np.square(differences @ self._trajectories.roots[ids]).sum(axis=2, dtype=np.float64)
         return (errors**PEAKS).mean(axis=1) ** (1 / PEAKS)
 
     def _chunks(self, ids: Ids, fewest: int) -> Iterator[tuple[Ids, int]]:
@@ -167,9 +161,3 @@ class Levels:
             same = np.flatnonzero(counts == times)
             for places in np.array_split(same, max(-(-len(same) * times // (CHUNK * FEWEST_TIMES)), 1)):
                 yield places, int(times)
-
-
-def _square_roots(forms: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """[M, 10, 10] matrices A with A Aᵀ = W."""
-    values, vectors = np.linalg.eigh(forms)
-    return (vectors * np.sqrt(np.maximum(values, 0))[:, None]).astype(np.float32)

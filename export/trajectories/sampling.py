@@ -1,9 +1,9 @@
 """Poses of the moving Gaussians, sampled over time as densely as each of them needs.
 
-All Gaussians are sampled at 65 times. If a cubic through the samples of a Gaussian is off by more than a tenth of a
-pixel between them, this Gaussian is sampled again twice as densely, and so on up to 2,049 times, so that only fast
-motion costs more. Cubics are compared at every second sample and at a few irregular times (probes), which detect motion
-with the period of the samples.
+All Gaussians are sampled at 65 times. Where errors of cubics between the samples are visible in frames, Gaussians are
+sampled again twice as densely, and so on up to 2,049 times, so that only fast and visible motion costs more. Cubics are
+compared at every second sample and at a few irregular times (probes), which detect motion with the period of the
+samples.
 
 The probes are taken in float64 and in float32. If float32 is close enough there, all other samples are taken in it: a
 network of the paper's size needs ten seconds per time in float64, one to two in float32.
@@ -19,16 +19,19 @@ import numpy as np
 import numpy.typing as npt
 
 from export.jobs.bake import Baked
+from export.measure.views import cameras_of_file
 from export.progress import Track, no_progress
 from export.trajectories.poses import MEANS, POSE, QUATS, SCALES, ExactPoses, Poses, SinglePoses, pixel
+from export.trajectories.sensitivity import PASSES, sensitivities, square_roots
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import SceneFileInvalid
 
 COARSE, FINEST = 64, 2048
 """Numbers of intervals between samples: of all Gaussians, and of the fastest."""
 
-RESOLVED = 0.1
-"""Largest error of a cubic between samples, pixels."""
+RESOLVED, VISIBLE = 10 ** (-70 / 10), 10 ** (-50 / 10)
+"""Squared errors that cubics of all Gaussians together, each at its worst time, may add to a frame: from the first on,
+samples are dense enough, and beyond the second, motion is too fast even for the finest."""
 
 FLOAT32_ENOUGH = 0.005
 """Largest error of float32 at the probes, pixels, with which all other samples are taken in it."""
@@ -64,11 +67,15 @@ class Trajectories:
         give_one_sign(samples)
         self._levels = {COARSE: (self._ids, samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
-        self.scene, self.cameras = baked.scene, cameras
+        self.scene = baked.scene
+        cameras = cameras or [camera for _, camera in cameras_of_file(baked.scene.metadata)]
+        self.forms = sensitivities(baked.scene, samples, cameras, track("visibility of errors", PASSES))
+        """[M, 10, 10] W of all that are sampled: an error e of a pose adds eᵀ W e to the squared error of a frame."""
+        self.roots = square_roots(self.forms)
+        """[M, 10, 10] A with A Aᵀ = W."""
         self._whole: Trajectories | None = None  # of which these are a part
         self._made: dict[Callable[[Trajectories], Any], Any] = {}
-        self._misses = np.zeros(self.count)  # scene units, error of cubics at the finest level
-        self._axes = _rotation_weights(samples, self.pixel)
+        self._misses = np.zeros(self.count)  # what cubics at the finest level add to the squared error of a frame
         self._refine()
 
     def some(self, rows: Ids) -> "Trajectories":
@@ -80,7 +87,7 @@ class Trajectories:
     @property
     def unresolved(self) -> Ids:
         """Gaussians that move faster than their finest sampling resolves."""
-        return np.flatnonzero(self._misses[self._ids] > RESOLVED * self.pixel)
+        return np.flatnonzero(np.isin(self._ids, self._missing(VISIBLE)))
 
     def intervals(self, ids: Ids) -> npt.NDArray[np.int64]:
         """[M] numbers of intervals between the samples of each."""
@@ -110,13 +117,19 @@ class Trajectories:
             self._made[make] = make(self._whole or self)
         return self._made[make]
 
+    def _missing(self, allowed: float) -> Ids:
+        """Those with the largest errors: the errors of all others add up to no more than `allowed`."""
+        order = np.argsort(self._misses)
+        return order[np.cumsum(self._misses[order]) > allowed]
+
     def _refine(self) -> None:
         ids, samples = self._levels[COARSE]
         self._misses[:] = self._missed(ids, samples)
         level, memory, work = COARSE, MEMORY, WORK
         while level < FINEST:
             level *= 2
-            fast = np.flatnonzero((self._misses > RESOLVED * self.pixel) & (self._depth == level // 2))
+            fast = self._missing(RESOLVED)
+            fast = fast[self._depth[fast] == level // 2]
             most = min(memory / ((level + 1) * POSE * 4), work / (level // 2 * self.exact.operations))
             fast = np.sort(fast[np.argsort(-self._misses[fast])[: int(most)]])
             if not len(fast):
@@ -133,13 +146,18 @@ class Trajectories:
             ids, samples = fast, fine
 
     def _missed(self, ids: Ids, samples: Samples) -> npt.NDArray[np.float64]:
-        """[M] errors of cubics through every second sample at the others, and through all samples at the probes."""
-        between = _distances(_cubic_between(samples[:, ::2]) - samples[:, 1::2], self._axes[ids])
+        """[M] squared errors of a frame by cubics through every second sample at the others, and by cubics through all
+        samples at the probes; of the worst time."""
+        between = self._visible(ids, _cubic_between(samples[:, ::2]) - samples[:, 1::2])
         got = _cubic_at(samples, self._probe_parts)
         probes = self._probes[ids]
         flipped = np.einsum("mtc,mtc->mt", got[..., QUATS], probes[..., QUATS]) < 0
         probes[..., QUATS] *= np.where(flipped, -1, 1)[..., None].astype(probes.dtype)
-        return np.maximum(between, _distances(got - probes, self._axes[ids]))
+        return np.maximum(between, self._visible(ids, got - probes))
+
+    def _visible(self, ids: Ids, differences: Samples) -> npt.NDArray[np.float64]:
+        """[M] squared errors of a frame by differences of poses, [M, T, 10], at the worst time."""
+        return np.square(differences @ self.roots[ids]).sum(axis=2, dtype=np.float64).max(axis=1)
 
     def _probed(self, baked: Baked) -> tuple[ExactPoses | SinglePoses, Samples]:
         """The sampler of all other times, and the samples at the probes."""

@@ -60,3 +60,9 @@ def sensitivities(
         sums += np.einsum("mc,md->mcd", found, found) / (PASSES * rgb.numel())
         on_pass()
     return sums
+
+
+def square_roots(forms: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """[M, 10, 10] matrices A with A Aᵀ = W."""
+    values, vectors = np.linalg.eigh(forms)
+    return (vectors * np.sqrt(np.maximum(values, 0))[:, None]).astype(np.float32)

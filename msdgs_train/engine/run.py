@@ -36,6 +36,7 @@ EVAL_SPLITS = ("test", "val")
 SELECTION_SPLITS = ("val", "test")  # the first of these that the dataset has selects the best model
 RENDERS_PER_EVAL = 4
 MAX_ROLLBACKS = 3
+TRIAL_STEPS = 4  # of a trainer that is thrown away, across all phases of the schedule
 PAUSE_SECONDS = 0.05  # between two calls of `Observer.is_paused`
 
 Status = Literal["finished", "interrupted"]
@@ -133,6 +134,8 @@ class Run:
     def execute(self) -> RunResult:
         """Train until the last step or an interruption, then evaluate and save."""
         self.observer.on_train_start(self.trainer)
+        if self.clock:
+            self._compile_kernels()
         status = self._train()
         metrics = {}
         if status != "interrupted":
@@ -144,8 +147,19 @@ class Run:
         size = self.trainer.system.size
         return RunResult(status, self.trainer.step_count, metrics, size, self._seconds(), self.record.best)
 
+    def _compile_kernels(self) -> None:
+        """Train and evaluate for a few steps with another trainer. On a new machine kernels take a minute to compile,
+        which doesn't count as training time."""
+        before, trial = self._now(), Trainer(self.config, self.trainer.scene)
+        with contextlib.suppress(TrainingDiverged):
+            for _ in range(TRIAL_STEPS):
+                trial.step(max(self.config.run.steps // TRIAL_STEPS, 1))
+        for split in self.splits[:1]:
+            next(trial.evaluate(split))
+        self.started += self._now() - before
+
     def _train(self) -> Status:
-        steps, is_first = self.config.run.steps, True
+        steps = self.config.run.steps
         while self.trainer.step_count < steps:
             before = self._now()
             try:
@@ -155,10 +169,9 @@ class Run:
                 continue
             taken = self._now() - before
             self._after_step(result)
-            if self.clock and not is_first:  # the first one compiles kernels
+            if self.clock:
                 images = self.config.run.batch_size
                 self.advance = self.clock.advance(result.step, taken, images, self._seconds())
-            is_first = False
             if result.step < steps and self._is_stopped():
                 return "interrupted"
         return "finished"

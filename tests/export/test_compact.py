@@ -74,7 +74,7 @@ def test_sensitivities_are_squared_differences_of_frames(monkeypatch: pytest.Mon
 def test_errors_of_levels_are_those_of_poses_rebuilt_from_what_is_stored(trajectories: Trajectories, levels: Levels):
     ids = np.arange(COUNT)
     samples = trajectories.on_grid(1025, ids).astype(np.float64)
-    roots = levels.roots.astype(np.float64)
+    roots = trajectories.roots.astype(np.float64)
 
     def error(control: np.ndarray) -> np.ndarray:
         got = np.einsum("tn,mnc->mtc", design(control.shape[1], 1025), control) + levels.means[:, None]

@@ -1,6 +1,8 @@
 """A schedule that follows the clock."""
 
+import itertools
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -8,7 +10,7 @@ import pytest
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.run import fit
-from msdgs_train.engine.trainer import Trainer
+from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.supports.nodes import NodesSupport
 from tests.support.training_scene import MODELS, small_config
 
@@ -46,9 +48,27 @@ def test_a_run_that_has_no_time_left_ends_its_schedule(data: Path, tmp_path: Pat
     config = small_config(minutes=1e-9)
     outcome = fit(config, data, tmp_path / "run")
     assert (outcome.status, outcome.step) == ("finished", config.run.steps)
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["optimizer_steps"] == 3
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["optimizer_steps"] == 2
     assert set(outcome.metrics) == {"test", "val"}
     assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
+@pytest.mark.usefixtures("no_curve")
+def test_compiling_kernels_does_not_count_as_training_time(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, costs, step = 0.0, itertools.chain([60.0, 0.5, 60.0], itertools.repeat(0.5)), Trainer.step
+
+    def timed(trainer: Trainer, advance: int) -> StepResult:
+        nonlocal now
+        now += next(costs)
+        return step(trainer, advance)
+
+    monkeypatch.setattr(Trainer, "step", timed)
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    outcome = fit(small_config(minutes=0.5), data, tmp_path / "run")
+    assert outcome.status == "finished"
+    assert outcome.seconds == pytest.approx(30, rel=0.1)
 
 
 def test_steps_that_the_clock_passes_over_take_effect_once(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,7 @@ def test_the_same_command_goes_on_from_its_rows(data: Path, capsys: pytest.Captu
     assert cli.main(command) == 0
     (first,) = read_rows(data / "out" / "bench.csv")
     shown = [first[name] for name in ("scene", "system", "optimizer_steps", "time")]
-    assert shown == ["small", "tiny", "3", "cpu"]
+    assert shown == ["small", "tiny", "2", "cpu"]
     assert float(first["test_psnr"]) > 0
     assert len(first["val_images"].split()) > 0
     assert cli.main(command) == 0
