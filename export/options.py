@@ -15,8 +15,8 @@ class ExportOptions:
 
     Ways to compute the motion (plans) are tried together with pruning: removing what is invisible in rendered frames.
     Frames of each candidate are compared with those of the exact network in float64, and timed. The fastest whose worst
-    frame has at least --min-psnr is written, or with --max-mb the most exact that fits; and beside it a report: error
-    against run time and bytes.
+    frame has at least --min-psnr is written, the smallest of several that are about as fast, or with --max-mb the most
+    exact that fits; and beside it a report: error against run time and bytes.
 
     Type this:
 

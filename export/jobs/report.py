@@ -43,8 +43,8 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
 
 LEGEND = """\
 - **◆ on the front**: no other point is faster, smaller and has a smaller error; compared before the chosen one is
-  packed if others aren't. **★ chosen**: the fastest within the error allowed; if bytes alone are limited, the one with
-  the smallest error.
+  packed if others aren't. **★ chosen**: the fastest within the error allowed, the smallest of several that
+  are about as fast; if bytes alone are limited, the one with the smallest error.
 - **pruned to**: lowest PSNR of a frame that pruning alone may cause; "–": not pruned.
 - **ms**: per frame, deformation and rasterization; minimum and median of interleaved repeats, mean of three views.
 - **memory**: peak while loading the file and drawing a frame, above that of the idle process.

@@ -21,10 +21,10 @@ from msdgs_serve.scene.metadata import SceneCamera
 MAX_RELATIVE_COST = 4.0
 """A plan that runs layers isn't tried if its layers take this many times the whole frame of a plan within the error."""
 
-PRUNING_STEPS = (10.0, 5.0, 2.0, -5.0, -10.0, -15.0)
+PRUNING_STEPS = (10.0, 5.0, 2.0, -5.0, -10.0)
 """dB above or below `min_psnr` at which pruning is tried."""
 
-SMALLER_STEPS = (-20.0, -25.0)
+SMALLER_STEPS = (-15.0, -20.0, -25.0)
 """The same, if bytes are limited too."""
 
 MIN_PRUNING_DB, MIN_USEFUL_DB = 25.0, 20.0
@@ -38,6 +38,8 @@ ESTIMATE_REPEATS = 3
 """A quick estimate takes the minimum of 3 timings."""
 
 TIME_MARGIN, DB_MARGIN = 1.15, 0.5
+"""A factor of time and a difference of dB that don't count: timings of one file differ by as much."""
+
 MAX_POINTS = 24
 LOWER_DEGREES = 3
 """The number of candidates of which lower SH degrees are tried."""
@@ -127,11 +129,13 @@ def front(points: Sequence[Point]) -> list[int]:
 
 
 def choose(points: Sequence[Point], min_psnr: float | None) -> int | None:
-    """The index of the fastest point whose worst frame has at least `min_psnr` dB, or if that is None, of the one with
-    the smallest error. It lies on the front."""
+    """The index of the smallest of the points about as fast as the fastest, of those whose worst frame has at least
+    `min_psnr` dB; or if that is None, of the one with the smallest error. It lies on the front."""
     if min_psnr is None:
         return max(front(points), key=lambda i: points[i].error.psnr_worst, default=None)
-    return next((i for i in front(points) if points[i].error.psnr_worst >= min_psnr), None)
+    enough = [i for i in front(points) if points[i].error.psnr_worst >= min_psnr]
+    fast = [i for i in enough if points[i].milliseconds <= TIME_MARGIN * points[enough[0]].milliseconds]
+    return min(fast, key=lambda i: points[i].candidate.size, default=None)
 
 
 def pruning_levels(job: ExportJob) -> list[float]:

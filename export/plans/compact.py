@@ -149,7 +149,7 @@ COMPACT = Plan(
     "compact:d, motion with a predicted error of d dB, 20 to 90",
     "#a463f2",
     lambda baked, spec, sample: compact(baked, spec, sample()),
-    candidates=lambda layers: [f"compact:{db}" for db in (72, 66, 60, 56, 52, 46, 40)],
+    candidates=lambda layers: [f"compact:{db}" for db in (72, 66, 63, 60, 56, 52, 46, 40)],
     counts=range(20, 91),
     fitted=True,
 )

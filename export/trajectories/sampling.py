@@ -29,7 +29,7 @@ from msdgs_serve.scene.errors import SceneFileInvalid
 COARSE, FINEST = 64, 2048
 """Numbers of intervals between samples: of all Gaussians, and of the fastest."""
 
-RESOLVED, VISIBLE = 10 ** (-70 / 10), 10 ** (-50 / 10)
+RESOLVED, VISIBLE = 10 ** (-60 / 10), 10 ** (-50 / 10)
 """Squared errors that cubics of all Gaussians together, each at its worst time, may add to a frame: from the first on,
 samples are dense enough, and beyond the second, motion is too fast even for the finest."""
 
@@ -38,8 +38,8 @@ FLOAT32_ENOUGH = 0.005
 
 PROBES = 9
 
-WORK = 1e14
-"""Largest number of operations for samples beyond the coarse ones: about ten minutes of two cores."""
+WORK = 3e13
+"""Largest number of operations for samples beyond the coarse ones: some minutes of two cores."""
 
 MEMORY = 2 * 2**30
 """Largest size in bytes of samples beyond the coarse ones; Gaussians with the largest errors come first."""
