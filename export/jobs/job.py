@@ -230,6 +230,7 @@ class ExportJob:
         for known_layers, known, sampled in self._sampled:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
                 return sampled.some(np.searchsorted(known, ids))
-        sampled = Trajectories(baked, self.progress, [camera for _, camera in self.cameras])
+        resolved = 10 ** (-max(self.min_psnr, MIN_PSNR) / 10 - 1)
+        sampled = Trajectories(baked, self.progress, [camera for _, camera in self.cameras], resolved)
         self._sampled = [*self._sampled[1 - SAMPLED_KEPT :], (layers, ids, sampled)]
         return sampled

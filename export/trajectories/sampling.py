@@ -29,9 +29,12 @@ from msdgs_serve.scene.errors import SceneFileInvalid
 COARSE, FINEST = 64, 2048
 """Numbers of intervals between samples: of all Gaussians, and of the fastest."""
 
-RESOLVED, VISIBLE = 10 ** (-60 / 10), 10 ** (-50 / 10)
-"""Squared errors that cubics of all Gaussians together, each at its worst time, may add to a frame: from the first on,
-samples are dense enough, and beyond the second, motion is too fast even for the finest."""
+RESOLVED = 10 ** (-60 / 10)
+"""Default of the squared error of a frame that cubics of all Gaussians together, each at its worst time, should not
+exceed."""
+
+VISIBLE = 10.0
+"""Motion is too fast for the finest samples if cubics add so many times that error."""
 
 FLOAT32_ENOUGH = 0.005
 """Largest error of float32 at the probes, pixels, with which all other samples are taken in it."""
@@ -52,7 +55,9 @@ Made = TypeVar("Made")
 class Trajectories:
     """Samples of one baked scene, used by all plans that are fitted to them."""
 
-    def __init__(self, baked: Baked, track: Track = no_progress, cameras: Sequence[Camera] = ()) -> None:
+    def __init__(
+        self, baked: Baked, track: Track = no_progress, cameras: Sequence[Camera] = (), resolved: float = RESOLVED
+    ) -> None:
         """`cameras` show how visible errors are; by default those of the scene."""
         self.exact = ExactPoses(baked)
         self.count = self.exact.count
@@ -67,7 +72,7 @@ class Trajectories:
         give_one_sign(samples)
         self._levels = {COARSE: (self._ids, samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
-        self.scene = baked.scene
+        self.scene, self._resolved = baked.scene, resolved
         cameras = cameras or [camera for _, camera in cameras_of_file(baked.scene.metadata)]
         self.forms = sensitivities(baked.scene, samples, cameras, track("visibility of errors", PASSES))
         """[M, 10, 10] W of all that are sampled: an error e of a pose adds eᵀ W e to the squared error of a frame."""
@@ -87,7 +92,7 @@ class Trajectories:
     @property
     def unresolved(self) -> Ids:
         """Gaussians that move faster than their finest sampling resolves."""
-        return np.flatnonzero(np.isin(self._ids, self._missing(VISIBLE)))
+        return np.flatnonzero(np.isin(self._ids, self._missing(VISIBLE * self._resolved)))
 
     def intervals(self, ids: Ids) -> npt.NDArray[np.int64]:
         """[M] numbers of intervals between the samples of each."""
@@ -128,7 +133,7 @@ class Trajectories:
         level, memory, work = COARSE, MEMORY, WORK
         while level < FINEST:
             level *= 2
-            fast = self._missing(RESOLVED)
+            fast = self._missing(self._resolved)
             fast = fast[self._depth[fast] == level // 2]
             most = min(memory / ((level + 1) * POSE * 4), work / (level // 2 * self.exact.operations))
             fast = np.sort(fast[np.argsort(-self._misses[fast])[: int(most)]])

@@ -35,8 +35,8 @@ class RunConfig(Checked):
     threads: int = 2
     """CPU threads. The same seed and threads give the same bits."""
     minutes: float | None = None
-    """Length of the run, counted as `time` says, evaluation and saving included: schedules are laid out over it, and
-    the bits depend on the speed of the machine."""
+    """Length of the run, counted as `time` says, with evaluation and saving, without compiling kernels: schedules are
+    laid out over it, and the bits depend on the speed of the machine."""
     time: Literal["wall", "cpu"] = "wall"
     """What `minutes` and reports count: time that passes, or the CPU time of all threads, which other work on the
     machine hardly changes."""

@@ -36,7 +36,7 @@ EVAL_SPLITS = ("test", "val")
 SELECTION_SPLITS = ("val", "test")  # the first of these that the dataset has selects the best model
 RENDERS_PER_EVAL = 4
 MAX_ROLLBACKS = 3
-TRIAL_STEPS = 4  # of a trainer that is thrown away, across all phases of the schedule
+TRIAL_STEPS = 4  # of a trainer that is thrown away, across the schedule
 PAUSE_SECONDS = 0.05  # between two calls of `Observer.is_paused`
 
 Status = Literal["finished", "interrupted"]
@@ -49,7 +49,7 @@ class RunResult(NamedTuple):
     step: int  # of the schedule
     metrics: dict[str, ImageMetrics]  # by held-out split; empty if interrupted
     gaussians: int
-    seconds: float  # of training, resumed parts and evaluations included
+    seconds: float  # of training, resumed parts and evaluations included, without the time to compile kernels
     best: Best | None  # the model in `best.pt`; None if nothing has been evaluated
 
 
@@ -134,7 +134,7 @@ class Run:
     def execute(self) -> RunResult:
         """Train until the last step or an interruption, then evaluate and save."""
         self.observer.on_train_start(self.trainer)
-        if self.clock:
+        if self.clock and self.trainer.step_count < self.config.run.steps:
             self._compile_kernels()
         status = self._train()
         metrics = {}
@@ -151,8 +151,8 @@ class Run:
         """Train and evaluate for a few steps with another trainer. On a new machine kernels take a minute to compile,
         which doesn't count as training time."""
         before, trial = self._now(), Trainer(self.config, self.trainer.scene)
-        with contextlib.suppress(TrainingDiverged):
-            for _ in range(TRIAL_STEPS):
+        for _ in range(TRIAL_STEPS):
+            if not self.observer.should_stop():
                 trial.step(max(self.config.run.steps // TRIAL_STEPS, 1))
         for split in self.splits[:1]:
             next(trial.evaluate(split))

@@ -114,7 +114,13 @@ WIRE_TRICKS = {
     "a list that ends within a number": with_listed(TensorProto.UINT8, field(5, b"\x80")),
     "a number of a list in one byte more": with_listed(TensorProto.UINT8, field(5, b"\x87\x00")),
     "a list of floats that ends within one": with_listed(TensorProto.FLOAT, field(4, bytes(3))),
-    "a list of 65,537 numbers": with_listed(TensorProto.UINT8, with_numbers(*[1] * 65_537), 65_537),
+    "INT64 in a list of int32": with_listed(TensorProto.INT64, with_numbers(7)),
+    "lists of 262,145 bytes": with_more_in_the_graph(
+        b"".join(
+            field(5, field(1, n) + field(2, TensorProto.UINT8) + field(8, b"x%d" % n) + field(5, b"\x01" * n))
+            for n in (131_072, 131_073)
+        )
+    ),
     "a list that isn't packed": with_listed(TensorProto.UINT8, field(5, 7)),
     "lengths whose product is zero in 64 bits": with_empty_constant(2**32, 2**32),
 }
@@ -131,6 +137,7 @@ def test_each_value_has_one_encoding(sound: onnx.ModelProto, what: str):
     [
         (TensorProto.UINT8, with_numbers(0, 255), [0, 255]),
         (TensorProto.INT8, with_numbers(127, 2**64 - 128), [127, -128]),
+        (TensorProto.INT16, with_numbers(2**15 - 1, 2**64 - 2**15), [2**15 - 1, -(2**15)]),
         (TensorProto.INT32, with_numbers(2**31 - 1, 2**64 - 2**31), [2**31 - 1, -(2**31)]),
         (TensorProto.FLOAT, field(4, np.array([0.1, -3], "<f4").tobytes()), np.array([0.1, -3], np.float32)),
     ],

@@ -41,7 +41,7 @@ def element_name(element: int) -> str:
 
 @dataclass(frozen=True)
 class Tensor:
-    """A constant. `data` is a view of the file's bytes."""
+    """A constant. `data` is a view of the file's bytes, unless it is stored as a list of integers."""
 
     name: str
     element: int
@@ -86,7 +86,7 @@ class Model:
 
 
 def read_model(contents: bytes | memoryview) -> Model:
-    """Parse a model; its constants are views of `contents`. Raises `ModelInvalid` for parts that are not allowed."""
+    """Parse a model; constants in bytes are views of `contents`. Raises `ModelInvalid` for parts that are not allowed."""
     fields = read_message(memoryview(contents), schema.MODEL, "the model")
     if fields.get("ir_version") not in IR_VERSIONS:
         raise _invalid(f"it is of IR version {fields.get('ir_version')}, not {_span(IR_VERSIONS)}")
@@ -96,7 +96,7 @@ def read_model(contents: bytes | memoryview) -> Model:
     return Model(
         _opset(fields["opset_import"]),
         tuple(_node(part) for part in graph["node"]),
-        _by_name([_tensor(part) for part in graph["initializer"]], "constant"),
+        _by_name(_tensors(graph["initializer"]), "constant"),
         _by_name([_port(part) for part in graph["input"]], "input"),
         _by_name([_port(part) for part in graph["output"]], "output"),
         _properties(fields["metadata_props"]),
@@ -151,8 +151,14 @@ def _attribute(part: memoryview, node: str) -> tuple[str, Attribute]:
     raise ModelInvalid(node, f"has the attribute `{key}` that isn't an integer or a list of integers")
 
 
-def _tensor(part: memoryview) -> Tensor:
-    fields = read_message(part, schema.TENSOR, "a constant")
+def _tensors(parts: list[memoryview]) -> list[Tensor]:
+    found = [read_message(part, schema.TENSOR, "a constant") for part in parts]
+    if sum(len(fields.get("int32_data", b"")) for fields in found) > schema.MAX_LISTED:
+        raise _invalid(f"its lists of integers have more than {schema.MAX_LISTED:,} bytes")
+    return [_tensor(fields) for fields in found]
+
+
+def _tensor(fields: dict[str, Any]) -> Tensor:
     name, element, shape = fields.get("name", ""), fields.get("data_type", 0), tuple(fields["dims"])
     if fields.get("data_location", 0):
         raise ModelInvalid(name, "is stored in another file")
@@ -176,7 +182,7 @@ def _contents(fields: dict[str, Any], element: int, name: str) -> memoryview:
         raise ModelInvalid(name, f"of {element_name(element)} is stored as {stored[0]}")
     if "int32_data" not in stored:
         return fields[stored[0]] if stored else memoryview(b"")  # packed floats are their bytes
-    numbers = np.array(read_integers(fields["int32_data"], schema.MAX_LISTED, f"constant `{name}`"), np.int64)
+    numbers = np.array(read_integers(fields["int32_data"]), np.int64)
     values = numbers.astype(DTYPES[element])
     if (values != numbers).any():
         raise ModelInvalid(name, f"has a number beyond {element_name(element)}")

@@ -14,8 +14,8 @@ MAX_OPERANDS = 64
 MAX_RANK = 8
 MAX_ELEMENTS = 1 << 40
 """Limit of elements of an array, counting lengths of 0 as 1: huge lengths of empty arrays overflow in libraries."""
-MAX_LISTED = 1 << 16
-"""Limit of numbers in a constant that is stored as a list of integers."""
+MAX_LISTED = 1 << 18
+"""Limit of bytes of all lists of integers together, which are read one by one."""
 MAX_PROPERTIES = 64
 """Limit of metadata entries of the model or a part of it."""
 MAX_VALUE_INFOS = 8192

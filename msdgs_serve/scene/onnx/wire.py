@@ -76,12 +76,10 @@ def read_message(message: memoryview, schema: Schema, name: str) -> dict[str, An
     return values
 
 
-def read_integers(packed: memoryview, max_count: int, name: str) -> list[int]:
+def read_integers(packed: memoryview) -> list[int]:
     """Return a packed list of int32 or int64. Raises `ModelInvalid` about `file`."""
     numbers, position = [], 0
     while position < len(packed):
-        if len(numbers) == max_count:
-            raise _invalid(f"{name} is a list of more than {max_count:,} numbers")
         number, position = _varint(packed, position)
         numbers.append(_signed(number))
     return numbers
