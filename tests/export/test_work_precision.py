@@ -1,6 +1,7 @@
 """The sweep and its report: dominated points are never chosen, errors repeat, invalid options are refused."""
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from PIL import Image
 
 from export.jobs.job import ExportJob
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
+from export.jobs.store import PLAN_PART
 from export.jobs.sweep import DEFAULT_RASTERIZER, TIME_MARGIN, Point, Sweep, SweepResult, choose, front
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
@@ -112,7 +114,8 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
     assert sum(p.rasterizer == DEFAULT_RASTERIZER and p.candidate.sh_degree == most for p in whole) == 1
     within = [p for p in result.points if p.error.psnr_worst >= 45 and p.rasterizer == DEFAULT_RASTERIZER]
     chosen = result.points[result.chosen]
-    assert chosen.milliseconds == min(p.milliseconds for p in within)
+    leaves = [p for p in within if p.error.psnr_worst >= 45 - 10 * math.log10(PLAN_PART)]  # something for storage
+    assert chosen.milliseconds <= TIME_MARGIN * min(p.milliseconds for p in leaves or within)
     assert any(p.candidate.session.scene.moving_count <= OBJECT for p in within)
 
 
