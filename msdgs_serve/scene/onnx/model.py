@@ -86,7 +86,7 @@ class Model:
 
 
 def read_model(contents: bytes | memoryview) -> Model:
-    """Parse a model; constants in bytes are views of `contents`. Raises `ModelInvalid` for parts that are not allowed."""
+    """Parse a model; constants in bytes are views of `contents`. Raises `ModelInvalid` for what is not allowed."""
     fields = read_message(memoryview(contents), schema.MODEL, "the model")
     if fields.get("ir_version") not in IR_VERSIONS:
         raise _invalid(f"it is of IR version {fields.get('ir_version')}, not {_span(IR_VERSIONS)}")
