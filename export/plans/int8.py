@@ -47,13 +47,16 @@ def int8(baked: Baked) -> onnx.ModelProto:
             calibrate_method=CalibrationMethod.MinMax,
         )
         quantized = onnx.load(path)
-    return _plain(quantized)
+    return _plain(quantized, exact)
 
 
-def _plain(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Store all constants as raw bytes, as scene files require; the quantizer writes its own as lists of numbers."""
+def _plain(model: onnx.ModelProto, exact: onnx.ModelProto) -> onnx.ModelProto:
+    """Store all constants as raw bytes and the metadata of `exact` alone, as scene files require; the quantizer writes
+    lists of numbers and adds an entry that isn't JSON."""
     for constant in model.graph.initializer:
         constant.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(constant), constant.name))
+    del model.metadata_props[:]
+    model.metadata_props.extend(exact.metadata_props)
     return model
 
 

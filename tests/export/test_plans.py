@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from export.jobs.bake import Baked, bake
+from export.jobs.write import properties
 from export.layers import HEAD_COLUMNS, LAYERS, ModelNotExportable
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder
@@ -155,6 +156,7 @@ def test_prefix_is_the_model_stopped_early_and_network_the_whole_of_it(tmp_path:
 def test_int8_rounds_wide_products_and_nothing_before_them(tmp_path: Path, kind: str):
     model, baked, _ = made(kind)
     contents = build("int8", baked)
+    assert properties(contents) == properties(network(baked, "int8"))
     eight_bits = [c.name for c in contents.graph.initializer if c.data_type == onnx.TensorProto.INT8 and c.dims]
     assert sorted(n.split("_quantized")[0] for n in eight_bits if "zero" not in n) == [
         f"layer{k}.trunk{i}.weight" for k, layer in enumerate(baked.layers, 1) if layer.kind == "mlp" for i in (0, 1)

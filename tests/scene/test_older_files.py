@@ -4,16 +4,15 @@
 cameras, [T, 24, 32, 3] in float32."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
+from tests.support.sound_scenes import OLDER
 from tests.support.tolerances import assert_close
 
-OLDER = Path(__file__).with_name("older")
 TIMES = 0.37, 1.0
 
 
