@@ -29,6 +29,8 @@ from msdgs_train.systems.registry import preset
 PARTS = ("deformation", "projection", "tiles", "blending", "loss", "loss gradient", "blending gradient",
          "projection gradient", "deformation gradient", "optimizer")  # fmt: skip
 
+ON_GPU = "whole step on the GPU"
+
 
 @dataclass(frozen=True)
 class Options:
@@ -50,6 +52,8 @@ class Options:
     threads: int = torch.get_num_threads()
     images: int = 4
     """Images of a step that is compared with a step of one image."""
+    gpu: bool = False
+    """Also time whole steps on the GPU, with gsplat."""
     repeats: int = 15
     check: bool = False
     """Test this benchmark at a small size."""
@@ -61,17 +65,22 @@ def main(options: Options) -> int:
         options = replace(options, check=False, gaussians=300, size=32, repeats=2, threads=1)
     with tempfile.TemporaryDirectory() as made:
         several, trainer = (make_trainer(options, Path(made), n) for n in (options.images, 1))
+        on_gpu = make_trainer(options, Path(made), 1, "cuda") if options.gpu else None
         for _ in range(3):  # compiles kernels and gives Adam its moments
             trainer.step()
             several.step()
+            if on_gpu:
+                on_gpu.step()
         times = Times()
         for _ in range(options.repeats):
             measure(trainer, several, times)
+            if on_gpu:
+                times.time(ON_GPU, on_gpu.step)  # ends when the GPU has, as the loss is read
     show(times, options)
     return 0
 
 
-def make_trainer(options: Options, made: Path, images: int) -> Trainer:
+def make_trainer(options: Options, made: Path, images: int, device: str = "cpu") -> Trainer:
     """A trainer whose steps train the whole model."""
     data = options.data
     if data is None:
@@ -84,6 +93,7 @@ def make_trainer(options: Options, made: Path, images: int) -> Trainer:
         max_gaussians=count,
         batch_size=images,
         threads=options.threads,
+        device=device,
         static_fraction=0.0,
         refine_stop_fraction=0.0,
     )
@@ -129,7 +139,7 @@ def show(times: Times, options: Options) -> None:
         f"{options.repeats} repeats",
         *("part", "ms, minimum (median)", "share"),
     )
-    for name in (*PARTS, "all parts", "whole step"):
+    for name in (*PARTS, "all parts", "whole step", *([ON_GPU] if options.gpu else [])):
         share = f"{least[name] / found['all parts']['min']:.0%}" if name in PARTS else ""
         made.add_row(name, minimum_and_median(found[name]), share)
     forward = least["projection"] + least["tiles"] + least["blending"]

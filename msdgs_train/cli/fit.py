@@ -21,7 +21,7 @@ from msdgs_train.systems.registry import DEFAULT, preset, systems
 
 HELP_ALL = "--help-all"
 COMMON = {
-    "run": ("steps", "batch_size", "threads", "minutes", "seed"),
+    "run": ("steps", "batch_size", "threads", "device", "minutes", "seed"),
     "data": ("size", "background"),
     "density": ("init_num_pts", "max_gaussians"),
     "model": ("layers", "support", "sh_degree", "embedding_dim"),

@@ -99,7 +99,9 @@ def key_of_row(row: Row) -> tuple[str, ...]:
 def _digest(config: TrainConfig) -> str:
     """Eight digits that change with any setting besides those of `KEY`, the scene's and the machine's."""
     same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1, time="wall")
-    return hashlib.sha256(json.dumps(same.to_dict(), sort_keys=True).encode()).hexdigest()[:8]
+    groups = same.to_dict()
+    del groups["run"]["device"]
+    return hashlib.sha256(json.dumps(groups, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -52,7 +52,7 @@ class GradientStrategy:
         """A new strategy for `count` Gaussians and so many cameras."""
         patience = schedule.config.density.prune_unseen_passes * max(views, MIN_PATIENCE)
         generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
-        gradients, counts, unseen = torch.zeros(3, count)
+        gradients, counts, unseen = torch.zeros(3, count, device=schedule.config.run.device)
         return cls(schedule, scene_scale, gradients, counts, unseen, patience, is_rig, generator)
 
     def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
@@ -91,7 +91,7 @@ class GradientStrategy:
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:
         """Continue from it."""
-        self.gradients, self.counts, self.unseen = state
+        self.gradients, self.counts, self.unseen = (tensor.to(self.gradients.device) for tensor in state)
 
     def densify(self, surgery: RowSurgery, step: int) -> DensityChange:
         """Clone small and split large Gaussians of large gradients, remove low-opacity and huge ones, and reset."""
@@ -106,8 +106,8 @@ class GradientStrategy:
             kept = torch.nonzero(~pruned & ~(chosen & large))[:, 0]
             surgery.replace_rows(kept, added)
         count = len(cloned) + 2 * len(split)
-        self.unseen = torch.cat([self.unseen[kept], torch.zeros(count)])
-        self.gradients, self.counts = torch.zeros(2, len(kept) + count)
+        self.unseen = torch.cat([self.unseen[kept], self.unseen.new_zeros(count)])
+        self.gradients, self.counts = self.unseen.new_zeros(2, len(kept) + count)
         return DensityChange(len(cloned), len(split), int(pruned.sum()))
 
     def reset_opacities(self, surgery: RowSurgery) -> None:
@@ -138,7 +138,7 @@ class GradientStrategy:
     def _halves(self, gaussians: CanonicalGaussians, rows: Tensor) -> dict[str, Tensor]:
         """Smaller copies of the given rows, at positions drawn from the Gaussian that is split."""
         values = {name: p[rows] for name, p in gaussians.named_parameters()}
-        noise = torch.randn(len(rows), 3, generator=self.generator) * values["log_scales"].exp()
+        noise = torch.randn(len(rows), 3, generator=self.generator).to(rows.device) * values["log_scales"].exp()
         values["means"] = values["means"] + rotate(functional.normalize(values["raw_quats"], dim=1), noise)
         values["log_scales"] = values["log_scales"] - math.log(SPLIT_SHRINK)
         return values

@@ -84,8 +84,9 @@ class MCMCStrategy:
         moved = count - len(alive)
         if moved + added == 0 or len(alive) == 0:  # a scene that is wholly transparent may recover
             return Relocated(0, 0)
-        drawn = torch.multinomial(opacities[alive], moved + added, replacement=True, generator=self.generator)
-        sources = alive[drawn]
+        weights = opacities[alive].cpu()
+        drawn = torch.multinomial(weights, moved + added, replacement=True, generator=self.generator)
+        sources = alive[drawn.to(alive.device)]
         copies = torch.bincount(sources, minlength=count)
         shared = torch.nonzero(copies)[:, 0]
         new_opacities, shrink = compute_relocation(opacities[shared], copies[shared] + 1)
@@ -100,7 +101,7 @@ class MCMCStrategy:
     def inject_noise(self, gaussians: CanonicalGaussians, rate: float) -> None:
         """Add noise with the covariance of each Gaussian to its mean, more at lower opacity (equation 9 there)."""
         gate = torch.sigmoid(-NOISE_SLOPE * (gaussians.raw_opacities.sigmoid() - self.config.prune_opa))
-        noise = torch.randn(len(gaussians), 3, generator=self.generator)
+        noise = torch.randn(len(gaussians), 3, generator=self.generator).to(gate.device)
         quats = functional.normalize(gaussians.raw_quats, dim=1)
         inverse = quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
         shaped = rotate(quats, gaussians.log_scales.exp().square() * rotate(inverse, noise))  # Σ times the noise
@@ -122,7 +123,7 @@ def compute_relocation(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tenso
     opacities = opacities.clamp(max=MAX_OPACITY)  # the sum cancels if its terms are large
     shares = shares.clamp(1, MAX_COPIES).double()
     new = -torch.expm1(torch.log1p(-opacities) / shares)
-    terms = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64)
+    terms = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64, device=new.device)
     binomials = torch.exp(
         torch.lgamma(shares + 1)[:, None]
         - torch.lgamma(terms + 1)

@@ -34,6 +34,9 @@ class RunConfig(Checked):
     """Seed of all random numbers of the run."""
     threads: int = 2
     """CPU threads. The same seed and threads give the same bits."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """cuda: the model is on the GPU and rendered by gsplat, which must be installed; the bits differ from run to
+    run."""
     minutes: float | None = None
     """Length of the run, counted as `time` says, with evaluation and saving, without compiling kernels: schedules are
     laid out over it, and the bits depend on the speed of the machine."""
@@ -46,6 +49,7 @@ class RunConfig(Checked):
         self.require_counts("seed", least=0)
         self.require_positive_or_none("minutes")
         self.require(("time",), "wall or cpu", lambda v: v in ("wall", "cpu"))
+        self.require(("device",), "cpu or cuda", lambda v: v in ("cpu", "cuda"))
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,7 @@ def _group_of(name: str) -> str:
     raise InvalidInput("config", "made of known settings", f"`{name}`")
 
 
-RESUMABLE_CHANGES = frozenset({"steps", "threads", "minutes", "log_every", "eval_every", "checkpoint_every"})
+RESUMABLE_CHANGES = frozenset({"steps", "threads", "device", "minutes", "log_every", "eval_every", "checkpoint_every"})
 """Settings that may change when a run is resumed. All others have affected the model already."""
 
 

@@ -46,7 +46,7 @@ def scene_bounds(
         posed = pose(float(t))
         means = posed.means[posed.opacities >= VISIBLE_OPACITY]
         if len(means):
-            boxes.append(torch.quantile(means, torch.tensor([OUTSIDE_BOUNDS, 1 - OUTSIDE_BOUNDS]), dim=0))
+            boxes.append(torch.quantile(means, means.new_tensor([OUTSIDE_BOUNDS, 1 - OUTSIDE_BOUNDS]), dim=0))
     if not boxes:
         return [[-scene_half_size] * 3, [scene_half_size] * 3]
     stacked = torch.stack(boxes)

@@ -1,5 +1,6 @@
 """Rendering by gsplat for CUDA tensors. Its kernels fix the alpha and transmittance limits of `GSPLAT`."""
 
+import gsplat
 import torch
 from torch import Tensor
 
@@ -16,10 +17,6 @@ def rasterize_cuda(
     info: RasterizationInfo,
 ) -> tuple[Tensor, Tensor]:
     """Return rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
-    try:
-        import gsplat
-    except ModuleNotFoundError as error:
-        raise RuntimeError("training on CUDA renders with gsplat: pip install gsplat, or train on the CPU") from error
     if options._replace(near_plane=GSPLAT.near_plane, eps2d=GSPLAT.eps2d) != GSPLAT:
         raise InvalidInput("options", "gsplat's alpha and transmittance limits on CUDA", options)
     means, quats, scales, opacities, sh = gaussians
@@ -38,7 +35,7 @@ def rasterize_cuda(
         eps2d=options.eps2d,
         sh_degree=round(sh.shape[1] ** 0.5) - 1,
         packed=False,
-        backgrounds=background[None],
+        backgrounds=background.to(means.device)[None],
     )
     info.radii = meta["radii"][0].amax(dim=-1).to(means.dtype)
     if meta["means2d"].requires_grad:

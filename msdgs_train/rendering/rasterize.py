@@ -1,5 +1,6 @@
 """Differentiable rendering: the service's own kernels on a CPU, gsplat on CUDA, behind one function."""
 
+import importlib.util
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from msdgs_serve.rasterizer.projection_backward import project_backward
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, Gaussians
+from msdgs_serve.scene.errors import InvalidInput
 
 
 class RasterizationInfo:
@@ -22,6 +24,14 @@ class RasterizationInfo:
     """[N] larger half-extent of the footprint in pixels; 0 for Gaussians that are not drawn."""
     means2d_grads: Tensor | None = None
     """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
+
+
+def require_device(device: str) -> None:
+    """Raise `InvalidInput` unless this machine can render on `device`."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InvalidInput("device", "cpu, as torch finds no GPU here", device)
+    if device == "cuda" and importlib.util.find_spec("gsplat") is None:
+        raise InvalidInput("device", "cpu without gsplat, which renders on a GPU: pip install gsplat", device)
 
 
 def rasterize(

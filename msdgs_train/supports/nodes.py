@@ -122,7 +122,7 @@ class NodesSupport(Support):
         """
         opaque = means[opacities > NODE_MIN_OPACITY] if bool((opacities > NODE_MIN_OPACITY).any()) else means
         chosen = int((opaque - opaque.mean(dim=0)).norm(dim=1).argmin())
-        distances = torch.full((len(opaque),), torch.inf)
+        distances = opaque.new_full((len(opaque),), torch.inf)
         for k in range(len(self.nodes)):
             self.nodes[k] = opaque[chosen]
             distances = torch.minimum(distances, (opaque - opaque[chosen]).norm(dim=1))

@@ -19,9 +19,10 @@ class Target(NamedTuple):
     alpha: Tensor  # [H, W] uint8
 
     @classmethod
-    def over(cls, rgba: np.ndarray, background: Tensor) -> "Target":
+    def over(cls, rgba: np.ndarray, background: Tensor, device: str = "cpu") -> "Target":
         """An image, [H, W, 4] uint8 with straight alpha, over a background color, [3]."""
-        return cls(torch.from_numpy(composite(rgba, background.numpy())), torch.from_numpy(rgba[:, :, 3].copy()))
+        rgb, alpha = composite(rgba, background.numpy()), rgba[:, :, 3].copy()
+        return cls(torch.from_numpy(rgb).to(device), torch.from_numpy(alpha).to(device))
 
     @property
     def shows_all(self) -> bool:

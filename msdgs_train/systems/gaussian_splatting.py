@@ -47,7 +47,7 @@ class GaussianSplatting:
             schedule = schedule._replace(config=config)
         self.schedule, self.config, self.scene = schedule, config, scene
         bounds = SceneBounds(self.scene_half_size, scene.time_range)
-        self._model = _new_model(schedule, scene, bounds, distinct)
+        self._model = _new_model(schedule, scene, bounds, distinct).to(config.run.device)
         self.density: DensityStrategy = (
             MCMCStrategy.start(schedule)
             if is_mcmc

@@ -52,7 +52,7 @@ def snapshot_of_training(trainer: Trainer) -> Snapshot:
     system, step = trainer.system, trainer.step_count
     if not isinstance(system, GaussianSplatting):
         raise InvalidInput("viewer", "off for this system, which isn't made of Gaussians", trainer.config.run.system)
-    schedule, model = trainer.schedule, copy.deepcopy(system.eval_model)
+    schedule, model = trainer.schedule, copy.deepcopy(system.eval_model).cpu()
     model.config = replace(model.config, eps2d=schedule.eps2d(step))
     background = trainer.config.data.evaluation_background
     return Snapshot(model, background, schedule.deforms(step), schedule.sh_degree(step))
