@@ -35,7 +35,7 @@ def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: fl
     """The candidate with packed arrays and its error, whose worst frame has at least `min_psnr` dB as the given one
     has; or the given ones if nothing can be packed."""
     trial = _Trial(job, chosen)
-    found = _in_fewer_bits(trial.contents, trial.error, min_psnr, squared(min_psnr) - squared(error.psnr_worst))
+    found = _in_fewer_bits(trial.contents, trial.error, min_psnr)
     return (chosen, error) if found is None else trial.kept(*found)
 
 
@@ -61,7 +61,7 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
     def measured(model: onnx.ModelProto, every: int) -> RenderedError:
         return frames.measure(session(model).gaussians, ids, every=every)
 
-    found = _in_fewer_bits(contents, measured, min_psnr, squared(min_psnr))
+    found = _in_fewer_bits(contents, measured, min_psnr)
     return None if found is None else (_with_entry(contents, *found), found[1])
 
 
@@ -99,23 +99,23 @@ def check_min_psnr(min_psnr: float) -> None:
 
 
 def _in_fewer_bits(
-    contents: onnx.ModelProto, measured: Measure, min_psnr: float, allowed: float
+    contents: onnx.ModelProto, measured: Measure, min_psnr: float
 ) -> tuple[Stored, RenderedError] | None:
-    """The smallest file by estimates of its squared error within `allowed`, and its error."""
-    tried = list[RenderedError]()
+    """The smallest file whose worst frame has `min_psnr`, and its error."""
+    allowed = list[RenderedError]()
 
     def is_allowed(model: onnx.ModelProto) -> bool:
-        tried.append(measured(model, 1))
-        return tried[-1].psnr_worst >= min_psnr
+        error = measured(model, 1)
+        allowed.extend([error] if error.psnr_worst >= min_psnr else [])
+        return error.psnr_worst >= min_psnr
 
-    estimates = [_estimate(measured, every) for every in (ESTIMATE_STRIDE, 1)]
-    found = fewest_bytes(contents, estimates, is_allowed, allowed)
-    return None if found is None else (found, tried[-1])
+    found = fewest_bytes(contents, _estimate(measured), is_allowed)
+    return None if found is None else (found, allowed[-1])
 
 
-def _estimate(measured: Measure, every: int) -> Callable[[onnx.ModelProto], float]:
-    """A function that returns the squared error of the worst of every n-th frame."""
-    return lambda model: squared(measured(model, every).psnr_worst)
+def _estimate(measured: Measure) -> Callable[[onnx.ModelProto], float]:
+    """A function that returns the squared error of the mean PSNR of every n-th frame."""
+    return lambda model: squared(measured(model, ESTIMATE_STRIDE).psnr_mean)
 
 
 def _with_entry(contents: onnx.ModelProto, found: Stored, error: RenderedError) -> onnx.ModelProto:
@@ -132,7 +132,7 @@ def _finest(job: ExportJob, candidate: Candidate, max_bytes: int) -> tuple[Candi
     if not job.packs or candidate.size + METADATA_BYTES <= max_bytes:
         return candidate, job.error(candidate)
     trial = _Trial(job, candidate)
-    found = smallest_error(trial.contents, _estimate(trial.error, ESTIMATE_STRIDE), max_bytes - METADATA_BYTES)
+    found = smallest_error(trial.contents, _estimate(trial.error), max_bytes - METADATA_BYTES)
     return trial.kept(found, trial.error(found.contents))
 
 

@@ -1,4 +1,4 @@
-"""Views at which errors are measured: the training cameras at times between those of the training images."""
+"""Views at which errors are measured: cameras of training and viewer at times between those of the training images."""
 
 import math
 from collections.abc import Sequence
@@ -30,12 +30,13 @@ class View(NamedTuple):
 
 
 def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[str, Camera]]:
-    """The cameras of a scene by name: those of `training` if given, else those of the model; more are added if too few.
+    """The cameras of a scene by name: those of `training` if given, else all in the model; more are added if too few.
 
     Raises `InvalidInput` for a stored camera that can't be used.
     """
     cameras = [(f"training {i}", camera) for i, camera in enumerate(training)]
-    cameras = cameras or [(str(stored["name"]), _camera(stored)) for stored in info.cameras]
+    stored = [*info.training_cameras, *info.cameras]
+    cameras = cameras or [(str(entry["name"]), _camera(entry)) for entry in stored]
     return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
 
 

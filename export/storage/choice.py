@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, cached_property
 from typing import NamedTuple
 
@@ -70,29 +70,24 @@ class Stored(NamedTuple):
 
 def fewest_bytes(
     contents: onnx.ModelProto,
-    estimates: Sequence[Callable[[onnx.ModelProto], float]],
+    estimate: Callable[[onnx.ModelProto], float],
     is_allowed: Callable[[onnx.ModelProto], bool],
-    allowed: float,
 ) -> Stored | None:
     """The smallest scene file that `is_allowed`, or None if only the given one is.
 
-    Groups are packed one at a time to estimate their squared errors, which add up; if the sum was wrong, the next of
-    `estimates` is taken, and after the last of them a smaller sum.
+    All groups start with their coarsest kind, and the one with the largest squared error per byte, estimated with that
+    group alone packed, becomes finer until the file is allowed: found by bisection.
     """
-    choices = [_Choice(contents, estimate) for estimate in estimates[::-1]]
-    while True:
-        kinds, total = choices[-1].within(allowed)
-        if not kinds:
-            return None
-        model = packed(contents, kinds)
+    steps = _Choice(contents, estimate).steps()
+    found, first, last = None, 0, len(steps)
+    while first < last:
+        middle = (first + last) // 2
+        model = packed(contents, steps[middle])
         if is_allowed(model):
-            return Stored(model, kinds)
-        if len(choices) > 1:
-            choices.pop()
-        elif total:
-            allowed = total / 2
+            found, last = Stored(model, steps[middle]), middle
         else:
-            return None
+            first = middle + 1
+    return found if found and found.kinds else None
 
 
 def smallest_error(contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float], max_bytes: int) -> Stored:
@@ -109,14 +104,12 @@ class _Choice:
         self._kinds: dict[str, list[str | None]] = {name: [*GROUPS[name].kinds, None] for name in _members(contents)}
         self._alone = cache(self._packed_alone)
 
-    def within(self, allowed: float) -> tuple[dict[str, str], float]:
-        """The coarsest kinds whose errors sum to `allowed` at most, without groups in float32, and the sum."""
-        sums = ((levels, sum(self._alone(*each)[0] for each in levels.items())) for levels in self._refined(math.inf))
-        levels, total = next((levels, total) for levels, total in sums if total <= allowed)
-        return self._chosen(levels), total
+    def steps(self) -> list[dict[str, str]]:
+        """Kinds without groups in float32, from the coarsest to those without an error."""
+        return [self._chosen(levels) for levels in self._refined(math.inf)]
 
     def within_bytes(self, max_bytes: int) -> dict[str, str]:
-        """The finest kinds of a file of `max_bytes`, likewise."""
+        """The finest of these kinds of a file of `max_bytes`."""
         smallest = packed(self._contents, self._chosen(dict.fromkeys(self._kinds, 0)))
         *_, levels = self._refined(max_bytes - smallest.ByteSize())
         return self._chosen(levels)

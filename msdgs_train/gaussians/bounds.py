@@ -27,6 +27,17 @@ def distinct_cameras(cameras: Sequence[Camera]) -> list[Camera]:
     return list({camera.camera_to_world.tobytes(): camera for camera in cameras}.values())
 
 
+def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:
+    """At most `count` frames whose cameras are far from each other, in their order; the first is among them."""
+    positions = np.array([frame.camera.position for frame in frames])
+    chosen, distances = [0], np.full(len(frames), np.inf)
+    while len(chosen) < min(count, len(frames)):
+        distances = np.minimum(distances, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
+        distances[chosen] = -1.0
+        chosen.append(int(distances.argmax()))
+    return [frames[i] for i in sorted(chosen)]
+
+
 def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """[N] number of the cameras that have each point, [N, 3], in their image."""
     counts = np.zeros(len(points), np.int64)

@@ -27,7 +27,10 @@ class SceneInfo:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sRGB in [0, 1], as trained
     bounds: list[list[float]] = field(default_factory=lambda: [[-1.0] * 3, [1.0] * 3])  # corners, scene units
     cameras: list[dict[str, Any]] = field(default_factory=list)
-    """Each has name, fx, fy, cx, cy (pixels), width, height, camera_to_world (4×4 nested lists, OpenCV) and t."""
+    """Those of the viewer. Each has name, fx, fy, cx, cy (pixels), width, height, camera_to_world (4×4 nested lists,
+    OpenCV) and t."""
+    training_cameras: list[dict[str, Any]] = field(default_factory=list)
+    """Some of the training images, from which export measures errors too."""
 
 
 class LoadedModel(NamedTuple):

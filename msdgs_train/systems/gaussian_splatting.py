@@ -17,7 +17,14 @@ from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.averaging import WeightAverage
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
-from msdgs_train.gaussians.bounds import camera_entry, distinct_cameras, scene_bounds, scene_scale, views_of
+from msdgs_train.gaussians.bounds import (
+    camera_entry,
+    distinct_cameras,
+    scene_bounds,
+    scene_scale,
+    spread_frames,
+    views_of,
+)
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
 from msdgs_train.gaussians.scale_space import count_clamped
@@ -28,8 +35,8 @@ from msdgs_train.losses.photometric import photometric_loss
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.systems.base import Target, ViewLoss
 
-CAMERAS_OF_TRAINING = 20
-"""Training cameras that a model file keeps if there is no test split."""
+VIEWER_CAMERAS, TRAINING_CAMERAS = 20, 32
+"""Training cameras that a model file keeps: for the viewer if there is no test split, and for export."""
 
 
 class GaussianSplatting:
@@ -139,7 +146,8 @@ class GaussianSplatting:
         model_file.save_model(path, model, info, step, as_drawn)
 
     def _scene_info(self, step: int) -> model_file.SceneInfo:
-        frames = self.scene.splits.get("test") or self.scene.splits["train"][:CAMERAS_OF_TRAINING]
+        training = self.scene.splits["train"]
+        frames = self.scene.splits.get("test") or spread_frames(training, VIEWER_CAMERAS)
         return model_file.SceneInfo(
             time_range=self.scene.time_range,
             background=self.config.data.evaluation_background,
@@ -147,6 +155,7 @@ class GaussianSplatting:
                 lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
             ),
             cameras=[camera_entry(frame) for frame in frames],
+            training_cameras=[camera_entry(frame) for frame in spread_frames(training, TRAINING_CAMERAS)],
         )
 
     def _options(self, step: int) -> RasterizerOptions:

@@ -153,6 +153,11 @@ def test_selection_times_are_not_evaluation_times():
     assert deciding & measured == {0.0, 1.0}
 
 
+def test_cameras_of_training_and_viewer_are_used():
+    info = SceneInfo(cameras=SCENE.cameras[:3], training_cameras=SCENE.cameras[10:15])
+    assert [name for name, _ in cameras_of(info)] == [f"r_{i:03}" for i in (10, 11, 12, 13, 14, 0, 1, 2)]
+
+
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_cameras_are_added_where_too_few_are_stored(count: int):
     cameras = cameras_of(SceneInfo(cameras=SCENE.cameras[:count], bounds=SCENE.bounds))

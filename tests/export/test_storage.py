@@ -202,7 +202,7 @@ def test_the_group_of_the_largest_error_per_byte_becomes_finer_first():
         return 1.0 + 4.0 * (names.get("sh.stored") == TensorProto.UINT8) + 2.0 * ("opacities.stored" in names)
 
     def chosen(allowed: float, is_allowed: bool = True) -> dict[str, str] | None:
-        found = fewest_bytes(contents, [estimate], lambda model: is_allowed, allowed)
+        found = fewest_bytes(contents, estimate, lambda model: is_allowed and estimate(model) - 1.0 <= allowed)
         return found and found.kinds
 
     everything = chosen(10.0)

@@ -25,10 +25,11 @@ def drawn(device: str, weights: Tensor) -> dict[str, np.ndarray]:
     """Image, alpha, and gradients of a weighted sum of both."""
     arrays = {name: getattr(GAUSSIANS, name) for name in FIELDS}
     tensors = {name: torch.tensor(array, device=device, requires_grad=True) for name, array in arrays.items()}
-    posed = PosedGaussians(**tensors)
+    parameters = PosedGaussians(**tensors)
+    posed = parameters._replace(quats=torch.nn.functional.normalize(parameters.quats, dim=1))
     rgb, alpha, info = rasterize(*posed, CAMERA, torch.tensor([0.2, 0.6, 0.9]))
     values = torch.cat([rgb, alpha[:, :, None]], dim=2)
-    grads = torch.autograd.grad((values * weights.to(device)).sum(), posed)
+    grads = torch.autograd.grad((values * weights.to(device)).sum(), parameters)
     assert info.means2d_grads is not None
     named = dict(zip(FIELDS, grads, strict=True))
     named |= {"means2d": info.means2d_grads, "rgb": rgb, "alpha": alpha}

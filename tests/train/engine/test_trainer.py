@@ -104,6 +104,10 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     assert loaded.step == 150
     assert len(loaded.model.gaussians) == outcome.gaussians
     assert [camera["t"] for camera in loaded.scene.cameras] == [0.25, 0.75]
+    training = [frame.camera.camera_to_world.tolist() for frame in load_scene(data).splits["train"]]
+    kept = [camera["camera_to_world"] for camera in loaded.scene.training_cameras]
+    assert len(kept) == min(len(training), system_module.TRAINING_CAMERAS)
+    assert all(pose in training for pose in kept)
     low, high = loaded.scene.bounds
     assert all(a < b for a, b in zip(low, high, strict=True))
 
