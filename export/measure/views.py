@@ -35,8 +35,9 @@ def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[s
     Raises `InvalidInput` for a stored camera that can't be used.
     """
     cameras = [(f"training {i}", camera) for i, camera in enumerate(training)]
-    stored = [*info.training_cameras, *info.cameras]
-    cameras = cameras or [(str(entry["name"]), _camera(entry)) for entry in stored]
+    if not cameras:
+        cameras = [(f"training {stored['name']}", _camera(stored)) for stored in info.training_cameras]
+        cameras += [(str(stored["name"]), _camera(stored)) for stored in info.cameras]
     return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
 
 
