@@ -175,7 +175,8 @@ def main(
         small, info, _ = load_model(model)
         if count < len(small.gaussians):
             raise InvalidInput("count", f"{len(small.gaussians):,} or more, the model's Gaussians", count)
-        info = replace(info, cameras=[_resized(camera, size) for camera in info.cameras])
+        resized = {n: [_resized(c, size) for c in getattr(info, n)] for n in ("cameras", "training_cameras")}
+        info = replace(info, **resized)
         parts = split(small, count, torch.Generator().manual_seed(0))
         training = Training(grown(parts), SmoothMotion(parts, info, control), info)
         training.run(60 * minutes, console)

@@ -70,12 +70,12 @@ def main(options: Options) -> int:
             trainer.step()
             several.step()
             if on_gpu:
-                on_gpu.step()
+                step_on_gpu(on_gpu)
         times = Times()
         for _ in range(options.repeats):
             measure(trainer, several, times)
             if on_gpu:
-                times.time(ON_GPU, on_gpu.step)  # ends when the GPU has, as the loss is read
+                times.time(ON_GPU, step_on_gpu, on_gpu)
     show(times, options)
     return 0
 
@@ -98,6 +98,12 @@ def make_trainer(options: Options, made: Path, images: int, device: str = "cpu")
         refine_stop_fraction=0.0,
     )
     return Trainer(config, load_scene(data, options.size))
+
+
+def step_on_gpu(trainer: Trainer) -> None:
+    """A step, until the GPU has ended it."""
+    trainer.step()
+    torch.cuda.synchronize()
 
 
 def measure(trainer: Trainer, several: Trainer, times: Times) -> None:
@@ -146,7 +152,7 @@ def show(times: Times, options: Options) -> None:
     gradient = least["blending gradient"] + least["projection gradient"]
     each, step = least["several"] / options.images, least["whole step"]
     report_console().print(
-        machine(),
+        machine() + (f", {torch.cuda.get_device_name()}" if options.gpu else ""),
         made,
         f"rasterizer: gradient / forward = {gradient / forward:.2f}",
         f"whole step / (forward rendering + deformation) = {step / (forward + least['deformation']):.2f}",

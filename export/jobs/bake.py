@@ -22,7 +22,7 @@ from msdgs_train.supports.base import Support
 from msdgs_train.supports.gaussians import GaussiansConfig
 
 STARTING_CAMERAS = 8
-"""Cameras stored in a scene file, evenly spread over the training cameras."""
+"""Cameras stored in a scene file, evenly spread over the model's."""
 
 
 DELTA_SPACES: dict[ScaleSpace, str] = {"log": "raw", "linear": "activated"}
@@ -128,7 +128,7 @@ def _metadata(
 
 
 def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
-    """Up to eight of the training cameras, evenly spread, including the first and the last."""
+    """Up to eight of the model's cameras, evenly spread, including the first and the last."""
     chosen = np.linspace(0, len(info.cameras) - 1, min(STARTING_CAMERAS, len(info.cameras))).round().astype(int)
     try:
         return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)

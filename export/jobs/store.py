@@ -114,8 +114,8 @@ def _in_fewer_bits(
 
 
 def _estimate(measured: Measure) -> Callable[[onnx.ModelProto], float]:
-    """A function that returns the squared error of the mean PSNR of every n-th frame."""
-    return lambda model: squared(measured(model, ESTIMATE_STRIDE).psnr_mean)
+    """A function that returns the squared error of the worst of every n-th frame."""
+    return lambda model: squared(measured(model, ESTIMATE_STRIDE).psnr_worst)
 
 
 def _with_entry(contents: onnx.ModelProto, found: Stored, error: RenderedError) -> onnx.ModelProto:

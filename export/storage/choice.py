@@ -1,6 +1,5 @@
 """The choice of a kind of storage for each group of arrays: the fewest bytes that an error allows, or the reverse."""
 
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache, cached_property
@@ -78,7 +77,7 @@ def fewest_bytes(
     All groups start with their coarsest kind, and the one with the largest squared error per byte, estimated with that
     group alone packed, becomes finer until the file is allowed: found by bisection.
     """
-    steps = _Choice(contents, estimate).steps()
+    steps = [kinds for kinds in _Choice(contents, estimate).steps() if kinds]
     found, first, last = None, 0, len(steps)
     while first < last:
         middle = (first + last) // 2
@@ -87,7 +86,7 @@ def fewest_bytes(
             found, last = Stored(model, steps[middle]), middle
         else:
             first = middle + 1
-    return found if found and found.kinds else None
+    return found
 
 
 def smallest_error(contents: onnx.ModelProto, estimate: Callable[[onnx.ModelProto], float], max_bytes: int) -> Stored:
@@ -105,8 +104,8 @@ class _Choice:
         self._alone = cache(self._packed_alone)
 
     def steps(self) -> list[dict[str, str]]:
-        """Kinds without groups in float32, from the coarsest to those without an error."""
-        return [self._chosen(levels) for levels in self._refined(math.inf)]
+        """Kinds without groups in float32, from the coarsest to none."""
+        return [self._chosen(levels) for levels in self._refined()]
 
     def within_bytes(self, max_bytes: int) -> dict[str, str]:
         """The finest of these kinds of a file of `max_bytes`."""
@@ -114,18 +113,20 @@ class _Choice:
         *_, levels = self._refined(max_bytes - smallest.ByteSize())
         return self._chosen(levels)
 
-    def _refined(self, free: float) -> Iterator[dict[str, int]]:
-        """Levels of all groups. They start with their coarsest kind; of those whose next kind adds no more than the
-        `free` bytes, the one with the largest error per byte that it adds gets it, until none has an error."""
+    def _refined(self, free: float | None = None) -> Iterator[dict[str, int]]:
+        """Levels of all groups. They start with their coarsest kind; the one with the largest error per byte that its
+        next kind adds gets it, until all are float32, or until no group with an error has a kind that adds no more than
+        the `free` bytes."""
         levels = dict.fromkeys(self._kinds, 0)
         while True:
             yield levels
-            gains = {name: self._gain(name, level) for name, level in levels.items() if self._alone(name, level)[0]}
-            gains = {name: gain for name, gain in gains.items() if self._added_bytes(name, levels[name]) <= free}
-            if not gains:
+            left = {name: level for name, level in levels.items() if self._kinds[name][level] is not None}
+            if free is not None:
+                left = {n: k for n, k in left.items() if self._alone(n, k)[0] and self._added_bytes(n, k) <= free}
+            if not left:
                 return
-            name = max(gains, key=lambda name: gains[name])
-            free -= self._added_bytes(name, levels[name])
+            name = max(left, key=lambda name: self._gain(name, left[name]))
+            free = None if free is None else free - self._added_bytes(name, levels[name])
             levels = levels | {name: levels[name] + 1}
 
     def _chosen(self, levels: Mapping[str, int]) -> dict[str, str]:

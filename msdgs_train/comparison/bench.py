@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
+import torch
 from llvmlite.binding import get_host_cpu_name
 
 from msdgs_serve.scene.errors import InvalidInput
@@ -100,7 +101,8 @@ def _digest(config: TrainConfig) -> str:
     """Eight digits that change with any setting besides those of `KEY`, the scene's and the machine's."""
     same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1, time="wall")
     groups = same.to_dict()
-    del groups["run"]["device"]
+    if config.run.device == "cpu":
+        del groups["run"]["device"]  # rows of before this setting stay valid
     return hashlib.sha256(json.dumps(groups, sort_keys=True).encode()).hexdigest()[:8]
 
 
@@ -160,7 +162,7 @@ def measure(run: Run, scene: BenchScene) -> Row:
     metrics = final_metrics(run) or {}
     row = dict(zip(KEY, key_of(run), strict=True)) | {
         "date": date.today().isoformat(),
-        "machine": f"{get_host_cpu_name()} {os.cpu_count()} cores",
+        "machine": _machine(run.config.run.device),
         "seconds": f"{metrics['seconds']:.0f}",
         "optimizer_steps": str(metrics["optimizer_steps"]),
         "gaussians": str(metrics["gaussians"]),
@@ -170,6 +172,11 @@ def measure(run: Run, scene: BenchScene) -> Row:
         found = split in scene.splits and split in metrics["splits"]
         row |= {f"{split}_{name}": value for name, value in (_scores(run, split) if found else {}).items()}
     return {name: row.get(name, "") for name in COLUMNS}
+
+
+def _machine(device: str) -> str:
+    gpu = f", {torch.cuda.get_device_name()}" if device == "cuda" else ""
+    return f"{get_host_cpu_name()} {os.cpu_count()} cores{gpu}"
 
 
 def _scores(run: Run, split: str) -> dict[str, str]:

@@ -31,6 +31,7 @@ from msdgs_train.engine.run_record import (
 from msdgs_train.engine.tensorboard_events import require_tensorboard
 from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
 from msdgs_train.evaluation.metrics import ImageMetrics, mean_metrics
+from msdgs_train.rendering.rasterize import require_device
 
 EVAL_SPLITS = ("test", "val")
 SELECTION_SPLITS = ("val", "test")  # the first of these that the dataset has selects the best model
@@ -88,6 +89,7 @@ def fit(
 
 def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tensorboard: bool) -> RunState:
     """Load the dataset, build the model or load its checkpoint, and write the first files of the folder."""
+    require_device(config.run.device)
     if tensorboard:
         require_tensorboard()
     if resume:

@@ -22,7 +22,6 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.evaluation.metrics import ImageMetrics, image_metrics, psnr_from_mse
 from msdgs_train.gaussians import safe_load
 from msdgs_train.layers.parameters import ParamGroup
-from msdgs_train.rendering.rasterize import require_device
 from msdgs_train.systems.base import System, Target
 from msdgs_train.systems.registry import system_of
 
@@ -62,7 +61,6 @@ class Trainer:
     """A system, its optimizer and the order of the images, advanced by `step`."""
 
     def __init__(self, config: TrainConfig, scene: SceneData) -> None:
-        require_device(config.run.device)
         torch.set_num_threads(config.run.threads if config.run.batch_size == 1 else 1)
         self.config, self.scene = config, scene
         self.schedule = Schedule.from_config(config)
@@ -116,7 +114,8 @@ class Trainer:
         background = torch.tensor(self.config.data.evaluation_background)
         for frame in self.scene.splits[split]:
             target = self._images.image(frame, background)
-            rgb = self.system.render(frame.camera, frame.t, background, self.step_count).cpu()
+            on_device = background.to(self.config.run.device)
+            rgb = self.system.render(frame.camera, frame.t, on_device, self.step_count).cpu()
             yield EvaluatedFrame(frame, target, rgb, image_metrics(rgb, target))
 
     def save_checkpoint(self, path: Path, seconds: float) -> None:
@@ -201,7 +200,7 @@ class Trainer:
     @sharing_cores()
     def _differentiate(self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor) -> ViewGradients:
         target = Target.over(self._images.rgba(frame), background, self.config.run.device)
-        view = self.system.loss(frame, target, background, self.step_count)
+        view = self.system.loss(frame, target, background.to(target.rgb.device), self.step_count)
         return differentiate(groups, frame, view, target.rgb)
 
     def _next_background(self) -> Tensor:

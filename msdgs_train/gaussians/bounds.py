@@ -28,14 +28,16 @@ def distinct_cameras(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:
-    """At most `count` frames whose cameras are far from each other, in their order; the first is among them."""
-    positions = np.array([frame.camera.position for frame in frames])
-    chosen, distances = [0], np.full(len(frames), np.inf)
-    while len(chosen) < min(count, len(frames)):
+    """At most `count` frames, of different cameras that are far from each other, in their order; the first is among
+    them."""
+    distinct = list({f.camera.camera_to_world.tobytes(): f for f in frames[::-1]}.values())[::-1]
+    positions = np.array([frame.camera.position for frame in distinct])
+    chosen, distances = [0], np.full(len(distinct), np.inf)
+    while len(chosen) < min(count, len(distinct)):
         distances = np.minimum(distances, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
         distances[chosen] = -1.0
         chosen.append(int(distances.argmax()))
-    return [frames[i] for i in sorted(chosen)]
+    return [distinct[i] for i in sorted(chosen)]
 
 
 def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from msdgs_serve import __version__
 from msdgs_serve.scene.camera import Camera
-from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -30,7 +31,7 @@ class SceneInfo:
     """Those of the viewer. Each has name, fx, fy, cx, cy (pixels), width, height, camera_to_world (4×4 nested lists,
     OpenCV) and t."""
     training_cameras: list[dict[str, Any]] = field(default_factory=list)
-    """Some of the training images, from which export measures errors too."""
+    """Others, of training images, from which export also measures errors."""
 
 
 class LoadedModel(NamedTuple):
@@ -104,6 +105,12 @@ def _refuse_not_finite(path: str | Path, state: dict[str, Tensor]) -> None:
 
 
 def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
+    for name in ("cameras", "training_cameras"):
+        try:
+            for camera in getattr(scene, name):
+                SceneCamera.from_plain(camera)
+        except (KeyError, TypeError, ValueError, MsdgsError) as error:
+            raise CheckpointInvalid(path, f"scene.{name} holds a camera that can't be used: {error}") from error
     for name, shape in (("time_range", (2,)), ("background", (3,)), ("bounds", (2, 3))):
         try:
             values = torch.tensor(getattr(scene, name), dtype=torch.float64)

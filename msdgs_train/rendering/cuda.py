@@ -35,7 +35,7 @@ def rasterize_cuda(
         eps2d=options.eps2d,
         sh_degree=round(sh.shape[1] ** 0.5) - 1,
         packed=False,
-        backgrounds=background.to(means.device)[None],
+        backgrounds=background[None],
     )
     info.radii = meta["radii"][0].amax(dim=-1).to(means.dtype)
     if meta["means2d"].requires_grad:

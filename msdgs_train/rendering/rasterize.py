@@ -1,5 +1,6 @@
 """Differentiable rendering: the service's own kernels on a CPU, gsplat on CUDA, behind one function."""
 
+import importlib
 import importlib.util
 from typing import Any
 
@@ -28,10 +29,15 @@ class RasterizationInfo:
 
 def require_device(device: str) -> None:
     """Raise `InvalidInput` unless this machine can render on `device`."""
-    if device == "cuda" and not torch.cuda.is_available():
+    if device == "cpu":
+        return
+    if not torch.cuda.is_available():
         raise InvalidInput("device", "cpu, as torch finds no GPU here", device)
-    if device == "cuda" and importlib.util.find_spec("gsplat") is None:
-        raise InvalidInput("device", "cpu without gsplat, which renders on a GPU: pip install gsplat", device)
+    if importlib.util.find_spec("gsplat") is None:
+        raise InvalidInput("device", "cpu without gsplat, which renders on a GPU: pip install 'msdgs[cuda]'", device)
+    backend = importlib.import_module("gsplat.cuda._backend")  # compiles kernels, for minutes the first time
+    if backend._C is None:
+        raise InvalidInput("device", "cpu without CUDA's compiler, nvcc, which gsplat needs", device)
 
 
 def rasterize(

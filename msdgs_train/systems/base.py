@@ -13,7 +13,7 @@ from msdgs_train.layers.parameters import ParamGroup
 
 
 class Target(NamedTuple):
-    """A training image."""
+    """A training image, on the run's device, as the background is."""
 
     rgb: Tensor  # [H, W, 3] in [0, 1], over the background
     alpha: Tensor  # [H, W] uint8

@@ -36,7 +36,7 @@ from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.systems.base import Target, ViewLoss
 
 VIEWER_CAMERAS, TRAINING_CAMERAS = 20, 32
-"""Training cameras that a model file keeps: for the viewer if there is no test split, and for export."""
+"""Cameras that a model file keeps: of the test split, or of training if there is none, and others of training."""
 
 
 class GaussianSplatting:
@@ -147,15 +147,16 @@ class GaussianSplatting:
 
     def _scene_info(self, step: int) -> model_file.SceneInfo:
         training = self.scene.splits["train"]
-        frames = self.scene.splits.get("test") or spread_frames(training, VIEWER_CAMERAS)
+        shown = list(map(camera_entry, spread_frames(self.scene.splits.get("test") or training, VIEWER_CAMERAS)))
+        others = map(camera_entry, spread_frames(training, TRAINING_CAMERAS))
         return model_file.SceneInfo(
             time_range=self.scene.time_range,
             background=self.config.data.evaluation_background,
             bounds=scene_bounds(
                 lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
             ),
-            cameras=[camera_entry(frame) for frame in frames],
-            training_cameras=[camera_entry(frame) for frame in spread_frames(training, TRAINING_CAMERAS)],
+            cameras=shown,
+            training_cameras=[entry for entry in others if entry not in shown],
         )
 
     def _options(self, step: int) -> RasterizerOptions:

@@ -214,6 +214,15 @@ def test_the_group_of_the_largest_error_per_byte_becomes_finer_first():
     assert chosen(0.0) == without | {"sh": "16 bits"}
     assert chosen(10.0, is_allowed=False) is None
 
+    # what no estimate shows becomes finer last, but before the whole file stays as it is
+    def seen(model: onnx.ModelProto) -> bool:
+        return "opacities.stored" not in {each.name for each in model.graph.initializer}
+
+    found = fewest_bytes(contents, lambda model: 1.0, seen)
+    assert found is not None
+    assert "opacities" not in found.kinds
+    assert found.kinds
+
     # the same order if bytes are limited, and no byte for what has no error
     smallest = packed(contents, COARSEST).ByteSize()
     assert smallest_error(contents, estimate, 0).kinds == everything

@@ -104,10 +104,8 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     assert loaded.step == 150
     assert len(loaded.model.gaussians) == outcome.gaussians
     assert [camera["t"] for camera in loaded.scene.cameras] == [0.25, 0.75]
-    training = [frame.camera.camera_to_world.tolist() for frame in load_scene(data).splits["train"]]
     kept = [camera["camera_to_world"] for camera in loaded.scene.training_cameras]
-    assert len(kept) == min(len(training), system_module.TRAINING_CAMERAS)
-    assert all(pose in training for pose in kept)
+    assert kept == [frame.camera.camera_to_world.tolist() for frame in load_scene(data).splits["train"]]
     low, high = loaded.scene.bounds
     assert all(a < b for a, b in zip(low, high, strict=True))
 
@@ -322,3 +320,20 @@ def test_metrics_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:
     (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + '\n{"kind": "tr')
     MetricsLog(tmp_path, keep_until=2)
     assert [line["step"] for line in read_metrics(tmp_path)] == [1, 2]
+
+
+def test_cameras_of_a_model_are_spread_and_kept_once(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(system_module, "VIEWER_CAMERAS", 2)
+    monkeypatch.setattr(system_module, "TRAINING_CAMERAS", 4)
+    scene = load_scene(data)
+    scene = dataclasses.replace(scene, splits={"train": scene.splits["train"]})
+    Trainer(small_config(), scene).system.save(tmp_path / "model.pt", 0)
+    info, poses = (
+        load_model(tmp_path / "model.pt").scene,
+        [f.camera.camera_to_world.tolist() for f in scene.splits["train"]],
+    )
+    assert (len(info.cameras), len(info.training_cameras)) == (2, 2)
+    found = [poses.index(entry["camera_to_world"]) for entry in [*info.cameras, *info.training_cameras]]
+    assert len(set(found)) == 4

@@ -126,6 +126,15 @@ def test_incomplete_files_are_refused(model_file: Path, key: str):
         load_model(model_file)
 
 
+@pytest.mark.parametrize("name", ["cameras", "training_cameras"])
+@pytest.mark.parametrize("cameras", [None, 5, [1], [{}], [{**SCENE.cameras[0], "fx": float("nan")}]])
+def test_damaged_cameras_are_named(model_file: Path, name: str, cameras: Any):
+    scene = torch.load(model_file, weights_only=True)["scene"]
+    rewritten(model_file, scene=scene | {name: cameras})
+    with pytest.raises(CheckpointInvalid, match=rf"scene\.{name}"):
+        load_model(model_file)
+
+
 @pytest.mark.parametrize("name", ["gaussians.raw_quats", "gaussians.embeddings", "deformation.layers.0.first.weight"])
 @pytest.mark.parametrize("tensor", [None, torch.zeros(2, 2)])
 def test_tensors_missing_or_of_another_shape_are_named(model_file: Path, name: str, tensor: torch.Tensor | None):
