@@ -89,6 +89,11 @@ def values_of(rows: Sequence[Row], scene: str, system: str, name: str) -> list[s
     return [row[name] for row in rows if (row["scene"], row["system"]) == (scene, system) and row[name]]
 
 
+def _images_by_seed(rows: Sequence[Row], scene: str, system: str) -> dict[str, np.ndarray]:
+    found = [row for row in rows if (row["scene"], row["system"]) == (scene, system) and row["test_images"]]
+    return {row["seed"]: np.array(row["test_images"].split(), float) for row in found}
+
+
 def _cell(rows: Sequence[Row], scene: str, system: str, split: str) -> str:
     found = [float(value) for value in values_of(rows, scene, system, f"{split}_psnr")]
     return mean_and_deviation(found, 2) if found else "–"
@@ -105,15 +110,13 @@ def _mean_over_scenes(
 def gain(rows: Sequence[Row], scenes: Sequence[str], system: str, first: str) -> str:
     """The gain of `system` over `first` on test images and its interval, as text; – if no scene has both.
 
-    The mean is over scenes that both systems have, and over images, each the mean over the seeds.
+    The mean is over scenes that both systems have, and over images, each the mean over the seeds that both have.
     """
     gains = []
     for scene in scenes:
-        images = [
-            [np.array(v.split(), float) for v in values_of(rows, scene, s, "test_images")] for s in (first, system)
-        ]
-        if all(images):
-            gains.append(np.mean(images[1], axis=0) - np.mean(images[0], axis=0))
+        old, new = (_images_by_seed(rows, scene, name) for name in (first, system))
+        if both := [new[seed] - old[seed] for seed in sorted(old.keys() & new.keys())]:
+            gains.append(np.mean(both, axis=0))
     if not gains:
         return "–"
     mean, low, high = paired_gain(gains)
