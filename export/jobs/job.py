@@ -12,7 +12,7 @@ import numpy as np
 
 from export.jobs.bake import Baked, changing_outputs
 from export.measure.poses import in_float64, posed
-from export.measure.rendered_error import ExactFrames, RenderedError
+from export.measure.rendered_error import ExactFrames, RenderedError, within_memory
 from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.registry import build, check_appearance, plan_of
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from export.measure.images import HeldOutImages
 
 EVALUATION_TIMES, CAMERAS_PER_TIME = 16, 3
-SELECTION_TIMES = 33
+SELECTION_TIMES, SELECTION_CAMERAS = 33, 3
 ESTIMATE_STRIDE = 6
 """A quick estimate compares every 6th frame."""
 
@@ -150,7 +150,8 @@ class ExportJob:
     @cached_property
     def statistics(self) -> PruningStatistics:
         """Visibility and motion by which pruning decides, computed on first use."""
-        views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES)
+        views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES, SELECTION_CAMERAS)
+        views = within_memory(views, len(self.model.gaussians))
         on_time = self.progress("motion and visibility of the Gaussians", SELECTION_TIMES)
         return PruningStatistics(self.model, views, self.info.background, on_time)
 

@@ -58,10 +58,11 @@ def evaluation_views(
     return views
 
 
-def selection_views(cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int) -> list[View]:
-    """Views at evenly spread times, a camera each; none of the times between the ends is one of `evaluation_views`."""
-    t0, t1 = time_range
-    spread = dict.fromkeys(float(t) for t in np.linspace(t0, t1, times))
+def selection_views(
+    cameras: Sequence[tuple[str, Camera]], time_range: tuple[float, float], times: int, cameras_per_time: int = 1
+) -> list[View]:
+    """Views at evenly spread times; none of the times between the ends is one of `evaluation_views`."""
+    spread = list(dict.fromkeys(float(t) for t in np.linspace(*time_range, times))) * cameras_per_time
     chosen = [int((i * GOLDEN + 0.5) % 1 * len(cameras)) for i in range(len(spread))]
     return [View(cameras[c][1], t, cameras[c][0]) for c, t in zip(chosen, spread, strict=True)]
 

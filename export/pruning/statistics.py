@@ -76,7 +76,7 @@ class PruningStatistics:
         if network == self._whole[0]:
             return self._whole[1]
         if network not in self._kept:
-            most = int(MEMORY / (POSE_BYTES * len(self._views) * max(len(self.model.gaussians), 1)))
+            most = int(MEMORY / (POSE_BYTES * len(self._whole[1].times) * max(len(self.model.gaussians), 1)))
             while len(self._kept) >= max(most, 1):
                 del self._kept[next(iter(self._kept))]
             self._kept[network] = self._posed(network)
