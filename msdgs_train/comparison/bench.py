@@ -102,7 +102,7 @@ def _digest(config: TrainConfig) -> str:
     same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1, time="wall")
     groups = same.to_dict()
     if config.run.device == "cpu":
-        del groups["run"]["device"]  # rows of before this setting stay valid
+        del groups["run"]["device"]  # only another device changes the digest
     return hashlib.sha256(json.dumps(groups, sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -35,8 +35,8 @@ class RunConfig(Checked):
     threads: int = 2
     """CPU threads. The same seed and threads give the same bits."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """cuda: the model is on the GPU and rendered by gsplat, which must be installed; the bits differ from run to
-    run."""
+    """cuda: the model is on the GPU and rendered by gsplat (msdgs[cuda]), while the loss and the kernels of nodes and
+    planes stay on the CPU; the bits differ from run to run."""
     minutes: float | None = None
     """Length of the run, counted as `time` says, with evaluation and saving, without compiling kernels: schedules are
     laid out over it, and the bits depend on the speed of the machine."""

@@ -112,9 +112,9 @@ class Trainer:
     def evaluate(self, split: str) -> Iterator[EvaluatedFrame]:
         """Render each frame of a split and compute its metrics."""
         background = torch.tensor(self.config.data.evaluation_background)
+        on_device = background.to(self.config.run.device)
         for frame in self.scene.splits[split]:
             target = self._images.image(frame, background)
-            on_device = background.to(self.config.run.device)
             rgb = self.system.render(frame.camera, frame.t, on_device, self.step_count).cpu()
             yield EvaluatedFrame(frame, target, rgb, image_metrics(rgb, target))
 

@@ -330,10 +330,8 @@ def test_cameras_of_a_model_are_spread_and_kept_once(
     scene = load_scene(data)
     scene = dataclasses.replace(scene, splits={"train": scene.splits["train"]})
     Trainer(small_config(), scene).system.save(tmp_path / "model.pt", 0)
-    info, poses = (
-        load_model(tmp_path / "model.pt").scene,
-        [f.camera.camera_to_world.tolist() for f in scene.splits["train"]],
-    )
+    info = load_model(tmp_path / "model.pt").scene
+    poses = [frame.camera.camera_to_world.tolist() for frame in scene.splits["train"]]
     assert (len(info.cameras), len(info.training_cameras)) == (2, 2)
     found = [poses.index(entry["camera_to_world"]) for entry in [*info.cameras, *info.training_cameras]]
     assert len(set(found)) == 4
