@@ -21,11 +21,9 @@ def main(options: ExportOptions) -> int:
             from export.importers.command import model_or_import  # slow to import: not before --help
             from export.importers.scene import changed_metadata
             from export.jobs.command import export
-            from export.measure.stability import MIN_PSNR
         if options.duration is not None and not 0 < options.duration <= MAX_NUMBER:
             raise InvalidInput("duration", "seconds above 0", options.duration)
-        min_psnr = None if options.keep_float32 else options.min_psnr or MIN_PSNR
-        with model_or_import(options.model, options.format, options.scene_file, console, min_psnr) as model:
+        with model_or_import(options, console) as model:
             if model is not None:
                 export(model, options, console)
         if options.duration is not None:

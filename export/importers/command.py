@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 
 from rich.console import Console
@@ -13,19 +14,23 @@ from export.importers.runs.model import RUNS, write_model
 from export.importers.scene import digest, note_left_out, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
 from export.importers.splats.formats import READERS, read_splats
+from export.measure.stability import MIN_PSNR
+from export.options import ExportOptions
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
 
+FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep_float32", "duration")
+"""The options that splats and sequences have; nothing is pruned or fitted."""
+
 
 @contextmanager
-def model_or_import(
-    path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None = None
-) -> Iterator[Path | None]:
-    """The model.pt to export: `path` itself, or a temporary one that is made from another trainer's run.
+def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path | None]:
+    """The model.pt to export: the given one, or a temporary one that is made from another trainer's run.
 
-    Splats and sequences are written as scene files directly, in fewer bits if `min_psnr` is given; the result is then
-    None. `file_format` is one of `FORMATS`, or "detect". Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
+    Splats and sequences are written as scene files directly, in fewer bits unless these are switched off; the result is
+    then None. Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
     """
+    path, file_format, output = options.model, options.format, options.scene_file
     if file_format == "detect":
         file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
     file_format = checked_format(file_format)
@@ -41,6 +46,12 @@ def model_or_import(
     else:
         if not output.parent.is_dir():
             raise InvalidInput("output", "in a folder that exists", str(output))
+        for field in fields(options):
+            if field.name not in FOR_SPLATS and getattr(options, field.name) != field.default:
+                raise InvalidInput(field.name, "left out: it is for trained models", str(getattr(options, field.name)))
+        if options.keep_float32 and options.min_psnr is not None:
+            raise InvalidInput("min_psnr", "left out with --keep-float32", options.min_psnr)
+        min_psnr = None if options.keep_float32 else MIN_PSNR if options.min_psnr is None else options.min_psnr
         write = _splats if file_format in READERS else _sequence
         _print(write(path, file_format, output, console, min_psnr), output, console)
         yield None

@@ -8,15 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullLocator
 
-from export.jobs.sweep import DEFAULT_RASTERIZER
 from export.plans.registry import PLANS
 
 DB_STEP = 10
 MAX_DB = 100.0
 LABEL_SIZE = np.array([250, 15])
 """Pixels reserved for a label."""
-
-OTHER = "#9498a0"
 
 
 Cost = Callable[[dict[str, Any]], float]
@@ -55,13 +52,10 @@ def _draw_points(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
         errors = [_rms(point["error"]["psnr_worst"]) for point in group]
         axes.scatter([cost(point) for point in group], errors, label=label, **style)
 
-    usual = [point for point in points if point["rasterizer"] == DEFAULT_RASTERIZER]
     for kind in dict.fromkeys(_kind(point) for point in points):
-        group, color = [point for point in usual if _kind(point) == kind], PLANS[kind].color
+        group, color = [point for point in points if _kind(point) == kind], PLANS[kind].color
         faces = [color if point["packed"] else "white" for point in group]
         scatter(group, f"plan {kind}", s=55, facecolors=faces, edgecolors=color, linewidths=2, zorder=3)
-    if others := [point for point in points if point not in usual]:
-        scatter(others, "other rasterizer options", s=55, marker="x", color=OTHER, zorder=3)
     ahead = [point for point in points if point["front"]]
     scatter(ahead, "Pareto front", s=150, marker="D", facecolors="none", edgecolors="black", zorder=2)
     chosen = [point for point in points if point["chosen"]]

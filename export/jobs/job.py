@@ -21,7 +21,6 @@ from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, f
 from export.pruning.mask import bake_pruned, in_spatial_order, rows, unpruned, with_sh_degree
 from export.trajectories.sampling import Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.evaluation.metrics import MAX_PSNR
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
 
 EVALUATION_TIMES, CAMERAS_PER_TIME = 16, 3
 SELECTION_TIMES, SELECTION_CAMERAS = 33, 3
-ESTIMATE_STRIDE = 6
-"""A quick estimate compares every 6th frame."""
+ESTIMATE_STRIDE = 7
+"""A quick estimate compares every 7th frame: no multiple of `CAMERAS_PER_TIME`, so not always the first of a time."""
 
 ADDED_DB = 0.05
 """What an export may add to the error against held-out images, dB, if no `min_psnr` is given."""
@@ -64,7 +63,6 @@ class Candidate:
     pruning_db: float | None  # dB, lowest PSNR of a frame that pruning alone may cause; None: not pruned
     pruned: PrunedModel
     path: Path
-    options: RasterizerOptions  # of its frames
     float32: Path | None = None  # the same in float32, if the arrays of this file are packed
 
     @cached_property
@@ -124,9 +122,10 @@ class ExportJob:
     def exact(self) -> ExactFrames:
         """Frames in float64, computed on first use."""
         views = evaluation_views(self.cameras, self.info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
+        views = within_memory(views, len(self.model.gaussians))
         on_frame = self.progress("exact frames in float64", len(views))
         pose, options = in_float64(self.model), self.model.rasterizer
-        return ExactFrames(pose, len(self.model.gaussians), views, self.info.background, options, on_frame)
+        return ExactFrames(pose, views, self.info.background, options, on_frame)
 
     @cached_property
     def exact_images_psnr(self) -> float | None:
@@ -152,8 +151,8 @@ class ExportJob:
         """Visibility and motion by which pruning decides, computed on first use."""
         views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES, SELECTION_CAMERAS)
         views = within_memory(views, len(self.model.gaussians))
-        on_time = self.progress("motion and visibility of the Gaussians", SELECTION_TIMES)
-        return PruningStatistics(self.model, views, self.info.background, on_time)
+        on_view = self.progress("motion and visibility of the Gaussians", len(views))
+        return PruningStatistics(self.model, views, self.info.background, on_view)
 
     def pruned(self, pruning_db: float | None) -> PrunedModel:
         """The model without everything that can be removed while the worst frame stays at `pruning_db` dB.
@@ -185,7 +184,7 @@ class ExportJob:
     def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
         """The error of a candidate's frames against exact ones, of all frames or of every n-th."""
         pose, ids = candidate.session.gaussians, candidate.pruned.ids
-        return self.exact.measure(pose, ids, options=candidate.options, every=every)
+        return self.exact.measure(pose, ids, every=every)
 
     def _checked_pruning(self, pruning_db: float) -> PrunedModel:
         min_db = pruning_db
@@ -223,7 +222,7 @@ class ExportJob:
         if plan_of(plan).fitted and len(baked.moving):
             sampled = self._trajectories(baked, pruned.ids[: len(baked.moving)])
         path.write_bytes(build(plan, baked, sampled).SerializeToString())
-        return Candidate(plan, pruning_db, pruned, path, self.model.rasterizer)
+        return Candidate(plan, pruning_db, pruned, path)
 
     def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
         """Trajectories of the Gaussians `ids`, ascending; sampled once, since pruning doesn't change their motion."""

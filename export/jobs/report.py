@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from export.jobs.figure import draw
-from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, SELECTION_TIMES, ExportJob
+from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, ExportJob
 from export.jobs.store import squared
-from export.jobs.sweep import DEFAULT_RASTERIZER, SweepResult
+from export.jobs.sweep import SweepResult
 from export.measure.machine import processor
 from export.plans.base import BASELINE
 from msdgs_serve import __version__
@@ -23,7 +23,6 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
     "plan": lambda p: p["plan"],
     "pruned to": lambda p: "–" if p["pruning_db"] is None else f"{p['pruning_db']:g} dB",
     "SH": lambda p: str(p["sh_degree"]),
-    "rasterizer": lambda p: "" if p["rasterizer"] == DEFAULT_RASTERIZER else p["rasterizer"],
     "moving": lambda p: f"{p['moving']:,}",
     "static": lambda p: f"{p['static']:,}",
     "ms": lambda p: f"{p['milliseconds']['total']['min']:.1f}",
@@ -53,7 +52,6 @@ LEGEND = """\
   a Gaussian, in scene units and in pixels, transparent and hidden ones included.
 - **held-out**: mean PSNR in dB against held-out images.
 - **MB**: 10⁶ bytes. MB and errors are those of a file whose arrays have fewer bits, or, if marked *, float32.
-- Points with other rasterizer options show their effect. A file can't select them, so none is chosen.
 """
 
 
@@ -73,7 +71,6 @@ def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
             "evaluation_frames": len(job.exact.views),
             "evaluation_times": EVALUATION_TIMES,
             "cameras_per_time": CAMERAS_PER_TIME,
-            "selection_times": SELECTION_TIMES,
             "width": job.exact.views[0].camera.width,
             "height": job.exact.views[0].camera.height,
         },

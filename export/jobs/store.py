@@ -10,7 +10,7 @@ import onnx
 
 from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob, TargetNotReached
 from export.jobs.write import properties, set_properties
-from export.measure.rendered_error import ExactFrames, RenderedError
+from export.measure.rendered_error import ExactFrames, RenderedError, within_memory
 from export.measure.views import cameras_of_file, evaluation_views
 from export.storage.choice import COARSEST, Stored, fewest_bytes, packed, smallest_error
 from msdgs_serve.deformation import DeformationSession
@@ -56,7 +56,8 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
     if not exact.scene.moving_count:
         views = list({view.name: view for view in views}.values())
     ids = np.arange(len(exact.scene))
-    frames = ExactFrames(exact.gaussians, len(ids), views, metadata.background, as_trained(metadata))
+    views = within_memory(views, len(ids))
+    frames = ExactFrames(exact.gaussians, views, metadata.background, as_trained(metadata))
 
     def measured(model: onnx.ModelProto, every: int) -> RenderedError:
         return frames.measure(session(model).gaussians, ids, every=every)

@@ -1,10 +1,11 @@
-"""The sweep: plans × pruning × SH degree × rasterizer options. Dominated ones are dropped after a quick estimate, the
+"""The sweep: plans × pruning × SH degree. Dominated ones are dropped after a quick estimate, the
 rest is measured in full."""
 
+import heapq
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import le
 from typing import Any, NamedTuple
 
@@ -46,10 +47,6 @@ LOWER_DEGREES = 3
 
 TIMED_VIEWS = 3
 
-DEFAULT_RASTERIZER = "default"
-RASTERIZERS = {"alpha ≥ 2/255": {"alpha_min": 2 / 255}, "ends at 1 %": {"transmittance_min": 1e-2}}
-"""Other rasterizer options, whose effect is shown on the point within the error that takes least processor time."""
-
 
 @dataclass(frozen=True, eq=False)
 class QuickEstimate:
@@ -72,7 +69,7 @@ class QuickEstimate:
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
         quick = {"cpu_milliseconds": self.cpu, "psnr_worst": self.worst_db}
-        return named(self.candidate, DEFAULT_RASTERIZER) | {"quick_estimate": quick}
+        return named(self.candidate) | {"quick_estimate": quick}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +77,6 @@ class Point:
     """A candidate, measured in full."""
 
     candidate: Candidate
-    rasterizer: str
     time: FrameTime
     error: RenderedError
     memory: int | None  # bytes at the peak of a frame
@@ -99,7 +95,7 @@ class Point:
     def to_plain(self) -> dict[str, Any]:
         """Plain values for JSON."""
         scene = self.candidate.session.scene
-        return named(self.candidate, self.rasterizer) | {
+        return named(self.candidate) | {
             "moving": scene.moving_count,
             "static": scene.static_count,
             "layers": len(scene.metadata.layers),
@@ -113,19 +109,15 @@ class Point:
         }
 
 
-def named(candidate: Candidate, rasterizer: str) -> dict[str, Any]:
+def named(candidate: Candidate) -> dict[str, Any]:
     """The keys that identify a point."""
-    c = candidate
-    return {"plan": c.plan, "pruning_db": c.pruning_db, "sh_degree": c.sh_degree, "rasterizer": rasterizer}
+    return {"plan": candidate.plan, "pruning_db": candidate.pruning_db, "sh_degree": candidate.sh_degree}
 
 
 def front(points: Sequence[Point]) -> list[int]:
-    """Indices of the points on the Pareto front of time, error and bytes, the fastest first.
-
-    Only those with default rasterizer options, since a file can't ask for others.
-    """
-    usual = sorted((point.costs, i) for i, point in enumerate(points) if point.rasterizer == DEFAULT_RASTERIZER)
-    return [i for n, (costs, i) in enumerate(usual) if not any(all(map(le, other, costs)) for other, _ in usual[:n])]
+    """Indices of the points on the Pareto front of time, error and bytes, the fastest first."""
+    fast = sorted((point.costs, i) for i, point in enumerate(points))
+    return [i for n, (costs, i) in enumerate(fast) if not any(all(map(le, other, costs)) for other, _ in fast[:n])]
 
 
 def choose(points: Sequence[Point], min_psnr: float | None) -> int | None:
@@ -173,11 +165,10 @@ class Sweep:
         Raises `TargetNotReached` if even the whole network in float32 is further from float64 than allowed, or if no
         file keeps the limits.
         """
-        levels = pruning_levels(self.job)
         self.baseline = self._estimate(BASELINE, None)
         self._reachable(self.baseline)
-        # the mildest pruning that removes anything: plans are then fitted to moving Gaussians only
-        mildest = next((level for level in levels if self.job.pruned(level).left_out), None)
+        levels = [level for level in pruning_levels(self.job) if self.job.pruned(level).left_out]
+        mildest = next(iter(levels), None)  # plans are then fitted to moving Gaussians only
         self._estimate_all("fitted plans", [(text, mildest) for text in self._texts(fitted=True)])
         self._estimate_all("network", [(BASELINE, level) for level in levels])
         self._estimate_all("other plans", [(text, mildest) for text in self._texts(fitted=False)])
@@ -193,7 +184,8 @@ class Sweep:
         return [text for plan in plans for text in plan.candidates(len(self.job.model.deformation))]
 
     def _estimate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> QuickEstimate | None:
-        if plan != BASELINE and not len(self.job.pruned(pruning_db).moving.gaussians):
+        moving = self.job.pruned(pruning_db).moving
+        if plan != BASELINE and not (len(moving.gaussians) and len(moving.deformation)):
             return None  # nothing moves: all plans give the same file
         if self.estimates and (why := self._too_expensive(plan, pruning_db)):
             self.refused.append((plan, why))
@@ -282,6 +274,8 @@ class Sweep:
         ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)
         if self.max_bytes is not None:
             ahead = [e for e in ahead if e.size <= self.max_bytes] or [min(self.estimates, key=lambda e: e.size)]
+        if self.min_psnr is None:  # speed doesn't count
+            ahead = heapq.nlargest(MAX_POINTS, ahead, key=lambda e: e.worst_db)
         ahead = ahead[:MAX_POINTS]
         ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
         candidates = [estimate.candidate for estimate in ahead]
@@ -294,18 +288,16 @@ class Sweep:
         best = choose(points, self.min_psnr)
         if best is None:  # estimates see only some of the frames, in float32
             reached = max(point.error.psnr_worst for point in points)
-            raise TargetNotReached.psnr(reached, "a file reaches that fits", self.job.min_psnr)
+            where = "a file reaches" if self.max_bytes is None else "a file reaches that fits"
+            raise TargetNotReached.psnr(reached, where, self.job.min_psnr)
+        if self.max_bytes is not None or not self.job.packs:
+            return best
         leaves = choose(points, self.job.min_psnr - 10 * math.log10(PLAN_PART))  # something for storage
-        return best if leaves is None or self.max_bytes is not None or not self.job.packs else leaves
+        fastest = min(p.milliseconds for p in points if p.error.psnr_worst >= self.job.min_psnr)
+        return best if leaves is None or points[leaves].milliseconds > TIME_MARGIN * fastest else leaves
 
     def _points(self, measured: list[tuple[Candidate, RenderedError]]) -> list[Point]:
-        """Points of candidates and their errors; the fastest within the error also with other rasterizer options."""
-        names = [DEFAULT_RASTERIZER] * len(measured)
-        within = [c for c, error in measured if self.min_psnr is None or error.psnr_worst >= self.min_psnr]
-        if within:  # candidates are sorted by processor time
-            usual = within[0].options
-            variants = [replace(within[0], options=usual._replace(**changes)) for changes in RASTERIZERS.values()]
-            measured, names = measured + self._errors(variants), [*names, *RASTERIZERS]
+        """Points of candidates and their errors."""
         candidates = [candidate for candidate, _ in measured]
         images = [self._images_psnr(candidate) for candidate in candidates]
         background, on_repeat = self.job.info.background, self.job.progress("timing", REPEATS)
@@ -313,8 +305,8 @@ class Sweep:
         memory = frame_memory(
             [c.path for c in candidates], SceneCamera("timed", self._timed[0].t, self._timed[0].camera)
         )
-        parts = zip(measured, names, times, memory, images, strict=True)
-        return [Point(c, name, time, error, bytes_, psnr) for (c, error), name, time, bytes_, psnr in parts]
+        parts = zip(measured, times, memory, images, strict=True)
+        return [Point(c, time, error, bytes_, psnr) for (c, error), time, bytes_, psnr in parts]
 
     def _errors(self, candidates: list[Candidate]) -> list[tuple[Candidate, RenderedError]]:
         on_error = self.job.progress("all frames of the points", len(candidates))
@@ -331,4 +323,5 @@ class Sweep:
         return self._measured_errors[candidate]
 
     def _images_psnr(self, candidate: Candidate) -> float | None:
-        return self.job.images.psnr(candidate.session.gaussians, candidate.options) if self.job.images else None
+        options = self.job.model.rasterizer
+        return self.job.images.psnr(candidate.session.gaussians, options) if self.job.images else None

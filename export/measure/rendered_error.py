@@ -51,15 +51,12 @@ class ExactFrames:
     def __init__(
         self,
         pose: Pose,
-        count: int,
         views: Sequence[View],
         background: Sequence[float],
         options: RasterizerOptions,
         on_frame: Callable[[], object] = lambda: None,
     ) -> None:
-        """`pose` returns `count` Gaussians."""
-        self.pose, self.background, self._options = pose, background, options
-        self.views = within_memory(views, count)
+        self.pose, self.views, self.background, self.options = pose, views, background, options
         self._frames: list[FloatArray] = []
         self._poses: dict[float, Gaussians] = {}
         for t, views_then in by_time(self.views):
@@ -76,18 +73,8 @@ class ExactFrames:
         first time."""
         return self._poses[t]
 
-    def measure(
-        self,
-        pose: Pose,
-        ids: np.ndarray,
-        *,
-        options: RasterizerOptions | None = None,
-        every: int = 1,
-    ) -> RenderedError:
-        """The error of `pose`, whose rows are the Gaussians `ids`, over all views or every n-th of them.
-
-        By default, frames are drawn with the rasterizer options of the exact ones."""
-        options = options or self._options
+    def measure(self, pose: Pose, ids: np.ndarray, *, every: int = 1) -> RenderedError:
+        """The error of `pose`, whose rows are the Gaussians `ids`, over all views or every n-th of them."""
         psnrs: list[float] = []
         worst, worst_frame, worst_pixel, position, position_pixels = np.inf, None, 0.0, 0.0, 0.0
         chosen = list(zip(self.views, self._frames, strict=True))[::every]
@@ -98,7 +85,8 @@ class ExactFrames:
             distances = np.linalg.norm(gaussians.means - exact_means, axis=1)
             position = max(position, float(distances.max(initial=0)))
             for view in views:
-                difference = compare(render(gaussians, view.camera, self.background, options), frames[id(view)])
+                drawn = render(gaussians, view.camera, self.background, self.options)
+                difference = compare(drawn, frames[id(view)])
                 psnrs.append(difference.psnr)
                 worst_pixel = max(worst_pixel, difference.worst_pixel)
                 offsets = _pixel_distances(view.camera, gaussians.means, exact_means)

@@ -9,7 +9,7 @@ import numpy as np
 
 from export.jobs.job import Candidate
 from export.measure.views import View
-from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.rasterizer import as_trained, rasterize
 
 REPEATS = 15
 SECONDS_PER_CANDIDATE = 6.0
@@ -77,7 +77,7 @@ def time_frame(
     start = clock()
     gaussians = candidate.session.gaussians(view.t)
     posed = clock()
-    rasterize(gaussians, view.camera, background=background, options=candidate.options)
+    rasterize(gaussians, view.camera, background=background, options=as_trained(candidate.session.scene.metadata))
     drawn = clock()
     return 1e3 * (posed - start), 1e3 * (drawn - posed), 1e3 * (drawn - start)
 

@@ -123,9 +123,9 @@ def times_to_verify(t0: float, t1: float, count: int) -> list[float]:
     """`count` float32 times in [t0, t1]: both ends, and irregular times between them."""
     golden = (math.sqrt(5) - 1) / 2
     inner = sorted((i * golden) % 1 for i in range(1, count - 1))
-    times = [t0 + (t1 - t0) * f for f in [0.0, *inner, 1.0]]
-    # t0 and t1 themselves are kept: their float32 neighbors may lie outside the range
-    return [t0, *(float(np.float32(t)) for t in times[1:-1]), t1]
+    rounded = (float(np.float32(t0 + (t1 - t0) * f)) for f in inner)
+    # the float32 neighbors of t0 and t1 may lie outside the range
+    return [t0, *(min(max(t, t0), t1) for t in rounded), t1]
 
 
 def _posed_by_file(session: DeformationSession, t: float, ids: np.ndarray) -> Gaussians:

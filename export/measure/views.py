@@ -8,7 +8,7 @@ import numpy as np
 
 from export.measure.verify import times_to_verify
 from msdgs_serve.scene.camera import Camera, orbit
-from msdgs_serve.scene.metadata import SceneMetadata
+from msdgs_serve.scene.metadata import SceneCamera, SceneMetadata
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MIN_CAMERAS = 4
@@ -30,14 +30,19 @@ class View(NamedTuple):
 
 
 def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[str, Camera]]:
-    """The cameras of a scene by name: those of `training` if given, else all in the model; more are added if too few.
+    """The cameras of a scene by name, one per pose: those of `training` if given, else all in the model; more are added
+    if too few.
 
-    Raises `InvalidInput` for a stored camera that can't be used.
+    Raises ValueError or KeyError for a stored camera that can't be used.
     """
-    cameras = [(f"training {i}", camera) for i, camera in enumerate(training)]
-    if not cameras:
-        cameras = [(f"training {stored['name']}", _camera(stored)) for stored in info.training_cameras]
-        cameras += [(str(stored["name"]), _camera(stored)) for stored in info.cameras]
+    named = [(f"training {i}", camera) for i, camera in enumerate(training)]
+    if not named:
+        stored = [("training ", entry) for entry in info.training_cameras] + [("", entry) for entry in info.cameras]
+        named = [(f"{prefix}{entry['name']}", SceneCamera.from_plain(entry).camera) for prefix, entry in stored]
+    poses = dict[bytes, tuple[str, Camera]]()
+    for name, camera in named:
+        poses.setdefault(camera.camera_to_world.tobytes(), (name, camera))
+    cameras = list(poses.values())
     return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
 
 
@@ -64,12 +69,8 @@ def selection_views(
     """Views at evenly spread times; none of the times between the ends is one of `evaluation_views`."""
     spread = list(dict.fromkeys(float(t) for t in np.linspace(*time_range, times))) * cameras_per_time
     chosen = [int((i * GOLDEN + 0.5) % 1 * len(cameras)) for i in range(len(spread))]
-    return [View(cameras[c][1], t, cameras[c][0]) for c, t in zip(chosen, spread, strict=True)]
-
-
-def _camera(stored: dict) -> Camera:
-    numbers = {name: stored[name] for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    return Camera(**numbers, camera_to_world=np.asarray(stored["camera_to_world"], float))
+    views = [View(cameras[c][1], t, cameras[c][0]) for c, t in zip(chosen, spread, strict=True)]
+    return sorted(views, key=lambda view: view.t)
 
 
 def _around(info: SceneInfo, cameras: Sequence[tuple[str, Camera]]) -> list[tuple[str, Camera]]:

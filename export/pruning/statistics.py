@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from export.measure.views import View
 from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_network
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.baked import APPEARANCE
+from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -57,18 +58,19 @@ class PruningStatistics:
         model: DynamicGaussians,
         views: Sequence[View],
         background: Sequence[float],
-        on_time: Callable[[], object] = lambda: None,
+        on_view: Callable[[], object] = lambda: None,
     ) -> None:
         self.model, self.background = model, background
         self._views = views
         self._order = list(range(len(views)))
         self._kept: dict[NetworkMask, Poses] = {}
+        self._motions: dict[NetworkMask, FloatArray] = {}
         network = full_mask(model).network
         self._whole = network, self._posed(network)
-        for t in self._whole[1].times:
-            self._whole[1].at(t)
-            on_time()
-        self._frames = [render(self._whole[1].at(view.t), view.camera, background, model.rasterizer) for view in views]
+        self._frames = list[FloatArray]()
+        for view in views:
+            self._frames.append(render(self._whole[1].at(view.t), view.camera, background, model.rasterizer))
+            on_view()
         self.peaks, self.amounts = self._visibility()
 
     def poses(self, network: NetworkMask) -> Poses:
@@ -112,6 +114,8 @@ class PruningStatistics:
     def motion(self, network: NetworkMask) -> FloatArray:
         """[N] largest displacement of the ends of a Gaussian's axes from its mean pose, pixels. A change of all of its
         opacity or color counts as one."""
+        if network in self._motions:
+            return self._motions[network]
         poses = self.poses(network)
         mean_axes, mean = half_axes(poses.static), poses.static
         furthest, changed = np.zeros((2, len(mean)), np.float32)
@@ -124,7 +128,8 @@ class PruningStatistics:
             faded = np.abs(at.opacities - mean.opacities) / np.maximum(mean.opacities, GSPLAT.alpha_min)
             colored = np.abs(at.sh - mean.sh).sum(axis=1).max(axis=1, initial=0)
             np.maximum(changed, faded + colored, out=changed)
-        return furthest * self.pixels_per_unit(mean.means) + changed
+        self._motions[network] = furthest * self._pixels_per_unit(mean.means) + changed
+        return self._motions[network]
 
     def change(self, network: NetworkMask, smaller: NetworkMask) -> float:
         """Mean displacement in pixels of a few Gaussians at a few times if part of a network is removed, weighted by
@@ -138,17 +143,14 @@ class PruningStatistics:
             after = posed(model, t, ids)
             moved = np.linalg.norm(after.means - before.means, axis=1)
             rotated = np.linalg.norm(half_axes(after) - half_axes(before), axis=1).max(axis=1, initial=0)
-            pixels = (moved + rotated) * self.pixels_per_unit(before.means) * self.peaks[ids]
+            pixels = (moved + rotated) * self._pixels_per_unit(before.means) * self.peaks[ids]
             change = max(change, float(pixels.sum() / max(self.peaks[ids].sum(), 1e-12)))
         return change
 
-    def pixels_per_unit(self, means: FloatArray) -> FloatArray:
+    def _pixels_per_unit(self, means: FloatArray) -> FloatArray:
         """[N] pixels per scene unit at each point, in the nearest camera."""
-        most = np.zeros(len(means), np.float32)
-        for camera in {id(view.camera): view.camera for view in self._views}.values():
-            distances = np.linalg.norm(means - camera.position, axis=1)
-            np.maximum(most, max(camera.fx, camera.fy) / np.maximum(distances, GSPLAT.near_plane), out=most)
-        return most
+        cameras = {id(view.camera): view.camera for view in self._views}.values()
+        return reduce(np.maximum, (pixels_per_unit(means, camera) for camera in cameras))
 
     def _posed(self, network: NetworkMask) -> Poses:
         return Poses(with_network(self.model, network), sorted({view.t for view in self._views}))
@@ -162,7 +164,7 @@ class PruningStatistics:
             g = poses.at(view.t)
             weights = blending_weights(g, view, self.model.rasterizer)
             # pixels covered by its two largest axes
-            sizes = np.sort(g.scales, axis=1)[:, 1:] * self.pixels_per_unit(g.means)[:, None]
+            sizes = np.sort(g.scales, axis=1)[:, 1:] * pixels_per_unit(g.means, view.camera)[:, None]
             np.maximum(peaks, weights / (2 * np.pi * (sizes.prod(axis=1) + self.model.config.eps2d)), out=peaks)
             np.maximum(amounts, weights, out=amounts)
         return np.minimum(peaks, 1), amounts
@@ -177,6 +179,12 @@ def blending_weights(gaussians: Gaussians, view: View, options: RasterizerOption
     rgb, _, _ = rasterize(means, quats, scales, opacities, gray, view.camera, torch.zeros(3), options)
     (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), gray)
     return (gradient[:, 0, 0] / SH_C0).numpy()
+
+
+def pixels_per_unit(means: FloatArray, camera: Camera) -> FloatArray:
+    """[N] pixels per scene unit at each point."""
+    distances = np.linalg.norm(means - camera.position, axis=1)
+    return (max(camera.fx, camera.fy) / np.maximum(distances, GSPLAT.near_plane)).astype(np.float32)
 
 
 def half_axes(gaussians: Gaussians) -> FloatArray:

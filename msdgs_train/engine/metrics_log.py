@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from msdgs_train.datasets.common.files import write_text
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine.tensorboard_events import FOLDER, add_scalars, open_events
 from msdgs_train.engine.trainer import EvaluatedFrame, StepResult
@@ -35,7 +36,7 @@ class MetricsLog:
     def rewind(self, step: int) -> None:
         """Drop the lines of steps after `step`."""
         kept = [line for line in read_metrics(self._run) if line["step"] <= step]
-        (self._run / METRICS).write_text("".join(json.dumps(line) + "\n" for line in kept))
+        write_text(self._run / METRICS, "".join(json.dumps(line) + "\n" for line in kept))
         self.close()
         if self._tensorboard:
             self._events = open_events(self._run / FOLDER, kept, step)

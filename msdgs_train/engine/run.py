@@ -11,6 +11,7 @@ from typing import IO, Literal, NamedTuple
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import SceneData, load_scene
+from msdgs_train.datasets.common.files import write_text
 from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.config import TrainConfig, check_resumable
 from msdgs_train.engine.metrics_log import MetricsLog, draw_curve, write_side_by_side
@@ -255,7 +256,7 @@ class Run:
             "splits": {split: metrics._asdict() for split, metrics in splits.items()},
             "best": self.record.best and {"file": BEST, **asdict(self.record.best)},
         }
-        (self.folder / FINAL_METRICS).write_text(json.dumps(metrics, indent=2) + "\n")
+        write_text(self.folder / FINAL_METRICS, json.dumps(metrics, indent=2) + "\n")
 
     def _seconds(self) -> float:
         return self._now() - self.started

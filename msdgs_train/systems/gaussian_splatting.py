@@ -147,16 +147,17 @@ class GaussianSplatting:
 
     def _scene_info(self, step: int) -> model_file.SceneInfo:
         training = self.scene.splits["train"]
-        shown = list(map(camera_entry, spread_frames(self.scene.splits.get("test") or training, VIEWER_CAMERAS)))
-        others = map(camera_entry, spread_frames(training, TRAINING_CAMERAS))
+        shown = spread_frames(self.scene.splits.get("test") or training, VIEWER_CAMERAS)
+        poses = {frame.camera.camera_to_world.tobytes() for frame in shown}
+        others = spread_frames(training, TRAINING_CAMERAS)
         return model_file.SceneInfo(
             time_range=self.scene.time_range,
             background=self.config.data.evaluation_background,
             bounds=scene_bounds(
                 lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
             ),
-            cameras=shown,
-            training_cameras=[entry for entry in others if entry not in shown],
+            cameras=list(map(camera_entry, shown)),
+            training_cameras=[camera_entry(f) for f in others if f.camera.camera_to_world.tobytes() not in poses],
         )
 
     def _options(self, step: int) -> RasterizerOptions:

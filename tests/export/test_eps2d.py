@@ -15,7 +15,7 @@ from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames
 from export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.rasterizer import GSPLAT, rasterize
+from msdgs_serve.rasterizer import GSPLAT, as_trained, rasterize
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets import Frame, load_scene
@@ -88,15 +88,16 @@ def test_exact_frames_of_an_export(
 ):
     model = loaded.model
     rows = np.arange(len(model.gaussians))
-    exact = ExactFrames(in_float64(model), len(rows), [View(camera, T, "a")], SCENE.background, model.rasterizer)
+    exact = ExactFrames(in_float64(model), [View(camera, T, "a")], SCENE.background, model.rasterizer)
     assert exact.measure(exact.pose, rows).psnr_worst == 100.0
-    assert exact.measure(exact.pose, rows, options=GSPLAT).psnr_worst < 40.0
+    exact.options = GSPLAT
+    assert exact.measure(exact.pose, rows).psnr_worst < 40.0
     job = ExportJob(folder / "model.pt", tmp_path)
     candidate = job.candidate("network", 50.0)
-    assert candidate.options == NARROW
+    assert job.exact.options == as_trained(candidate.session.scene.metadata) == NARROW
     assert job.error(candidate).psnr_worst > 50.0
     got = candidate.session.gaussians(T)
-    drawn = rasterize(got, camera, background=SCENE.background, options=candidate.options).rgb.clip(0, 1)
+    drawn = rasterize(got, camera, background=SCENE.background, options=NARROW).rgb.clip(0, 1)
     assert np.square(drawn - expected).mean() < 1e-5
 
 

@@ -7,6 +7,7 @@ import tracemalloc
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from export.importers.detect import detect_format, frame_files
 from export.importers.errors import ImportFailed
 from export.importers.sequence import read_sequence
 from export.importers.splats.formats import read_splats
+from export.options import ExportOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.spherical_harmonics import sh_basis
@@ -244,8 +247,20 @@ def write_frames(folder: Path, frames: list[Gaussians]) -> Path:
 
 def scene_of(folder: Path, file_format: str = "sequence") -> DeformationSession:
     output = folder.parent / "scene.onnx"
-    with model_or_import(folder, file_format, output, Console(quiet=True)):
+    with model_or_import(ExportOptions(folder, output, file_format, keep_float32=True), Console(quiet=True)):
         return DeformationSession(output)
+
+
+@pytest.mark.parametrize("option", [{"max_mb": 5.0}, {"plan": "network"}, {"quick": True}, {"keep_static": True}])
+def test_options_of_trained_models_are_refused_for_splats(tmp_path: Path, option: dict[str, Any]):
+    splats = write(tmp_path, "a.ply", ply_bytes(inria_columns(some_gaussians(20, 0))))
+    (name,) = option
+    with (
+        pytest.raises(InvalidInput, match=f"`{name}` must be left out"),
+        model_or_import(ExportOptions(splats, **option), Console(quiet=True)),
+    ):
+        pass
+    assert not splats.with_suffix(".onnx").exists()
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 11])

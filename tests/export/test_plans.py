@@ -100,7 +100,7 @@ def test_a_plan_that_this_model_cannot_have_says_what_it_can():
 def test_compact_has_about_its_predicted_error_in_frames_and_fewer_bytes_for_more(tmp_path: Path, kind: str):
     model, baked, trajectories = made(kind)
     views = evaluation_views(cameras_of(SCENE), SCENE.time_range, 16, 2)
-    exact, sizes = ExactFrames(in_float64(model), 60, views, SCENE.background, GSPLAT), []
+    exact, sizes = ExactFrames(in_float64(model), views, SCENE.background, GSPLAT), []
     for db in (60, 50, 40, 30):
         session = opened(tmp_path / "scene.onnx", build(f"compact:{db}", baked, trajectories))
         sizes.append((tmp_path / "scene.onnx").stat().st_size)

@@ -9,9 +9,10 @@ import onnx
 import pytest
 import torch
 
-from export.jobs.job import Candidate, ExportJob
+from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob
 from export.jobs.write import write_scene
 from export.measure.poses import posed
+from export.measure.rendered_error import within_memory
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.pruning import RULES
 from export.spatial_order import morton_order
@@ -153,10 +154,36 @@ def test_selection_times_are_not_evaluation_times():
     assert deciding & measured == {0.0, 1.0}
 
 
+def test_with_less_memory_for_frames_pruning_is_still_decided_all_over_time(monkeypatch: pytest.MonkeyPatch):
+    views = selection_views(cameras_of(SCENE), (0.0, 1.0), 33, 3)
+    frame = 12 * views[0].camera.width * views[0].camera.height
+    for count in (50, 25, 11):
+        monkeypatch.setattr("export.measure.rendered_error.MEMORY", count * frame)
+        times = [view.t for view in within_memory(views, 0)]
+        assert len(set(times)) == min(count, 33)
+        assert (min(times), max(times)) == (0.0, 1.0)
+
+
+def test_quick_estimates_see_early_and_late_cameras():
+    views = evaluation_views(cameras_of(SCENE), (0.0, 1.0), EVALUATION_TIMES, CAMERAS_PER_TIME)
+    names = sorted(name for name, _ in cameras_of(SCENE))
+    positions = [names.index(view.name) / len(names) for view in views[::ESTIMATE_STRIDE]]
+    assert min(positions) < 0.2
+    assert max(positions) > 0.6
+
+
 def test_cameras_of_training_and_viewer_are_used():
     info = SceneInfo(cameras=SCENE.cameras[:3], training_cameras=SCENE.cameras[10:15])
     training = [f"training r_{i:03}" for i in range(10, 15)]
     assert [name for name, _ in cameras_of(info)] == [*training, "r_000", "r_001", "r_002"]
+
+
+def test_one_camera_at_several_times_counts_once():
+    stored = [SCENE.cameras[0] | {"name": f"video {i}", "t": i / 9} for i in range(10)]
+    names = [name for name, _ in cameras_of(SceneInfo(cameras=stored, bounds=SCENE.bounds))]
+    assert names[0] == "video 0"
+    assert all(name.startswith("added") for name in names[1:])
+    assert len(names) > 4
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

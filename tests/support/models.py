@@ -36,11 +36,19 @@ CAMERA = {
     "height": 48,
     "camera_to_world": [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -4.0], [0.0, 0.0, 0.0, 1.0]],
 }
+
+
+def moved_camera(x: float) -> dict[str, Any]:
+    """`CAMERA` moved to the right."""
+    first, *others = CAMERA["camera_to_world"]
+    return CAMERA | {"camera_to_world": [[*first[:3], x], *others]}
+
+
 SCENE = SceneInfo(
     time_range=(0.0, 1.0),
     background=(1.0, 1.0, 1.0),
     bounds=[[-1.3] * 3, [1.3] * 3],
-    cameras=[{"name": f"r_{i:03}", "t": i / 29, **CAMERA} for i in range(30)],
+    cameras=[{"name": f"r_{i:03}", "t": i / 29, **moved_camera(i / 1000)} for i in range(30)],
 )
 
 
