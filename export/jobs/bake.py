@@ -5,11 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from export.layers.base import ModelNotExportable
 from export.layers.graph import to_numpy
 from msdgs_serve import __version__
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
-from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import FloatArray
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
@@ -130,10 +128,7 @@ def _metadata(
 def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
     """Up to eight of the model's cameras, evenly spread, including the first and the last."""
     chosen = np.linspace(0, len(info.cameras) - 1, min(STARTING_CAMERAS, len(info.cameras))).round().astype(int)
-    try:
-        return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)
-    except (InvalidInput, ValueError, KeyError, TypeError) as error:
-        raise ModelNotExportable(f"a camera of the model's scene can't be used: {error}") from error
+    return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)
 
 
 def changing_outputs(model: DynamicGaussians) -> tuple[str, ...]:

@@ -46,7 +46,9 @@ GROUPS = {
     "skinning weights": Group(r"skinning\.weight\d+", _bits(lambda bits: fractions(bits, 0.5), 8, 16)),
     "splines": Group(
         r"layer\d+\.table",
-        {f"rank {rank}": low_rank(rank) for rank in (12, 16, 24, 32, 48)} | _bits(in_range, 16),
+        {f"rank {rank}": low_rank(rank) for rank in (12, 16, 24, 32, 48)}
+        | {"rank 64": low_rank(64, fine=24)}
+        | _bits(in_range, 16),
     ),
     "planes": Group(r"layer\d+\.(space|time)", _bits(in_range, 8, 16)),
     "functions of time": Group(r"functions\.control", _bits(in_range, 8, 16)),

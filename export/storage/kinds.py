@@ -67,14 +67,14 @@ def directions(bits: int) -> Pack:
     return pack
 
 
-def low_rank(rank: int) -> Pack:
-    """[n, C] as a product of the first singular vectors, 8 of them in 16 bits: control points of splines over time, of
-    which most move little or alike."""
+def low_rank(rank: int, fine: int = 8) -> Pack:
+    """[n, C] as a product of the first singular vectors, `fine` of them in 16 bits: control points of splines over
+    time, of which most move little or alike."""
 
     def pack(graph: GraphBuilder, name: str, values: np.ndarray) -> str:
         over_time, sizes, columns = np.linalg.svd(values.astype(np.float64), full_matrices=False)
         parts = []
-        for bits, part in ((16, slice(0, min(8, rank))), (8, slice(8, rank))):
+        for bits, part in ((16, slice(0, min(fine, rank))), (8, slice(fine, rank))):
             if len(columns[part]):
                 parts.append(in_range(bits)(graph, f"{name}.in{bits}", columns[part].T))
         factors = (over_time * sizes)[:, :rank].T.astype(np.float32)
