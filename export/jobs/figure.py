@@ -15,6 +15,12 @@ MAX_DB = 100.0
 LABEL_SIZE = np.array([250, 15])
 """Pixels reserved for a label."""
 
+LABELED_LEFT = 0.7
+"""Fraction of the width from which a point's label is to its left, so that it stays inside."""
+
+TICKS, MAX_TICKS = ((1, 1.5, 2, 3, 4, 5, 7), (1, 2, 5), (1,)), 14
+"""Ticks per decade, the first of these of which no more fit between the points."""
+
 
 Cost = Callable[[dict[str, Any]], float]
 COSTS: tuple[Cost, Cost] = (lambda p: p["milliseconds"]["total"]["min"], lambda p: p["bytes"] / 1e6)
@@ -70,7 +76,9 @@ def _label(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
         at = cost(point), _rms(point["error"]["psnr_worst"])
         place = axes.transData.transform(at)
         if all((np.abs(place - other) > LABEL_SIZE).any() for other in taken):
-            axes.annotate(_text(point), at, xytext=(9, -11), textcoords="offset points", fontsize=8, zorder=5)
+            left = axes.transAxes.inverted().transform(place)[0] > LABELED_LEFT
+            side, offset = ("right", (-9, -11)) if left else ("left", (9, -11))
+            axes.annotate(_text(point), at, offset, textcoords="offset points", ha=side, fontsize=8, zorder=5)
             taken.append(place)
 
 
@@ -89,8 +97,11 @@ def _set_ticks(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
     costs = [cost(point) for point in points]
     low, high = min(costs) / 1.15, max(costs) * 1.5
-    places = [base * 10.0**power for power in range(-3, 6) for base in (1, 1.5, 2, 3, 4, 5, 7)]
-    places = [place for place in places if low <= place <= high]
+    places: list[float] = []
+    for bases in TICKS:
+        if not 0 < len(places) <= MAX_TICKS:
+            every = [base * 10.0**power for power in range(-3, 6) for base in bases]
+            places = [place for place in every if low <= place <= high]
     axes.set_xlim(low, high)
     axes.xaxis.set_major_locator(FixedLocator(places))
     axes.xaxis.set_major_formatter(FixedFormatter([f"{place:g}" for place in places]))
