@@ -8,7 +8,8 @@ import OpenImageIO as oiio
 import pytest
 
 from msdgs_serve.rasterizer import rasterize
-from msdgs_serve.scene import Camera, Gaussians, InvalidInput
+from msdgs_serve.scene import Gaussians, InvalidInput
+from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.cli import main as cli
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.layer_strip import write_steps
@@ -30,8 +31,8 @@ def model(tmp_path: Path) -> Path:
 def _render(t: float, num_layers: int | None) -> np.ndarray:
     posed = random_model(noise=0.2).pose(t, num_layers=num_layers)
     gaussians = Gaussians(*(tensor.detach().numpy() for tensor in posed))
-    matrix = np.array(CAMERA["camera_to_world"])
-    camera = Camera(**{**CAMERA, "camera_to_world": matrix}).resized(WIDTH, HEIGHT)
+    nearest = min(SCENE.cameras, key=lambda camera: abs(camera["t"] - t))
+    camera = SceneCamera.from_plain(nearest).camera.resized(WIDTH, HEIGHT)
     return to_bytes(rasterize(gaussians, camera, background=(1.0, 1.0, 1.0)).rgb)
 
 
