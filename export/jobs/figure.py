@@ -97,11 +97,9 @@ def _set_ticks(axes: Any, cost: Cost, points: list[dict[str, Any]]) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
     costs = [cost(point) for point in points]
     low, high = min(costs) / 1.15, max(costs) * 1.5
-    places: list[float] = []
-    for bases in TICKS:
-        if not 0 < len(places) <= MAX_TICKS:
-            every = [base * 10.0**power for power in range(-3, 6) for base in bases]
-            places = [place for place in every if low <= place <= high]
+    every = [[base * 10.0**power for power in range(-3, 6) for base in bases] for bases in TICKS]
+    inside = [[place for place in places if low <= place <= high] for places in every]
+    places = next((places for places in inside if len(places) <= MAX_TICKS), inside[-1])
     axes.set_xlim(low, high)
     axes.xaxis.set_major_locator(FixedLocator(places))
     axes.xaxis.set_major_formatter(FixedFormatter([f"{place:g}" for place in places]))

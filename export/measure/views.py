@@ -9,6 +9,7 @@ import numpy as np
 from export.measure.verify import times_to_verify
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.metadata import SceneCamera, SceneMetadata
+from msdgs_train.gaussians.bounds import first_by_pose
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MIN_CAMERAS = 4
@@ -39,10 +40,7 @@ def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[s
     if not named:
         stored = [("training ", entry) for entry in info.training_cameras] + [("", entry) for entry in info.cameras]
         named = [(f"{prefix}{entry['name']}", SceneCamera.from_plain(entry).camera) for prefix, entry in stored]
-    poses = dict[bytes, tuple[str, Camera]]()
-    for name, camera in named:
-        poses.setdefault(camera.camera_to_world.tobytes(), (name, camera))
-    cameras = list(poses.values())
+    cameras = list(first_by_pose(named, lambda each: each[1]).values())
     return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
 
 

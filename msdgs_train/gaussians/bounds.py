@@ -1,7 +1,7 @@
 """The size of a scene, from its cameras and from its visible Gaussians."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -9,6 +9,8 @@ import torch
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame
 from msdgs_train.gaussians.model import PosedGaussians
+
+T = TypeVar("T")
 
 BOUNDS_TIMES = 9
 VISIBLE_OPACITY = 0.05
@@ -27,10 +29,18 @@ def distinct_cameras(cameras: Sequence[Camera]) -> list[Camera]:
     return list({camera.camera_to_world.tobytes(): camera for camera in cameras}.values())
 
 
+def first_by_pose(items: Iterable[T], camera: Callable[[T], Camera]) -> dict[bytes, T]:
+    """The first item of each position and direction of a camera, in their order, by the bytes of the pose."""
+    found: dict[bytes, T] = {}
+    for item in items:
+        found.setdefault(camera(item).camera_to_world.tobytes(), item)
+    return found
+
+
 def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:
     """At most `count` frames, of different cameras that are far from each other, in their order; the first is among
     them."""
-    distinct = list({f.camera.camera_to_world.tobytes(): f for f in frames[::-1]}.values())[::-1]
+    distinct = list(first_by_pose(frames, lambda frame: frame.camera).values())
     positions = np.array([frame.camera.position for frame in distinct])
     chosen, distances = [0], np.full(len(distinct), np.inf)
     while len(chosen) < min(count, len(distinct)):

@@ -20,6 +20,7 @@ from msdgs_train.gaussians import model_file
 from msdgs_train.gaussians.bounds import (
     camera_entry,
     distinct_cameras,
+    first_by_pose,
     scene_bounds,
     scene_scale,
     spread_frames,
@@ -148,8 +149,7 @@ class GaussianSplatting:
     def _scene_info(self, step: int) -> model_file.SceneInfo:
         training = self.scene.splits["train"]
         shown = spread_frames(self.scene.splits.get("test") or training, VIEWER_CAMERAS)
-        poses = {frame.camera.camera_to_world.tobytes() for frame in shown}
-        others = spread_frames(training, TRAINING_CAMERAS)
+        others = first_by_pose([*shown, *spread_frames(training, TRAINING_CAMERAS)], lambda frame: frame.camera)
         return model_file.SceneInfo(
             time_range=self.scene.time_range,
             background=self.config.data.evaluation_background,
@@ -157,7 +157,7 @@ class GaussianSplatting:
                 lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
             ),
             cameras=list(map(camera_entry, shown)),
-            training_cameras=[camera_entry(f) for f in others if f.camera.camera_to_world.tobytes() not in poses],
+            training_cameras=list(map(camera_entry, list(others.values())[len(shown) :])),
         )
 
     def _options(self, step: int) -> RasterizerOptions:

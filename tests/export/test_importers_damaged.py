@@ -32,8 +32,8 @@ from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
 QUIET = Console(quiet=True)
-DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "12"))
-"""Damaged files of each kind."""
+DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "30"))
+"""Damaged files of each kind; a quarter of them of runs, each file of which is read by a process of its own."""
 
 COUNT = 300 if DAMAGED < 1000 else 1_000
 """Gaussians in a file."""
@@ -129,7 +129,7 @@ def test_damaged_files_are_refused_or_drawn(tmp_path: Path, name: str):
     drawn(kind.read(tmp_path, files))  # compiles
     sound = max(measured(lambda: kind.read(tmp_path, files))[1] for _ in range(3))
     worst, slowest, refused = 0.0, 0.0, 0
-    count = DAMAGED // 4 if name in RUNS else DAMAGED  # each file of a run is read by a process of its own
+    count = DAMAGED // 4 if name in RUNS else DAMAGED
     for _ in range(count):
         file = files[rng.integers(len(files))]
         file.write_bytes(damaged(whole[file], rng))
