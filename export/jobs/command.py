@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import onnx
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Column, Table
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
@@ -46,7 +46,7 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
     _check(options)
     with (
         tempfile.TemporaryDirectory(prefix="msdgs-export-") as folder,
-        Progress(console=console, transient=True) as progress,
+        Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True) as progress,
     ):
         track = _tracker(console, progress)
         images = _held_out_images(model, options.data, track)

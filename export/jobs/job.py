@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from export.jobs.bake import Baked, changing_outputs
+from export.layers import HEADS
 from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames, RenderedError, within_memory
-from export.measure.stability import MIN_PSNR, StabilityReport, assess
+from export.measure.stability import FRAME_STEPS, MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
+from export.plans.base import BASELINE
 from export.plans.registry import build, check_appearance, plan_of
 from export.progress import Track, no_progress
 from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
-from export.pruning.mask import bake_pruned, in_spatial_order, rows, unpruned, with_sh_degree
-from export.trajectories.sampling import Trajectories, layers_digest
+from export.pruning.mask import NetworkMask, bake_pruned, in_spatial_order, rows, unpruned, with_sh_degree
+from export.trajectories.poses import SinglePoses
+from export.trajectories.sampling import Sampler, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -42,6 +45,9 @@ BACK_OFFS = 4
 
 BACK_OFF_DB = 0.5
 STABILITY_TIMES = 8
+ROUND_OFF_DB = 30.0
+"""By how much frames in float32 must be better than what an export may add, so that pruning doesn't see round-off."""
+
 SAMPLED_KEPT = 2
 """Sets of trajectories that are cached; one takes up to 2 GiB."""
 
@@ -74,6 +80,10 @@ class Candidate:
     def digest(self) -> bytes:
         """SHA-256 of the file."""
         return hashlib.sha256(self.path.read_bytes()).digest()
+
+    def gaussians(self, t: float) -> Gaussians:
+        """All Gaussians at a time."""
+        return self.session.gaussians(t)
 
     def close(self) -> None:
         """Release the memory of the open file."""
@@ -152,7 +162,18 @@ class ExportJob:
         views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES, SELECTION_CAMERAS)
         views = within_memory(views, len(self.model.gaussians))
         on_view = self.progress("motion and visibility of the Gaussians", len(views))
-        return PruningStatistics(self.model, views, self.info.background, on_view)
+        network = self.network
+        found = PruningStatistics(self.model, views, self.info.background, on_view, network and network.gaussians)
+        if network:
+            network.close()
+        return found
+
+    @cached_property
+    def network(self) -> Candidate | None:
+        """The whole network in float32, which takes 0.6 of torch's time; None if its round-off is near `min_psnr`."""
+        report, limit = self.stability, self.min_psnr + ROUND_OFF_DB
+        exact_enough = report.stable and all(gap.psnr >= limit for gap in report.formats)
+        return self.candidate(BASELINE, None) if exact_enough else None
 
     def pruned(self, pruning_db: float | None) -> PrunedModel:
         """The model without everything that can be removed while the worst frame stays at `pruning_db` dB.
@@ -178,13 +199,14 @@ class ExportJob:
     @cached_property
     def stability(self) -> StabilityReport:
         """Whether the layers are exact enough in float32, computed on first use."""
-        on_time = self.progress("stability of the layers", STABILITY_TIMES)
-        return assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_time=on_time)
+        on_step = self.progress("stability of the layers", STABILITY_TIMES + FRAME_STEPS)
+        return assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_step=on_step)
 
-    def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
+    def error(
+        self, candidate: Candidate, every: int = 1, on_frame: Callable[[], object] = lambda: None
+    ) -> RenderedError:
         """The error of a candidate's frames against exact ones, of all frames or of every n-th."""
-        pose, ids = candidate.session.gaussians, candidate.pruned.ids
-        return self.exact.measure(pose, ids, every=every)
+        return self.exact.measure(candidate.gaussians, candidate.pruned.ids, every=every, on_frame=on_frame)
 
     def _checked_pruning(self, pruning_db: float) -> PrunedModel:
         min_db = pruning_db
@@ -220,17 +242,30 @@ class ExportJob:
         path = self.folder / f"{self._files}.onnx"
         baked, sampled = bake_pruned(pruned, self.info, self.sha256), None
         if plan_of(plan).fitted and len(baked.moving):
-            sampled = self._trajectories(baked, pruned.ids[: len(baked.moving)])
+            sampled = self._trajectories(baked, pruned)
         path.write_bytes(build(plan, baked, sampled).SerializeToString())
         return Candidate(plan, pruning_db, pruned, path)
 
-    def _trajectories(self, baked: Baked, ids: np.ndarray) -> Trajectories:
-        """Trajectories of the Gaussians `ids`, ascending; sampled once, since pruning doesn't change their motion."""
-        layers = layers_digest(baked)
+    def _trajectories(self, baked: Baked, pruned: PrunedModel) -> Trajectories:
+        """Trajectories of the moving Gaussians; sampled once, since pruning doesn't change their motion."""
+        layers, ids = layers_digest(baked), pruned.ids[: len(baked.moving)]
         for known_layers, known, sampled in self._sampled:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
                 return sampled.some(np.searchsorted(known, ids))
         resolved = 10 ** (-max(self.min_psnr, MIN_PSNR) / 10 - 1)
-        sampled = Trajectories(baked, self.progress, [camera for _, camera in self.cameras], resolved)
+        sampler = self._sampler(baked, pruned.network, ids) if self.network else None
+        sampled = Trajectories(baked, self.progress, [camera for _, camera in self.cameras], resolved, sampler)
         self._sampled = [*self._sampled[1 - SAMPLED_KEPT :], (layers, ids, sampled)]
         return sampled
+
+    def _sampler(self, baked: Baked, network: NetworkMask, ids: np.ndarray) -> Sampler:
+        """Poses of the moving Gaussians `ids` in float32, from the statistics at times that these have."""
+        single, whole = SinglePoses(baked), full_mask(self.model).network
+        known = self.statistics.poses(whole) if self.rules and network == whole else None
+
+        def at(t: float, rows: np.ndarray) -> np.ndarray:
+            if known is None or t not in known.times:
+                return single.at(t, rows)
+            return np.hstack([getattr(known.at(t), head)[ids[rows]] for head in HEADS])
+
+        return at

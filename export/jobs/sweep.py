@@ -4,7 +4,7 @@ rest is measured in full."""
 import heapq
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import le
 from typing import Any, NamedTuple
@@ -201,7 +201,11 @@ class Sweep:
         runs = [time_frame(candidate, view, background, time.process_time) for _ in range(1 + ESTIMATE_REPEATS)][1:]
         # each of the whole network's frames may take seconds, and `_reachable` needs all of them
         whole = plan == BASELINE and pruning_db is None and self.min_psnr is not None
-        error = self._error(candidate) if whole else self.job.error(candidate, every=ESTIMATE_STRIDE)
+        if whole:
+            on_frame = self.job.progress("frames of the whole network", len(self.job.exact.views))
+            error = self._error(candidate, on_frame)
+        else:
+            error = self.job.error(candidate, every=ESTIMATE_STRIDE)
         deformation, _, total = (min(run[part] for run in runs) for part in range(3))
         candidate.close()
         size = candidate.size if self.max_bytes is None else min_bytes(self.job, candidate)
@@ -316,10 +320,10 @@ class Sweep:
             on_error()
         return errors
 
-    def _error(self, candidate: Candidate) -> RenderedError:
+    def _error(self, candidate: Candidate, on_frame: Callable[[], object] = lambda: None) -> RenderedError:
         """The error of all frames, measured once."""
         if candidate not in self._measured_errors:
-            self._measured_errors[candidate] = self.job.error(candidate)
+            self._measured_errors[candidate] = self.job.error(candidate, on_frame=on_frame)
         return self._measured_errors[candidate]
 
     def _images_psnr(self, candidate: Candidate) -> float | None:

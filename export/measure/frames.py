@@ -48,9 +48,8 @@ def project(points: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]
         return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy], in_camera[:, 2]
 
 
-def in_frame(points: FloatArray, camera: Camera) -> np.ndarray:
-    """[N] whether a point is inside the image and beyond the near plane."""
-    pixels, depths = project(points, camera)
+def in_frame(pixels: FloatArray, depths: FloatArray, camera: Camera) -> np.ndarray:
+    """[N] whether a projected point is inside the image and beyond the near plane."""
     return (depths > NEAR) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
 
 
@@ -72,9 +71,10 @@ class PoseRenderer:
 
     def pixel_gaps(self, got: Gaussians, expected: Gaussians, camera: Camera) -> np.ndarray:
         """[N] distance of each projected mean in pixels; 0 if the Gaussian isn't drawn in either pose."""
-        seen, seen_too = in_frame(expected.means, camera), in_frame(got.means, camera)
+        (pixels, depths), (moved, depths_too) = project(expected.means, camera), project(got.means, camera)
+        seen, seen_too = in_frame(pixels, depths, camera), in_frame(moved, depths_too, camera)
         with np.errstate(invalid="ignore"):
-            gaps = np.linalg.norm(project(expected.means, camera)[0] - project(got.means, camera)[0], axis=1)
+            gaps = np.linalg.norm(pixels - moved, axis=1)
         lost = ~np.isfinite(gaps) | (seen != seen_too)
         most = math.hypot(camera.width, camera.height)
         gaps = np.where(lost, np.minimum(np.nan_to_num(gaps, nan=math.inf), most), gaps)

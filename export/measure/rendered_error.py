@@ -73,7 +73,9 @@ class ExactFrames:
         first time."""
         return self._poses[t]
 
-    def measure(self, pose: Pose, ids: np.ndarray, *, every: int = 1) -> RenderedError:
+    def measure(
+        self, pose: Pose, ids: np.ndarray, *, every: int = 1, on_frame: Callable[[], object] = lambda: None
+    ) -> RenderedError:
         """The error of `pose`, whose rows are the Gaussians `ids`, over all views or every n-th of them."""
         psnrs: list[float] = []
         worst, worst_frame, worst_pixel, position, position_pixels = np.inf, None, 0.0, 0.0, 0.0
@@ -93,6 +95,7 @@ class ExactFrames:
                 position_pixels = max(position_pixels, float(offsets.max(initial=0)))
                 if psnrs[-1] < worst:
                     worst, worst_frame = psnrs[-1], WorstFrame(view.name, t)
+                on_frame()
         return RenderedError(
             float(np.mean(psnrs)), min(psnrs), worst_frame, worst_pixel, position, position_pixels, len(psnrs)
         )
@@ -113,5 +116,6 @@ def within_memory(views: Sequence[View], gaussians: int) -> list[View]:
 
 def _pixel_distances(camera: Camera, got: FloatArray, exact: FloatArray) -> FloatArray:
     """[M] distances in pixels of the points `got` from the points `exact`, of those inside the image."""
-    inside = in_frame(exact, camera)
-    return np.linalg.norm(project(got[inside], camera)[0] - project(exact[inside], camera)[0], axis=1)
+    pixels, depths = project(exact, camera)
+    inside = in_frame(pixels, depths, camera)
+    return np.linalg.norm(project(got[inside], camera)[0] - pixels[inside], axis=1)

@@ -29,8 +29,8 @@ TIMES = 20
 SAMPLED = 2_000
 """Gaussians per time whose amplification is computed; others at each next time."""
 
-FRAME_TIMES, FRAME_CAMERAS = 2, 2
-"""Frames are rendered at the times and from the cameras with the largest errors of float32."""
+FRAME_TIMES, FRAME_CAMERAS, FRAME_STEPS = 2, 2, 4
+"""Frames are rendered at the times and from the cameras with the largest errors of float32, in so many steps."""
 
 WORST_FRACTION = 0.001
 """Fraction of the Gaussians, those with the largest errors, that is reported separately."""
@@ -67,16 +67,17 @@ def assess(
     min_psnr: float = MIN_PSNR,
     times: int = TIMES,
     formats: Sequence[Format] = (FLOAT32,),
-    on_time: Callable[[], object] = lambda: None,
+    on_step: Callable[[], object] = lambda: None,
 ) -> StabilityReport:
     """Compare the model in float32, and in `formats`, with itself in float64: poses at `times` times, frames at the
-    worst of them. Errors under `min_psnr`, in dB, count as visible. The model isn't changed."""
+    worst of them. Errors under `min_psnr`, in dB, count as visible. The model isn't changed. `on_step` is called
+    `times + FRAME_STEPS` times."""
     if not len(model.deformation) or not len(model.gaussians):
-        on_time()
+        on_step()
         broken = _hidden(PoseRenderer(scene), model) if len(model.gaussians) else []
         return StabilityReport(len(model.gaussians), times, min_psnr, limits_met(model, []), broken)
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is part of the report
-        return _Assessment(model, scene, min_psnr, formats).run(times, on_time)
+        return _Assessment(model, scene, min_psnr, formats).run(times, on_step)
 
 
 class _Assessment:
@@ -90,15 +91,15 @@ class _Assessment:
         self.mean_factors = _mean_factors(self.double)
         self.renderer = PoseRenderer(scene, model.rasterizer)
 
-    def run(self, times: int, on_time: Callable[[], object]) -> StabilityReport:
+    def run(self, times: int, on_step: Callable[[], object]) -> StabilityReport:
         found = []
         stride = max(1, math.ceil(self.count / SAMPLED))
         for i, t in enumerate(times_to_verify(*self.scene.time_range, times)):
             found.append(self._sample(t, np.arange(i % stride, self.count, stride)))
-            on_time()
+            on_step()
         samples = _joined(found)
         by_error = sorted(found, key=lambda m: np.quantile(m.errors[FLOAT32.name], NEAR_WORST, method="higher"))
-        frames = [self._frames(sample, samples) for sample in by_error[::-1][:FRAME_TIMES]]
+        frames = [self._frames(sample, samples, on_step) for sample in by_error[::-1][:FRAME_TIMES]]
         gaps = [_format_gap(f, found, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
         predicted = min(prediction for _, prediction, _ in frames)
         overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in found)
@@ -160,10 +161,14 @@ class _Assessment:
             return [f"float32 round-off may be visible: {found}, under {self.min_psnr:g}"]
         return []
 
-    def _frames(self, sample: _TimeSample, joined: Samples) -> tuple[dict[str, _FrameGap], float, WorstGaussians]:
+    def _frames(
+        self, sample: _TimeSample, joined: Samples, on_step: Callable[[], object]
+    ) -> tuple[dict[str, _FrameGap], float, WorstGaussians]:
         """Frames at one time: gaps by format, PSNR of the predicted displacement, the worst Gaussians of float32."""
         exact, draw = posed(self.double, sample.t), self.renderer.draw
+        on_step()
         poses = {name: posed(model, sample.t) for name, model in self.models.items()}
+        on_step()
         single = poses[FLOAT32.name]
         gaps = [np.square(self.renderer.pixel_gaps(single, exact, c)).sum() for c in self.renderer.cameras]
         cameras = [self.renderer.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]

@@ -5,6 +5,7 @@ decided by rate-distortion optimization, the fewest bytes within the squared err
 number of coefficients.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,9 @@ from export.trajectories.splines import time_weights
 from export.trajectories.stored import GriddedPoses, StoredPoses, at_time
 from msdgs_train.evaluation.metrics import psnr_from_mse
 
-BISECTIONS = 30
+BISECTIONS, SAMPLED = 20, 8192
+"""Steps of the search for the multiplier, and number of Gaussians by which the highest rank is chosen."""
+
 LOG_MULTIPLIERS = -24.0, 3.0
 """Decimal logarithms between which the Lagrange multiplier is searched, squared error per byte."""
 
@@ -92,25 +95,39 @@ def chosen(levels: Levels, rows: Ids, allowed: float) -> Choice:
 
 
 def _fewest_bytes(errors: Errors, rates: npt.NDArray[np.float64], levels: Levels, allowed: float) -> tuple[Ids, float]:
-    """[M] levels, and the multiplier by which they are chosen; functions are stored up to the highest rank."""
-    found = []
-    every = np.arange(errors.shape[1])
-    for top in range(levels.num_ranks):
-        among = np.r_[: top + 1, levels.num_ranks : len(rates)]
-        some, low, high = errors[among], *LOG_MULTIPLIERS
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2
-            picked = among[_minimal(some, rates[among], 10**middle)]
-            low, high = (middle, high) if errors[picked, every].sum() <= allowed else (low, middle)
-        picked = among[_minimal(some, rates[among], 10**low)]
-        error, size = errors[picked, every].sum(), rates[picked].sum() + RANKS[top] * levels.bytes_per_function
-        found.append(((error > allowed, error if error > allowed else size), picked, 10**low))
-    _, picked, multiplier = min(found, key=lambda each: each[0])
-    return picked, multiplier
+    """[M] levels, and the multiplier by which they are chosen; functions are stored up to the highest rank. Some of the
+    Gaussians decide which that is, or a higher one if all need it: errors are the smaller, the more ranks there are."""
+    some = errors[:, :: -(-errors.shape[1] // SAMPLED)]
+    share, last = some.shape[1] / errors.shape[1], levels.num_ranks - 1
+
+    def size(top: int) -> float:
+        picked, _, error = _up_to(top, some, rates, levels.num_ranks, allowed * share)
+        whole = rates[picked].sum() + share * RANKS[top] * levels.bytes_per_function
+        return whole if error <= allowed * share else math.inf
+
+    for top in range(min(range(last, -1, -1), key=size), last):  # the last one if no sum is small enough
+        picked, multiplier, error = _up_to(top, errors, rates, levels.num_ranks, allowed)
+        if error <= allowed:
+            return picked, multiplier
+    return _up_to(last, errors, rates, levels.num_ranks, allowed)[:2]
 
 
-def _minimal(errors: Errors, rates: npt.NDArray[np.float64], multiplier: float) -> Ids:
-    return (errors + multiplier * rates[:, None]).argmin(axis=0)
+def _up_to(
+    top: int, errors: Errors, rates: npt.NDArray[np.float64], num_ranks: int, allowed: float
+) -> tuple[Ids, float, float]:
+    """[M] levels with no rank above `top`, the multiplier, and the sum of errors."""
+    among, (low, high), every = np.r_[: top + 1, num_ranks : len(rates)], LOG_MULTIPLIERS, np.arange(errors.shape[1])
+    some = errors[among]
+
+    def pick(exponent: float) -> tuple[Ids, float]:
+        picked = (some + 10**exponent * rates[among, None]).argmin(axis=0)
+        return among[picked], some[picked, every].sum()
+
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if pick(middle)[1] <= allowed else (low, middle)
+    picked, error = pick(low)
+    return picked, 10**low, error
 
 
 def _products(

@@ -10,7 +10,7 @@ from rich.progress import Progress
 from rich.table import Column, Table
 
 from export.measure.amplification import UNIT_ROUNDOFF
-from export.measure.stability import assess
+from export.measure.stability import FRAME_STEPS, assess
 from export.precision.formats import FORMATS
 from export.precision.report import StabilityReport, WorstGaussians
 from msdgs_train.datasets.common.files import replacing, write_text
@@ -27,14 +27,14 @@ def assess_and_show(
     """Assess a model.pt in all formats, print the report, and write the files that are asked for."""
     loaded = load_model(model)
     with Progress(console=messages, transient=True) as progress:
-        task = progress.add_task("comparing with float64", total=times)
+        task = progress.add_task("comparing with float64", total=times + FRAME_STEPS)
         report = assess(
             loaded.model,
             loaded.scene,
             min_psnr=min_psnr,
             times=times,
             formats=FORMATS,
-            on_time=lambda: progress.advance(task),
+            on_step=lambda: progress.advance(task),
         )
     print_report(report, Console(soft_wrap=True, highlight=False))
     if json_file is not None:

@@ -57,6 +57,7 @@ class PrunedModel:
     moving: DynamicGaussians
     static: Gaussians  # float32, activated
     ids: np.ndarray  # [M + S] int64, the model's id of each: moving ones, then static ones
+    network: NetworkMask  # of those that move
     left_out: tuple[dict[str, Any], ...] = ()
 
 
@@ -87,14 +88,14 @@ def pruned(
     network = mask.network if mask.moves.any() else replace(mask.network, layers=())
     static = np.flatnonzero(mask.kept & ~mask.moves)
     moving = _model(model, network, torch.from_numpy(mask.moves), mask.sh_degree)
-    return PrunedModel(moving, rows(mean_poses, static, mask.sh_degree), mask.ids, tuple(left_out))
+    return PrunedModel(moving, rows(mean_poses, static, mask.sh_degree), mask.ids, network, tuple(left_out))
 
 
 def unpruned(model: DynamicGaussians) -> PrunedModel:
     """A model of which nothing is pruned."""
     every = np.arange(len(model.gaussians))
     canonical = posed(model, 0.0, deform=False)
-    return PrunedModel(model, rows(canonical, every[:0], model.config.sh_degree), every)
+    return PrunedModel(model, rows(canonical, every[:0], model.config.sh_degree), every, full_mask(model).network)
 
 
 def bake_pruned(pruned: PrunedModel, info: SceneInfo, checkpoint_sha256: str) -> Baked:
@@ -120,7 +121,7 @@ def with_sh_degree(pruned: PrunedModel, sh_degree: int) -> PrunedModel:
     static = rows(pruned.static, np.arange(len(pruned.static)), sh_degree)
     entry = {"rule": "sh_degree", "what": "SH bands, as asked for", "count": before - sh_degree, "of": before}
     moving = _model(pruned.moving, network, slice(None), sh_degree)
-    return PrunedModel(moving, static, pruned.ids, (*pruned.left_out, entry))
+    return PrunedModel(moving, static, pruned.ids, pruned.network, (*pruned.left_out, entry))
 
 
 def rows(gaussians: Gaussians, ids: np.ndarray, sh_degree: int) -> Gaussians:

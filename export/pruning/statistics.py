@@ -2,14 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 
 import numpy as np
 import torch
 
 from export.jobs.bake import changing_outputs
 from export.measure.frames import compare, render
-from export.measure.poses import operations, posed
+from export.measure.poses import Pose, operations, posed
 from export.measure.views import View
 from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_network
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
@@ -32,14 +32,14 @@ SAMPLED_GAUSSIANS, SAMPLED_TIMES = 1000, 5
 class Poses:
     """All Gaussians at the selection times, posed on first use, and their mean poses."""
 
-    def __init__(self, model: DynamicGaussians, times: Sequence[float]) -> None:
-        self.times, self._model = times, model
+    def __init__(self, model: DynamicGaussians, times: Sequence[float], pose: Pose | None = None) -> None:
+        self.times, self._model, self._pose = times, model, pose or partial(posed, model)
         self._at: dict[float, Gaussians] = {}
 
     def at(self, t: float) -> Gaussians:
         """The Gaussians at one of the times."""
         if t not in self._at:
-            g = posed(self._model, t)
+            g = self._pose(t)
             shared, changing = next(iter(self._at.values()), g), changing_outputs(self._model)
             self._at[t] = replace(g, **{name: getattr(shared, name) for name in APPEARANCE if name not in changing})
         return self._at[t]
@@ -59,14 +59,16 @@ class PruningStatistics:
         views: Sequence[View],
         background: Sequence[float],
         on_view: Callable[[], object] = lambda: None,
+        pose: Pose | None = None,
     ) -> None:
+        """`pose` gives the poses of the whole model; by default torch does."""
         self.model, self.background = model, background
         self._views = views
         self._order = list(range(len(views)))
         self._kept: dict[NetworkMask, Poses] = {}
         self._motions: dict[NetworkMask, FloatArray] = {}
         network = full_mask(model).network
-        self._whole = network, self._posed(network)
+        self._whole = network, self._posed(network, pose)
         self._frames = list[FloatArray]()
         for view in views:
             self._frames.append(render(self._whole[1].at(view.t), view.camera, background, model.rasterizer))
@@ -152,8 +154,8 @@ class PruningStatistics:
         cameras = {id(view.camera): view.camera for view in self._views}.values()
         return reduce(np.maximum, (pixels_per_unit(means, camera) for camera in cameras))
 
-    def _posed(self, network: NetworkMask) -> Poses:
-        return Poses(with_network(self.model, network), sorted({view.t for view in self._views}))
+    def _posed(self, network: NetworkMask, pose: Pose | None = None) -> Poses:
+        return Poses(with_network(self.model, network), sorted({view.t for view in self._views}), pose)
 
     def _visibility(self) -> tuple[FloatArray, FloatArray]:
         """[N] the largest contribution of a Gaussian to a pixel at its center, in [0, 1], and the largest sum of its

@@ -4,15 +4,11 @@ All Gaussians are sampled at 65 times. Where errors of cubics between the sample
 sampled again twice as densely, and so on up to 2,049 times, so that only fast and visible motion costs more. Cubics are
 compared at every second sample and at a few irregular times (probes), which detect motion with the period of the
 samples.
-
-The probes are taken in float64 and in float32. If float32 is close enough there, all other samples are taken in it: a
-network of the paper's size needs ten seconds per time in float64, one to two in float32.
 """
 
 import copy
 import hashlib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,10 +17,9 @@ import numpy.typing as npt
 from export.jobs.bake import Baked
 from export.measure.views import cameras_of_file
 from export.progress import Track, no_progress
-from export.trajectories.poses import MEANS, POSE, QUATS, SCALES, ExactPoses, Poses, SinglePoses, pixel
+from export.trajectories.poses import POSE, QUATS, ExactPoses
 from export.trajectories.sensitivity import PASSES, sensitivities, square_roots
 from msdgs_serve.scene.camera import Camera
-from msdgs_serve.scene.errors import SceneFileInvalid
 
 COARSE, FINEST = 64, 2048
 """Numbers of intervals between samples: of all Gaussians, and of the fastest."""
@@ -36,12 +31,9 @@ exceed."""
 VISIBLE = 10.0
 """Motion is too fast for the finest samples if cubics add so many times that error."""
 
-FLOAT32_ENOUGH = 0.005
-"""Largest error of float32 at the probes, pixels, with which all other samples are taken in it."""
-
 PROBES = 9
 
-WORK = 3e13
+WORK = 1.5e13
 """Largest number of operations for samples beyond the coarse ones: some minutes of two cores."""
 
 MEMORY = 2 * 2**30
@@ -49,6 +41,7 @@ MEMORY = 2 * 2**30
 
 Samples = npt.NDArray[np.floating]  # [M, T, 10] means, linear scales, unit quaternions of one sign along time
 Ids = npt.NDArray[np.int64]
+Sampler = Callable[[float, Ids], npt.NDArray[np.floating]]  # [M, 10] poses of some Gaussians at a time
 Made = TypeVar("Made")
 
 
@@ -56,19 +49,24 @@ class Trajectories:
     """Samples of one baked scene, used by all plans that are fitted to them."""
 
     def __init__(
-        self, baked: Baked, track: Track = no_progress, cameras: Sequence[Camera] = (), resolved: float = RESOLVED
+        self,
+        baked: Baked,
+        track: Track = no_progress,
+        cameras: Sequence[Camera] = (),
+        resolved: float = RESOLVED,
+        sampler: Sampler | None = None,
     ) -> None:
-        """`cameras` show how visible errors are; by default those of the scene."""
-        self.exact = ExactPoses(baked)
-        self.count = self.exact.count
-        self.time_range = baked.scene.metadata.time_range
-        self.pixel = pixel(baked)
+        """`cameras` show how visible errors are; by default those of the scene. Poses are computed in float64 if no
+        `sampler` is given."""
+        exact = ExactPoses(baked)
+        self.count, self._operations, self._sampler = exact.count, exact.operations, sampler or exact.at
+        self.time_range = t0, t1 = baked.scene.metadata.time_range
         self._ids = np.arange(self.count)  # in the arrays below
         self.track = track
         self._on_time = track(f"{self.count:,} trajectories", COARSE + 1 + PROBES)
         self._probe_parts = np.arange(1, PROBES + 1) * (np.sqrt(5) - 1) / 2 % 1
-        self._sampler, self._probes = self._probed(baked)
-        samples = self._sampled(self._ids, np.linspace(*self.time_range, COARSE + 1))
+        self._probes = self._sampled(self._ids, t0 + (t1 - t0) * self._probe_parts)
+        samples = self._sampled(self._ids, np.linspace(t0, t1, COARSE + 1))
         give_one_sign(samples)
         self._levels = {COARSE: (self._ids, samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
@@ -135,11 +133,11 @@ class Trajectories:
             level *= 2
             fast = self._missing(self._resolved)
             fast = fast[self._depth[fast] == level // 2]
-            most = min(memory / ((level + 1) * POSE * 4), work / (level // 2 * self.exact.operations))
+            most = min(memory / ((level + 1) * POSE * 4), work / (level // 2 * self._operations))
             fast = np.sort(fast[np.argsort(-self._misses[fast])[: int(most)]])
             if not len(fast):
                 break
-            work -= len(fast) * (level // 2) * self.exact.operations
+            work -= len(fast) * (level // 2) * self._operations
             coarse = samples[np.searchsorted(ids, fast)]
             self._on_time = self.track("fast trajectories, sampled more densely", level // 2)
             between = self._sampled(fast, np.linspace(*self.time_range, level + 1)[1::2])
@@ -164,46 +162,12 @@ class Trajectories:
         """[M] squared errors of a frame by differences of poses, [M, T, 10], at the worst time."""
         return np.square(differences @ self.roots[ids]).sum(axis=2, dtype=np.float64).max(axis=1)
 
-    def _probed(self, baked: Baked) -> tuple[ExactPoses | SinglePoses, Samples]:
-        """The sampler of all other times, and the samples at the probes."""
-        t0, t1 = self.time_range
-        probes = np.empty((self.count, PROBES, POSE), np.float32)
-        single: SinglePoses | None = None
-        with suppress(SceneFileInvalid):
-            single = SinglePoses(baked)
-        for i, t in enumerate(t0 + (t1 - t0) * self._probe_parts):
-            probes[:, i] = exact = self.exact.at(float(t), self._ids)
-            if single and not self._close(single, float(t), exact):
-                single = None
-            self._on_time()
-        return single or self.exact, probes
-
-    def _close(self, sampler: SinglePoses, t: float, exact: Poses) -> bool:
-        try:
-            single = sampler.at(t, self._ids)
-        except SceneFileInvalid:
-            return False
-        signs = np.where(np.einsum("mc,mc->m", single[:, QUATS], exact[:, QUATS]) < 0, -1, 1)
-        single[:, QUATS] *= signs[:, None]
-        weights = _rotation_weights(exact[:, None], self.pixel)
-        off = _distances(single[:, None] - exact[:, None], weights)
-        return bool((off <= FLOAT32_ENOUGH * self.pixel).all())
-
     def _sampled(self, ids: Ids, times: np.ndarray) -> Samples:
         samples = np.empty((len(ids), len(times), POSE), np.float32)
-        for i, t in enumerate(times):
-            samples[:, i] = self._sampler.at(float(t), ids)
+        for i, t in enumerate(times.tolist()):
+            samples[:, i] = self._sampler(t, ids)
             self._on_time()
         return samples
-
-
-def _distances(differences: np.ndarray, rotation_weights: np.ndarray) -> npt.NDArray[np.float64]:
-    """[M] the largest of differences from poses, [M, T, 10], in scene units: of means, of scales, and of the end of the
-    longest axis by a wrong rotation."""
-    squares = np.square(differences)
-    rotations = squares[..., QUATS].sum(-1).max(-1) * rotation_weights**2
-    moves = squares[..., MEANS].sum(-1).max(-1)
-    return np.sqrt(np.maximum(np.maximum(moves, rotations), squares[..., SCALES].max((-1, -2))))
 
 
 def layers_digest(baked: Baked) -> bytes:
@@ -220,15 +184,6 @@ def give_one_sign(samples: Samples) -> None:
     quats = samples[..., QUATS]
     signs = np.where(np.einsum("mtc,mtc->mt", quats[:, 1:], quats[:, :-1]) < 0, -1, 1)
     quats[:, 1:] *= np.cumprod(signs, axis=1)[..., None].astype(samples.dtype)
-
-
-def _rotation_weights(samples: Samples, pixel: float) -> npt.NDArray[np.float64]:
-    """[M] scene units by which one unit of quaternion displaces the end of the longest axis.
-
-    At least a thousandth of a pixel.
-    """
-    scales = samples[..., SCALES].astype(np.float64)
-    return np.maximum(2 * (scales.max(-1) - scales.min(-1)).max(1, initial=0), 1e-3 * pixel)
 
 
 def _cubic_between(samples: Samples) -> Samples:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from export.measure.frames import PoseRenderer, compare, in_frame
+from export.measure.frames import PoseRenderer, compare, in_frame, project
 from export.measure.poses import posed
 from export.precision.formats import FLOAT32, in_format
 from msdgs_serve.scene import Gaussians
@@ -86,7 +86,7 @@ def worst_frame(
     for t in times:
         got, exact = pose(t), posed(double, t)
         for camera in view.cameras[:cameras]:
-            seen = max(seen, int(in_frame(exact.means, camera).sum()))
+            seen = max(seen, int(in_frame(*project(exact.means, camera), camera).sum()))
             worst = min(worst, compare(view.draw(got, camera), view.draw(exact, camera)).psnr)
     return seen, worst
 

@@ -9,6 +9,7 @@ import pytest
 from export.jobs.bake import bake
 from export.measure.poses import posed
 from export.measure.views import cameras_of
+from export.plans import compact
 from export.plans.compact import chosen
 from export.plans.registry import build
 from export.pruning.mask import bake_pruned, full_mask, pruned
@@ -92,7 +93,11 @@ def test_errors_of_levels_are_those_of_poses_rebuilt_from_what_is_stored(traject
         assert_close(np.maximum(got, INVISIBLE), np.maximum(want, INVISIBLE), "visible_error.relative")
 
 
-def test_the_choice_keeps_the_error_and_minimizes_a_lagrangian_of_errors_and_bytes(levels: Levels):
+@pytest.mark.parametrize("sampled", [COUNT, 7])
+def test_the_choice_keeps_the_error_and_minimizes_a_lagrangian_of_errors_and_bytes(
+    monkeypatch: pytest.MonkeyPatch, levels: Levels, sampled: int
+):
+    monkeypatch.setattr(compact, "SAMPLED", sampled)
     rows, rates = np.arange(COUNT), sizes(levels.num_ranks)
     every = np.concatenate([levels.errors, [levels.own_errors(rows, level) for level in range(len(OWN))]])
     totals = []

@@ -10,11 +10,10 @@ from scipy.interpolate import BSpline
 from export.jobs.bake import Baked, bake
 from export.plans.registry import build
 from export.trajectories import sampling as module
-from export.trajectories.poses import ExactPoses, SinglePoses, pixel
+from export.trajectories.poses import ExactPoses
 from export.trajectories.sampling import Trajectories
 from export.trajectories.splines import design, fitting, samples_for
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance
 
@@ -42,8 +41,7 @@ def sampled(monkeypatch: pytest.MonkeyPatch) -> Callable[[Motion], tuple[Baked, 
     baked = bake(random_model(COUNT), SCENE, "0" * 64)
 
     def sample(motion: Motion) -> tuple[Baked, Trajectories]:
-        for precision in ("ExactPoses", "SinglePoses"):
-            monkeypatch.setattr(module, precision, lambda baked: Made(baked, motion))
+        monkeypatch.setattr(module, "ExactPoses", lambda baked: Made(baked, motion))
         return baked, Trajectories(baked)
 
     return sample
@@ -69,26 +67,6 @@ def test_a_fast_motion_that_a_coarse_sampling_misses_is_followed(sampled, tmp_pa
     session = DeformationSession(tmp_path / "scene.onnx")
     off = max(abs(session.pose(t, [0])[0][0, 0] - FAST[name](t)) for t in np.linspace(0, 1, 401))
     assert off < tolerance("fast_motion")
-
-
-@pytest.mark.parametrize("how", ["refused", "overflows", "a hundredth of a pixel off"])
-def test_where_float32_is_not_exact_enough_no_sample_is_taken_in_it(monkeypatch: pytest.MonkeyPatch, how: str):
-    class Wrong(SinglePoses):
-        def __init__(self, baked: Baked) -> None:
-            if how == "refused":
-                raise SceneFileInvalid("scene", "means", "overflow")
-            super().__init__(baked)
-
-        def at(self, t: float, ids: np.ndarray) -> np.ndarray:
-            if how == "overflows":
-                raise SceneFileInvalid("scene", "means", "overflow")
-            return super().at(t, ids) + np.float32(0.01 * pixel(baked)) * (np.arange(10) < 3)
-
-    monkeypatch.setattr(module, "SinglePoses", Wrong)
-    baked = bake(random_model(COUNT), SCENE, "0" * 64)
-    got = Trajectories(baked).on_grid(module.COARSE + 1, np.arange(COUNT))
-    want = ExactPoses(baked).at(7 / module.COARSE)
-    assert_close(got[:, 7, :3], want[:, :3].astype(np.float32), "float32.relative")
 
 
 def test_unresolved_motion_is_counted(sampled):

@@ -9,6 +9,8 @@ import onnx
 import pytest
 import torch
 
+from export.jobs import job as jobs
+from export.jobs.bake import Baked
 from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob
 from export.jobs.write import write_scene
 from export.measure.poses import posed
@@ -16,17 +18,20 @@ from export.measure.rendered_error import within_memory
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.pruning import RULES
 from export.spatial_order import morton_order
+from export.trajectories.poses import QUATS, ExactPoses
+from export.trajectories.sampling import COARSE, Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_train.evaluation.layer_strip import camera_of
+from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.layers.mlp import MLPLayer
 from tests.support.images import psnr
 from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model, saved
-from tests.support.tolerances import tolerance
+from tests.support.tolerances import assert_close, tolerance
 
 pytestmark = pytest.mark.slow
 
@@ -50,6 +55,31 @@ def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: Sc
         got = rasterize(session.gaussians(float(t)), camera, background=info.background).rgb
         worst = min(worst, psnr(np.clip(got, 0, 1), np.clip(exact, 0, 1)))
     return worst
+
+
+@pytest.mark.parametrize("rules", [("invisible", "static"), tuple(RULES)])
+@pytest.mark.parametrize("limit", [0.0, MAX_PSNR])
+def test_trajectories_are_those_of_the_pruned_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rules: tuple[str, ...], limit: float
+):
+    """In float32 if it is exact enough: from pruning's statistics at their times, or else by the network."""
+    monkeypatch.setattr(jobs, "ROUND_OFF_DB", limit)
+    made = list[tuple[Baked, Trajectories]]()
+
+    def trajectories(baked: Baked, *args: Any) -> Trajectories:
+        assert (args[-1] is None) == (limit == MAX_PSNR)
+        made.append((baked, Trajectories(baked, *args)))
+        return made[-1][1]
+
+    monkeypatch.setattr(jobs, "Trajectories", trajectories)
+    job_of(tmp_path, with_hidden_one(moving_object()), rules=rules).candidate("compact:40", 50.0)
+    ((baked, got),) = made
+    every = np.arange(len(baked.moving))
+    samples = got.on_grid(COARSE + 1, every)
+    for i in (0, 6, 7, COARSE):
+        want = ExactPoses(baked).at(i / COARSE)
+        want[:, QUATS] *= np.sign((want * samples[:, i])[:, QUATS].sum(axis=1, keepdims=True))
+        assert_close(samples[:, i], want.astype(np.float32), "export.relative")
 
 
 def test_everything_without_effect_is_pruned_and_listed(tmp_path: Path):
