@@ -15,7 +15,7 @@ VIEWER := .venv-viewer
 HTTP_TESTS := tests/service tests/frames/test_video.py --ignore-glob='*/test_viewer*'
 BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.avx512 service.scaling \
 	training.training_step training.known_motion training.k_steps export.imported_formats export.paper_sized \
-	export.nodes
+	export.nodes export.scene_file
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package
 PINS := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt

@@ -59,7 +59,7 @@ class Levels:
 
     def __init__(self, trajectories: Trajectories) -> None:
         self._trajectories = weakref.proxy(trajectories)  # which keep what is made of them
-        self._every = np.arange(trajectories.count)
+        self._every, self._on_chunk = np.arange(trajectories.count), trajectories.track("levels of detail", 0)
         some = self._every[:: -(-len(self._every) // SAMPLED)]
         share = len(some) / len(self._every)
         enough = (n for n in KNOTS[:-1] if self._fit_errors(some, n).sum() <= ENOUGH * share)
@@ -161,3 +161,4 @@ class Levels:
             same = np.flatnonzero(counts == times)
             for places in np.array_split(same, max(-(-len(same) * times // (CHUNK * FEWEST_TIMES)), 1)):
                 yield places, int(times)
+                self._on_chunk()

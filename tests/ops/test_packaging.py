@@ -94,3 +94,7 @@ def test_it_serves_a_scene(environment: Path, monkeypatch: pytest.MonkeyPatch, t
     pixels, _ = decode(png, "png")
     assert pixels.shape == (32, 48, 3)
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100, "an empty frame"
+
+
+def test_the_examples_take_at_most_two_megabytes():
+    assert sum(file.stat().st_size for file in (ROOT / "examples").iterdir() if file.is_file()) <= 2.1e6

@@ -9,6 +9,7 @@ from typing import Any
 from export.importers.sequence import Frames, sequence_scene
 from export.jobs.bake import bake
 from export.plans.registry import build
+from export.storage.choice import COARSEST, GROUPS, packed
 from tests.support.models import NODES, SCENE, random_model
 from tests.support.scene_files import write_scene
 from tests.support.splat_files import some_gaussians
@@ -33,15 +34,15 @@ BY_HAND: dict[str, dict[str, Any]] = {
 OLDER = Path(__file__).parents[1] / "scene" / "older"
 """Files of older exporters."""
 
-COUNT = 20
-"""Gaussians of each scene."""
+COUNT, PACKED_COUNT = 20, 100
+"""Gaussians of each scene: arrays of fewer than 256 values aren't packed."""
 
 
 @cache
 def sound_scenes() -> dict[str, bytes]:
     """Scene files by name."""
     older = ((f"older {path.stem}", path.read_bytes()) for path in sorted(OLDER.glob("*.onnx")))
-    return dict([*_exported(), *_of_sequences(), *_by_hand(), *older])
+    return dict([*_exported(), *_packed(), *_of_sequences(), *_by_hand(), *older])
 
 
 def _exported() -> Iterator[tuple[str, bytes]]:
@@ -50,6 +51,15 @@ def _exported() -> Iterator[tuple[str, bytes]]:
         for plan in PLANS if config["layers"] and not baked.scene.changing else PLANS[:1]:
             if plan != "int8" or "mlp" in config["layers"]:  # other layers have no product of width × width
                 yield f"{name} {plan}", build(plan, baked).SerializeToString()
+
+
+def _packed() -> Iterator[tuple[str, bytes]]:
+    """Arrays in the coarsest and the finest kinds of storage, unfolded by nodes."""
+    finest = {name: list(group.kinds)[-1] for name, group in GROUPS.items()}
+    for name, plan in (("mlp", "network"), ("mixed on nodes", "network"), ("mlp", "compact:40"), ("static", "network")):
+        contents = build(plan, bake(random_model(PACKED_COUNT, **MODELS[name]), SCENE, "0" * 64))
+        for kinds in (COARSEST, finest):
+            yield f"{name} {plan}, packed in {kinds['quats']}", packed(contents, kinds).SerializeToString()
 
 
 def _of_sequences() -> Iterator[tuple[str, bytes]]:

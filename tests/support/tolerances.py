@@ -88,6 +88,7 @@ TABLE = (
         1e-4,
         "weights of 16 bits, off by 1.5e-5 each, times motions of size 1; and as export.relative",
     ),
+    Row("redrawn", 0.1, "dB; a frame is drawn in float32, and again by gsplat's reference in float64"),
     Row("stored_scale", 1e-5, "logarithms up to 18, and the exponential, in float32"),
     Row("stored_16bit", 1e-3, "half a step of a range of 3 is 2e-5; a network without high frequencies multiplies it"),
     Row("stored_8bit", 5e-2, "half a step of a range of 3 is 6e-3; multiplied as 16 bits are"),
