@@ -16,6 +16,7 @@ from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES
 from export.measure.frame_memory import frame_memory
 from export.measure.frames import compare, render
 from export.measure.poses import in_float64
+from export.measure.rendered_error import by_time
 from export.measure.views import View, evaluation_views
 from export.plans.base import BASELINE
 from export.plans.registry import build
@@ -97,9 +98,9 @@ def errors(session: DeformationSession, model: Path, views: list[View]) -> list[
     loaded = load_model(model)
     pose, background, options = in_float64(loaded.model), loaded.scene.background, loaded.model.rasterizer
     found = []
-    for t in track(dict.fromkeys(view.t for view in views), "frames", console=Console(stderr=True)):
+    for t, views_then in track([*by_time(views)], "frames", console=Console(stderr=True)):
         exact, got = pose(t), session.gaussians(t)
-        for view in (view for view in views if view.t == t):
+        for view in views_then:
             target = render(exact, view.camera, background, options).astype(np.float32)
             found.append(compare(render(got, view.camera, background, options), target).psnr)
     return found
