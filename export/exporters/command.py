@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 from rich.console import Console
-from rich.progress import Progress, track
+from rich.progress import track
 
 from export.exporters.gltf import read_gltf, write_gltf
 from export.exporters.ply import write_ply
@@ -22,9 +22,11 @@ from export.jobs.write import set_properties, storage_differences, write_measure
 from export.measure.stability import MIN_PSNR
 from export.options import ConvertOptions
 from export.plans.registry import PLANS
+from export.progress import tracked
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.datasets.common.files import replacing, write_text
 
 LOSSLESS, LOSSY = 60.0, 45.0
@@ -106,15 +108,12 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
     single = metadata.time_range[0] if options.t is None else options.t
     times = _times(session, options) if moves else [single]
     check = RoundTrip(session)
-    with Progress(console=console, transient=True) as progress, replacing(out) as temporary:
-        task = progress.add_task("writing frames", total=len(times))
-        write_usd(
-            temporary,
-            lambda t: of_the_moment(session.gaussians(t), metadata.plan),
-            times,
-            session.scene.changing,
-            lambda: progress.advance(task),
-        )
+
+    def pose(t: float) -> Gaussians:
+        return of_the_moment(session.gaussians(t), metadata.plan)
+
+    with tracked(console) as progress, replacing(out) as temporary:
+        write_usd(temporary, pose, times, session.scene.changing, progress("writing frames", len(times)))
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
         worst = min(check.psnr(shown(number), times[number]) for number in compared)

@@ -7,7 +7,6 @@ from dataclasses import fields
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress
 
 from export.importers.detect import checked_format, detect_format, frame_files
 from export.importers.runs.model import RUNS, write_model
@@ -16,6 +15,7 @@ from export.importers.sequence import posed, read_sequence, sequence_scene, show
 from export.importers.splats.formats import READERS, read_splats
 from export.measure.stability import MIN_PSNR
 from export.options import ExportOptions
+from export.progress import tracked
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
 
@@ -66,17 +66,15 @@ def _splats(path: Path, file_format: str, output: Path, console: Console, min_ps
 
 def _sequence(path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None) -> BakedScene:
     how = file_format.partition(":")[2] or None
-    with Progress(console=console, transient=True) as progress:
-        reading = progress.add_task("reading frames", total=len(frame_files(path)))
-        sequence = read_sequence(path, how, lambda: progress.advance(reading))
+    with tracked(console) as track:
+        sequence = read_sequence(path, how, track("reading frames", len(frame_files(path))))
         times = sequence.times()
-        comparing = progress.add_task("comparing frames", total=len(times))
         scene = write_imported(
             output,
             sequence_scene(sequence, digest(path)),
             lambda t: posed(sequence, times.index(t)),
             times,
-            lambda: progress.advance(comparing),
+            track("comparing frames", len(times)),
             rows=lambda t: shown_rows(sequence, times.index(t)),
             min_psnr=min_psnr,
         )

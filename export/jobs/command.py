@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import onnx
 from rich.console import Console
-from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Column, Table
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
@@ -23,7 +20,7 @@ from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
 from export.plans.registry import parse
-from export.progress import Track
+from export.progress import Track, tracked
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model_file import load_model
@@ -46,9 +43,8 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
     _check(options)
     with (
         tempfile.TemporaryDirectory(prefix="msdgs-export-") as folder,
-        Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True) as progress,
+        tracked(console) as track,
     ):
-        track = _tracker(console, progress)
         images = _held_out_images(model, options.data, track)
         rules = [rule for rule in RULES if rule not in options.keep]
         packs, result = STORAGE not in options.keep, None
@@ -83,20 +79,6 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
         for path in write_report(contents, options.scene_file):
             console.print(f"wrote {path}", markup=False)
     _print_chosen(chosen, error, exported, console)
-
-
-def _tracker(console: Console, progress: Progress) -> Track:
-    started = time.monotonic()
-
-    def track(name: str, steps: int) -> Callable[[], object]:
-        if steps and not console.is_terminal:  # no progress bars in a log
-            console.print(f"{time.monotonic() - started:5.0f} s  {name} …", markup=False)
-        for task in progress.tasks:
-            progress.update(task.id, visible=not (task.finished or task.total is None))  # so that running ones fit
-        task = progress.add_task(name, total=steps or None)
-        return lambda: progress.advance(task)
-
-    return track
 
 
 def _check(options: ExportOptions) -> None:

@@ -1,8 +1,10 @@
 """The exports of one model file: candidates by plan, and the exact frames and pruning statistics that all use."""
 
+import copy
 import hashlib
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +16,7 @@ from export.jobs.bake import Baked, changing_outputs
 from export.layers import HEADS
 from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames, RenderedError, within_memory
-from export.measure.stability import FRAME_STEPS, MIN_PSNR, StabilityReport, assess
+from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.base import BASELINE
 from export.plans.registry import build, check_appearance, plan_of
@@ -24,7 +26,7 @@ from export.pruning.mask import NetworkMask, bake_pruned, in_spatial_order, rows
 from export.trajectories.poses import SinglePoses
 from export.trajectories.sampling import Sampler, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
@@ -81,10 +83,6 @@ class Candidate:
         """SHA-256 of the file."""
         return hashlib.sha256(self.path.read_bytes()).digest()
 
-    def gaussians(self, t: float) -> Gaussians:
-        """All Gaussians at a time."""
-        return self.session.gaussians(t)
-
     def close(self) -> None:
         """Release the memory of the open file."""
         self.__dict__.pop("session", None)
@@ -119,6 +117,7 @@ class ExportJob:
         training cameras. Raises `CheckpointInvalid`."""
         self.folder, self.rules, self.packs, self.progress = folder, rules, packs, progress
         self._min_psnr, self.max_bytes, self.images = min_psnr, max_bytes, images
+        self.on_work = progress("frames, and parts of poses", 0)
         model, self.info, _ = load_model(checkpoint)
         self.model = in_spatial_order(model)
         with checkpoint.open("rb") as file:
@@ -134,7 +133,7 @@ class ExportJob:
         views = evaluation_views(self.cameras, self.info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
         views = within_memory(views, len(self.model.gaussians))
         on_frame = self.progress("exact frames in float64", len(views))
-        pose, options = in_float64(self.model), self.model.rasterizer
+        pose, options = in_float64(self.model, self.on_work), self.model.rasterizer
         return ExactFrames(pose, views, self.info.background, options, on_frame)
 
     @cached_property
@@ -158,15 +157,13 @@ class ExportJob:
 
     @cached_property
     def statistics(self) -> PruningStatistics:
-        """Visibility and motion by which pruning decides, computed on first use."""
+        """Visibility and motion by which pruning decides, computed on first use; in float64 without `network`."""
         views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES, SELECTION_CAMERAS)
-        views = within_memory(views, len(self.model.gaussians))
-        on_view = self.progress("motion and visibility of the Gaussians", len(views))
-        network = self.network
-        found = PruningStatistics(self.model, views, self.info.background, on_view, network and network.gaussians)
-        if network:
-            network.close()
-        return found
+        inputs = within_memory(views, len(self.model.gaussians)), self.info.background, self.progress
+        if network := self.network:
+            with suppress(SceneFileInvalid), closing(network):  # it overflows at a time that stability didn't try
+                return PruningStatistics(self.model, *inputs, lambda t: network.session.gaussians(t))
+        return PruningStatistics(copy.deepcopy(self.model).double(), *inputs)
 
     @cached_property
     def network(self) -> Candidate | None:
@@ -199,14 +196,11 @@ class ExportJob:
     @cached_property
     def stability(self) -> StabilityReport:
         """Whether the layers are exact enough in float32, computed on first use."""
-        on_step = self.progress("stability of the layers", STABILITY_TIMES + FRAME_STEPS)
-        return assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, on_step=on_step)
+        return assess(self.model, self.info, min_psnr=self.min_psnr, times=STABILITY_TIMES, track=self.progress)
 
-    def error(
-        self, candidate: Candidate, every: int = 1, on_frame: Callable[[], object] = lambda: None
-    ) -> RenderedError:
+    def error(self, candidate: Candidate, every: int = 1) -> RenderedError:
         """The error of a candidate's frames against exact ones, of all frames or of every n-th."""
-        return self.exact.measure(candidate.gaussians, candidate.pruned.ids, every=every, on_frame=on_frame)
+        return self.exact.measure(candidate.session.gaussians, candidate.pruned.ids, every=every, on_frame=self.on_work)
 
     def _checked_pruning(self, pruning_db: float) -> PrunedModel:
         min_db = pruning_db
@@ -235,7 +229,7 @@ class ExportJob:
             pairs = zip(vars(moved).values(), vars(pruned.static).values(), strict=True)
             return Gaussians(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
 
-        return self.exact.measure(pose, pruned.ids).psnr_worst
+        return self.exact.measure(pose, pruned.ids, on_frame=self.on_work).psnr_worst
 
     def _written(self, plan: str, pruning_db: float | None, pruned: PrunedModel) -> Candidate:
         self._files += 1
@@ -253,8 +247,11 @@ class ExportJob:
             if known_layers == layers and np.isin(ids, known, assume_unique=True).all():
                 return sampled.some(np.searchsorted(known, ids))
         resolved = 10 ** (-max(self.min_psnr, MIN_PSNR) / 10 - 1)
-        sampler = self._sampler(baked, pruned.network, ids) if self.network else None
-        sampled = Trajectories(baked, self.progress, [camera for _, camera in self.cameras], resolved, sampler)
+        inputs = baked, self.progress, [camera for _, camera in self.cameras], resolved
+        sampled = None
+        with suppress(SceneFileInvalid):  # as in `statistics`
+            sampled = self.network and Trajectories(*inputs, self._sampler(baked, pruned.network, ids))
+        sampled = sampled or Trajectories(*inputs)
         self._sampled = [*self._sampled[1 - SAMPLED_KEPT :], (layers, ids, sampled)]
         return sampled
 

@@ -4,7 +4,7 @@ rest is measured in full."""
 import heapq
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import le
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReac
 from export.jobs.store import PLAN_PART, min_bytes, within_bytes
 from export.measure.frame_memory import frame_memory
 from export.measure.rendered_error import RenderedError
-from export.measure.timing import REPEATS, FrameTime, time_frame, time_frames
+from export.measure.timing import FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
@@ -165,7 +165,8 @@ class Sweep:
         Raises `TargetNotReached` if even the whole network in float32 is further from float64 than allowed, or if no
         file keeps the limits.
         """
-        self.baseline = self._estimate(BASELINE, None)
+        self._estimate_all("the whole network", [(BASELINE, None)])
+        self.baseline = next(iter(self.estimates), None)
         self._reachable(self.baseline)
         levels = [level for level in pruning_levels(self.job) if self.job.pruned(level).left_out]
         mildest = next(iter(levels), None)  # plans are then fitted to moving Gaussians only
@@ -183,34 +184,32 @@ class Sweep:
         plans = [plan for plan in PLANS.values() if plan.fitted == fitted]
         return [text for plan in plans for text in plan.candidates(len(self.job.model.deformation))]
 
-    def _estimate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> QuickEstimate | None:
+    def _estimate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> None:
         moving = self.job.pruned(pruning_db).moving
         if plan != BASELINE and not (len(moving.gaussians) and len(moving.deformation)):
-            return None  # nothing moves: all plans give the same file
+            return  # nothing moves: all plans give the same file
         if self.estimates and (why := self._too_expensive(plan, pruning_db)):
             self.refused.append((plan, why))
-            return None
+            return
         try:
             candidate = self.job.candidate(plan, pruning_db, sh_degree)
-        except MsdgsError as error:
+            if not any(estimate.candidate.digest == candidate.digest for estimate in self.estimates):
+                self.estimates.append(self._estimated(candidate))  # else pruning to another PSNR removed the same
+        except MsdgsError as error:  # also if its motion overflows in float32
             self.refused.append((plan, str(error)))
-            return None
-        if any(estimate.candidate.digest == candidate.digest for estimate in self.estimates):
-            return None  # pruning to another PSNR removed the same
-        view, background = self._timed[0], self.job.info.background
-        runs = [time_frame(candidate, view, background, time.process_time) for _ in range(1 + ESTIMATE_REPEATS)][1:]
+
+    def _estimated(self, candidate: Candidate) -> QuickEstimate:
+        view, background, runs = self._timed[0], self.job.info.background, []
+        for _ in range(1 + ESTIMATE_REPEATS):
+            runs.append(time_frame(candidate, view, background, time.process_time))
+            self.job.on_work()
         # each of the whole network's frames may take seconds, and `_reachable` needs all of them
-        whole = plan == BASELINE and pruning_db is None and self.min_psnr is not None
-        if whole:
-            on_frame = self.job.progress("frames of the whole network", len(self.job.exact.views))
-            error = self._error(candidate, on_frame)
-        else:
-            error = self.job.error(candidate, every=ESTIMATE_STRIDE)
-        deformation, _, total = (min(run[part] for run in runs) for part in range(3))
+        whole = candidate.plan == BASELINE and candidate.pruning_db is None and self.min_psnr is not None
+        error = self._error(candidate) if whole else self.job.error(candidate, every=ESTIMATE_STRIDE)
+        deformation, _, total = (min(run[part] for run in runs[1:]) for part in range(3))
         candidate.close()
         size = candidate.size if self.max_bytes is None else min_bytes(self.job, candidate)
-        self.estimates.append(QuickEstimate(candidate, total, deformation, error.psnr_worst, size))
-        return self.estimates[-1]
+        return QuickEstimate(candidate, total, deformation, error.psnr_worst, size)
 
     def _estimate_all(self, name: str, candidates: Sequence[tuple]) -> None:
         """Estimate candidates, given as the arguments of `_estimate`."""
@@ -304,11 +303,9 @@ class Sweep:
         """Points of candidates and their errors."""
         candidates = [candidate for candidate, _ in measured]
         images = [self._images_psnr(candidate) for candidate in candidates]
-        background, on_repeat = self.job.info.background, self.job.progress("timing", REPEATS)
-        times = time_frames(candidates, self._timed, background, on_repeat=on_repeat)
-        memory = frame_memory(
-            [c.path for c in candidates], SceneCamera("timed", self._timed[0].t, self._timed[0].camera)
-        )
+        times = time_frames(candidates, self._timed, self.job.info.background, self.job.progress)
+        view = SceneCamera("timed", self._timed[0].t, self._timed[0].camera)
+        memory = frame_memory([candidate.path for candidate in candidates], view, self.job.progress)
         parts = zip(measured, times, memory, images, strict=True)
         return [Point(c, time, error, bytes_, psnr) for (c, error), time, bytes_, psnr in parts]
 
@@ -320,10 +317,10 @@ class Sweep:
             on_error()
         return errors
 
-    def _error(self, candidate: Candidate, on_frame: Callable[[], object] = lambda: None) -> RenderedError:
+    def _error(self, candidate: Candidate) -> RenderedError:
         """The error of all frames, measured once."""
         if candidate not in self._measured_errors:
-            self._measured_errors[candidate] = self.job.error(candidate, on_frame=on_frame)
+            self._measured_errors[candidate] = self.job.error(candidate)
         return self._measured_errors[candidate]
 
     def _images_psnr(self, candidate: Candidate) -> float | None:

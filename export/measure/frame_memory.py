@@ -1,6 +1,6 @@
 """Memory of one frame of a scene file, measured in a process that loads only the service's modules.
 
-`frame_memory` runs this module as that process, which reads a request on standard input and prints a list of bytes.
+`frame_memory` runs this module as that process, which gets a request as its argument and prints bytes.
 """
 
 import gc
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from export.progress import Track, no_progress
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained, rasterize
 from msdgs_serve.scene.metadata import SceneCamera
@@ -22,28 +23,26 @@ EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALL
 """Makes glibc return freed memory at once; otherwise a file would reuse memory of the one before."""
 
 
-def frame_memory(paths: Sequence[Path], view: SceneCamera) -> list[int | None]:
+def frame_memory(paths: Sequence[Path], view: SceneCamera, track: Track = no_progress) -> list[int | None]:
     """Peak bytes of loading each file and drawing one of its frames, above the memory of the process before."""
-    request = {"paths": [str(path.resolve()) for path in paths], "view": view.to_plain()}
-    done = subprocess.run(
-        [sys.executable, "-m", "export.measure.frame_memory"],
-        input=json.dumps(request),
-        cwd=Path(__file__).resolve().parents[2],
-        env=os.environ | EAGER,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return json.loads(done.stdout) if done.returncode == 0 else [None] * len(paths)
+    request = json.dumps({"paths": [str(path.resolve()) for path in paths], "view": view.to_plain()})
+    command = [sys.executable, "-m", "export.measure.frame_memory", request]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    on_file, found = track("memory of a frame", len(paths) + 1), list[int | None]()
+    with subprocess.Popen(
+        command, cwd=Path(__file__).resolve().parents[2], env=os.environ | EAGER, **streams
+    ) as process:
+        for line in process.stdout or ():
+            found.append(json.loads(line))
+            on_file()
+    return found[1:] if process.returncode == 0 else [None] * len(paths)
 
 
 def main() -> None:
-    """Answer the request on standard input."""
-    request: dict[str, Any] = json.load(sys.stdin)
-    view = SceneCamera.from_plain(request["view"])
-    for path in request["paths"][:1]:
-        _draw(path, view)  # loads libraries and kernels
-    print(json.dumps([_peak(path, view) for path in request["paths"]]))
+    """Print a number per line: one per file, after one that doesn't count, as it includes libraries and kernels."""
+    request: dict[str, Any] = json.loads(sys.argv[1])
+    for path in [*request["paths"][:1], *request["paths"]]:
+        print(json.dumps(_peak(path, SceneCamera.from_plain(request["view"]))), flush=True)
 
 
 def _peak(path: str, view: SceneCamera) -> int | None:

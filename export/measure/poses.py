@@ -15,6 +15,9 @@ from msdgs_train.supports.base import Support
 
 Pose = Callable[[float], Gaussians]
 
+BLOCK = 1 << 14
+"""Gaussians that are posed at once; in float64 it takes some seconds for a model of the paper's size."""
+
 SMALLEST_VISIBLE = 1e-3
 """Scales below this fraction of the scene's half diagonal are less than a pixel; errors are relative to at least it."""
 
@@ -23,20 +26,30 @@ UNIT_TOLERANCE = 1e-3
 
 
 @torch.no_grad()
-def posed(model: DynamicGaussians, t: float, ids: np.ndarray | None = None, *, deform: bool = True) -> Gaussians:
+def posed(
+    model: DynamicGaussians,
+    t: float,
+    ids: np.ndarray | None = None,
+    *,
+    deform: bool = True,
+    on_block: Callable[[], object] = lambda: None,
+) -> Gaussians:
     """The Gaussians `ids`, int64 [M], or all, at time `t`, in the model's precision; canonical ones if not `deform`.
 
-    The time is rounded to float32, as a scene file takes it.
+    The time is rounded to float32, as a scene file takes it. `on_block` is called after every `BLOCK` Gaussians.
     """
-    rows = None if ids is None else torch.from_numpy(ids)
-    pose = model.pose(float(np.float32(t)), ids=rows, deform=deform)
-    return Gaussians(*(tensor.numpy() for tensor in pose))
+    rows = torch.arange(len(model.gaussians)) if ids is None else torch.from_numpy(ids)
+    blocks = []
+    for block in rows.split(BLOCK):
+        blocks.append(model.pose(float(np.float32(t)), ids=block, deform=deform))
+        on_block()
+    return Gaussians(*(torch.cat(parts).numpy() for parts in zip(*blocks, strict=True)))
 
 
-def in_float64(model: DynamicGaussians) -> Pose:
+def in_float64(model: DynamicGaussians, on_block: Callable[[], object] = lambda: None) -> Pose:
     """The Gaussians of a model as a function of time, computed in float64."""
     double = copy.deepcopy(model).double()
-    return lambda t: posed(double, t)
+    return lambda t: posed(double, t, on_block=on_block)
 
 
 def operations(support: Support, chain: MultiStepDeformation, count: int) -> float:

@@ -17,6 +17,7 @@ from export.measure.poses import half_diagonal, largest_error, pose_errors, pose
 from export.measure.verify import times_to_verify
 from export.precision.formats import FLOAT32, Format, in_format
 from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians, limits_met
+from export.progress import Track, no_progress
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians, canonical_points
@@ -29,8 +30,8 @@ TIMES = 20
 SAMPLED = 2_000
 """Gaussians per time whose amplification is computed; others at each next time."""
 
-FRAME_TIMES, FRAME_CAMERAS, FRAME_STEPS = 2, 2, 4
-"""Frames are rendered at the times and from the cameras with the largest errors of float32, in so many steps."""
+FRAME_TIMES, FRAME_CAMERAS = 2, 2
+"""Frames are rendered at the times and from the cameras with the largest errors of float32."""
 
 WORST_FRACTION = 0.001
 """Fraction of the Gaussians, those with the largest errors, that is reported separately."""
@@ -67,17 +68,15 @@ def assess(
     min_psnr: float = MIN_PSNR,
     times: int = TIMES,
     formats: Sequence[Format] = (FLOAT32,),
-    on_step: Callable[[], object] = lambda: None,
+    track: Track = no_progress,
 ) -> StabilityReport:
     """Compare the model in float32, and in `formats`, with itself in float64: poses at `times` times, frames at the
-    worst of them. Errors under `min_psnr`, in dB, count as visible. The model isn't changed. `on_step` is called
-    `times + FRAME_STEPS` times."""
+    worst of them. Errors under `min_psnr`, in dB, count as visible. The model isn't changed."""
     if not len(model.deformation) or not len(model.gaussians):
-        on_step()
         broken = _hidden(PoseRenderer(scene), model) if len(model.gaussians) else []
         return StabilityReport(len(model.gaussians), times, min_psnr, limits_met(model, []), broken)
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is part of the report
-        return _Assessment(model, scene, min_psnr, formats).run(times, on_step)
+        return _Assessment(model, scene, min_psnr, formats).run(times, track)
 
 
 class _Assessment:
@@ -91,15 +90,16 @@ class _Assessment:
         self.mean_factors = _mean_factors(self.double)
         self.renderer = PoseRenderer(scene, model.rasterizer)
 
-    def run(self, times: int, on_step: Callable[[], object]) -> StabilityReport:
-        found = []
+    def run(self, times: int, track: Track) -> StabilityReport:
+        found, on_time = [], track("stability of the layers", times)
         stride = max(1, math.ceil(self.count / SAMPLED))
         for i, t in enumerate(times_to_verify(*self.scene.time_range, times)):
             found.append(self._sample(t, np.arange(i % stride, self.count, stride)))
-            on_step()
+            on_time()
         samples = _joined(found)
         by_error = sorted(found, key=lambda m: np.quantile(m.errors[FLOAT32.name], NEAR_WORST, method="higher"))
-        frames = [self._frames(sample, samples, on_step) for sample in by_error[::-1][:FRAME_TIMES]]
+        on_block = track("poses and frames in float32 and float64", 0)
+        frames = [self._frames(sample, samples, on_block) for sample in by_error[::-1][:FRAME_TIMES]]
         gaps = [_format_gap(f, found, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
         predicted = min(prediction for _, prediction, _ in frames)
         overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in found)
@@ -162,18 +162,18 @@ class _Assessment:
         return []
 
     def _frames(
-        self, sample: _TimeSample, joined: Samples, on_step: Callable[[], object]
+        self, sample: _TimeSample, joined: Samples, on_block: Callable[[], object]
     ) -> tuple[dict[str, _FrameGap], float, WorstGaussians]:
         """Frames at one time: gaps by format, PSNR of the predicted displacement, the worst Gaussians of float32."""
-        exact, draw = posed(self.double, sample.t), self.renderer.draw
-        on_step()
-        poses = {name: posed(model, sample.t) for name, model in self.models.items()}
-        on_step()
+        exact, draw = posed(self.double, sample.t, on_block=on_block), self.renderer.draw
+        poses = {name: posed(model, sample.t, on_block=on_block) for name, model in self.models.items()}
         single = poses[FLOAT32.name]
         gaps = [np.square(self.renderer.pixel_gaps(single, exact, c)).sum() for c in self.renderer.cameras]
         cameras = [self.renderer.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]
         frames = [(camera, draw(exact, camera)) for camera in cameras]
+        on_block()
         by_format = {name: self._frame_gap(pose, exact, frames) for name, pose in poses.items()}
+        on_block()
         displaced = replace(exact, means=_displaced(exact.means, sample, joined))
         predicted = min(compare(draw(displaced, camera), frame).psnr for camera, frame in frames)
         return by_format, predicted, self._worst(sample.t, single, exact, frames)

@@ -9,6 +9,7 @@ import numpy as np
 
 from export.jobs.job import Candidate
 from export.measure.views import View
+from export.progress import Track
 from msdgs_serve.rasterizer import as_trained, rasterize
 
 REPEATS = 15
@@ -41,30 +42,23 @@ TimingRun = tuple[float, float, float]
 
 
 def time_frames(
-    candidates: Sequence[Candidate],
-    views: Sequence[View],
-    background: Sequence[float],
-    *,
-    repeats: int = REPEATS,
-    on_repeat: Callable[[], object] = lambda: None,
+    candidates: Sequence[Candidate], views: Sequence[View], background: Sequence[float], track: Track
 ) -> list[FrameTime]:
-    """Time a frame of each candidate at each of the views, `repeats` times; the first frames don't count."""
+    """Time a frame of each candidate at each of the views, up to `REPEATS` times; the first frames don't count."""
     firsts = [time_frame(candidate, views[0], background) for candidate in candidates]
     possible = [int(1e3 * SECONDS_PER_CANDIDATE / (first[2] * len(views))) for first in firsts]
-    counts = [max(MIN_REPEATS, min(repeats, count)) for count in possible]
-    runs: list[list[list[TimingRun]]] = [[] for _ in candidates]
-    collecting = gc.isenabled()
+    counts = [max(MIN_REPEATS, min(REPEATS, count)) for count in possible]
+    turns = [(i, view) for n in range(REPEATS) for i, count in enumerate(counts) if n < count for view in views]
+    runs: list[list[TimingRun]] = [[] for _ in candidates]
+    on_frame = track("timing", len(turns))
     gc.disable()
     try:
-        for repeat in range(repeats):
-            for candidate, count, found in zip(candidates, counts, runs, strict=True):
-                if repeat < count:
-                    found.append([time_frame(candidate, view, background) for view in views])
-            on_repeat()
+        for i, view in turns:
+            runs[i].append(time_frame(candidates[i], view, background))
+            on_frame()
     finally:
-        if collecting:
-            gc.enable()
-    return [_frame_time(np.array(found)) for found in runs]
+        gc.enable()
+    return [_frame_time(np.reshape(found, (-1, len(views), 3))) for found in runs]
 
 
 def time_frame(

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Column, Table
 
 from export.measure.amplification import UNIT_ROUNDOFF
-from export.measure.stability import FRAME_STEPS, assess
+from export.measure.stability import assess
 from export.precision.formats import FORMATS
 from export.precision.report import StabilityReport, WorstGaussians
+from export.progress import tracked
 from msdgs_train.datasets.common.files import replacing, write_text
 from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
@@ -26,16 +26,8 @@ def assess_and_show(
 ) -> StabilityReport:
     """Assess a model.pt in all formats, print the report, and write the files that are asked for."""
     loaded = load_model(model)
-    with Progress(console=messages, transient=True) as progress:
-        task = progress.add_task("comparing with float64", total=times + FRAME_STEPS)
-        report = assess(
-            loaded.model,
-            loaded.scene,
-            min_psnr=min_psnr,
-            times=times,
-            formats=FORMATS,
-            on_step=lambda: progress.advance(task),
-        )
+    with tracked(messages) as track:
+        report = assess(loaded.model, loaded.scene, min_psnr=min_psnr, times=times, formats=FORMATS, track=track)
     print_report(report, Console(soft_wrap=True, highlight=False))
     if json_file is not None:
         write_text(json_file, json.dumps(report.to_plain(), indent=2, allow_nan=False) + "\n")

@@ -1,6 +1,6 @@
 """The basis of pruning: the visibility of each Gaussian, its motion in pixels, and frames to compare."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, partial, reduce
 
@@ -11,6 +11,7 @@ from export.jobs.bake import changing_outputs
 from export.measure.frames import compare, render
 from export.measure.poses import Pose, operations, posed
 from export.measure.views import View
+from export.progress import Track, no_progress
 from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_network
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.baked import APPEARANCE
@@ -32,14 +33,14 @@ SAMPLED_GAUSSIANS, SAMPLED_TIMES = 1000, 5
 class Poses:
     """All Gaussians at the selection times, posed on first use, and their mean poses."""
 
-    def __init__(self, model: DynamicGaussians, times: Sequence[float], pose: Pose | None = None) -> None:
-        self.times, self._model, self._pose = times, model, pose or partial(posed, model)
+    def __init__(self, model: DynamicGaussians, times: Sequence[float], pose: Pose) -> None:
+        self.times, self._model, self._pose = times, model, pose
         self._at: dict[float, Gaussians] = {}
 
     def at(self, t: float) -> Gaussians:
         """The Gaussians at one of the times."""
         if t not in self._at:
-            g = self._pose(t)
+            g = Gaussians(*(array.astype(np.float32, copy=False) for array in vars(self._pose(t)).values()))
             shared, changing = next(iter(self._at.values()), g), changing_outputs(self._model)
             self._at[t] = replace(g, **{name: getattr(shared, name) for name in APPEARANCE if name not in changing})
         return self._at[t]
@@ -51,17 +52,21 @@ class Poses:
 
 
 class PruningStatistics:
-    """Frames of the whole model at the selection views, and the changes that a mask makes in them. All in float32."""
+    """Frames of the whole model at the selection views, and the changes that a mask makes in them."""
 
     def __init__(
         self,
         model: DynamicGaussians,
         views: Sequence[View],
         background: Sequence[float],
-        on_view: Callable[[], object] = lambda: None,
+        track: Track = no_progress,
         pose: Pose | None = None,
     ) -> None:
         """`pose` gives the poses of the whole model; by default torch does."""
+        on_view, self._on_frame = (
+            track("motion and visibility of the Gaussians", len(views)),
+            track("frames of pruned models", 0),
+        )
         self.model, self.background = model, background
         self._views = views
         self._order = list(range(len(views)))
@@ -107,6 +112,7 @@ class PruningStatistics:
             drawn = Gaussians(*(np.concatenate(pair) for pair in pairs))
             frame = render(drawn, view.camera, self.background, self.model.rasterizer)
             worst = min(worst, compare(frame, self._frames[i]).psnr)
+            self._on_frame()
             if worst < min_db:
                 self._order.remove(i)  # probably the worst one in the next call too
                 self._order.insert(0, i)
@@ -155,7 +161,9 @@ class PruningStatistics:
         return reduce(np.maximum, (pixels_per_unit(means, camera) for camera in cameras))
 
     def _posed(self, network: NetworkMask, pose: Pose | None = None) -> Poses:
-        return Poses(with_network(self.model, network), sorted({view.t for view in self._views}), pose)
+        model = with_network(self.model, network)
+        pose = pose or partial(posed, model, on_block=self._on_frame)
+        return Poses(model, sorted({view.t for view in self._views}), pose)
 
     def _visibility(self) -> tuple[FloatArray, FloatArray]:
         """[N] the largest contribution of a Gaussian to a pixel at its center, in [0, 1], and the largest sum of its
@@ -165,6 +173,7 @@ class PruningStatistics:
         for view in self._views if len(peaks) else ():
             g = poses.at(view.t)
             weights = blending_weights(g, view, self.model.rasterizer)
+            self._on_frame()
             # pixels covered by its two largest axes
             sizes = np.sort(g.scales, axis=1)[:, 1:] * pixels_per_unit(g.means, view.camera)[:, None]
             np.maximum(peaks, weights / (2 * np.pi * (sizes.prod(axis=1) + self.model.config.eps2d)), out=peaks)

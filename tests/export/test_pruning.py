@@ -24,6 +24,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.baked import BakedScene
+from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -58,22 +59,29 @@ def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: Sc
 
 
 @pytest.mark.parametrize("rules", [("invisible", "static"), tuple(RULES)])
-@pytest.mark.parametrize("limit", [0.0, MAX_PSNR])
+@pytest.mark.parametrize("float32", ["exact", "not exact enough", "overflows"])
 def test_trajectories_are_those_of_the_pruned_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rules: tuple[str, ...], limit: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rules: tuple[str, ...], float32: str
 ):
     """In float32 if it is exact enough: from pruning's statistics at their times, or else by the network."""
-    monkeypatch.setattr(jobs, "ROUND_OFF_DB", limit)
-    made = list[tuple[Baked, Trajectories]]()
+
+    def overflow(*args: Any) -> None:
+        raise SceneFileInvalid("scene", "means", "overflow")
+
+    monkeypatch.setattr(jobs, "ROUND_OFF_DB", MAX_PSNR if float32 == "not exact enough" else 0.0)
+    if float32 == "overflows":  # at times that stability didn't try
+        monkeypatch.setattr(jobs.SinglePoses, "at", overflow)
+        monkeypatch.setattr(DeformationSession, "gaussians", overflow)
+    made = list[tuple[Baked, Trajectories, bool]]()
 
     def trajectories(baked: Baked, *args: Any) -> Trajectories:
-        assert (args[-1] is None) == (limit == MAX_PSNR)
-        made.append((baked, Trajectories(baked, *args)))
+        made.append((baked, Trajectories(baked, *args), args[-1] is None))
         return made[-1][1]
 
     monkeypatch.setattr(jobs, "Trajectories", trajectories)
     job_of(tmp_path, with_hidden_one(moving_object()), rules=rules).candidate("compact:40", 50.0)
-    ((baked, got),) = made
+    ((baked, got, in_float64),) = made
+    assert in_float64 == (float32 != "exact")
     every = np.arange(len(baked.moving))
     samples = got.on_grid(COARSE + 1, every)
     for i in (0, 6, 7, COARSE):
