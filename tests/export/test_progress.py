@@ -15,7 +15,7 @@ from tests.support.tolerances import assert_close
 @pytest.mark.parametrize("config", [{}, {"support": NODES}])
 @pytest.mark.parametrize("ids", [None, np.arange(3, 20)])
 def test_poses_tick_after_each_block(monkeypatch: pytest.MonkeyPatch, config: dict, ids: np.ndarray | None):
-    model, ticks = random_model(20, **config), list[None]()
+    model, ticks = random_model(20, **config).double(), list[None]()
     whole = poses.posed(model, 0.3, ids)
     monkeypatch.setattr(poses, "BLOCK", 7)
     got = poses.posed(model, 0.3, ids, on_block=lambda: ticks.append(None))
