@@ -29,7 +29,7 @@ def main(options: ExportOptions) -> int:
         if options.duration is not None:
             changed_metadata(options.scene_file, duration=options.duration)
 
-    return run(exported, f"stopped; {options.scene_file} is unchanged")
+    return run(exported, "stopped; existing files are complete")
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def cameras_of(info: SceneInfo, training: Sequence[Camera] = ()) -> list[tuple[s
     if not named:
         stored = [("training ", entry) for entry in info.training_cameras] + [("", entry) for entry in info.cameras]
         named = [(f"{prefix}{entry['name']}", SceneCamera.from_plain(entry).camera) for prefix, entry in stored]
-    cameras = list(first_by_pose(named, lambda each: each[1]).values())
+    cameras = first_by_pose(named, lambda each: each[1])
     return cameras if len(cameras) >= MIN_CAMERAS else [*cameras, *_around(info, cameras)]
 
 

@@ -24,23 +24,19 @@ def scene_scale(cameras: Sequence[Camera]) -> float:
     return 1.1 * float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
 
 
-def distinct_cameras(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras without repeated positions and directions, such as those of a video camera that stands still."""
-    return list({camera.camera_to_world.tobytes(): camera for camera in cameras}.values())
-
-
-def first_by_pose(items: Iterable[T], camera: Callable[[T], Camera]) -> dict[bytes, T]:
-    """The first item of each position and direction of a camera, in their order, by the bytes of the pose."""
+def first_by_pose(items: Iterable[T], camera: Callable[[T], Camera]) -> list[T]:
+    """The first item of each position and direction of a camera, in their order: one of a video camera that stands
+    still."""
     found: dict[bytes, T] = {}
     for item in items:
         found.setdefault(camera(item).camera_to_world.tobytes(), item)
-    return found
+    return list(found.values())
 
 
 def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:
     """At most `count` frames, of different cameras that are far from each other, in their order; the first is among
     them."""
-    distinct = list(first_by_pose(frames, lambda frame: frame.camera).values())
+    distinct = first_by_pose(frames, lambda frame: frame.camera)
     positions = np.array([frame.camera.position for frame in distinct])
     chosen, distances = [0], np.full(len(distinct), np.inf)
     while len(chosen) < min(count, len(distinct)):

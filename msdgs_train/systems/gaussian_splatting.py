@@ -19,7 +19,6 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
 from msdgs_train.gaussians.bounds import (
     camera_entry,
-    distinct_cameras,
     first_by_pose,
     scene_bounds,
     scene_scale,
@@ -47,7 +46,7 @@ class GaussianSplatting:
         config = schedule.config
         self.scene_half_size = config.data.scene_half_size or scene.scene_half_size
         cameras = [frame.camera for frame in scene.splits["train"]]
-        distinct = distinct_cameras(cameras)
+        distinct = first_by_pose(cameras, lambda camera: camera)
         scale, views = scene_scale(cameras) or self.scene_half_size, len(distinct)
         is_mcmc, is_rig = config.density.density_strategy == "mcmc", 2 * views <= len(cameras)
         if is_rig and views > 1:
@@ -157,7 +156,7 @@ class GaussianSplatting:
                 lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
             ),
             cameras=list(map(camera_entry, shown)),
-            training_cameras=list(map(camera_entry, list(others.values())[len(shown) :])),
+            training_cameras=list(map(camera_entry, others[len(shown) :])),
         )
 
     def _options(self, step: int) -> RasterizerOptions:

@@ -23,6 +23,7 @@ from export.plans.registry import PLANS
 from export.pruning import RULES
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that the sweep runs once
@@ -106,6 +107,24 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
     within = [p for p in result.points if p.error.psnr_worst >= 45]
     assert result.points[result.chosen].milliseconds <= TIME_MARGIN * min(p.milliseconds for p in within)
     assert any(p.candidate.session.scene.moving_count <= OBJECT for p in within)
+
+
+def test_plans_whose_motion_overflows_in_float32_are_refused_and_fitted_ones_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """At times that stability didn't try."""
+    whole = DeformationSession.pose
+
+    def pose(session: DeformationSession, *args: Any, **kwargs: Any) -> Any:
+        if not session.scene.metadata.plan.startswith("compact"):
+            raise SceneFileInvalid("scene", "means", "overflow")
+        return whole(session, *args, **kwargs)
+
+    monkeypatch.setattr(DeformationSession, "pose", pose)
+    monkeypatch.setitem(PLANS, "compact", replace(PLANS["compact"], candidates=lambda layers: ["compact:70"]))
+    result = Sweep(new_job(tmp_path)).run()
+    assert {plan for plan, why in result.refused if "overflow" in why} == {"network", "prefix:1"}
+    assert {point.candidate.plan for point in result.points} == {"compact:70"}
 
 
 def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
