@@ -88,7 +88,7 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
 def _moving(model: DynamicGaussians) -> Moving:
     g = model.gaussians
     stored = {name: values for name, values in g.attributes.items() if name != EMBEDDINGS}
-    factors = {} if model.modulation is None else model.modulation(g.attributes[EMBEDDINGS]).present()
+    factors = {} if model.modulation is None else model.modulation(g.attributes[EMBEDDINGS])
     appearance = {"opacities": g.raw_opacities[:, None], "sh": torch.cat([g.sh_dc, g.sh_rest], dim=1)}
     return Moving(
         to_numpy(g.means),

@@ -229,7 +229,7 @@ def _format_gap(number_format: Format, samples: list[_TimeSample], frames: list[
 @torch.no_grad()
 def _mean_factors(model: DynamicGaussians) -> np.ndarray:
     """[N] largest modulation factor of each mean's displacement; 1 if means aren't modulated."""
-    factors = None if model.modulation is None else model.modulation(model.gaussians.embeddings).means
+    factors = None if model.modulation is None else model.modulation(model.gaussians.embeddings).get("means")
     return np.ones(len(model.gaussians)) if factors is None else factors.amax(dim=1).numpy()
 
 

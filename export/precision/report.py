@@ -129,7 +129,7 @@ def limits_met(model: DynamicGaussians, scales: list[np.ndarray]) -> dict[str, i
         f"scales at e^±{LOG_SCALE_LIMIT:g}, most at one time": max(posed, default=0),
         "quaternions without a direction": (torch.linalg.vector_norm(g.raw_quats, dim=1) < MIN_NORM).sum(),
     }
-    for name, factors in model.modulation(g.embeddings).present().items() if model.modulation is not None else ():
+    for name, factors in model.modulation(g.embeddings).items() if model.modulation is not None else ():
         bounded = factors.log().abs() >= MAX_LOG_FACTOR * AT_LIMIT
         found[f"modulation of {name} at e^±{MAX_LOG_FACTOR:g}"] = bounded.any(dim=1).sum()
     return {limit: int(count) for limit, count in found.items() if count}

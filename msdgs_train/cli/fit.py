@@ -132,19 +132,13 @@ def _cli(arguments: Sequence[str], default: Fit) -> Fit:
                 config=(tyro.conf.OmitArgPrefixes,),
             )
     except SystemExit as end:
-        invalid = _invalid_setting(end)
-        if invalid is not None:  # reported in one line, as by the other commands, instead of tyro's box
-            raise invalid from None
+        cause: BaseException | None = end
+        while cause is not None and not isinstance(cause, InvalidInput):
+            cause = cause.__context__
+        if cause is not None:  # of a setting: reported in one line, as by the other commands, instead of tyro's box
+            raise cause from None
         sys.stderr.write(errors.getvalue())
         raise
-
-
-def _invalid_setting(end: SystemExit) -> InvalidInput | None:
-    """Return the error of a setting for which tyro exits; None if it exits for another reason."""
-    cause: BaseException | None = end
-    while cause is not None and not isinstance(cause, InvalidInput):
-        cause = cause.__context__
-    return cause
 
 
 def _short_help(command: Fit) -> Any:

@@ -128,11 +128,7 @@ def append_row(path: Path, row: Row) -> None:
 
 
 def train_and_measure(
-    runs: Sequence[Run],
-    scenes: Sequence[BenchScene],
-    csv_file: Path,
-    jobs: int,
-    on_end: Callable[[Run, RunEnd], None],
+    runs: Sequence[Run], scenes: Sequence[BenchScene], csv_file: Path, jobs: int, on_end: Callable[[Run, RunEnd], None]
 ) -> bool:
     """Train the runs that have no row in the file, and add their rows; returns False if Ctrl-C has stopped it."""
     by_name = {scene.name: scene for scene in scenes}

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from msdgs_train.density.config import DensityConfig
+from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import PosedGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.quaternions import rotate
 
@@ -35,17 +34,15 @@ class DensityChange(NamedTuple):
 
 
 @dataclass
-class GradientStrategy:
+class GradientStrategy(DensityStrategy):
     """Accumulates gradients over many images and periodically adds and removes Gaussians."""
 
-    schedule: Schedule
     scene_scale: float  # radius of the cameras' positions, scene units
     gradients: Tensor  # [N] sums of norms
     counts: Tensor  # [N] images in which each was drawn
     unseen: Tensor  # [N] images since each contributed to a pixel; infinite once it was outside of the whole scene
     patience: float  # images after which a Gaussian that contributes to none is removed; 0: never
     is_rig: bool  # cameras that stand still: a time window has images of all of them
-    generator: torch.Generator
 
     @classmethod
     def start(cls, schedule: Schedule, scene_scale: float, count: int, views: int, is_rig: bool) -> "GradientStrategy":
@@ -53,7 +50,7 @@ class GradientStrategy:
         patience = schedule.config.density.prune_unseen_passes * max(views, MIN_PATIENCE)
         generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
         gradients, counts, unseen = torch.zeros(3, count, device=schedule.config.run.device)
-        return cls(schedule, scene_scale, gradients, counts, unseen, patience, is_rig, generator)
+        return cls(schedule, generator, scene_scale, gradients, counts, unseen, patience, is_rig)
 
     def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
         """Add one image: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn; `shows_all`
@@ -66,15 +63,6 @@ class GradientStrategy:
             self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
             if shows_all:
                 self.unseen[~drawn] = torch.inf
-
-    @property
-    def config(self) -> DensityConfig:
-        """The settings."""
-        return self.schedule.config.density
-
-    def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:
-        """Opacity and scale regularizers: Gaussians that aren't needed become transparent and are removed."""
-        return self.config.regularizers(posed.opacities, posed.scales)
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """`densify` and `reset_opacities` when they are due."""

@@ -6,17 +6,15 @@ and scales of a Gaussian and its copies are reduced so that the image doesn't ch
 The formulas and constants are those of gsplat's `MCMCStrategy`, which itself runs on CUDA only.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from msdgs_train.density.config import DensityConfig
+from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import PosedGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.quaternions import rotate
 
@@ -36,36 +34,13 @@ class Relocated(NamedTuple):
     added: int
 
 
-@dataclass
-class MCMCStrategy:
+class MCMCStrategy(DensityStrategy):
     """Periodically relocates low-opacity Gaussians and adds new ones, never more than `max_gaussians` in all."""
-
-    schedule: Schedule
-    generator: torch.Generator
 
     @classmethod
     def start(cls, schedule: Schedule) -> "MCMCStrategy":
         """A new strategy, with a generator of its own."""
         return cls(schedule, torch.Generator().manual_seed(schedule.config.run.seed + 1))
-
-    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
-        """Unused: relocation depends on opacities."""
-
-    def state(self) -> tuple[Tensor, ...]:
-        """No state besides the generator."""
-        return ()
-
-    def load_state(self, state: tuple[Tensor, ...]) -> None:
-        """No state to load."""
-
-    @property
-    def config(self) -> DensityConfig:
-        """The settings."""
-        return self.schedule.config.density
-
-    def regularizers(self, posed: PosedGaussians) -> dict[str, Tensor]:
-        """Opacity and scale regularizers: Gaussians that aren't needed become transparent and are relocated."""
-        return self.config.regularizers(posed.opacities, posed.scales)
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """Relocate if a round is due, then inject noise in proportion to the learning rate of means."""

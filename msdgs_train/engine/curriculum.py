@@ -17,29 +17,23 @@ MIN_NEW_FRAME_DISTANCE = 0.7
 
 
 class WindowCurriculum:
-    """A time window that grows from the middle. `_order` holds the indices that remain in a pass over its images."""
+    """A time window that grows from the middle. `order` holds the indices that remain in a pass over its images."""
 
     def __init__(self, schedule: Schedule, frames: list[Frame], time_range: tuple[float, float]) -> None:
         self._schedule, self._frames = schedule, frames
         self.distances = distances_from_middle(time_range, frames)
-        self._order = torch.empty(0, dtype=torch.int64)
-
-    def state(self) -> Tensor:
-        return self._order
-
-    def load_state(self, state: Tensor) -> None:
-        self._order = state
+        self.order = torch.empty(0, dtype=torch.int64)
 
     def next(self, number: int, step: int, generator: torch.Generator) -> Frame:
         window = self._schedule.window(step)
         if window < 0.5 and number % 2 == 1 and step >= self._schedule.deform_start_step:
             new = self._new_frames(window)
             return self._frames[int(new[torch.randint(len(new), (), generator=generator)])]
-        self._order = self._order[self.distances[self._order] <= window]
-        if not len(self._order):
+        self.order = self.order[self.distances[self.order] <= window]
+        if not len(self.order):
             inside = torch.nonzero(self.distances <= window)[:, 0]
-            self._order = inside[torch.randperm(len(inside), generator=generator)]
-        chosen, self._order = self._order[0], self._order[1:]
+            self.order = inside[torch.randperm(len(inside), generator=generator)]
+        chosen, self.order = self.order[0], self.order[1:]
         return self._frames[int(chosen)]
 
     def _new_frames(self, window: float) -> Tensor:

@@ -130,7 +130,7 @@ class Trainer:
             "rollbacks": self.rollbacks,
             "averages": self._averages,
             "generators": [generator.get_state() for generator in self._generators()],
-            "curriculum": self._curriculum.state(),
+            "curriculum": self._curriculum.order,
             "system": self.system.state(),
             "optimizer": self.optimizer.state_dict(),
         }
@@ -149,7 +149,7 @@ class Trainer:
         self.system.load_state(state["system"], self.step_count)
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
         self.optimizer.load_state_dict(state["optimizer"])
-        self._curriculum.load_state(state["curriculum"])
+        self._curriculum.order = state["curriculum"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self.rollbacks = state["rollbacks"]
         for generator, stored in zip(self._generators(), state["generators"], strict=True):
@@ -165,7 +165,7 @@ class Trainer:
             self.load_checkpoint(checkpoint)
         self.skipped, self.rollbacks, self._skipped_in_a_row = skipped, rollbacks, 0
         self._generator.manual_seed(self.config.run.seed + ROLLBACK_SEED * rollbacks)
-        self._curriculum.load_state(torch.empty(0, dtype=torch.int64))
+        self._curriculum.order = torch.empty(0, dtype=torch.int64)
 
     @property
     def is_skipping(self) -> bool:
@@ -224,7 +224,4 @@ class Trainer:
     def _average(self, views: list[ViewGradients]) -> None:
         loss, error = (sum(getattr(v, name) for v in views) / len(views) for name in ("loss", "squared_error"))
         old = self._averages or (loss, error)
-        self._averages = (
-            SMOOTHING * old[0] + (1 - SMOOTHING) * loss,
-            SMOOTHING * old[1] + (1 - SMOOTHING) * error,
-        )
+        self._averages = (SMOOTHING * old[0] + (1 - SMOOTHING) * loss, SMOOTHING * old[1] + (1 - SMOOTHING) * error)

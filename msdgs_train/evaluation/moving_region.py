@@ -50,8 +50,7 @@ def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -
         background = models[0].scene.background
         medians = {camera: _median(groups[camera], background) for camera in cameras}
         return MovingRegion(
-            "images",
-            lambda frame: _differs(composite(frame.load_rgba(), background), medians[_identity(frame.camera)]),
+            "images", lambda frame: _differs(composite(frame.load_rgba(), background), medians[_identity(frame.camera)])
         )
     masks = [_model_region(loaded, scene.time_range) for loaded in models]
     return MovingRegion("model", lambda frame: np.any([mask(frame) for mask in masks], 0))

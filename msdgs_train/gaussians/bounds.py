@@ -1,7 +1,7 @@
 """The size of a scene, from its cameras and from its visible Gaussians."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -70,10 +70,3 @@ def scene_bounds(
         return [[-scene_half_size] * 3, [scene_half_size] * 3]
     stacked = torch.stack(boxes)
     return [stacked[:, 0].amin(dim=0).tolist(), stacked[:, 1].amax(dim=0).tolist()]
-
-
-def camera_entry(frame: Frame) -> dict[str, Any]:
-    """A frame's camera in plain values, as `SceneInfo.cameras` holds it."""
-    camera = frame.camera
-    entry = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    return {"name": frame.name, **entry, "camera_to_world": camera.camera_to_world.tolist(), "t": frame.t}

@@ -66,16 +66,10 @@ class ModelConfig:
             raise InvalidInput("model.eps2d", "finite and 0 or above", self.eps2d)
         if self.sh_degree > 3:
             raise InvalidInput("model.sh_degree", "0, 1, 2 or 3", self.sh_degree)
-        self._check_modulation()
-        self._check_parts()
-
-    def _check_modulation(self) -> None:
         targets, known = self.modulation_targets, get_args(ModulationTarget)
         if not targets or len(set(targets)) < len(targets) or not set(targets) <= set(known):
             expected = f"one or more of {list(known)}, each once; embedding_dim 0: no modulation"
             raise InvalidInput("model.modulation_targets", expected, targets)
-
-    def _check_parts(self) -> None:
         if not isinstance(self.support, SupportConfig):
             raise InvalidInput("model.support", f"one of {', '.join(SUPPORTS)}", self.support)
         self.support.check("model.support")

@@ -10,10 +10,10 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians, GaussianRows
 from msdgs_train.gaussians.config import ModelConfig
-from msdgs_train.gaussians.modulation import EMBEDDINGS, Factors, Modulation
+from msdgs_train.gaussians.modulation import EMBEDDINGS, Modulation
 from msdgs_train.gaussians.scale_space import activated_scales, add_to_scales
 from msdgs_train.layers.base import SceneBounds
-from msdgs_train.layers.chain import Deltas, MultiStepDeformation
+from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.layers.parameters import ParamGroup
 from msdgs_train.layers.quaternions import unit_or_identity
 from msdgs_train.supports.base import CanonicalPoints
@@ -74,7 +74,9 @@ class DynamicGaussians(nn.Module):
             time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
             motions = self.support.motions(self.deformation, means, time, num_layers)
         deltas = self.support.follow(points, motions)
-        deltas = self._modulated(deltas, g.attributes)
+        if self.modulation is not None:  # equation 12, applied to the sums over all layers
+            factors = self.modulation(g.attributes[EMBEDDINGS])
+            deltas = deltas._replace(**{name: f * getattr(deltas, name) for name, f in factors.items()})
         if deltas.opacities is not None:
             raw_opacities = raw_opacities + deltas.opacities
         if deltas.sh is not None:
@@ -103,13 +105,6 @@ class DynamicGaussians(nn.Module):
             if parameter.requires_grad:
                 groups.append(ParamGroup(name, [parameter], attribute.lr))
         return groups
-
-    def _modulated(self, deltas: Deltas, attributes: dict[str, Tensor]) -> Deltas:
-        """Equation 12, applied to the sums over all layers."""
-        if self.modulation is None:
-            return deltas
-        factors: Factors = self.modulation(attributes[EMBEDDINGS])
-        return deltas._replace(**{name: f * getattr(deltas, name) for name, f in factors.present().items()})
 
 
 def canonical_points(rows: GaussianRows) -> CanonicalPoints:

@@ -1,7 +1,7 @@
 """Time-invariant modulation of the summed deltas (paper, section 3.4)."""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -19,18 +19,6 @@ COLUMNS: dict[ModulationTarget, int] = {"means": 3, "scales": 3, "quats": 4}
 
 EMBEDDINGS = "embeddings"
 """The attribute of the Gaussians that the modulation reads."""
-
-
-class Factors(NamedTuple):
-    """Factors of the summed deltas of N Gaussians; None: not modulated."""
-
-    means: Tensor | None  # [N, 3]
-    scales: Tensor | None  # [N, 3]
-    quats: Tensor | None  # [N, 4]
-
-    def present(self) -> dict[str, Tensor]:
-        """Factors by the name of the delta."""
-        return {name: factors for name, factors in self._asdict().items() if factors is not None}
 
 
 def embeddings_attribute(dim: int, lr: LearningRate) -> Attribute:
@@ -54,9 +42,8 @@ class Modulation(nn.Module):
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
-    def forward(self, embeddings: Tensor) -> Factors:
-        """Factors in [e^-2, e^2] of embeddings, [N, embedding_dim]."""
+    def forward(self, embeddings: Tensor) -> dict[ModulationTarget, Tensor]:
+        """Factors in [e^-2, e^2] of the summed deltas, by name, from embeddings, [N, embedding_dim]."""
         logs = self.output(self.hidden(embeddings).relu_()).clamp(-MAX_LOG_FACTOR, MAX_LOG_FACTOR)
         columns = logs.exp().split([COLUMNS[name] for name in self.targets], dim=1)
-        found = dict(zip(self.targets, columns, strict=True))
-        return Factors(found.get("means"), found.get("scales"), found.get("quats"))
+        return dict(zip(self.targets, columns, strict=True))

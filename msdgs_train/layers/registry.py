@@ -5,13 +5,9 @@ from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.layers.spline import SplineConfig
 
-LAYERS: dict[str, type[LayerConfig]] = {}
+LAYERS: dict[str, type[LayerConfig]] = {config.kind: config for config in (MLPConfig, PlaneConfig, SplineConfig)}
 
 
 def register_layer(config: type[LayerConfig]) -> None:
     """Make a kind known under its `kind`."""
     LAYERS[config.kind] = config
-
-
-for _config in (MLPConfig, PlaneConfig, SplineConfig):
-    register_layer(_config)

@@ -4,13 +4,9 @@ from msdgs_train.supports.base import SupportConfig
 from msdgs_train.supports.gaussians import GaussiansConfig
 from msdgs_train.supports.nodes import NodesConfig
 
-SUPPORTS: dict[str, type[SupportConfig]] = {}
+SUPPORTS: dict[str, type[SupportConfig]] = {config.kind: config for config in (GaussiansConfig, NodesConfig)}
 
 
 def register_support(config: type[SupportConfig]) -> None:
     """Make a kind known under its `kind`."""
     SUPPORTS[config.kind] = config
-
-
-for _config in (GaussiansConfig, NodesConfig):
-    register_support(_config)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera
+from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.density.gradient import GradientStrategy
 from msdgs_train.density.mcmc import MCMCStrategy
@@ -17,14 +18,7 @@ from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.averaging import WeightAverage
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
-from msdgs_train.gaussians.bounds import (
-    camera_entry,
-    first_by_pose,
-    scene_bounds,
-    scene_scale,
-    spread_frames,
-    views_of,
-)
+from msdgs_train.gaussians.bounds import first_by_pose, scene_bounds, scene_scale, spread_frames, views_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
 from msdgs_train.gaussians.scale_space import count_clamped
@@ -54,17 +48,13 @@ class GaussianSplatting:
             schedule = schedule._replace(config=config)
         self.schedule, self.config, self.scene = schedule, config, scene
         bounds = SceneBounds(self.scene_half_size, scene.time_range)
-        self._model = _new_model(schedule, scene, bounds, distinct).to(config.run.device)
+        self.model = _new_model(schedule, scene, bounds, distinct).to(config.run.device)
         self.density: DensityStrategy = (
             MCMCStrategy.start(schedule)
             if is_mcmc
             else GradientStrategy.start(schedule, scale, self.size, views, is_rig)
         )
         self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
-
-    @property
-    def model(self) -> DynamicGaussians:
-        return self._model
 
     @property
     def size(self) -> int:
@@ -155,8 +145,8 @@ class GaussianSplatting:
             bounds=scene_bounds(
                 lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
             ),
-            cameras=list(map(camera_entry, shown)),
-            training_cameras=list(map(camera_entry, others[len(shown) :])),
+            cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in shown],
+            training_cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in others[len(shown) :]],
         )
 
     def _options(self, step: int) -> RasterizerOptions:
@@ -176,16 +166,13 @@ class GaussianSplatting:
 
     def _regularizers(self, posed: PosedGaussians, motions: Any, t: float) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
-        terms = list(self.density.regularizers(posed).values())
+        terms = list(self.config.density.regularizers(posed.opacities, posed.scales).values())
         if motions is not None:
             time = posed.means.new_tensor(t)
             terms += self.model.support.regularizers(motions).values()
             for layer in self.model.deformation:
                 terms += layer.regularizers(time).values()
-        total: Tensor | float = 0.0
-        for term in terms:
-            total = total + term
-        return total
+        return sum(terms, 0.0)
 
 
 def _new_model(

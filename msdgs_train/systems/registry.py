@@ -33,10 +33,7 @@ _ENTRIES: dict[str, SystemEntry] = {}
 
 
 def register_system(
-    name: str,
-    description: str,
-    config: TrainConfig,
-    build: Callable[[Schedule, SceneData], System] | None = None,
+    name: str, description: str, config: TrainConfig, build: Callable[[Schedule, SceneData], System] | None = None
 ) -> None:
     """Register a system under its name."""
     _ENTRIES[name] = SystemEntry(name, description, config.updated(system=name), build)

@@ -140,7 +140,7 @@ def test_embeddings_and_their_network_are_gone(scene_file: Path, model: DynamicG
     assert not any(stored(row) for row in embeddings[:20])
     assert not any(stored(parameter) for parameter in model.modulation.parameters())
     assert stored(model.gaussians.means)
-    scales = model.modulation(embeddings).scales
+    scales = model.modulation(embeddings)["scales"]
     assert scales is not None
     assert stored(scales)
     names = [tensor.name for tensor in onnx.load(scene_file).graph.initializer]

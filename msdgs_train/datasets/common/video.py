@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -90,30 +90,24 @@ def _cache_file(video: Path, wanted: VideoInfo) -> Path:
 
 
 def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
+    """Write the frames as a stream: on a full disk this raises an error, but a memory map would kill the process."""
+    count, shape = 0, (wanted.count, wanted.height, wanted.width, 3)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as temporary, temporary.open("wb") as output:
-            _write(output, video, wanted)
+            np.lib.format.write_array_header_1_0(output, {"descr": "|u1", "fortran_order": False, "shape": shape})
+            for pixels in _decoded(video, wanted):
+                count += 1
+                if count <= wanted.count:
+                    output.write(pixels.data)
+            if count != wanted.count:
+                problem = f"has {wanted.count} frames by its header, but {count} can be decoded: encode it again"
+                raise _invalid(video, problem)
     except OSError as error:
         gigabytes = 3e-9 * wanted.count * wanted.width * wanted.height
-        problem = (
-            f"can't be decoded into {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the environment "
-        )
-        problem += "variable XDG_CACHE_HOME to a folder with space, or train at a smaller size"
+        problem = f"can't be decoded into {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the "
+        problem += "environment variable XDG_CACHE_HOME to a folder with space, or train at a smaller size"
         raise _invalid(video, problem) from None
-
-
-def _write(output: BinaryIO, video: Path, wanted: VideoInfo) -> None:
-    """Write the frames as a stream: on a full disk this raises an error, but a memory map would kill the process."""
-    shape = (wanted.count, wanted.height, wanted.width, 3)
-    np.lib.format.write_array_header_1_0(output, {"descr": "|u1", "fortran_order": False, "shape": shape})
-    count = 0
-    for pixels in _decoded(video, wanted):
-        count += 1
-        if count <= wanted.count:
-            output.write(pixels.data)
-    if count != wanted.count:
-        raise _invalid(video, f"has {wanted.count} frames by its header, but {count} can be decoded: encode it again")
 
 
 def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:

@@ -11,13 +11,7 @@ from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.scene import Camera
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 from msdgs_train.datasets.synthetic.motion import GROUND_RADIUS, GROUND_Z, OBJECTS, Motion, motion_at
-from msdgs_train.datasets.synthetic.shapes import (
-    GROUND,
-    GROUND_ROUNDING,
-    PALETTE,
-    color_at_rest,
-    distance_at_rest,
-)
+from msdgs_train.datasets.synthetic.shapes import GROUND, GROUND_ROUNDING, PALETTE, color_at_rest, distance_at_rest
 
 SAMPLES = 2  # rays along each side of a pixel
 MAX_STEPS = 400

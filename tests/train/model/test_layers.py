@@ -34,11 +34,11 @@ def test_the_modulation_has_the_papers_size_starts_at_one_and_stays_bounded():
     modulation = Modulation()
     assert parameters(modulation) == 1_155
     factors = modulation(torch.randn(7, 32))
-    assert torch.equal(factors.present()["scales"], torch.ones(7, 3))
-    assert list(factors.present()) == ["scales"]
+    assert torch.equal(factors["scales"], torch.ones(7, 3))
+    assert list(factors) == ["scales"]
     with torch.no_grad():
         modulation.output.bias[:] = torch.tensor([200.0, -200.0, 1.0])
-    scales = modulation(torch.randn(7, 32)).scales
+    scales = modulation(torch.randn(7, 32))["scales"]
     torch.testing.assert_close(scales, torch.tensor([2.0, -2.0, 1.0]).exp().expand(7, 3))
 
 

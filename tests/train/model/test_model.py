@@ -49,7 +49,7 @@ def test_modulated_deltas_are_added_once_before_activation(targets: tuple[Any, .
     g, posed = model.gaussians, model.pose(0.3)
     deltas = model.deformation(g.means, torch.tensor(0.3, dtype=torch.float64))
     assert model.modulation is not None
-    factors = model.modulation(g.attributes[EMBEDDINGS]).present()
+    factors = model.modulation(g.attributes[EMBEDDINGS])
     assert list(factors) == [name for name in ("means", "scales", "quats") if name in targets]
     assert all((f - 1).abs().max() > 1e-3 for f in factors.values())
     means, scales, quats = (factors.get(name, 1.0) * getattr(deltas, name) for name in ("means", "scales", "quats"))

@@ -88,7 +88,7 @@ def test_modulation_multiplies_the_growth_of_scales() -> None:
     model = random_model(25, noise=0.3, support=NODES).double()
     modulated, modulation = model.pose(0.6), model.modulation
     assert modulation is not None
-    factors = modulation(model.gaussians.attributes["embeddings"]).scales
+    factors = modulation(model.gaussians.attributes["embeddings"])["scales"]
     model.modulation = None
     plain, log_scales = model.pose(0.6), model.gaussians.log_scales
     assert_close((modulated.scales.log() - log_scales).detach(), (factors * (plain.scales.log() - log_scales)).detach(),
