@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from benchmarks.measuring import machine
-from benchmarks.rasterizer.scenes import object_scene, write_splat
+from benchmarks.rasterizer.scenes import object_scene
 from benchmarks.service.process import Running, service
 from export.exporters.ply import write_ply
 from export.importers.detect import detect_format
@@ -21,6 +21,7 @@ from export.options import ExportOptions
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.evaluation.sheets import Panel, draw_sheet
+from tests.support.splat_files import splat_bytes
 
 COLUMNS = 4
 BACKGROUND = 0.1
@@ -106,7 +107,7 @@ def self_test() -> int:
         folder = Path(temporary)
         gaussians = object_scene(3000)
         write_ply(folder / "some.ply", gaussians)
-        write_splat(folder / "some.splat", gaussians)
+        (folder / "some.splat").write_bytes(splat_bytes(gaussians))
         return main((folder / "some.ply", folder / "some.splat"), folder / "sheet.png", 64)
 
 

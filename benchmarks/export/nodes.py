@@ -16,6 +16,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
+from benchmarks.export.paper_sized import resized
 from benchmarks.measuring import Times, machine, report_console, table
 from export.jobs.job import Candidate, ExportJob
 from export.jobs.store import stored
@@ -32,8 +33,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.threads import THREADS_VARIABLE
 from msdgs_train.engine.config import SMALL_LAYER
-from msdgs_train.evaluation.layer_strip import camera_of
-from msdgs_train.gaussians.model_file import SceneInfo, save_model
+from msdgs_train.gaussians.model_file import save_model
 from msdgs_train.supports.nodes import NodesConfig
 from tests.support.models import SCENE, random_model
 
@@ -41,32 +41,7 @@ OPENINGS = 3
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Sizes of the model and number of poses."""
-
-    count: int
-    layers: int
-    nodes: int
-    followed: int
-    noise: float
-    threads: tuple[int, ...]
-    repeats: int
-    size: int  # pixels, of the frames
-
-
-def main(
-    count: int = 106_500,
-    layers: int = 10,
-    widths: tuple[int, ...] = (96, 128),
-    nodes: int = 512,
-    followed: int = 4,
-    seeds: tuple[int, ...] = (0, 1),
-    noise: float = 0.05,
-    threads: tuple[int, ...] = (1, 2),
-    repeats: int = 100,
-    size: int = 256,
-    check: bool = False,
-) -> int:
+class Nodes:
     """Export random models on control nodes as `export/to_onnx.py --plan network` does, unpruned, in float32 and in
     fewer bits, and print errors, sizes and times.
 
@@ -75,34 +50,46 @@ def main(
     Errors are the largest at 50 times against the checkpoint in float64, as docs/contract.md defines `measured_error`,
     and of the worst of 48 frames; motion is the largest between the first and the last time, in scene units. Times are
     of `DeformationSession.pose` of all Gaussians.
-
-    Args:
-        count: Gaussians, all of which move.
-        layers: MLP layers, two hidden ones each.
-        widths: Width of the hidden layers; a model each.
-        nodes: Control nodes.
-        followed: Nodes that each Gaussian follows.
-        seeds: A model each.
-        noise: Standard deviation of the noise added to all parameters but means.
-        threads: Threads of onnxruntime.
-        repeats: Poses that are timed, at other times each.
-        size: Width of the frames in pixels.
-        check: Test this benchmark on a model of 2,000 Gaussians.
     """
-    if check:
+
+    count: int = 106_500
+    """Gaussians, all of which move."""
+    layers: int = 10
+    """MLP layers, two hidden ones each."""
+    widths: tuple[int, ...] = (96, 128)
+    """Width of the hidden layers; a model each."""
+    nodes: int = 512
+    """Control nodes."""
+    followed: int = 4
+    """Nodes that each Gaussian follows."""
+    seeds: tuple[int, ...] = (0, 1)
+    """A model each."""
+    noise: float = 0.05
+    """Standard deviation of the noise added to all parameters but means."""
+    threads: tuple[int, ...] = (1, 2)
+    """Threads of onnxruntime."""
+    repeats: int = 100
+    """Poses that are timed, at other times each."""
+    size: int = 256
+    """Width of the frames in pixels."""
+    check: bool = False
+    """Test this benchmark on a model of 2,000 Gaussians."""
+
+
+def main(settings: Nodes) -> int:
+    """Measure each model and print the tables."""
+    if settings.check:
         return self_test()
-    settings = Settings(count, layers, nodes, followed, noise, threads, repeats, size)
-    models = [(width, seed) for width in widths for seed in seeds]
+    models = [(width, seed) for width in settings.widths for seed in settings.seeds]
     rows = [measured(settings, *model) for model in track(models, "models", console=Console(stderr=True))]
     console, names = report_console(), MOVING_OUTPUTS
-    title = f"{count:,} Gaussians, {layers} layers, {nodes} nodes"
+    title = f"{settings.count:,} Gaussians, {settings.layers} layers, {settings.nodes} nodes"
     errors = table(title, "width, seed", "motion", *names, "worst frame, dB")
     files = table(
         "files", "width, seed", "storage", "MB", "bytes per Gaussian, static", "moving", "worst frame, dB", "opening, s"
     )
-    times = table(
-        "ms per pose", "width, seed", *(f"{n} threads: {w}" for n in threads for w in ("median", "95 %", "CPU"))
-    )
+    columns = [f"{n} threads: {w}" for n in settings.threads for w in ("median", "95 %", "CPU")]
+    times = table("ms per pose", "width, seed", *columns)
     for row in rows:
         found = [f"{row['errors'][name]:.1e}" for name in names]
         errors.add_row(row["name"], f"{row['motion']:.2f}", *found, f"{row['psnr_worst']:.1f}")
@@ -115,7 +102,7 @@ def main(
     return 0
 
 
-def measured(settings: Settings, width: int, seed: int) -> dict[str, Any]:
+def measured(settings: Nodes, width: int, seed: int) -> dict[str, Any]:
     """The figures of one model."""
     support = NodesConfig(num_nodes=settings.nodes, k_nearest=settings.followed)
     chain = (replace(SMALL_LAYER, width=width),) * settings.layers
@@ -124,7 +111,7 @@ def measured(settings: Settings, width: int, seed: int) -> dict[str, Any]:
     )
     with tempfile.TemporaryDirectory() as folder:
         checkpoint = Path(folder) / "model.pt"
-        save_model(checkpoint, model, _scene(settings.size), 1)
+        save_model(checkpoint, model, replace(SCENE, cameras=[resized(c, settings.size) for c in SCENE.cameras]), 1)
         job = ExportJob(checkpoint, Path(folder), rules=())
         candidate = job.candidate(BASELINE, None)
         error = job.error(candidate)
@@ -165,7 +152,7 @@ def bytes_per_gaussian(job: ExportJob, size: int, kinds: Mapping[str, str]) -> t
     return (half_static - half) / changed, (size - half_static) / changed
 
 
-def milliseconds(path: Path, settings: Settings) -> dict[int, tuple[float, float, float]]:
+def milliseconds(path: Path, settings: Nodes) -> dict[int, tuple[float, float, float]]:
     """Median and 95 % quantile of the time of a pose, and median of its processor time, by number of threads."""
     sessions = {threads: _opened(path, threads) for threads in settings.threads}
     wall, processor = Times(), Times(time.process_time)
@@ -175,11 +162,7 @@ def milliseconds(path: Path, settings: Settings) -> dict[int, tuple[float, float
     found = {}
     for threads in settings.threads:
         of_pose, of_processor = (1e3 * np.array(each.seconds[str(threads)]) for each in (wall, processor))
-        found[threads] = (
-            float(np.median(of_pose)),
-            float(np.quantile(of_pose, 0.95)),
-            float(np.median(of_processor)),
-        )
+        found[threads] = (float(np.median(of_pose)), float(np.quantile(of_pose, 0.95)), float(np.median(of_processor)))
     return found
 
 
@@ -202,19 +185,9 @@ def _seconds_to_open(path: Path) -> float:
     return times.minimum("open") / 1e3
 
 
-def _scene(width: int) -> SceneInfo:
-    """The cameras of the tests' scene with images of this width."""
-    cameras = []
-    for entry in SCENE.cameras:
-        camera = camera_of(entry, width)
-        cameras.append(entry | {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")})
-    return replace(SCENE, cameras=cameras)
-
-
 def self_test() -> int:
     """The export of a small model is exact, and each Gaussian adds the expected number of bytes to its file."""
-    settings = Settings(count=2_000, layers=2, nodes=20, followed=4, noise=0.05, threads=(1, 2), repeats=3, size=48)
-    found = measured(settings, 32, 0)
+    found = measured(Nodes(count=2_000, layers=2, nodes=20, repeats=3, size=48), 32, 0)
     assert max(found["errors"][name] for name in MOVING_OUTPUTS) < 1e-4
     assert found["psnr_worst"] > 60
     assert found["motion"] > 0.01
@@ -224,8 +197,8 @@ def self_test() -> int:
     assert small["static"] < static / 2
     assert 0 < small["moving"] <= 12
     assert small["psnr_worst"] >= MIN_PSNR
-    return main(count=200, layers=1, widths=(16,), nodes=8, seeds=(0,), repeats=2, size=32)
+    return main(Nodes(count=200, layers=1, widths=(16,), nodes=8, seeds=(0,), repeats=2, size=32))
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(main))
+    sys.exit(main(tyro.cli(Nodes)))

@@ -175,8 +175,8 @@ def main(
         small, info, _ = load_model(model)
         if count < len(small.gaussians):
             raise InvalidInput("count", f"{len(small.gaussians):,} or more, the model's Gaussians", count)
-        resized = {n: [_resized(c, size) for c in getattr(info, n)] for n in ("cameras", "training_cameras")}
-        info = replace(info, **resized)
+        kept = {n: [resized(c, size) for c in getattr(info, n)] for n in ("cameras", "training_cameras")}
+        info = replace(info, **kept)
         parts = split(small, count, torch.Generator().manual_seed(0))
         training = Training(grown(parts), SmoothMotion(parts, info, control), info)
         training.run(60 * minutes, console)
@@ -305,7 +305,7 @@ def _pixel(model: DynamicGaussians, info: SceneInfo) -> float:
     return float(min(np.linalg.norm(c.position - middle) / max(c.fx, c.fy) for c in cameras))
 
 
-def _resized(entry: dict, width: int) -> dict:
+def resized(entry: dict, width: int) -> dict:
     camera = camera_of(entry, width)
     return entry | {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
 

@@ -15,11 +15,12 @@ from rich.progress import track
 from benchmarks.measuring import Times, machine, report_console
 from benchmarks.rasterizer.report import stage_table, work_table
 from benchmarks.rasterizer.roofline import Roofline
-from benchmarks.rasterizer.scenes import Case, file_cases, object_scene, seeded_cases, write_splat
+from benchmarks.rasterizer.scenes import Case, file_cases, object_scene, seeded_cases
 from benchmarks.rasterizer.stages import Gradient, draw_in_stages, memory_of, row_of, work_of
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import MsdgsError
 from msdgs_train.datasets.common.files import write_text
+from tests.support.splat_files import splat_bytes
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def check() -> int:
     """A small run through the files that it writes."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        write_splat(folder / "some.splat", object_scene(50, 1))
+        (folder / "some.splat").write_bytes(splat_bytes(object_scene(50, 1)))
         (written,) = file_cases((folder / "some.splat",))
         assert np.abs(written.gaussians.opacities - object_scene(50, 1).opacities).max() <= 0.51 / 255
         options = Benchmark((300,), ("64x48",), 2, 0, True, (folder / "some.splat",), folder / "all.json")

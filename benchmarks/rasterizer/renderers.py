@@ -18,9 +18,10 @@ import tyro
 
 from benchmarks.measuring import Times, machine, minimum_and_median, psnr, report_console, table
 from benchmarks.rasterizer.avx512 import Avx512Renderer, why_not
-from benchmarks.rasterizer.scenes import Case, file_cases, seeded_cases, write_splat
+from benchmarks.rasterizer.scenes import Case, file_cases, seeded_cases
 from benchmarks.rasterizer.stages import STAGES, draw_in_stages
 from msdgs_serve.rasterizer import GSPLAT, rasterize
+from tests.support.splat_files import splat_bytes
 
 WORKER, ROOT = Path(__file__).with_name("renderer_worker.py"), Path(__file__).resolve().parents[2]
 LONG_ENOUGH = 0.03
@@ -166,7 +167,7 @@ def rows_of(case: Case, options: Compare, hand: Avx512Renderer | None) -> Iterat
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         exact, rounded = folder / "exact.npz", folder / "8 bits.splat"
         np.savez(exact, **vars(case.gaussians))
-        write_splat(rounded, case.gaussians)
+        rounded.write_bytes(splat_bytes(case.gaussians))
         others = {"by hand": by_hand(hand, case)} if hand else {}
         for name, checkout in checkouts.items():  # both in processes of their own, so that nothing else differs
             others[name] = stack.enter_context(in_a_process(name, sys.executable, case, exact, checkout))

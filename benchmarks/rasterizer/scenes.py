@@ -6,9 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from export.importers.splats.formats import read_splats
-from export.importers.splats.splat import RECORD
 from msdgs_serve.scene import Camera, Gaussians
-from msdgs_serve.scene.spherical_harmonics import SH_C0
 
 MEDIAN_SCALES = {10_000: 0.010, 100_000: 0.007, 300_000: 0.005, 1_000_000: 0.0035}
 """Median standard deviation by number of Gaussians, as a fraction of the object's diameter."""
@@ -42,16 +40,6 @@ def file_cases(files: tuple[Path, ...], width: int = 800, height: int = 800) -> 
     """Splat files of any format that can be imported, each seen from outside."""
     scenes = [(path.name, read_splats(path).gaussians) for path in files]
     return [Case(name, gaussians, around(gaussians, width, height)) for name, gaussians in scenes]
-
-
-def write_splat(file: Path, gaussians: Gaussians) -> None:
-    """Write a .splat file: 8 bits for color, opacity and rotation, and SH of degree 0."""
-    records = np.zeros(len(gaussians), RECORD)
-    records["means"], records["scales"] = gaussians.means, gaussians.scales
-    colors = 0.5 + SH_C0 * gaussians.sh[:, 0]
-    records["rgba"] = np.clip(np.round(255 * np.column_stack([colors, gaussians.opacities])), 0, 255)
-    records["quats"] = np.clip(np.round(gaussians.quats * 128 + 128), 0, 255)
-    records.tofile(file)
 
 
 def object_scene(count: int, seed: int = 0) -> Gaussians:

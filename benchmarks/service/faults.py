@@ -11,14 +11,15 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from benchmarks.service.levels import Row, Settings
-from benchmarks.service.process import JSON, MOMENT, Connection, Running, service
+from benchmarks.service.process import JSON, Connection, Running, service
 from benchmarks.service.requests import digest
+from tests.support.processes import wait_for
 from tests.support.scene_files import write_scene
 
 ORBIT = {"type": "orbit", "azimuth": 30, "elevation": 20}
@@ -140,7 +141,7 @@ def _disconnect_after(running: Running, body: dict[str, Any], seconds: float) ->
     disconnect.join()
     connection.close()
     gone = time.monotonic()
-    _wait_until(lambda: running.metric("msdgs_renders_running") == 0)
+    wait_for(lambda: running.metric("msdgs_renders_running") == 0)
     return time.monotonic() - gone
 
 
@@ -158,7 +159,7 @@ def _shutdown(scene: Path) -> Row:
     with service(scene) as running, ThreadPoolExecutor(IN_FLIGHT) as pool:
         frames = [pool.submit(running.ask, "POST", "/render", _long_frame(300, 16)) for _ in range(IN_FLIGHT)]
         names = ("msdgs_queue_waiting", "msdgs_renders_running")
-        _wait_until(lambda: sum(map(running.metric, names)) == IN_FLIGHT)
+        wait_for(lambda: sum(map(running.metric, names)) == IN_FLIGHT)
         running.process.send_signal(signal.SIGTERM)
         time.sleep(0.1)
         health = [running.ask("GET", path).status for path in ("/ready", "/live")]
@@ -199,7 +200,7 @@ def _uploads_until_killed(running: Running, folder: Path, contents: Sequence[byt
     uploads = 0
     with socket.create_connection(("127.0.0.1", running.port)) as half:
         half.sendall(b"POST /scenes?name=other HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nhalf a scene")
-        _wait_until(lambda: len(list(folder.glob(".incoming-*"))) == 1)
+        wait_for(lambda: len(list(folder.glob(".incoming-*"))) == 1)
         kill = threading.Timer(seconds, running.process.kill)
         kill.start()
         connection = Connection(running.port)
@@ -221,10 +222,3 @@ def _versions(folder: Path) -> list[Path]:
 def _long_frame(size: int, samples: int) -> dict[str, Any]:
     """A request for a frame with motion blur, which takes as long as `samples` frames."""
     return {**SMALL, "width": size, "height": size, "shutter": {"open": -0.1, "close": 0.1, "samples": samples}}
-
-
-def _wait_until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    started = time.monotonic()
-    while not condition():
-        assert time.monotonic() - started < seconds
-        time.sleep(MOMENT)

@@ -25,7 +25,7 @@ from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.mlp import MLPConfig, frequency_matrix, positional_encoding
 from msdgs_train.layers.plane import PlaneConfig
-from tests.export.stability_rows import Change, Row, measured, refused, relative, worst_frame
+from tests.export.stability_rows import Row, measured, refused, relative, worst_frame
 from tests.export.stability_rows import changed as any_changed
 from tests.support.models import CAMERA, MLP, SCENE, export_scene
 
@@ -77,7 +77,8 @@ def traps() -> Iterator[Row]:
             float(np.abs(exported(model).scene.static_quats - identity).max()),
             "float32.relative",
         )
-    shrinking = changed(_head_bias(slice(3, 6), -10.0), scale_space="linear")
+    heads = "deformation.layers.0.heads.bias"
+    shrinking = changed(lambda m: m.get_parameter(heads)[3:6].fill_(-10.0), scale_space="linear")
     yield measured("activated ΔS of −5 on scales of 0.1", MOVES, file_error(shrinking), "export.relative")
     for logit in (1e4, -1e4):
         model = changed(lambda m, v=logit: m.get_parameter("modulation.output.bias").fill_(v))
@@ -103,13 +104,6 @@ def _network(model: DynamicGaussians) -> bytes:
 def _scale_error(scale: float) -> float:
     model = changed(lambda m: m.gaussians.log_scales.fill_(math.log(scale)), layers=())
     return relative(exported(model).scene.static_scales, posed(in_format(model, FLOAT32).double(), 0.0).scales)
-
-
-def _head_bias(columns: slice, value: float) -> Change:
-    def change(model: DynamicGaussians) -> None:
-        model.get_parameter("deformation.layers.0.heads.bias")[columns] = value
-
-    return change
 
 
 def a_million() -> Iterator[Row]:

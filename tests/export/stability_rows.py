@@ -48,17 +48,16 @@ def measured(case: str, quantity: str, error: float, bound: str) -> Row:
 
 def refused(case: str, action: Callable[[], object], *reasons: str, quantity: str = "") -> Row:
     """Whether `action` is refused with one of the package's own errors, whose message has all `reasons` in it."""
+    verdict = f"{FAILS}: was accepted"
     try:
         action()
     except MsdgsError as error:
         message = " ".join(str(error).split())
         named = all(reason in message for reason in reasons)
-        return Row(
-            case, quantity, "–", "a refusal", f"{REFUSED}: {shortened(message)}" if named else f"{FAILS}: {message}"
-        )
+        verdict = f"{REFUSED}: {shortened(message)}" if named else f"{FAILS}: {message}"
     except Exception as error:  # an unexpected success is a failed row
-        return Row(case, quantity, "–", "a refusal", f"{FAILS}: {type(error).__name__} {error}")
-    return Row(case, quantity, "–", "a refusal", f"{FAILS}: was accepted")
+        verdict = f"{FAILS}: {type(error).__name__} {error}"
+    return Row(case, quantity, "–", "a refusal", verdict)
 
 
 def shortened(message: str, length: int = 110) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,26 +23,18 @@ UNSEEN_TIMES = (0.137, 0.4321, 0.777)
 """None of them is one of the times of `assess`."""
 
 
-def steps_times(factor: float) -> Change:
-    """Scale a layer's last Linear by `factor`: steps, their Jacobian, and the weight's logit."""
+def steps_times(factor: float, part: str = "heads") -> Change:
+    """Scale a layer's last Linear by `factor`: steps, their Jacobian, and the weight's logit; or another `part`."""
 
     def change(model: DynamicGaussians) -> None:
         for name, parameter in model.deformation.named_parameters():
-            if "heads" in name and name.endswith("weight"):
+            if part in name and name.endswith("weight"):
                 parameter *= factor
 
     return change
 
 
-def all_times(factor: float) -> Change:
-    """Scale every weight matrix by `factor`."""
-
-    def change(model: DynamicGaussians) -> None:
-        for name, parameter in model.deformation.named_parameters():
-            if name.endswith("weight"):
-                parameter *= factor
-
-    return change
+all_times = partial(steps_times, part="")
 
 
 def rougher(factor: float) -> Change:

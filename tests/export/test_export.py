@@ -218,8 +218,7 @@ def interrupt() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "error"),
-    [({"tolerance": 0.0}, VerificationFailed), ({"on_time": interrupt}, KeyboardInterrupt)],
+    ("settings", "error"), [({"tolerance": 0.0}, VerificationFailed), ({"on_time": interrupt}, KeyboardInterrupt)]
 )
 def test_an_old_file_survives_failures(tmp_path: Path, settings: dict[str, Any], error: type):
     output = tmp_path / "scene.onnx"

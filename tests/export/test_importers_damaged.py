@@ -55,8 +55,7 @@ class Kind(NamedTuple):
 def one(file_format: str) -> Kind:
     """Return the kind of a format of one file, which is detected from the damaged file."""
     return Kind(
-        lambda folder, g: [write_splats(folder, file_format, g)],
-        lambda folder, files: read_splats(files[0]).gaussians,
+        lambda folder, g: [write_splats(folder, file_format, g)], lambda folder, files: read_splats(files[0]).gaussians
     )
 
 

@@ -1,7 +1,6 @@
 """Files that native code reads are read in a subprocess: crashes, hangs and memory errors end only that process."""
 
 import ctypes
-import gzip
 import sys
 import time
 from collections.abc import Callable
@@ -11,13 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from export.exporters.spz import write_spz
 from export.importers import guard
 from export.importers.errors import ImportFailed
 from export.importers.guard import read_guarded
 from export.importers.runs.state import State
 from export.importers.splats.formats import READERS, UNPACKED, read_splats
-from tests.support.splat_files import ksplat_bytes, some_gaussians, spz4_bytes, write_sog
+from tests.support.splat_files import some_gaussians, write_splats
 
 
 def crash(path: Path) -> dict[str, np.ndarray]:
@@ -79,21 +77,10 @@ def test_arrays_come_back_by_name(tmp_path: Path):
     assert {name: array.item() for name, array in arrays.items()} == {"size": 7, "a/b\0\ud800": "text"}
 
 
-def written(folder: Path, file_format: str) -> Path:
-    g, file = some_gaussians(20, 0), folder / f"a.{file_format.partition(':')[0]}"
-    if file_format == "ksplat":
-        file.write_bytes(ksplat_bytes(g))
-    elif file_format == "sog":
-        return write_sog(folder / "sog", g)
-    else:
-        write_spz(file, g, "dilate")
-        file.write_bytes(spz4_bytes(gzip.decompress(file.read_bytes())))
-    return file
-
-
 @pytest.mark.parametrize("file_format", sorted(UNPACKED))
 def test_no_splat_file_is_unpacked_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_format: str):
-    file = written(tmp_path, file_format)
+    kind = "spz 4" if file_format.startswith("spz") else file_format
+    file = write_splats(tmp_path, kind, some_gaussians(20, 0))
     here = READERS[file_format](file)
     monkeypatch.setitem(READERS, file_format, lambda _: pytest.fail("in this process"))
     read = read_splats(file, file_format)

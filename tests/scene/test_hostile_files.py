@@ -12,15 +12,7 @@ from msdgs_serve import deformation
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.onnx import GraphLimits, ModelInvalid, read_model
-from tests.support.hostile_scenes import (
-    ATTACKS,
-    POISON,
-    Attack,
-    field,
-    poisoned,
-    varint,
-    with_graph,
-)
+from tests.support.hostile_scenes import ATTACKS, POISON, Attack, field, poisoned, varint, with_graph
 from tests.support.scene_files import write_scene
 
 

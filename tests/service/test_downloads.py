@@ -13,7 +13,7 @@ import zstandard
 
 from msdgs_serve.api.downloads import takes_zstd
 from tests.support.scene_files import write_scene
-from tests.support.service import check_problem, connect, eventually, own_connection, serving
+from tests.support.service import check_problem, connect, eventually, own_connection, rest_of, serving
 
 NAME = 'a "b"; 50% – it\'s'
 PATH = f"/scenes/{NAME.replace('%', '%25')}/file"
@@ -78,20 +78,9 @@ def large_scene(path: Path) -> bytes:
 @contextlib.contextmanager
 def begun(client: httpx.Client, encoding: str) -> Iterator[tuple[socket.socket, bytes]]:
     """A connection on which a download has begun, and its first bytes."""
-    with connect(client) as connection:
-        request = (
-            f"GET /scenes/walk/file HTTP/1.1\r\nHost: x\r\nAccept-Encoding: {encoding}\r\nConnection: close\r\n\r\n"
-        )
-        connection.sendall(request.encode())
+    request = f"GET /scenes/walk/file HTTP/1.1\r\nHost: x\r\nAccept-Encoding: {encoding}\r\nConnection: close\r\n\r\n"
+    with connect(client, request.encode()) as connection:
         yield connection, connection.recv(65536)
-
-
-def rest(connection: socket.socket) -> bytes:
-    received = bytearray()
-    with contextlib.suppress(ConnectionResetError):
-        while part := connection.recv(1 << 20):
-            received += part
-    return bytes(received)
 
 
 @own_connection
@@ -110,7 +99,7 @@ def test_a_download_is_whole_or_cut_off(client: httpx.Client, folder: Path, tmp_
             with path.open("r+b") as file:
                 file.seek(len(old) - 1)
                 file.write(b"x")
-        head, _, body = (first + rest(connection)).partition(b"\r\n\r\n")
+        head, _, body = (first + rest_of(connection)).partition(b"\r\n\r\n")
     assert head.startswith(b"HTTP/1.1 200 ")
     if change == "overwritten":
         assert len(body) < len(old)

@@ -26,11 +26,7 @@ CASES = int(os.environ.get("MSDGS_FUZZ", "400"))
 SEEDED: dict[str, Any] = {
     "database": None,
     "derandomize": True,
-    "suppress_health_check": [
-        HealthCheck.too_slow,
-        HealthCheck.filter_too_much,
-        HealthCheck.function_scoped_fixture,
-    ],
+    "suppress_health_check": [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.function_scoped_fixture],
 }
 ALLOWED = {501, 503, 504, 507}
 JSON = {"Content-Type": "application/json"}

@@ -127,9 +127,7 @@ def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: Slo
 def leave(client: httpx.Client, body: dict[str, Any], path: str = "/render") -> socket.socket:
     content = json.dumps(body)
     head = f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(content)}"
-    connection = connect(client)
-    connection.sendall(f"{head}\r\n\r\n{content}".encode())
-    return connection
+    return connect(client, f"{head}\r\n\r\n{content}".encode())
 
 
 @pytest.mark.parametrize("path", ["/render", "/render/batch"])

@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from msdgs_serve.api.server import Server
-from tests.support.service import FRAME, MAX_SECONDS, connect, eventually, serving
+from tests.support.service import FRAME, MAX_SECONDS, connect, eventually, rest_of, serving
 
 pytestmark = pytest.mark.slow
 
@@ -30,12 +30,6 @@ def client(scene: Path, server: list[Server]) -> Iterator[httpx.Client]:
         yield client
 
 
-def begun(client: httpx.Client, first: bytes) -> socket.socket:
-    connection = connect(client)
-    connection.sendall(first)
-    return connection
-
-
 def takes(connection: socket.socket, drip: bytes) -> bool:
     """Return whether more can be sent. If not, the service has closed the connection, and its response is lost."""
     try:
@@ -45,26 +39,14 @@ def takes(connection: socket.socket, drip: bytes) -> bool:
     return True
 
 
-def rest_of(connection: socket.socket) -> bytes:
-    received = b""
-    try:
-        while part := connection.recv(65536):
-            received += part
-    except ConnectionResetError:
-        pass
-    return received
-
-
 @pytest.mark.parametrize(
-    ("first", "drip"),
-    [(b"", b""), (b"GET /live HTTP/1.1\r\n", b"X"), (HEAD, b"x")],
-    ids=["nothing", "headers", "body"],
+    ("first", "drip"), [(b"", b""), (b"GET /live HTTP/1.1\r\n", b"X"), (HEAD, b"x")], ids=["nothing", "headers", "body"]
 )
 def test_slow_senders_are_closed_and_others_are_served(client: httpx.Client, first: bytes, drip: bytes):
     assert client.post("/render", json=FRAME).status_code == 200, "kernels are compiled before the time limit applies"
     with contextlib.ExitStack() as sockets:
         silent, dripping = (
-            [sockets.enter_context(begun(client, first)) for _ in range(SOCKETS // 2)] for _ in range(2)
+            [sockets.enter_context(connect(client, first)) for _ in range(SOCKETS // 2)] for _ in range(2)
         )
         deadline = time.monotonic() + MAX_SECONDS
         while drip and (dripping := [connection for connection in dripping if takes(connection, drip)]):
@@ -78,7 +60,7 @@ def test_slow_senders_are_closed_and_others_are_served(client: httpx.Client, fir
 
 
 def test_a_drip_after_an_answer_is_closed_too(client: httpx.Client):
-    connection = begun(client, b"GET /live HTTP/1.1\r\nHost: x\r\n\r\n")
+    connection = connect(client, b"GET /live HTTP/1.1\r\nHost: x\r\n\r\n")
     assert connection.recv(65536).startswith(b"HTTP/1.1 200")
     connection.sendall(b"GET /li")
     assert b" 408 " in rest_of(connection)
@@ -103,7 +85,7 @@ def test_a_reader_that_stands_still_is_closed(client: httpx.Client, server: list
 
 def test_a_reader_that_is_only_slow_gets_all(client: httpx.Client):
     link = b"/render?format=npy&width=300&height=200"
-    connection = begun(client, b"GET %s HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n" % link)
+    connection = connect(client, b"GET %s HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n" % link)
     received = 0
     while part := connection.recv(100_000):
         received += len(part)
@@ -118,7 +100,7 @@ def test_a_reader_that_is_only_slow_gets_all(client: httpx.Client):
     ids=["TLS", "version", "long"],
 )
 def test_invalid_http_gets_a_problem(client: httpx.Client, sent: bytes):
-    connection = begun(client, sent)
+    connection = connect(client, sent)
     answer = rest_of(connection)
     connection.close()
     head, _, body = answer.partition(b"\r\n\r\n")

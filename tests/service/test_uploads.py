@@ -12,15 +12,7 @@ import pytest
 
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
-from tests.support.service import (
-    FRAME,
-    check_problem,
-    connect,
-    eventually,
-    in_this_process,
-    own_connection,
-    serving,
-)
+from tests.support.service import FRAME, check_problem, connect, eventually, in_this_process, own_connection, serving
 
 
 @pytest.fixture
@@ -108,9 +100,8 @@ def test_a_file_that_is_too_large_is_refused(client: httpx.Client, folder: Path)
 def test_a_file_that_stops_coming_leaves_nothing(folder: Path, limits: dict[str, Any]):
     """The client disconnects, or the service times out."""
     with serving(folder, uploads=True, **limits) as client:
-        with connect(client) as connection:
-            head = b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
-            connection.sendall(head + b"half a scene")
+        head = b"POST /scenes?name=walk HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
+        with connect(client, head + b"half a scene") as connection:
             eventually(lambda: len(files(folder)) == 1)
             if limits:
                 assert connection.recv(65536).startswith(b"HTTP/1.1 408 ")

@@ -4,7 +4,7 @@ import itertools
 import json
 import re
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Page
 from msdgs_serve.api.routes.viewer import FILES, FOLDER
 from msdgs_serve.imaging import ImageFormat
 from tests.support.images import decode
-from tests.support.processes import bodies, chromium, forget, image, wait_until_still
+from tests.support.processes import bodies, chromium, forget, image, wait_for, wait_until_still
 from tests.support.scene_files import write_scene
 from tests.support.service import serving
 
@@ -187,7 +187,7 @@ def test_it_plays_one_request_at_a_time(opened: Page):
     opened.evaluate("performance.clearResourceTimings()")
     opened.select_option("#speed", "2")
     opened.get_by_role("button", name="Play").click()
-    assert in_time(opened, lambda: len({body["t"] for body in asked}) > 5 and began_again(asked))  # a run takes 2 s
+    wait_for(lambda: opened.wait_for_timeout(100) or (len({body["t"] for body in asked}) > 5 and began_again(asked)))
     opened.get_by_role("button", name="Pause").click()
     wait_until_still(opened)
     spans = opened.evaluate(RENDER_TIMES)
@@ -330,21 +330,13 @@ def strongest_in_the_middle(image: np.ndarray) -> int:
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
-def in_time(page: Page, holds: Callable[[], bool]) -> bool:
-    for _ in range(600):
-        if holds():
-            return True
-        page.wait_for_timeout(100)
-    return False
-
-
 def test_a_changed_file_is_shown(page: Page, tmp_path: Path):
     write_scene(tmp_path / "ball.onnx", static_color=(1.0, 0.0, 0.0), moving=False)
     with serving(tmp_path) as client:
         open_page(page, client, "")
-        assert in_time(page, lambda: strongest_in_the_middle(image(page)) == 0)
+        wait_for(lambda: strongest_in_the_middle(image(page)) == 0)
         write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=False).rename(tmp_path / "ball.onnx")
-        assert in_time(page, lambda: strongest_in_the_middle(image(page)) == 1)
+        wait_for(lambda: strongest_in_the_middle(image(page)) == 1)
 
 
 def test_a_service_that_allows_fewer_pixels(page: Page, scenes: Path):

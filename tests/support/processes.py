@@ -49,7 +49,7 @@ def program(module: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def wait_for(holds: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait until a port is listened on."""
+    """Wait until a condition holds; fail after some seconds."""
     deadline = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < deadline, "waited in vain"

@@ -29,9 +29,7 @@ class Reference(NamedTuple):
     rgb: np.ndarray  # [H, W, 3] background included
     alpha: np.ndarray  # [H, W]
     depth: np.ndarray  # [H, W] mean distance along the camera axis, inf where alpha is 0
-    slack: (
-        np.ndarray
-    )  # [H, W] bound on what decisions at a threshold can change in a pixel's weights; 0 almost everywhere
+    slack: np.ndarray  # [H, W] bound on what decisions at a threshold change in a pixel's weights; 0 almost everywhere
     color_range: float  # largest difference between two colors in the scene, background included
 
 

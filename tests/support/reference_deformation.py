@@ -49,13 +49,8 @@ def plain_encoding(x: np.ndarray, frequencies: int) -> np.ndarray:
     return np.concatenate([x, *(np.sin(p) for p in phases), *(np.cos(p) for p in phases)], axis=-1)
 
 
-def plain_mlp(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
-    """Equations 7 and 10: the columns of all heads."""
-    return linear(layer.heads, plain_hidden(layer, means, t))
-
-
 def plain_hidden(layer: MLPLayer, means: np.ndarray, t: float) -> np.ndarray:
-    """[N, width] the last hidden units, with the time features repeated for every point."""
+    """Equations 7 and 10: [N, width] the last hidden units, with the time features repeated for every point."""
     time = plain_encoding(np.array([[t]]), layer.time_frequency_matrix.shape[1])
     code = linear(layer.time_output, np.maximum(linear(layer.time_hidden, time), 0))
     encoded = plain_encoding(means, layer.xyz_frequency_matrix.shape[1] // 3)
@@ -108,7 +103,8 @@ def plain_step(layer: DeformationLayer, means: np.ndarray, t: float) -> PlainDel
         transls, rots, stretches = np.split(plain_curves(layer, t), [3, 7], axis=1)
         return PlainDeltas(transls, stretches, rots - [1, 0, 0, 0])
     assert isinstance(layer, MLPLayer | PlaneLayer)
-    columns = plain_mlp(layer, means, t) if isinstance(layer, MLPLayer) else plain_plane(layer, means, t)
+    is_mlp = isinstance(layer, MLPLayer)
+    columns = linear(layer.heads, plain_hidden(layer, means, t)) if is_mlp else plain_plane(layer, means, t)
     weight = 1 / (1 + np.exp(-columns[:, 10:])) if layer.outputs.weight else 1.0
     return PlainDeltas(columns[:, :3], columns[:, 3:6], columns[:, 6:10], weight)
 
@@ -127,12 +123,6 @@ def plain_chain(layers: Iterable[DeformationLayer], means: np.ndarray, t: float)
 
 def rotation(wxyz: np.ndarray) -> Rotation:
     return Rotation.from_quat(np.asarray(wxyz)[..., [1, 2, 3, 0]])
-
-
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The Hamilton product of two quaternions [4]."""
-    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.concatenate([[w], v])
 
 
 def plain_motion(node: np.ndarray, deltas: PlainDeltas, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -171,5 +161,5 @@ def _skinned(model: DynamicGaussians, support: NodesSupport, canonical: PlainPos
         matrix, offset, rot = (np.average(parts, axis=0, weights=weights) for parts in zip(*followed, strict=True))
         means[n] = matrix @ mean + offset
         scales[n] = scale * np.maximum(np.linalg.norm(matrix @ rotation(quat).as_matrix(), axis=0), MIN_STRETCH)
-        quats[n] = product(rot / np.linalg.norm(rot), quat)
+        quats[n] = (rotation(rot) * rotation(quat)).as_quat()[[3, 0, 1, 2]]
     return PlainPose(means, scales, quats)

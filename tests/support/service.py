@@ -4,8 +4,8 @@ import contextlib
 import os
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from msdgs_serve.api.service import Phase
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
+from tests.support.processes import wait_for
 from tests.support.service_on_ray import serving_on_ray
 
 ORBIT = {"type": "orbit", "azimuth": 0, "elevation": 0}
@@ -27,6 +28,7 @@ FRAME = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
 MAX_SECONDS = 300.0
 """Maximum seconds that a test waits, also on a busy machine that compiles kernels first."""
 
+eventually = partial(wait_for, seconds=MAX_SECONDS)
 WATCH_SECONDS = 0.05
 SERVICE_VARIABLE = "MSDGS_TEST_SERVICE"
 ON_RAY = os.environ.get(SERVICE_VARIABLE) == "ray"
@@ -71,18 +73,21 @@ def serving(
     assert not thread.is_alive()
 
 
-def connect(client: httpx.Client) -> socket.socket:
-    """Return a plain connection to a client's service."""
+def connect(client: httpx.Client, first: bytes = b"") -> socket.socket:
+    """Return a plain connection to a client's service, after `first` is sent."""
     assert client.base_url.port
-    return socket.create_connection((client.base_url.host, client.base_url.port), timeout=MAX_SECONDS)
+    connection = socket.create_connection((client.base_url.host, client.base_url.port), timeout=MAX_SECONDS)
+    connection.sendall(first)
+    return connection
 
 
-def eventually(condition: Callable[[], object]) -> None:
-    """Wait until a condition holds; fail after `MAX_SECONDS`."""
-    deadline = time.monotonic() + MAX_SECONDS
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+def rest_of(connection: socket.socket) -> bytes:
+    """Return what the service sends until it closes the connection."""
+    received = bytearray()
+    with contextlib.suppress(ConnectionResetError):
+        while part := connection.recv(1 << 20):
+            received += part
+    return bytes(received)
 
 
 def check_problem(response: httpx.Response, status: int | None = None, field: str | None = None) -> None:

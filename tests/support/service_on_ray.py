@@ -44,9 +44,7 @@ def _cluster() -> int:
 
     port = free_port()
     os.environ["PYTHONPATH"] = str(ROOT)
-    os.environ.setdefault(
-        "RAY_agent_register_timeout_ms", "300000"
-    )  # Ray's default time limit is short for a busy machine
+    os.environ.setdefault("RAY_agent_register_timeout_ms", "300000")  # Ray's default is short for a busy machine
     os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")
     ray.init(
         address="local", include_dashboard=False, num_cpus=CORES, object_store_memory=OBJECT_STORE_BYTES,

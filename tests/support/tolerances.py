@@ -51,11 +51,7 @@ TABLE = (
     Row("color.float32", 2e-6, "16 products of size 1, stored as float32"),
     Row("color.float64", 1e-12, "the same in float64"),
     # gradients, relative to the largest entry of their kind
-    Row(
-        "gradient.finite_differences",
-        1e-6,
-        "central differences with a step of 1e-6: 1e-10 / 1e-3 of the largest entry",
-    ),
+    Row("gradient.finite_differences", 1e-6, "central differences, step 1e-6: 1e-10 / 1e-3 of the largest entry"),
     Row("gradient.autograd", 1e-9, "the same derivative in another order of operations, float64"),
     Row("gradient.float32", 1e-4, "sums over thousands of pixels of terms of both signs, each off by some 1e-6"),
     Row("gradient.second_order", 1e-5, "what a linear step of 2e-4 leaves out: its square times curvatures up to 100"),
@@ -63,9 +59,7 @@ TABLE = (
     Row("motion_vector", 2e-3, "pixels; a displacement of 30, stored and blended in float32, over a sum of weights"),
     Row("stress.growth", 61.0, "MiB that 16 threads keep; a frame lost each time would be gigabytes"),
     Row("kernel_coverage", 95.0, "per cent of the kernels' lines; what is left needs the compiler"),
-    Row(
-        "cuda.pixel", 1e-3, "7e-4 where a splat's alpha is at the threshold of 1 / 255 in one of them; 3e-7 in the mean"
-    ),
+    Row("cuda.pixel", 1e-3, "7e-4 where a splat's alpha is at the threshold in one of them; 3e-7 in the mean"),
     Row("cuda.psnr", 3.0, "dB; the same images in the same order, but no two runs of a few steps are alike"),
     Row("cuda.gradient", 1e-3, "of the largest of its kind; 4e-4 for the same reason"),
     # losses
@@ -83,30 +77,14 @@ TABLE = (
     Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
     Row("neighbor_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
-    Row(
-        "export.nodes.relative",
-        1e-4,
-        "weights of 16 bits, off by 1.5e-5 each, times motions of size 1; and as export.relative",
-    ),
+    Row("export.nodes.relative", 1e-4, "16-bit weights, off by 1.5e-5 each, times motions; and as export.relative"),
     Row("redrawn", 0.1, "dB; a frame is drawn in float32, and again by gsplat's reference in float64"),
     Row("stored_scale", 1e-5, "logarithms up to 18, and the exponential, in float32"),
     Row("stored_16bit", 1e-3, "half a step of a range of 3 is 2e-5; a network without high frequencies multiplies it"),
     Row("stored_8bit", 5e-2, "half a step of a range of 3 is 6e-3; multiplied as 16 bits are"),
-    Row(
-        "hutchinson.relative",
-        0.2,
-        "2,000 random signs: a standard deviation of 0.03 of each entry, and some clamped pixels",
-    ),
-    Row(
-        "visible_error.relative",
-        0.1,
-        "means over 257 times instead of 1,025, of motion up to the Nyquist rate of either",
-    ),
-    Row(
-        "compact.predicted",
-        7.0,
-        "dB; errors of Gaussians are taken as independent; those of 12 nodes' followers aren't",
-    ),
+    Row("hutchinson.relative", 0.2, "2,000 random signs: a deviation of 0.03 of each entry, and some clamped pixels"),
+    Row("visible_error.relative", 0.1, "means over 257 times, not 1,025, of motion up to the Nyquist rate of either"),
+    Row("compact.predicted", 7.0, "dB; errors are taken as independent; those of 12 nodes' followers aren't"),
     Row("compact.pose", 5e-3, "scene units of motion of size 1; what is left of 90 dB in hardly visible Gaussians"),
     Row("int8.relative", 0.3, "of the largest motion; 8 bits are 0.4 % of a range, layers multiply it, AVX2 saturates"),
     Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),
@@ -116,16 +94,7 @@ TABLE = (
     Row("served_frame.8bit", 0.756, "of 255; as served_frame, and half a step of 8 bits"),
     # stability: made cases, docs/stability.md
     Row("stability.accepted_db", 50.0, "the export's default bound, which accepted models must keep"),
-    Row(
-        "stability.predicted",
-        2.0,
-        "a first-order bound, each layer's error measured once; roundings of the sum of deltas come on top",
-    ),
-    Row(
-        "stability.spectral_norm.relative",
-        1e-12,
-        "a root of a cubic in float64, of matrices with entries of similar size",
-    ),
+    Row("stability.predicted", 2.0, "a first-order bound of errors measured once; roundings of the sum come on top"),
     Row("stability.none", 0.0, "a count of pixels that must be 0"),
     Row("stability.first_order", 1e-4, "scene units of round-off up to which a chain is taken as linear; no error"),
     Row("stability.jacobian", 1e-6, "central differences with a step of 1e-7: 1e-13 / 1e-7 through three layers"),
@@ -138,11 +107,7 @@ TABLE = (
     Row("stored_frame", 1e-4, "16 bits over a motion of half the scene, relative to the scene"),
     Row("spz_position", 3e-4, "scene units; 12 fractional bits"),
     Row("spz_rotation", 2e-2, "entries of a matrix; 10 bits a component of one file, 10 of the other"),
-    Row(
-        "damaged_file.seconds",
-        20.0,
-        "of the processor; small files take milliseconds, and machine code is compiled on the way",
-    ),
+    Row("damaged_file.seconds", 20.0, "of the processor; small files take milliseconds; some code is compiled, too"),
     Row("damaged_file.megabytes", 8.0, "beside twice the sound file's: what the allocator keeps from call to call"),
     Row("import.network", 1e-5, "a network of 8 layers in float32, its sums in another order"),
     Row("visionary.relative", 2e-5, "products of float32 rotations and scales, relative to the largest covariance"),
@@ -156,11 +121,7 @@ TABLE = (
     Row("material_point", 1e-6, "scene units; trajectories are written with 7 digits"),
     Row("image_offset", 0.1, "pixels; estimated from colors at 96×96, where half a pixel would be a wrong centre"),
     Row("dot_centroid", 0.05, "pixels; a dot of 2 pixels in 8 bits, stretched unevenly over its width by the lens"),
-    Row(
-        "silent_places",
-        0.02,
-        "part of the places at which a new layer can't learn; 0.4 % for the smallest layer tested",
-    ),
+    Row("silent_places", 0.02, "part of the places where a new layer can't learn; 0.4 % for the smallest one tested"),
 )
 
 _ROWS = {row.name: row for row in TABLE}

@@ -1,7 +1,6 @@
 """A replacement of viser for tests of the viewer without a browser."""
 
 import contextlib
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,7 +46,7 @@ class PageServer:
             add_slider=lambda label, low, high, step, value, **_: self._add(label, value, limits=(low, high, step)),
             add_checkbox=lambda label, value, **_: self._add(label, value),
             add_dropdown=lambda label, options, **_: self._add(label, options[0]),
-            add_folder=self._add_folder,
+            add_folder=lambda label: contextlib.nullcontext(),
         )
 
     def get_port(self) -> int:
@@ -68,13 +67,6 @@ class PageServer:
     def _add_text(self, content: str) -> SimpleNamespace:
         self.texts.append(SimpleNamespace(content=content))
         return self.texts[-1]
-
-    @contextlib.contextmanager
-    def _folder(self) -> Iterator[None]:
-        yield
-
-    def _add_folder(self, label: str) -> Any:
-        return self._folder()
 
 
 @pytest.fixture

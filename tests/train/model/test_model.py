@@ -148,7 +148,7 @@ def test_quaternions_without_direction_become_identity():
         ("embedding_dim", -1),
         ("scale_space", "activated"),
         ("weights", 1),
-        ("eps2d", -0.1),
+        *(("eps2d", eps2d) for eps2d in (-0.1, float("nan"), float("inf"), "0.3", True)),
         ("modulation_lr_init", 0.0),
         *(("modulation_targets", targets) for targets in ((), ("scales", "scales"), ("opacities",))),
     ],
