@@ -121,12 +121,17 @@ class SceneStore:
         return sorted(self._files())
 
     def file(self, name: str) -> Path:
-        """Return the path of a scene's file. Raises `SceneNotFound`."""
-        return self._file(name)
+        """Find a scene's file, without listing folders: every request does this. Raises `SceneNotFound`."""
+        if is_servable_name(name) and "/" not in name:
+            for path in self._paths:
+                file = path / f"{name}{SUFFIX}" if path.is_dir() else path
+                if file.stem == name and file.is_file():
+                    return file
+        raise SceneNotFound(name, self.names())
 
     def status(self, name: str) -> SceneStatus:
         """Return the state of a scene. Raises `SceneNotFound`."""
-        self._file(name)
+        self.file(name)
         return self._status(name)
 
     def statuses(self) -> list[SceneStatus]:
@@ -140,7 +145,7 @@ class SceneStore:
             SceneNotFound: if there is no file of this name.
             SceneFileInvalid: if it violates the contract and no earlier version is loaded.
         """
-        file = self._file(name)
+        file = self.file(name)
         entry = self._entry(name)
         if entry.served is None:
             self._update(entry, file)
@@ -154,7 +159,7 @@ class SceneStore:
         Raises `SceneNotFound`, and `SceneFileInvalid` if the file violates the contract, also if an earlier version of
         it is loaded.
         """
-        served, path = self.get(name), self._file(name)
+        served, path = self.get(name), self.file(name)
         if problem := self._entry(name).problem:
             raise problem.again()
         try:
@@ -217,7 +222,7 @@ class SceneStore:
         """
         folder = self._writable_folder()
         with self._writing:
-            file = self._file(name)
+            file = self.file(name)
             if file.parent != folder:
                 raise InvalidInput("name", "that of a scene in the folder for uploads", name)
             file.unlink(missing_ok=True)
@@ -233,15 +238,6 @@ class SceneStore:
                 "paths", "paths with a folder, to which scenes are added", [str(path) for path in self._paths]
             )
         return self.folder
-
-    def _file(self, name: str) -> Path:
-        """Find a scene's file by name, without listing folders: every request does this."""
-        if is_servable_name(name) and "/" not in name:
-            for path in self._paths:
-                file = path / f"{name}{SUFFIX}" if path.is_dir() else path
-                if file.stem == name and file.is_file():
-                    return file
-        raise SceneNotFound(name, self.names())
 
     def _update(self, entry: _Entry, file: Path) -> None:
         """Load `file` if it changed since the last attempt. Other threads wait only if no version is loaded."""
@@ -296,7 +292,9 @@ class SceneStore:
         found: list[Path] = []
         for path in self._paths:
             if path.is_dir():
-                found += sorted(file for file in path.iterdir() if _is_scene(file))
+                found += sorted(
+                    f for f in path.iterdir() if f.suffix == SUFFIX and is_servable_name(f.stem) and f.is_file()
+                )
             elif path.is_file():
                 found.append(path)
         return found
@@ -318,10 +316,6 @@ def _checked(path: Path) -> Path:
     if not is_servable_name(path.stem):
         raise InvalidInput("paths", "files with printable, unhidden names", repr(path.name))
     return path
-
-
-def _is_scene(file: Path) -> bool:
-    return file.suffix == SUFFIX and is_servable_name(file.stem) and file.is_file()
 
 
 def _signature(path: Path, status: os.stat_result) -> Signature:

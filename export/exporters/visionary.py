@@ -13,6 +13,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from export.importers.splats.base import as_float32
 from export.layers.graph import GraphBuilder
+from export.supports.nodes import quaternion_products
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
@@ -55,7 +56,9 @@ def visionary_model(scene_file: Path) -> onnx.ModelProto:
     else:
         graph.node("Identity", [harmonics], COLORS)
     graph.node("Identity", [graph.constant("count", np.array([count], np.int32))], COUNT)
-    return _model(graph, count + padding)
+    shapes = {GAUSSIANS: [count + padding, COLUMNS], COLORS: [count + padding, COLOR_COLUMNS], COUNT: [1]}
+    types, time = {COLORS: TensorProto.FLOAT16, COUNT: TensorProto.INT32}, {"time": (TensorProto.FLOAT, [1])}
+    return graph.model(time, shapes, {}, types=types, name="msdgs_visionary", opset=OPSET, ir_version=IR_VERSION)
 
 
 def _moving_colors(graph: GraphBuilder, scene: BakedScene) -> str:
@@ -86,6 +89,8 @@ def _moving(graph: GraphBuilder, source: onnx.GraphProto, outputs: tuple[str, ..
         copied = NodeProto.FromString(node.SerializeToString())
         copied.input[:] = [_RENAMED.get(name, name) for name in node.input]
         copied.output[:] = [_RENAMED.get(name, name) for name in node.output]
+        if node.op_type == "ReduceProd":  # in opset 17 its axes are an attribute
+            copied.attribute.append(helper.make_attribute("axes", known[copied.input.pop()].reshape(-1)))
         graph.nodes.append(copied)
 
 
@@ -108,7 +113,8 @@ def _computed(nodes: list[NodeProto], source: onnx.GraphProto, names: list[str])
 
 def _packed(graph: GraphBuilder, scene: BakedScene) -> str:
     """[M, 10] position, opacity and covariance R S Sᵀ Rᵀ, from `means`, `quats`, `scales` and changing `opacities`."""
-    first, second, matrix_of = _quadratic()
+    first, second, factors = quaternion_products()
+    matrix_of = (factors + (first == second)[:, None, None] * np.eye(3, dtype=np.float32)).reshape(10, 9)
     monomials = graph.node("Mul", [_take(graph, "quats", first), _take(graph, "quats", second)], "quats.monomials")
     matrix = graph.node("MatMul", [monomials, graph.constant("quats.to_matrix", matrix_of)], "rotation")
     axes = graph.node("Mul", [matrix, _take(graph, "scales", [0, 1, 2] * 3)], "axes")  # rows of R S
@@ -123,29 +129,10 @@ def _packed(graph: GraphBuilder, scene: BakedScene) -> str:
     return graph.node("Concat", ["means", column, covariances], "moving_rows", axis=1)
 
 
-def _take(graph: GraphBuilder, value: str, columns: list[int]) -> str:
+def _take(graph: GraphBuilder, value: str, columns: list[int] | np.ndarray) -> str:
     name = f"{value}.take{len(graph.nodes)}"
     indices = graph.constant(f"{name}.columns", np.array(columns, np.int64))
     return graph.node("Gather", [value, indices], name, axis=1)
-
-
-def _quadratic() -> tuple[list[int], list[int], np.ndarray]:
-    """The ten products of two components of a quaternion, and the [10, 9] matrix from them to a rotation matrix."""
-    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
-    w, x, y, z = range(4)
-    entries = [
-        {(w, w): 1, (x, x): 1, (y, y): -1, (z, z): -1},
-        {(x, y): 2, (w, z): -2},
-        {(x, z): 2, (w, y): 2},
-        {(x, y): 2, (w, z): 2},
-        {(w, w): 1, (x, x): -1, (y, y): 1, (z, z): -1},
-        {(y, z): 2, (w, x): -2},
-        {(x, z): 2, (w, y): -2},
-        {(y, z): 2, (w, x): 2},
-        {(w, w): 1, (x, x): -1, (y, y): -1, (z, z): 1},
-    ]
-    matrix = np.array([[entry.get(pair, 0) for entry in entries] for pair in pairs], np.float32)
-    return [i for i, _ in pairs], [j for _, j in pairs], matrix
 
 
 def _packed_static(scene: BakedScene) -> np.ndarray:
@@ -154,25 +141,6 @@ def _packed_static(scene: BakedScene) -> np.ndarray:
     kept = np.stack([covariances[:, i, j] for i, j in PAIRS], axis=1)
     opacities = scene.opacities[len(scene.opacities) - scene.static_count :, None]
     return np.concatenate([scene.static_means, opacities, kept], axis=1).astype(np.float32)
-
-
-def _model(graph: GraphBuilder, rows: int) -> onnx.ModelProto:
-    outputs = {
-        GAUSSIANS: (TensorProto.FLOAT, [rows, COLUMNS]),
-        COLORS: (TensorProto.FLOAT16, [rows, COLOR_COLUMNS]),
-        COUNT: (TensorProto.INT32, [1]),
-    }
-    contents = helper.make_graph(
-        graph.nodes,
-        "msdgs_visionary",
-        [helper.make_tensor_value_info("time", TensorProto.FLOAT, [1])],
-        [helper.make_tensor_value_info(name, *kind) for name, kind in outputs.items()],
-        list(graph.constants.values()),
-    )
-    imports = [helper.make_opsetid("", OPSET)]
-    model = helper.make_model(contents, opset_imports=imports, ir_version=IR_VERSION, producer_name="msdgs")
-    onnx.checker.check_model(model)
-    return model
 
 
 def unpacked(gaussians: np.ndarray, colors: np.ndarray, count: int) -> Gaussians:

@@ -1,5 +1,7 @@
 """A small builder of ONNX graphs of named constants and nodes."""
 
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,8 @@ from onnx import TensorProto, helper, numpy_helper
 OPSET = 18
 IR_VERSION = 9
 """The version of opset 18, which every onnxruntime since 1.14 reads."""
+
+Parameter = torch.Tensor | torch.nn.Module  # torch types every attribute of a module as either
 
 
 class GraphBuilder:
@@ -39,27 +43,38 @@ class GraphBuilder:
 
     def model(
         self,
-        inputs: dict[str, tuple[int, list[int | str]]],
-        outputs: dict[str, list[int | str]],
+        inputs: Mapping[str, tuple[int, Sequence[int | str]]],
+        outputs: Mapping[str, Sequence[int | str]],
         properties: dict[str, str],
+        *,
+        types: Mapping[str, int] = MappingProxyType({}),
+        name: str = "msdgs",
+        opset: int = OPSET,
+        ir_version: int = IR_VERSION,
     ) -> onnx.ModelProto:
-        """The checked model; inputs by name with type and shape, outputs (float32) by name with shape."""
+        """The checked model; inputs with type and shape, outputs with shape by name, float32 but for `types`."""
         graph = helper.make_graph(
             self.nodes,
-            "msdgs",
-            [helper.make_tensor_value_info(name, *kind) for name, kind in inputs.items()],
-            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
+            name,
+            [helper.make_tensor_value_info(each, *kind) for each, kind in inputs.items()],
+            [helper.make_tensor_value_info(n, types.get(n, TensorProto.FLOAT), shape) for n, shape in outputs.items()],
             list(self.constants.values()),
         )
         model = helper.make_model(
-            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="msdgs"
+            graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=ir_version, producer_name="msdgs"
         )
         helper.set_model_props(model, properties)
         onnx.checker.check_model(model)
         return model
 
 
-def to_numpy(tensor: torch.Tensor | torch.nn.Module) -> np.ndarray:
+def affine(graph: GraphBuilder, name: str, value: str, weight: Parameter, bias: Parameter) -> str:
+    """Rows times a Linear's weight, plus its bias."""
+    constants = [graph.constant(f"{name}.{kind}", to_numpy(v)) for kind, v in (("weight", weight), ("bias", bias))]
+    return graph.node("Gemm", [value, *constants], f"{name}.out", transB=1)
+
+
+def to_numpy(tensor: Parameter) -> np.ndarray:
     """A parameter or buffer as contiguous float32."""
-    assert isinstance(tensor, torch.Tensor)  # torch types every attribute of a module as either
+    assert isinstance(tensor, torch.Tensor)
     return np.ascontiguousarray(tensor.detach().to("cpu", torch.float32).numpy())

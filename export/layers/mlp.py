@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, heads_of, zero
-from export.layers.graph import GraphBuilder, to_numpy
+from export.layers.graph import GraphBuilder, affine, to_numpy
 from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.mlp import MLPLayer
 
@@ -17,7 +17,21 @@ class MLPExport(FieldLayerExport):
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Encoded means and time through the hidden layers, then one product for all heads."""
-        return _outputs(graph, inputs.name, cast(MLPLayer, inputs.layer), inputs.means, inputs.time, rows)
+        name, layer = inputs.name, cast(MLPLayer, inputs.layer)
+        encoded = _encode(graph, f"{name}.xyz", inputs.means, layer.xyz_frequency_matrix)
+        code = _time_code(graph, name, layer, inputs.time)
+        hidden = _read_input(graph, f"{name}.first", layer, layer.first, encoded, code)
+        hidden = graph.node("Relu", [hidden], f"{name}.first.relu")
+        for i, linear in enumerate(layer.trunk):
+            trunk = f"{name}.trunk{i}"
+            if i + 1 == layer.skip:
+                read = _read_input(graph, trunk, layer, linear, encoded, code)
+                weight = graph.constant(f"{trunk}.weight", to_numpy(linear.weight)[:, layer.input_features :])
+                out = graph.node("Gemm", [hidden, weight, read], f"{trunk}.out", transB=1)
+            else:
+                out = affine(graph, trunk, hidden, linear.weight, linear.bias)
+            hidden = graph.node("Relu", [out], f"{trunk}.relu")
+        return affine(graph, f"{name}.heads", hidden, layer.heads.weight[rows], layer.heads.bias[rows])
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose rows of the last Linear are all 0."""
@@ -32,35 +46,12 @@ class MLPExport(FieldLayerExport):
         return layer
 
 
-def _outputs(graph: GraphBuilder, name: str, layer: MLPLayer, means: str, time: str, rows: np.ndarray) -> str:
-    """[M, len(rows)] deltas, then the logit of the weight, of means [M, 3]."""
-    encoded, code = (
-        _encode(graph, f"{name}.xyz", means, layer.xyz_frequency_matrix),
-        _time_code(graph, name, layer, time),
-    )
-    hidden = _read_input(graph, f"{name}.first", layer, layer.first, encoded, code)
-    hidden = graph.node("Relu", [hidden], f"{name}.first.relu")
-    for i, linear in enumerate(layer.trunk):
-        trunk = f"{name}.trunk{i}"
-        if i + 1 == layer.skip:
-            read = _read_input(graph, trunk, layer, linear, encoded, code)
-            weight = graph.constant(f"{trunk}.weight", to_numpy(linear.weight)[:, layer.input_features :])
-            out = graph.node("Gemm", [hidden, weight, read], f"{trunk}.out", transB=1)
-        else:
-            out = _linear(graph, trunk, linear, hidden)
-        hidden = graph.node("Relu", [out], f"{trunk}.relu")
-    weight = graph.constant(f"{name}.heads.weight", to_numpy(layer.heads.weight)[rows])
-    bias = graph.constant(f"{name}.heads.bias", to_numpy(layer.heads.bias)[rows])
-    return graph.node("Gemm", [hidden, weight, bias], f"{name}.heads.out", transB=1)
-
-
 def _time_code(graph: GraphBuilder, name: str, layer: MLPLayer, time: str) -> str:
     """[1, time_features] the encoded time: one row per call, for any number of ids."""
     encoded = _encode(graph, f"{name}.time", time, layer.time_frequency_matrix)
-    hidden = graph.node(
-        "Relu", [_linear(graph, f"{name}.time_hidden", layer.time_hidden, encoded)], f"{name}.time_relu"
-    )
-    return _linear(graph, f"{name}.time_output", layer.time_output, hidden)
+    hidden = affine(graph, f"{name}.time_hidden", encoded, layer.time_hidden.weight, layer.time_hidden.bias)
+    hidden = graph.node("Relu", [hidden], f"{name}.time_relu")
+    return affine(graph, f"{name}.time_output", hidden, layer.time_output.weight, layer.time_output.bias)
 
 
 def _read_input(
@@ -83,9 +74,3 @@ def _encode(graph: GraphBuilder, name: str, value: str, frequency_matrix: torch.
     sines = graph.node("Sin", [phases], f"{name}.sines")
     cosines = graph.node("Cos", [phases], f"{name}.cosines")
     return graph.node("Concat", [value, sines, cosines], f"{name}.encoded", axis=1)
-
-
-def _linear(graph: GraphBuilder, name: str, linear: torch.nn.Module, value: str) -> str:
-    weight = graph.constant(f"{name}.weight", to_numpy(linear.weight))
-    bias = graph.constant(f"{name}.bias", to_numpy(linear.bias))
-    return graph.node("Gemm", [value, weight, bias], f"{name}.out", transB=1)

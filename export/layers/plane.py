@@ -8,7 +8,7 @@ import torch
 from onnx import TensorProto
 
 from export.layers.base import HEADS, FieldLayerExport, LayerInputs, heads_of, zero
-from export.layers.graph import GraphBuilder, to_numpy
+from export.layers.graph import GraphBuilder, affine, to_numpy
 from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
@@ -21,7 +21,18 @@ class PlaneExport(FieldLayerExport):
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Features of the planes, then a hidden layer and a product for each head."""
-        return _outputs(graph, inputs.name, cast(PlaneLayer, inputs.layer), inputs.means, inputs.time, rows)
+        name, layer = inputs.name, cast(PlaneLayer, inputs.layer)
+        grids = enumerate(layer.plane_grids())
+        read = [_features(graph, f"{name}.grid{i}", grid, inputs.means, inputs.time) for i, grid in grids]
+        features = graph.node("Concat", read, f"{name}.features", axis=1) if len(read) > 1 else read[0]
+        hidden = affine(graph, f"{name}.features.linear", features, layer.features.weight, layer.features.bias)
+        hidden = graph.node("Relu", [hidden], f"{name}.features.relu")
+        weights, biases = (torch.cat([each.get_parameter(n) for each in layer.hidden]) for n in ("weight", "bias"))
+        hidden = graph.node("Relu", [affine(graph, f"{name}.hidden", hidden, weights, biases)], f"{name}.hidden.relu")
+        # each head reads its own hidden units
+        heads = torch.block_diag(*(head.get_parameter("weight") for head in layer.heads))
+        bias = torch.cat([head.get_parameter("bias") for head in layer.heads])
+        return affine(graph, f"{name}.heads", hidden, heads[rows], bias[rows])
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """Heads whose Linear is all 0."""
@@ -34,23 +45,6 @@ class PlaneExport(FieldLayerExport):
         for name in names:
             zero(*layer.heads[HEADS.index(name)].parameters())
         return layer
-
-
-def _outputs(graph: GraphBuilder, name: str, layer: PlaneLayer, means: str, time: str, rows: np.ndarray) -> str:
-    """[M, len(rows)] deltas, then the logit of the weight, of means [M, 3]."""
-    read = [_features(graph, f"{name}.grid{i}", grid, means, time) for i, grid in enumerate(layer.plane_grids())]
-    features = graph.node("Concat", read, f"{name}.features", axis=1) if len(read) > 1 else read[0]
-    hidden = _affine(graph, f"{name}.features.linear", features, layer.features.weight, layer.features.bias)
-    hidden = graph.node("Relu", [hidden], f"{name}.features.relu")
-    weights, biases = (
-        torch.cat([linear.get_parameter(kind) for linear in layer.hidden]) for kind in ("weight", "bias")
-    )
-    hidden = graph.node("Relu", [_affine(graph, f"{name}.hidden", hidden, weights, biases)], f"{name}.hidden.relu")
-    heads = torch.block_diag(
-        *(head.get_parameter("weight") for head in layer.heads)
-    )  # each head reads its own hidden units
-    bias = torch.cat([head.get_parameter("bias") for head in layer.heads])
-    return _affine(graph, f"{name}.heads", hidden, heads[rows], bias[rows])
 
 
 def _features(graph: GraphBuilder, name: str, grid: PlaneGrid, means: str, time: str) -> str:
@@ -111,20 +105,14 @@ def _interpolated_lines(graph: GraphBuilder, name: str, lines: str, cells: str, 
 
 def _interpolated_planes(graph: GraphBuilder, name: str, table: str, cells: str, parts: str, size: int) -> str:
     """[M, C] the product of the three planes' values, from a table of [3 S², C]."""
-    first, second = (
-        graph.node(
-            "Gather", [cells, graph.constant(f"{name}.planes.{which}", axes)], f"{name}.planes.{which}.cells", axis=1
-        )
-        for which, axes in (("first", FIRST_AXES), ("second", SECOND_AXES))
-    )
-    a, b = (
-        _with_channels(
-            graph,
-            f"{name}.planes.{which}.parts",
-            graph.node("Gather", [parts, f"{name}.planes.{which}"], f"{name}.planes.{which}.part", axis=1),
-        )
-        for which in ("first", "second")
-    )
+    sides = (("first", FIRST_AXES), ("second", SECOND_AXES))
+
+    def along(value: str, which: str, axes: np.ndarray, what: str) -> str:
+        axis = graph.constant(f"{name}.planes.{which}", axes)
+        return graph.node("Gather", [value, axis], f"{name}.planes.{which}.{what}", axis=1)
+
+    first, second = (along(cells, *side, "cells") for side in sides)
+    a, b = (_with_channels(graph, f"{name}.planes.{side[0]}.parts", along(parts, *side, "part")) for side in sides)
     width = graph.constant(f"{name}.planes.width", np.array(size, np.int64))
     offsets = graph.constant(f"{name}.planes.offsets", np.arange(3, dtype=np.int64) * size * size)
     rows = graph.node("Mul", [first, width], f"{name}.planes.lines")
@@ -161,8 +149,3 @@ def _product(graph: GraphBuilder, name: str, values: str) -> str:
     """[M, 3, C] → [M, C]."""
     axis = graph.constant(f"{name}.axis", np.array([1], np.int64))
     return graph.node("ReduceProd", [values, axis], name, keepdims=0)
-
-
-def _affine(graph: GraphBuilder, name: str, value: str, weight: torch.Tensor, bias: torch.Tensor) -> str:
-    constants = [graph.constant(f"{name}.{kind}", to_numpy(v)) for kind, v in (("weight", weight), ("bias", bias))]
-    return graph.node("Gemm", [value, *constants], f"{name}.out", transB=1)

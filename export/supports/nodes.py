@@ -15,7 +15,7 @@ from export.layers.graph import GraphBuilder, to_numpy
 from export.supports.base import Layout, SupportExport, SupportInputs
 from export.supports.blocks import block_layout
 from export.supports.skinning import Blend, columns_of, reshaped, skinned_deltas, skinned_poses
-from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.nodes import NodesSupport
 
@@ -118,27 +118,23 @@ def _stretching(graph: GraphBuilder, name: str, rotations: str, stretches: str) 
 
 def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
     """[·, 9] rotation matrices, column by column: products of pairs of w, x, y, z, summed by a constant."""
-    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
-    first, second = (
-        graph.constant(f"{name}.{n}", np.array(ids, np.int64))
-        for n, ids in zip(("i", "j"), zip(*pairs, strict=True), strict=True)
-    )
+    first, second, factors = quaternion_products()
     left, right = (
-        graph.node("Gather", [quats, ids], f"{name}.{side}", axis=1)
-        for side, ids in (("left", first), ("right", second))
+        graph.node("Gather", [quats, graph.constant(f"{name}.{letter}", ids)], f"{name}.{side}", axis=1)
+        for letter, side, ids in (("i", "left", first), ("j", "right", second))
     )
-    w, x, y, z = range(4)
-    entries = [
-        {(): 1, (y, y): -2, (z, z): -2}, {(x, y): 2, (w, z): 2}, {(x, z): 2, (w, y): -2},
-        {(x, y): 2, (w, z): -2}, {(): 1, (x, x): -2, (z, z): -2}, {(y, z): 2, (w, x): 2},
-        {(x, z): 2, (w, y): 2}, {(y, z): 2, (w, x): -2}, {(): 1, (x, x): -2, (y, y): -2},
-    ]  # fmt: skip
-    sums = np.array([[entry.get(pair, 0) for entry in entries] for pair in pairs], np.float32)
-    ones = np.array([entry.get((), 0) for entry in entries], np.float32)
-    products = graph.node("Mul", [left, right], f"{name}.products")
-    return graph.node(
-        "Gemm", [products, graph.constant(f"{name}.sums", sums), graph.constant(f"{name}.ones", ones)], name
-    )
+    sums = graph.constant(f"{name}.sums", factors.transpose(0, 2, 1).reshape(10, 9))
+    ones = graph.constant(f"{name}.ones", np.eye(3, dtype=np.float32).reshape(9))
+    return graph.node("Gemm", [graph.node("Mul", [left, right], f"{name}.products"), sums, ones], name)
+
+
+def quaternion_products() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices, [10], of the factors of all products of two components, and what each adds to `to_matrix` beyond the
+    identity, [10, 3, 3]."""
+    first, second = np.triu_indices(4)
+    alone = to_matrix(np.eye(4)) - np.eye(3)
+    both = to_matrix(np.eye(4)[first] + np.eye(4)[second]) - np.eye(3) - alone[first] - alone[second]
+    return first, second, np.where((first == second)[:, None, None], alone[first], both).astype(np.float32)
 
 
 def _unit(graph: GraphBuilder, name: str, quats: str) -> str:

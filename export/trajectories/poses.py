@@ -31,8 +31,10 @@ class ExactPoses:
         m = baked.moving
         self.count = len(m)
         self._space: ScaleSpace = "log" if baked.scene.metadata.delta_space == DELTA_SPACES["log"] else "linear"
-        self._means, self._log_scales, self._quats = (_double(a) for a in (m.means, m.log_scales, m.quats))
-        self._factors = {head: _double(factors) for head, factors in m.modulation.items()}
+        self._means, self._log_scales, self._quats = (
+            torch.from_numpy(a).double() for a in (m.means, m.log_scales, m.quats)
+        )
+        self._factors = {head: torch.from_numpy(factors).double() for head, factors in m.modulation.items()}
         self._attributes = {name: torch.from_numpy(values) for name, values in m.attributes.items()}
         self._attributes |= {n: v.double() for n, v in self._attributes.items() if v.is_floating_point()}
         self._support = copy.deepcopy(baked.support).double()
@@ -43,25 +45,19 @@ class ExactPoses:
         """Approximate operations per Gaussian and pose."""
         return max(operations(self._support, self._deformation, self.count), 1)
 
+    @torch.no_grad()
     def at(self, t: float, ids: npt.NDArray[np.int64] | None = None) -> Poses:
         """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`, or of all."""
-        return self._posed(t, torch.from_numpy(np.arange(self.count) if ids is None else ids))
-
-    @torch.no_grad()
-    def _posed(self, t: float, ids: torch.Tensor) -> Poses:
-        means, log_scales = self._means[ids], self._log_scales[ids]
-        points = CanonicalPoints(means, self._quats[ids], {name: v[ids] for name, v in self._attributes.items()})
+        rows = torch.from_numpy(np.arange(self.count) if ids is None else ids)
+        means, log_scales, quats = self._means[rows], self._log_scales[rows], self._quats[rows]
+        points = CanonicalPoints(means, quats, {name: v[rows] for name, v in self._attributes.items()})
         deltas = self._support(self._deformation, points, torch.tensor(t, dtype=torch.float64))
         of_means, of_scales, of_quats = (
-            self._factors[head][ids] * getattr(deltas, head) if head in self._factors else getattr(deltas, head)
+            self._factors[head][rows] * getattr(deltas, head) if head in self._factors else getattr(deltas, head)
             for head in HEADS  # equation 12
         )
         scales = add_to_scales(self._space, log_scales, of_scales)
-        return torch.cat([means + of_means, scales, unit_or_identity(self._quats[ids] + of_quats)], dim=1).numpy()
-
-
-def _double(array: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(array).double()
+        return torch.cat([means + of_means, scales, unit_or_identity(quats + of_quats)], dim=1).numpy()
 
 
 class SinglePoses:

@@ -61,14 +61,15 @@ class Trajectories:
         exact = ExactPoses(baked)
         self.count, self._operations, self._sampler = exact.count, exact.operations, sampler or exact.at
         self.time_range = t0, t1 = baked.scene.metadata.time_range
-        self._ids = np.arange(self.count)  # in the arrays below
+        self.rows = np.arange(self.count)
+        """[M] indices of these Gaussians among those that were sampled, whose arrays follow."""
         self.track = track
         self._on_time = track(f"{self.count:,} trajectories", COARSE + 1 + PROBES)
         self._probe_parts = np.arange(1, PROBES + 1) * (np.sqrt(5) - 1) / 2 % 1
-        self._probes = self._sampled(self._ids, t0 + (t1 - t0) * self._probe_parts)
-        samples = self._sampled(self._ids, np.linspace(t0, t1, COARSE + 1))
+        self._probes = self._sampled(self.rows, t0 + (t1 - t0) * self._probe_parts)
+        samples = self._sampled(self.rows, np.linspace(t0, t1, COARSE + 1))
         give_one_sign(samples)
-        self._levels = {COARSE: (self._ids, samples)}
+        self._levels = {COARSE: (self.rows, samples)}
         self._depth = np.full(self.count, COARSE)  # intervals at which each is sampled
         self.scene, self._resolved = baked.scene, resolved
         cameras = cameras or [camera for _, camera in cameras_of_file(baked.scene.metadata)]
@@ -84,21 +85,21 @@ class Trajectories:
     def some(self, rows: Ids) -> "Trajectories":
         """Trajectories of some of the Gaussians; the samples are shared."""
         made = copy.copy(self)
-        made.count, made._ids, made._whole = len(rows), self._ids[rows], self._whole or self
+        made.count, made.rows, made._whole = len(rows), self.rows[rows], self._whole or self
         return made
 
     @property
     def unresolved(self) -> Ids:
         """Gaussians that move faster than their finest sampling resolves."""
-        return np.flatnonzero(np.isin(self._ids, self._missing(VISIBLE * self._resolved)))
+        return np.flatnonzero(np.isin(self.rows, self._missing(VISIBLE * self._resolved)))
 
     def intervals(self, ids: Ids) -> npt.NDArray[np.int64]:
         """[M] numbers of intervals between the samples of each."""
-        return self._depth[self._ids[ids]]
+        return self._depth[self.rows[ids]]
 
     def on_grid(self, times: int, ids: Ids) -> Samples:
         """[M, T, 10] poses at T = 2ⁿ + 1 evenly spread times, interpolated by cubics between samples."""
-        ids = self._ids[ids]
+        ids = self.rows[ids]
         got = np.empty((len(ids), times, POSE), np.float32)
         for level in np.unique(self._depth[ids]):
             rows = np.flatnonzero(self._depth[ids] == level)
@@ -108,11 +109,6 @@ class Trajectories:
                 values = _with_between(values, _cubic_between(values))
             got[rows] = values[:, :: (values.shape[1] - 1) // (times - 1)]
         return got
-
-    @property
-    def rows(self) -> Ids:
-        """[M] indices of these Gaussians among those that were sampled."""
-        return self._ids
 
     def once(self, make: "Callable[[Trajectories], Made]") -> Made:
         """What `make` returns for all Gaussians that were sampled; made once, whichever part of them asks."""

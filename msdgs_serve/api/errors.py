@@ -17,12 +17,12 @@ from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneN
 from msdgs_serve.store import SceneExists
 from msdgs_serve.video import VideoUnavailable
 
-STATUS_OF: dict[type[MsdgsError], HTTPStatus] = {
-    InvalidInput: HTTPStatus.UNPROCESSABLE_ENTITY,
-    SceneNotFound: HTTPStatus.NOT_FOUND,
-    SceneExists: HTTPStatus.CONFLICT,
-    VideoUnavailable: HTTPStatus.NOT_IMPLEMENTED,
-    SceneFileInvalid: HTTPStatus.SERVICE_UNAVAILABLE,
+STATUS_AND_KIND: dict[type[MsdgsError], tuple[HTTPStatus, str]] = {
+    InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "invalid"),
+    SceneNotFound: (HTTPStatus.NOT_FOUND, "not_found"),
+    SceneExists: (HTTPStatus.CONFLICT, "conflict"),
+    VideoUnavailable: (HTTPStatus.NOT_IMPLEMENTED, "unavailable"),
+    SceneFileInvalid: (HTTPStatus.SERVICE_UNAVAILABLE, "broken_scene"),
 }
 KIND = "msdgs.problem"
 """Key of an ASGI scope for the kind of problem in the response, for the metrics."""
@@ -58,15 +58,7 @@ class RequestRejected(MsdgsError):
 class ClientGone(MsdgsError):
     """The client closed the connection before the response was ready."""
 
-
-KINDS: dict[type[Exception], str] = {
-    InvalidInput: "invalid",
-    SceneNotFound: "not_found",
-    SceneExists: "conflict",
-    VideoUnavailable: "unavailable",
-    SceneFileInvalid: "broken_scene",
-    ClientGone: "client_gone",
-}
+    kind = "client_gone"
 
 
 class FieldError(BaseModel):
@@ -137,7 +129,8 @@ def rejection(error: RequestRejected) -> Response:
 
 async def _on_domain_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, MsdgsError)
-    request.scope[KIND] = error.kind if isinstance(error, RequestRejected) else KINDS.get(type(error), "internal")
+    known = isinstance(error, RequestRejected | ClientGone)
+    request.scope[KIND] = error.kind if known else STATUS_AND_KIND.get(type(error), (None, "internal"))[1]
     return _domain_problem(error)
 
 
@@ -146,7 +139,7 @@ def _domain_problem(error: MsdgsError) -> Response:
         return Response(status_code=CLIENT_CLOSED_REQUEST)  # for metrics and log only
     if isinstance(error, RequestRejected):
         return rejection(error)
-    status = next((status for kind, status in STATUS_OF.items() if isinstance(error, kind)), None)
+    status = next((status for kind, (status, _) in STATUS_AND_KIND.items() if isinstance(error, kind)), None)
     if status is None:
         logger.error("unexpected domain error", exc_info=error)
         return server_error()

@@ -1,5 +1,6 @@
 """The OpenAPI document: error responses, API keys, and examples for the scenes that are served."""
 
+from collections.abc import Iterable
 from http import HTTPStatus
 from typing import Any
 
@@ -19,73 +20,59 @@ Responses = dict[int | str, dict[str, Any]]
 Examples = dict[str, dict[str, Any]]
 
 
-def _headers(meanings: dict[str, str]) -> dict[str, Any]:
-    return {name: {"description": text, "schema": {"type": "string"}} for name, text in meanings.items()}
+BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 
-IMAGE_RESPONSE: Responses = {
-    200: {
-        "description": "The frame, or a ZIP file of frames at several times",
-        "content": {
-            media_type: {"schema": {"type": "string", "format": "binary"}}
-            for media_type in (*(traits.media_type for traits in FORMATS.values()), "application/zip")
-        },
-        "headers": _headers(
-            {
-                "ETag": "ETag of scene file and request",
-                "Server-Timing": "milliseconds by stage: queue, pose (cached or not), draw, encode",
-                "Msdgs-Scene": "the scene's name, percent-encoded",
-                "Msdgs-Plan": "how the scene's motion is computed",
-                "Msdgs-Error": "PSNR in dB of the file's worst frame against the full model, if measured",
-                "Msdgs-Channels": "channels of the file, in order",
-            }
-        ),
-    }
-}
+def _file(description: str, media_types: Iterable[str], **headers: str) -> Responses:
+    """A file of one of these media types; hyphens in names of headers are given as underscores."""
+    response: dict[str, Any] = {"description": description, "content": dict.fromkeys(media_types, BINARY)}
+    if headers:
+        texts = {name.replace("_", "-"): text for name, text in headers.items()}
+        response["headers"] = {n: {"description": text, "schema": {"type": "string"}} for n, text in texts.items()}
+    return {200: response}
+
+
+IMAGE_RESPONSE = _file(
+    "The frame, or a ZIP file of frames at several times",
+    [*(traits.media_type for traits in FORMATS.values()), "application/zip"],
+    ETag="ETag of scene file and request",
+    Server_Timing="milliseconds by stage: queue, pose (cached or not), draw, encode",
+    Msdgs_Scene="the scene's name, percent-encoded",
+    Msdgs_Plan="how the scene's motion is computed",
+    Msdgs_Error="PSNR in dB of the file's worst frame against the full model, if measured",
+    Msdgs_Channels="channels of the file, in order",
+)
 NOT_MODIFIED: Responses = {304: {"description": "The client has this version"}}
-FILE_RESPONSE: Responses = {
-    200: {
-        "description": "The file",
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
-        "headers": _headers(
-            {
-                "ETag": "SHA-256 of the file, weak if it is compressed",
-                "Content-Encoding": "`zstd`, if the client takes it",
-                "Content-Disposition": "with the file's name",
-            }
-        ),
-    }
-}
+FILE_RESPONSE = _file(
+    "The file",
+    ["application/octet-stream"],
+    ETag="SHA-256 of the file, weak if it is compressed",
+    Content_Encoding="`zstd`, if the client takes it",
+    Content_Disposition="with the file's name",
+)
 BATCH_RESPONSE: Responses = {
     200: {
         "description": "A frame or a problem per line or part",
         "content": {
             "application/x-ndjson": {"schema": {"$ref": "#/components/schemas/BatchItem"}},
-            "multipart/mixed": {"schema": {"type": "string", "format": "binary"}},
+            "multipart/mixed": BINARY,
         },
     }
 }
-VIDEO_RESPONSE: Responses = {
-    200: {
-        "description": "The video",
-        "content": {
-            traits.media_type: {"schema": {"type": "string", "format": "binary"}} for traits in VIDEO_FORMATS.values()
-        },
-    }
-}
+VIDEO_RESPONSE = _file("The video", [traits.media_type for traits in VIDEO_FORMATS.values()])
 SCENE_BODY = {
     "requestBody": {
         "required": True,
         "description": "a scene file, contract `msdgs/1` or `msdgs/2`",
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        "content": {"application/octet-stream": BINARY},
     }
 }
 
 
-def problems(*statuses: HTTPStatus) -> Responses:
+def problems(*statuses: int) -> Responses:
     """Return the error responses of a call."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    return {status.value: {"description": status.phrase, "content": content} for status in statuses}
+    return {status: {"description": HTTPStatus(status).phrase, "content": content} for status in statuses}
 
 
 def install_openapi(app: FastAPI, store: SceneStore, *, keys: bool) -> None:
@@ -126,7 +113,7 @@ def _add_keys(document: dict[str, Any]) -> None:
         "key": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
     }
     document["components"]["securitySchemes"] = schemes
-    refusals = problems(HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN)
+    refusals = problems(401, 403)
     for path, calls in document["paths"].items():
         for method, call in calls.items():
             if (scope := scope_of(method.upper(), path)) is not None:

@@ -6,8 +6,6 @@ preempt the event loop while that holds Python's interpreter: under 4x overload 
 
 import asyncio
 import http
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import h11
@@ -138,15 +136,6 @@ class _HeadWithBody(h11.Connection):
             return b""
         head, self._head = self._head, b""
         return head + data
-
-
-def limited_protocol(
-    header_seconds: float, read_seconds: float, early_rejection: EarlyRejection | None
-) -> Callable[..., LimitedProtocol]:
-    """Return the protocol factory for uvicorn."""
-    return partial(
-        LimitedProtocol, header_seconds=header_seconds, read_seconds=read_seconds, early_rejection=early_rejection
-    )
 
 
 def _cancelled(timer: asyncio.TimerHandle | None) -> None:

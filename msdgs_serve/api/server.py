@@ -3,13 +3,14 @@
 import asyncio
 import socket
 import time
+from functools import partial
 from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
 
 from msdgs_serve.api.early_rejection import EarlyRejection
-from msdgs_serve.api.protocol import limited_protocol
+from msdgs_serve.api.protocol import LimitedProtocol
 from msdgs_serve.api.service import Phase, Service
 from msdgs_serve.api.settings import Settings
 
@@ -30,7 +31,8 @@ class Server(uvicorn.Server):
         early_rejection = (
             EarlyRejection(self.service.queue, self.service.metrics, settings.max_body_bytes) if is_simple else None
         )
-        protocol = limited_protocol(settings.header_seconds, settings.read_seconds, early_rejection)
+        limits = {"header_seconds": settings.header_seconds, "read_seconds": settings.read_seconds}
+        protocol = partial(LimitedProtocol, **limits, early_rejection=early_rejection)
         config = uvicorn.Config(
             app,
             http=protocol,  # pyright: ignore[reportArgumentType]

@@ -36,50 +36,15 @@ def from_matrix(matrices: np.ndarray) -> np.ndarray:
     The largest component is computed from the diagonal and the others are divided by it, which avoids divisions by
     numbers near zero.
     """
-    m = np.asarray(matrices)
-    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(np.asarray(matrices), (-2, -1), (0, 1))
     # row k: 4 q_k times (w, x, y, z)
-    candidates = np.stack(
-        [
-            np.stack(
-                [
-                    1 + m00 + m11 + m22,
-                    m[..., 2, 1] - m[..., 1, 2],
-                    m[..., 0, 2] - m[..., 2, 0],
-                    m[..., 1, 0] - m[..., 0, 1],
-                ],
-                axis=-1,
-            ),
-            np.stack(
-                [
-                    m[..., 2, 1] - m[..., 1, 2],
-                    1 + m00 - m11 - m22,
-                    m[..., 0, 1] + m[..., 1, 0],
-                    m[..., 0, 2] + m[..., 2, 0],
-                ],
-                axis=-1,
-            ),
-            np.stack(
-                [
-                    m[..., 0, 2] - m[..., 2, 0],
-                    m[..., 0, 1] + m[..., 1, 0],
-                    1 - m00 + m11 - m22,
-                    m[..., 1, 2] + m[..., 2, 1],
-                ],
-                axis=-1,
-            ),
-            np.stack(
-                [
-                    m[..., 1, 0] - m[..., 0, 1],
-                    m[..., 0, 2] + m[..., 2, 0],
-                    m[..., 1, 2] + m[..., 2, 1],
-                    1 - m00 - m11 + m22,
-                ],
-                axis=-1,
-            ),
-        ],
-        axis=-2,
-    )
+    rows = [
+        [1 + a + e + i, h - f, c - g, d - b],
+        [h - f, 1 + a - e - i, b + d, c + g],
+        [c - g, b + d, 1 - a + e - i, f + h],
+        [d - b, c + g, f + h, 1 - a - e + i],
+    ]
+    candidates = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     best = np.argmax(np.diagonal(candidates, axis1=-2, axis2=-1), axis=-1)
     quats = normalize(np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :])
     return np.where(quats[..., :1] < 0, -quats, quats)

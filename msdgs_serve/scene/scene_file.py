@@ -17,7 +17,7 @@ from msdgs_serve.scene.onnx import (
     Tensor,
     Value,
     infer,
-    names_needed,
+    needed,
     read_model,
     write_model,
 )
@@ -161,7 +161,7 @@ def _before_selection(
         if not value.varies or value.shape[0].per_id or value.shape[0].fixed not in rows_range:
             return otherwise
         rows.append(node.inputs[0])
-    if len({*rows}) < len(rows) or (takes_ids and "ids" in names_needed(model, rows)):
+    if len({*rows}) < len(rows) or (takes_ids and "ids" in needed(model, rows)[1]):
         return otherwise
     return tuple(rows)
 

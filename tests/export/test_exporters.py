@@ -30,7 +30,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
-from tests.support.models import MLP, SCENE, random_model
+from tests.support.models import MLP, NODES, SCENE, random_model
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
@@ -38,7 +38,8 @@ QUIET = Console(quiet=True)
 
 
 def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
-    model = random_model(300, noise=0.02, layers=(replace(MLP, time_frequencies=2),) * 2, **config)
+    settings: dict[str, Any] = {"layers": (replace(MLP, time_frequencies=2),) * 2} | config
+    model = random_model(300, noise=0.02, **settings)
     file = folder / "scene.onnx"
     file.write_bytes(build(plan, bake(model, SCENE, "0" * 64)).SerializeToString())
     return file
@@ -205,9 +206,18 @@ def test_opacities_and_colors_that_change_are_those_of_each_time(tmp_path: Path,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plan", ["network", "compact:30", "compact:60"])
-def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str):
-    scene = scene_file(tmp_path, plan)
+@pytest.mark.parametrize(
+    ("plan", "config"),
+    [
+        ("network", {}),
+        ("network", {"layers": ("plane", "spline")}),
+        ("network", {"layers": ("spline", "mlp"), "support": NODES}),
+        ("compact:30", {}),
+        ("compact:60", {}),
+    ],
+)
+def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str, config: dict[str, Any]):
+    scene = scene_file(tmp_path, plan, **config)
     run(scene, tmp_path / "a.visionary.onnx")
     shown, session = visionary_of(tmp_path / "a.visionary.onnx"), DeformationSession(scene)
     for t in (0.0, 0.3, 0.77, 1.0):

@@ -20,7 +20,6 @@ TABLE = (
     # scene vocabulary, float64
     Row("rotation", 1e-12, "a few dozen float64 operations on numbers of size 1"),
     Row("sh_basis", 1e-12, "polynomials of degree 3 in float64; published constants carry 16 digits"),
-    Row("sh_basis.float32", 2e-6, "the same in float32"),
     Row("sh_basis.gsplat", 1e-12, "as sh_basis; gsplat keeps some constants to 14 digits"),
     Row("float32.relative", 1e-6, "a handful of float32 operations"),
     Row("pixel", 1e-9, "projecting a known point through float64 matrices, in pixels"),

@@ -12,7 +12,7 @@ from export.measure.frames import compare, render
 from export.measure.poses import posed
 from export.measure.views import cameras_of, selection_views
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_serve.scene.quaternion import from_matrix
+from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.scale_space import MIN_SCALE, activated_scales
@@ -46,19 +46,9 @@ def as_trained(model: DynamicGaussians, t: float, ours: Gaussians) -> tuple[Gaus
     step = model.deformation.layers[0](g.means, torch.tensor(t, dtype=g.means.dtype))
     quats = (unit_or_identity(g.raw_quats) + step.delta_quats).double()
     scales = (activated_scales(g.log_scales) + step.delta_scales).double()
-    axes, lengths, _ = torch.linalg.svd(_unnormalized_matrices(quats) * scales[:, None, :])
+    matrices = torch.from_numpy(to_matrix(quats.numpy()))  # by the formula for unit quaternions
+    axes, lengths, _ = torch.linalg.svd(matrices * scales[:, None, :])
     axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
     deviation = float((torch.linalg.vector_norm(quats, dim=1) - 1).abs().max()) if len(quats) else 0.0
     rotated, sizes = from_matrix(axes.numpy()).astype(np.float32), lengths.clamp_min(MIN_SCALE).float().numpy()
     return Gaussians(ours.means, rotated, sizes, ours.opacities, ours.sh), deviation
-
-
-def _unnormalized_matrices(quats: torch.Tensor) -> torch.Tensor:
-    """[N, 3, 3] the formula of the rotation matrix of a unit wxyz quaternion, for quaternions of any norm."""
-    w, x, y, z = quats.unbind(1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)

@@ -43,16 +43,7 @@ class Item:
     "/render/batch",
     summary="Many frames",
     response_class=StreamingResponse,
-    responses={
-        **BATCH_RESPONSE,
-        **problems(
-            HTTPStatus.BAD_REQUEST,
-            HTTPStatus.REQUEST_TIMEOUT,
-            HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-            HTTPStatus.UNPROCESSABLE_ENTITY,
-            HTTPStatus.SERVICE_UNAVAILABLE,
-        ),
-    },
+    responses={**BATCH_RESPONSE, **problems(400, 408, 413, 422, 503)},
 )
 async def render_batch(
     body: BatchRequest, service: SharedService, accept: Annotated[str | None, Header(max_length=1000)] = None

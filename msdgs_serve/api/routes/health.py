@@ -21,7 +21,7 @@ async def live() -> Live:
     return Live(version=__version__)
 
 
-@router.get("/ready", summary="Whether the service is ready", responses=problems(HTTPStatus.SERVICE_UNAVAILABLE))
+@router.get("/ready", summary="Whether the service is ready", responses=problems(503))
 async def ready(service: SharedService) -> Ready:
     """503 until scenes are loaded and kernels compiled, and while the service is stopping; needs no key."""
     if service.phase is not Phase.READY:

@@ -16,19 +16,7 @@ from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
 from msdgs_serve.render_job import RenderJob
 
-RESPONSES = {
-    **IMAGE_RESPONSE,
-    **NOT_MODIFIED,
-    **problems(
-        HTTPStatus.BAD_REQUEST,
-        HTTPStatus.NOT_FOUND,
-        HTTPStatus.REQUEST_TIMEOUT,
-        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-        HTTPStatus.UNPROCESSABLE_ENTITY,
-        HTTPStatus.SERVICE_UNAVAILABLE,
-        HTTPStatus.GATEWAY_TIMEOUT,
-    ),
-}
+RESPONSES = {**IMAGE_RESPONSE, **NOT_MODIFIED, **problems(400, 404, 408, 413, 422, 503, 504)}
 
 router = APIRouter(tags=["frames"])
 

@@ -25,7 +25,6 @@ from msdgs_serve.api.openapi import FILE_RESPONSE, NOT_MODIFIED, SCENE_BODY, pro
 from msdgs_serve.api.schemas import (
     GaussianCounts,
     GraphCost,
-    GraphLimit,
     SceneAdded,
     SceneDetail,
     SceneEntry,
@@ -34,9 +33,7 @@ from msdgs_serve.api.schemas import (
 )
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.uploads import Stored
-from msdgs_serve.framing import Framing
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
-from msdgs_serve.scene.scene_file import SceneCost
 from msdgs_serve.scene_report import read_report, report_path
 from msdgs_serve.store import SceneStatus, SceneStore
 
@@ -51,28 +48,20 @@ Sha256 = Annotated[
 router = APIRouter(tags=["scenes"])
 
 
-@router.get("/scenes", summary="The scenes that are served", responses=problems(HTTPStatus.UNPROCESSABLE_ENTITY))
+@router.get("/scenes", summary="The scenes that are served", responses=problems(422))
 def list_scenes(service: SharedService) -> SceneList:
     """Names and states, without loading scenes."""
     statuses = service.store.statuses()
     return SceneList(scenes=[SceneEntry(name=each.name, loaded=each.loaded, **_problem(each)) for each in statuses])
 
 
-@router.get(
-    "/scenes/{name}",
-    summary="Description of a scene",
-    responses=problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
-)
+@router.get("/scenes/{name}", summary="Description of a scene", responses=problems(404, 422, 503))
 def describe_scene(name: SceneName, service: SharedService) -> SceneDetail:
     """Time range, cameras, plan, counts and measured error. Loads the scene if necessary."""
     return _describe(service.store, name)
 
 
-@router.get(
-    "/scenes/{name}/report",
-    summary="Error against run time",
-    responses=problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
-)
+@router.get("/scenes/{name}/report", summary="Error against run time", responses=problems(404, 422, 503))
 def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
     """The exporter's measurements of the plans for this scene: the `.report.json` beside its file, in the format
     `msdgs-report/1`. 404 if there is none, or if it belongs to another model."""
@@ -87,11 +76,7 @@ def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
     "/scenes/{name}/file",
     summary="The scene's file",
     response_class=Response,
-    responses={
-        **FILE_RESPONSE,
-        **NOT_MODIFIED,
-        **problems(HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.SERVICE_UNAVAILABLE),
-    },
+    responses={**FILE_RESPONSE, **NOT_MODIFIED, **problems(404, 422, 503)},
 )
 def scene_file(
     name: SceneName,
@@ -121,15 +106,7 @@ def scene_file(
     summary="Add a scene",
     status_code=HTTPStatus.CREATED,
     openapi_extra=SCENE_BODY,
-    responses=problems(
-        HTTPStatus.BAD_REQUEST,
-        HTTPStatus.FORBIDDEN,
-        HTTPStatus.REQUEST_TIMEOUT,
-        HTTPStatus.CONFLICT,
-        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-        HTTPStatus.UNPROCESSABLE_ENTITY,
-        HTTPStatus.INSUFFICIENT_STORAGE,
-    ),
+    responses=problems(400, 403, 408, 409, 413, 422, 507),
 )
 async def add_scene(
     name: NewName,
@@ -166,7 +143,7 @@ async def add_scene(
     "/scenes/{name}",
     summary="Delete a scene",
     status_code=HTTPStatus.NO_CONTENT,
-    responses=problems(HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND, HTTPStatus.UNPROCESSABLE_ENTITY),
+    responses=problems(403, 404, 422),
 )
 async def delete_scene(name: SceneName, service: SharedService) -> None:
     """Deletes the scene's file; renders in progress are finished. Requires that the service runs with `--uploads`."""
@@ -203,52 +180,23 @@ async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
 
 
 def _describe(store: SceneStore, name: str) -> SceneDetail:
-    served = store.get(name)
-    scene = served.session.scene
-    status = store.status(name)
-    metadata = scene.metadata
-    low, high = metadata.bounds
+    served, status = store.get(name), store.status(name)
+    scene, metadata, seen = served.session.scene, served.session.scene.metadata, served.framing
     counts = GaussianCounts(moving=scene.moving_count, static=scene.static_count, total=len(scene))
     return SceneDetail(
+        **vars(metadata) | {"cameras": [camera.to_plain() for camera in metadata.cameras]},
+        **_problem(status),
         name=name,
         loaded=status.loaded,
-        **_problem(status),
-        contract=metadata.contract,
-        plan=metadata.plan,
-        layers=list(metadata.layers),
         steps=served.session.max_steps,
         gaussians=counts,
-        sh_degree=metadata.sh_degree,
-        time_range=metadata.time_range,
-        duration=metadata.duration,
-        bounds=(list(low), list(high)),
-        background=metadata.background,
-        antialiasing=metadata.antialiasing,
-        eps2d=metadata.eps2d,
-        delta_space=metadata.delta_space,
-        view=_view(served.framing),
-        cameras=[camera.to_plain() for camera in metadata.cameras],
-        measured_error=metadata.measured_error,
+        view=SceneView(**vars(seen) | {"target": seen.target.tolist(), "up": seen.up.tolist()}),
         report=report_path(store.file(name)).is_file(),
-        left_out=list(metadata.left_out),
-        package_version=metadata.package_version,
-        checkpoint_sha256=metadata.checkpoint_sha256,
         sha256=served.sha256,
-        cost=_cost(served.session.cost),
+        cost=GraphCost.model_validate(served.session.cost, from_attributes=True),
     )
 
 
 def _problem(status: SceneStatus) -> dict[str, Any]:
     reason = None if status.problem is None else f"`{status.problem.field}` {status.problem.problem}"
     return {"problem": reason is not None, "reason": reason and reason[:MAX_REASON]}
-
-
-def _cost(cost: SceneCost) -> GraphCost:
-    allowed = cost.limits
-    limits = GraphLimit(gaussians=allowed.gaussians, memory_bytes=allowed.memory_bytes, operations=allowed.operations)
-    return GraphCost(memory_bytes=cost.memory_bytes, operations=cost.operations, calls=cost.calls, limits=limits)
-
-
-def _view(seen: Framing) -> SceneView:
-    vectors = {"target": seen.target.tolist(), "up": seen.up.tolist()}
-    return SceneView(**vectors, distance=seen.distance, fov_y=seen.fov_y, width=seen.width, height=seen.height)

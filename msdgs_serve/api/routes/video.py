@@ -3,7 +3,6 @@
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from functools import partial
-from http import HTTPStatus
 from typing import BinaryIO, cast
 
 import anyio.to_thread
@@ -30,19 +29,7 @@ router = APIRouter(tags=["frames"])
     "/render/video",
     summary="A video along a camera path",
     response_class=Response,
-    responses={
-        **VIDEO_RESPONSE,
-        **problems(
-            HTTPStatus.BAD_REQUEST,
-            HTTPStatus.NOT_FOUND,
-            HTTPStatus.REQUEST_TIMEOUT,
-            HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-            HTTPStatus.UNPROCESSABLE_ENTITY,
-            HTTPStatus.NOT_IMPLEMENTED,
-            HTTPStatus.SERVICE_UNAVAILABLE,
-            HTTPStatus.GATEWAY_TIMEOUT,
-        ),
-    },
+    responses={**VIDEO_RESPONSE, **problems(400, 404, 408, 413, 422, 501, 503, 504)},
 )
 async def render_video(body: VideoRequest, service: SharedService, request: Request) -> Response:
     """Streams the video while its frames are rendered, with renders of other requests in between. The time limit holds

@@ -8,7 +8,7 @@ from msdgs_serve.scene.onnx.cost import UNLIMITED, CallCost, GraphLimits
 from msdgs_serve.scene.onnx.infer import Value, infer
 from msdgs_serve.scene.onnx.model import Model, Node, Port, Tensor, read_model
 from msdgs_serve.scene.onnx.wire import ModelInvalid
-from msdgs_serve.scene.onnx.write import names_needed, write_model
+from msdgs_serve.scene.onnx.write import needed, write_model
 
 __all__ = [
     "UNLIMITED",
@@ -21,7 +21,7 @@ __all__ = [
     "Tensor",
     "Value",
     "infer",
-    "names_needed",
+    "needed",
     "read_model",
     "write_model",
 ]

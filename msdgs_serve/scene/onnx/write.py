@@ -1,6 +1,6 @@
 """Write the part of a model that some outputs need, in a canonical encoding."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from msdgs_serve.scene.onnx.infer import Value
 from msdgs_serve.scene.onnx.model import INT_ATTRIBUTE, INTS_ATTRIBUTE, Attribute, Model, Node, Tensor
@@ -9,41 +9,25 @@ from msdgs_serve.scene.onnx.shapes import IDS
 IR_VERSION = 9
 _VARINT, _LENGTH = 0, 2
 
-Parts = list[bytes | memoryview]
-
 
 def write_model(
     model: Model, outputs: Sequence[str], inputs: Mapping[str, Value], values: Mapping[str, Value]
 ) -> bytes:
     """Return a model that computes `outputs` from `inputs`, without defaults. Large constants are copied once."""
-    nodes, names = _needed(model, outputs)
-    graph = _Message()
-    for node in nodes:
-        graph.message(1, _node(node))
-    graph.text(2, "msdgs")
-    for name in model.constants:
-        if name in names and name not in inputs:
-            graph.message(5, _tensor(model.constants[name]))
-    for name, value in inputs.items():
-        graph.message(11, _port(name, value))
-    for name in outputs:
-        graph.message(12, _port(name, values[name]))
-    opset = _Message()
-    opset.number(2, model.opset)
-    whole = _Message()
-    whole.number(1, IR_VERSION)
-    whole.message(7, graph)
-    whole.message(8, opset)
-    return b"".join(whole.parts)
+    nodes, names = needed(model, outputs)
+    stored = [tensor for name, tensor in model.constants.items() if name in names and name not in inputs]
+    graph = _Message(
+        *((1, _node(node)) for node in nodes),
+        (2, "msdgs"),
+        *((5, _tensor(tensor)) for tensor in stored),
+        *((11, _port(name, value)) for name, value in inputs.items()),
+        *((12, _port(name, values[name])) for name in outputs),
+    )
+    return b"".join(_Message((1, IR_VERSION), (7, graph), (8, _Message((2, model.opset)))).parts)
 
 
-def names_needed(model: Model, outputs: Sequence[str]) -> set[str]:
-    """Return the names of all values that the outputs depend on, and their own."""
-    return _needed(model, outputs)[1]
-
-
-def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]:
-    """Return the nodes, in order, and the names of values that the outputs depend on."""
+def needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]:
+    """Return the nodes, in order, and the names of values that the outputs depend on, their own included."""
     names, nodes = set(outputs), []
     for node in reversed(model.nodes):
         if names.intersection(node.outputs):
@@ -53,86 +37,40 @@ def _needed(model: Model, outputs: Sequence[str]) -> tuple[list[Node], set[str]]
 
 
 class _Message:
-    """A Protobuf message in construction."""
+    """A Protobuf message of fields: their numbers and values."""
 
-    def __init__(self) -> None:
-        self.parts: Parts = []
-        self.length = 0
-
-    def number(self, field: int, value: int) -> None:
-        self._add(_varint(field << 3 | _VARINT), _varint(value % (1 << 64)))
-
-    def data(self, field: int, value: bytes | memoryview) -> None:
-        self._add(_varint(field << 3 | _LENGTH), _varint(len(value)), value)
-
-    def text(self, field: int, value: str) -> None:
-        self.data(field, value.encode())
-
-    def message(self, field: int, value: "_Message") -> None:
-        self._add(_varint(field << 3 | _LENGTH), _varint(value.length), *value.parts)
-
-    def _add(self, *parts: bytes | memoryview) -> None:
-        self.parts += parts
-        self.length += sum(len(part) for part in parts)
+    def __init__(self, *fields: "tuple[int, int | str | memoryview | _Message]") -> None:
+        self.parts: list[bytes | memoryview] = []
+        for number, value in fields:
+            if isinstance(value, int):
+                self.parts += [_varint(number << 3 | _VARINT), _varint(value % (1 << 64))]
+                continue
+            parts = (
+                value.parts if isinstance(value, _Message) else [value.encode() if isinstance(value, str) else value]
+            )
+            self.parts += [_varint(number << 3 | _LENGTH), _varint(sum(map(len, parts))), *parts]
 
 
 def _node(node: Node) -> _Message:
-    message = _Message()
-    _texts(message, 1, node.inputs)
-    _texts(message, 2, node.outputs)
-    message.text(3, node.name)
-    message.text(4, node.operator)
-    for name, value in node.attributes.items():
-        message.message(5, _attribute(name, value))
-    return message
+    operands = [(field, name) for field, names in ((1, node.inputs), (2, node.outputs)) for name in names]
+    attributes = [(5, _attribute(*each)) for each in node.attributes.items()]
+    return _Message(*operands, (3, node.name), (4, node.operator), *attributes)
 
 
 def _attribute(name: str, value: Attribute) -> _Message:
-    message = _Message()
-    message.text(1, name)
     if isinstance(value, int):
-        message.number(3, value)
-        message.number(20, INT_ATTRIBUTE)
-    else:
-        for number in value:
-            message.number(8, number)
-        message.number(20, INTS_ATTRIBUTE)
-    return message
-
-
-def _texts(message: _Message, field: int, values: Iterable[str]) -> None:
-    for value in values:
-        message.text(field, value)
+        return _Message((1, name), (3, value), (20, INT_ATTRIBUTE))
+    return _Message((1, name), *((8, number) for number in value), (20, INTS_ATTRIBUTE))
 
 
 def _tensor(tensor: Tensor) -> _Message:
-    message = _Message()
-    for length in tensor.shape:
-        message.number(1, length)
-    message.number(2, tensor.element)
-    message.text(8, tensor.name)
-    message.data(9, tensor.data)
-    return message
+    return _Message(*((1, length) for length in tensor.shape), (2, tensor.element), (8, tensor.name), (9, tensor.data))
 
 
 def _port(name: str, value: Value) -> _Message:
-    shape = _Message()
-    for dim in value.shape:
-        dimension = _Message()
-        if dim == IDS:
-            dimension.text(2, "M")
-        elif not dim.per_id:
-            dimension.number(1, dim.fixed)
-        shape.message(1, dimension)
-    tensor = _Message()
-    tensor.number(1, value.element)
-    tensor.message(2, shape)
-    kind = _Message()
-    kind.message(1, tensor)
-    port = _Message()
-    port.text(1, name)
-    port.message(2, kind)
-    return port
+    lengths = ([(2, "M")] if dim == IDS else [] if dim.per_id else [(1, dim.fixed)] for dim in value.shape)
+    shape = _Message(*((1, _Message(*length)) for length in lengths))
+    return _Message((1, name), (2, _Message((1, _Message((1, value.element), (2, shape))))))
 
 
 def _varint(value: int) -> bytes:
