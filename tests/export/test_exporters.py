@@ -210,7 +210,7 @@ def test_opacities_and_colors_that_change_are_those_of_each_time(tmp_path: Path,
     ("plan", "config"),
     [
         ("network", {}),
-        ("network", {"layers": ("plane", "spline")}),
+        ("network", {"layers": ("plane", "mlp")}),
         ("network", {"layers": ("spline", "mlp"), "support": NODES}),
         ("compact:30", {}),
         ("compact:60", {}),
