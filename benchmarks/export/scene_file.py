@@ -20,6 +20,7 @@ from export.measure.rendered_error import by_time
 from export.measure.views import View, evaluation_views
 from export.plans.base import BASELINE
 from export.plans.registry import build
+from export.progress import no_progress
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
@@ -83,7 +84,7 @@ def report(scene: Path, model: Path, views: list[View], console: Console) -> Non
     for t in np.linspace(t0, t1, POSES):
         times.time("pose", session.gaussians, float(t))
     psnrs = errors(session, model, views)
-    (memory,) = frame_memory([scene], SceneCamera("timed", views[0].t, views[0].camera))
+    (memory,) = frame_memory([scene], SceneCamera("timed", views[0].t, views[0].camera), no_progress)
     poses = times.milliseconds()["pose"]
     made = table(f"{scene.name}, {len(psnrs)} frames", "MB", "opening, s", "memory, MB", "ms per pose: median", "least",
                  "worst frame, dB", "mean, dB")  # fmt: skip

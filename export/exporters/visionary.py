@@ -82,14 +82,15 @@ def _moving(graph: GraphBuilder, source: onnx.GraphProto, outputs: tuple[str, ..
     static = [node for node in source.node if node not in nodes]
     needed = {name for node in nodes for name in node.input} | {*outputs}
     known |= _computed(static, source, sorted(needed & {name for node in static for name in node.output}))
-    for name in sorted(needed & set(known)):
+    axes = {node.input[1] for node in nodes if node.op_type == "ReduceProd"}  # attributes in opset 17
+    for name in sorted((needed & set(known)) - axes):
         values = known[name]
         graph.constant(name, values.astype(np.float32) if values.dtype in (np.int16, np.float16) else values)
     for node in nodes:
         copied = NodeProto.FromString(node.SerializeToString())
         copied.input[:] = [_RENAMED.get(name, name) for name in node.input]
         copied.output[:] = [_RENAMED.get(name, name) for name in node.output]
-        if node.op_type == "ReduceProd":  # in opset 17 its axes are an attribute
+        if node.op_type == "ReduceProd":
             copied.attribute.append(helper.make_attribute("axes", known[copied.input.pop()].reshape(-1)))
         graph.nodes.append(copied)
 

@@ -157,13 +157,14 @@ class ExportJob:
 
     @cached_property
     def statistics(self) -> PruningStatistics:
-        """Visibility and motion by which pruning decides, computed on first use; in float64 without `network`."""
+        """Visibility and motion by which pruning decides, computed on first use; in float64 if float32 overflows."""
         views = selection_views(self.cameras, self.info.time_range, SELECTION_TIMES, SELECTION_CAMERAS)
         inputs = within_memory(views, len(self.model.gaussians)), self.info.background, self.progress
         if network := self.network:
             with suppress(SceneFileInvalid), closing(network):  # it overflows at a time that stability didn't try
                 return PruningStatistics(self.model, *inputs, lambda t: network.session.gaussians(t))
-        return PruningStatistics(copy.deepcopy(self.model).double(), *inputs)
+        fits = self.stability.stable and not self.network  # float32 doesn't overflow
+        return PruningStatistics(self.model if fits else copy.deepcopy(self.model).double(), *inputs)
 
     @cached_property
     def network(self) -> Candidate | None:
@@ -229,7 +230,10 @@ class ExportJob:
             pairs = zip(vars(moved).values(), vars(pruned.static).values(), strict=True)
             return Gaussians(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
 
-        return self.exact.measure(pose, pruned.ids, on_frame=self.on_work).psnr_worst
+        try:
+            return self.exact.measure(pose, pruned.ids, on_frame=self.on_work).psnr_worst
+        except InvalidInput:  # poses that overflow in float32
+            return -math.inf
 
     def _written(self, plan: str, pruning_db: float | None, pruned: PrunedModel) -> Candidate:
         self._files += 1

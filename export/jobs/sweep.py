@@ -16,7 +16,7 @@ from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.scene.metadata import SceneCamera
 
 MAX_RELATIVE_COST = 4.0
@@ -273,7 +273,7 @@ class Sweep:
 
     def _measured(self) -> SweepResult:
         if not self.estimates:
-            raise InvalidInput("model", "one that some plan can hold", "; ".join(why for _, why in self.refused))
+            raise self._nothing_left()
         ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)
         if self.max_bytes is not None:
             ahead = [e for e in ahead if e.size <= self.max_bytes] or [min(self.estimates, key=lambda e: e.size)]
@@ -286,6 +286,9 @@ class Sweep:
         points = self._points(measured)
         left = [estimate for estimate in self.estimates if estimate not in ahead]
         return SweepResult(points, left, self._best(points), self.refused, front(points))
+
+    def _nothing_left(self) -> InvalidInput:
+        return InvalidInput("model", "one that some plan can hold", "; ".join(why for _, why in self.refused))
 
     def _best(self, points: list[Point]) -> int:
         best = choose(points, self.min_psnr)
@@ -313,8 +316,13 @@ class Sweep:
         on_error = self.job.progress("all frames of the points", len(candidates))
         errors = []
         for candidate in candidates:
-            errors.append((candidate, self._error(candidate)))
+            try:
+                errors.append((candidate, self._error(candidate)))
+            except SceneFileInvalid as error:  # its motion overflows in float32 at a time that no estimate has tried
+                self.refused.append((candidate.plan, str(error)))
             on_error()
+        if not errors:
+            raise self._nothing_left()
         return errors
 
     def _error(self, candidate: Candidate) -> RenderedError:

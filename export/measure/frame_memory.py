@@ -3,6 +3,8 @@
 `frame_memory` runs this module as that process, which gets a request as its argument and prints bytes.
 """
 
+from __future__ import annotations
+
 import gc
 import json
 import os
@@ -10,12 +12,14 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from export.progress import Track, no_progress
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained, rasterize
 from msdgs_serve.scene.metadata import SceneCamera
+
+if TYPE_CHECKING:
+    from export.progress import Track
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 RESET_PEAK = "5"
@@ -23,7 +27,7 @@ EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALL
 """Makes glibc return freed memory at once; otherwise a file would reuse memory of the one before."""
 
 
-def frame_memory(paths: Sequence[Path], view: SceneCamera, track: Track = no_progress) -> list[int | None]:
+def frame_memory(paths: Sequence[Path], view: SceneCamera, track: Track) -> list[int | None]:
     """Peak bytes of loading each file and drawing one of its frames, above the memory of the process before."""
     request = json.dumps({"paths": [str(path.resolve()) for path in paths], "view": view.to_plain()})
     command = [sys.executable, "-m", "export.measure.frame_memory", request]

@@ -16,6 +16,7 @@ from export.pruning.mask import NetworkMask, PruningMask, full_mask, rows, with_
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.baked import APPEARANCE
 from msdgs_serve.scene.camera import Camera
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -110,7 +111,10 @@ class PruningStatistics:
             changing = rows(poses.at(view.t), moving, mask.sh_degree)
             pairs = zip(vars(changing).values(), vars(standing).values(), strict=True)
             drawn = Gaussians(*(np.concatenate(pair) for pair in pairs))
-            frame = render(drawn, view.camera, self.background, self.model.rasterizer)
+            try:
+                frame = render(drawn, view.camera, self.background, self.model.rasterizer)
+            except InvalidInput:  # poses that overflow in float32
+                return -np.inf
             worst = min(worst, compare(frame, self._frames[i]).psnr)
             self._on_frame()
             if worst < min_db:

@@ -1,4 +1,4 @@
-"""The interface of density control."""
+"""The base of strategies of density control."""
 
 from dataclasses import dataclass
 
@@ -28,6 +28,7 @@ class DensityStrategy:
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """Density control after an optimizer step, which stands for these steps of the schedule, counted from 1."""
+        raise NotImplementedError
 
     def state(self) -> tuple[Tensor, ...]:
         """The accumulated state, besides the generator, for a bit-exact continuation."""
