@@ -98,8 +98,8 @@ class _Assessment:
             on_time()
         samples = _joined(found)
         by_error = sorted(found, key=lambda m: np.quantile(m.errors[FLOAT32.name], NEAR_WORST, method="higher"))
-        on_block = track("poses and frames in float32 and float64", 0)
-        frames = [self._frames(sample, samples, on_block) for sample in by_error[::-1][:FRAME_TIMES]]
+        on_step = track("poses and frames in float32 and float64", 0)
+        frames = [self._frames(sample, samples, on_step) for sample in by_error[::-1][:FRAME_TIMES]]
         gaps = [_format_gap(f, found, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
         predicted = min(prediction for _, prediction, _ in frames)
         overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in found)
@@ -162,18 +162,18 @@ class _Assessment:
         return []
 
     def _frames(
-        self, sample: _TimeSample, joined: Samples, on_block: Callable[[], object]
+        self, sample: _TimeSample, joined: Samples, on_step: Callable[[], object]
     ) -> tuple[dict[str, _FrameGap], float, WorstGaussians]:
         """Frames at one time: gaps by format, PSNR of the predicted displacement, the worst Gaussians of float32."""
-        exact, draw = posed(self.double, sample.t, on_block=on_block), self.renderer.draw
-        poses = {name: posed(model, sample.t, on_block=on_block) for name, model in self.models.items()}
+        exact, draw = posed(self.double, sample.t, on_block=on_step), self.renderer.draw
+        poses = {name: posed(model, sample.t, on_block=on_step) for name, model in self.models.items()}
         single = poses[FLOAT32.name]
         gaps = [np.square(self.renderer.pixel_gaps(single, exact, c)).sum() for c in self.renderer.cameras]
         cameras = [self.renderer.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]
         frames = [(camera, draw(exact, camera)) for camera in cameras]
-        on_block()
+        on_step()
         by_format = {name: self._frame_gap(pose, exact, frames) for name, pose in poses.items()}
-        on_block()
+        on_step()
         displaced = replace(exact, means=_displaced(exact.means, sample, joined))
         predicted = min(compare(draw(displaced, camera), frame).psnr for camera, frame in frames)
         return by_format, predicted, self._worst(sample.t, single, exact, frames)

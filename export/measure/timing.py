@@ -51,13 +51,15 @@ def time_frames(
     turns = [(i, view) for n in range(REPEATS) for i, count in enumerate(counts) if n < count for view in views]
     runs: list[list[TimingRun]] = [[] for _ in candidates]
     on_frame = track("timing", len(turns))
+    collecting = gc.isenabled()
     gc.disable()
     try:
         for i, view in turns:
             runs[i].append(time_frame(candidates[i], view, background))
             on_frame()
     finally:
-        gc.enable()
+        if collecting:
+            gc.enable()
     return [_frame_time(np.reshape(found, (-1, len(views), 3))) for found in runs]
 
 

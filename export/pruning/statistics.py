@@ -64,10 +64,8 @@ class PruningStatistics:
         pose: Pose | None = None,
     ) -> None:
         """`pose` gives the poses of the whole model; by default torch does."""
-        on_view, self._on_frame = (
-            track("motion and visibility of the Gaussians", len(views)),
-            track("frames of pruned models", 0),
-        )
+        on_view = track("motion and visibility of the Gaussians", len(views))
+        self._on_frame = track("frames of pruned models", 0)
         self.model, self.background = model, background
         self._views = views
         self._order = list(range(len(views)))

@@ -45,9 +45,8 @@ class _Message:
             if isinstance(value, int):
                 self.parts += [_varint(number << 3 | _VARINT), _varint(value % (1 << 64))]
                 continue
-            parts = (
-                value.parts if isinstance(value, _Message) else [value.encode() if isinstance(value, str) else value]
-            )
+            data = value.encode() if isinstance(value, str) else value
+            parts = data.parts if isinstance(data, _Message) else [data]
             self.parts += [_varint(number << 3 | _LENGTH), _varint(sum(map(len, parts))), *parts]
 
 
