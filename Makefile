@@ -19,6 +19,8 @@ BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.av
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package
 PINS := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt
+# without bytecode each process would compile what it imports: `import torch` takes twice as long
+unexport PYTHONDONTWRITEBYTECODE
 DEMO_FLAGS = --port $(PORT) $(if $(filter-out 0,$(ONCE)),--once)
 
 .DEFAULT_GOAL := help
