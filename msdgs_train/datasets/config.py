@@ -23,7 +23,10 @@ class DataConfig(Checked):
     """Half the side of the cube around the origin that holds the scene, in scene units; the dataset's if not given."""
 
     def __post_init__(self) -> None:
-        self.require_positive_or_none("size", "scene_half_size")
+        self.require(
+            ("size",), "a whole number above 0, or not given", lambda v: v is None or (type(v) is int and v > 0)
+        )
+        self.require_positive_or_none("scene_half_size")
         self.require(("llffhold",), "0, or an integer of 3 or more", lambda v: type(v) is int and (v == 0 or v > 2))
         self.require(("background",), f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
 

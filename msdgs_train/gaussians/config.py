@@ -60,8 +60,6 @@ class ModelConfig:
                 raise InvalidInput(f"model.{field.name}", "an integer of 0 or more", value)
             if field.type is bool and type(value) is not bool:
                 raise InvalidInput(f"model.{field.name}", "true or false", value)
-            if "_lr_" in field.name and not (type(value) in (int, float) and 0 < value < math.inf):
-                raise InvalidInput(f"model.{field.name}", "a finite learning rate above 0", value)
         if type(self.eps2d) not in (int, float) or not 0 <= self.eps2d < math.inf:
             raise InvalidInput("model.eps2d", "finite and 0 or above", self.eps2d)
         if self.sh_degree > 3:
@@ -72,10 +70,13 @@ class ModelConfig:
             raise InvalidInput("model.modulation_targets", expected, targets)
         if not isinstance(self.support, SupportConfig):
             raise InvalidInput("model.support", f"one of {', '.join(SUPPORTS)}", self.support)
+        _check_rates("model", self)
+        _check_rates("model.support", self.support)
         self.support.check("model.support")
         for index, layer in enumerate(self.layers):
             if not isinstance(layer, LayerConfig):
                 raise InvalidInput(f"model.layers.{index}", f"one of {', '.join(LAYERS)}", layer)
+            _check_rates(f"model.layers.{index}", layer)
             layer.check(f"model.layers.{index}", self.support.moves_nodes)
         if self.scale_space not in get_args(ScaleSpace):
             raise InvalidInput("model.scale_space", f"one of {list(get_args(ScaleSpace))}", self.scale_space)
@@ -126,3 +127,14 @@ class ModelConfig:
             layers = (from_plain(f"model.layers.{i}", layer, LAYERS) for i, layer in enumerate(values["layers"]))
             values["layers"] = tuple(layers)
         return cls(**values)
+
+
+def _check_rates(field: str, settings: Any) -> None:
+    """Raise `InvalidInput` unless learning rates are finite and above 0, and weights finite and 0 or above."""
+    for name in (item.name for item in fields(settings)):
+        value = getattr(settings, name)
+        is_number = type(value) in (int, float)
+        if "lr_" in name and not (is_number and 0 < value < math.inf):
+            raise InvalidInput(f"{field}.{name}", "a finite learning rate above 0", value)
+        if name.endswith("_weight") and not (is_number and 0 <= value < math.inf):
+            raise InvalidInput(f"{field}.{name}", "finite and 0 or above", value)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from msdgs_serve import __version__
 from msdgs_serve.scene.camera import Camera
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
@@ -79,7 +79,7 @@ def load_model(path: str | Path) -> LoadedModel:
         scene = SceneInfo(**contents["scene"])
         _refuse_unusable_scene(path, scene)
         return LoadedModel(model, scene, int(contents["step"]))
-    except (InvalidInput, KeyError, TypeError, AttributeError, RuntimeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
         raise CheckpointInvalid(path, f"isn't a complete model: {error}") from error
 
 
@@ -109,7 +109,7 @@ def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
         try:
             for camera in getattr(scene, name):
                 SceneCamera.from_plain(camera)
-        except (KeyError, TypeError, ValueError, MsdgsError) as error:
+        except (LookupError, TypeError, ValueError, MsdgsError) as error:
             raise CheckpointInvalid(path, f"scene.{name} holds a camera that can't be used: {error}") from error
     for name, shape in (("time_range", (2,)), ("background", (3,)), ("bounds", (2, 3))):
         try:

@@ -58,10 +58,9 @@ class MLPConfig(LayerConfig):
         return MLPLayer(self, heads)
 
     def check(self, field: str, moves_nodes: bool) -> None:
-        for name in ("width", "depth", "time_width", "time_features"):
+        for name in ("width", "depth", "xyz_frequencies", "time_frequencies", "time_width", "time_features"):
             check_size(f"{field}.{name}", getattr(self, name))
-        for name in ("xyz_frequencies", "time_frequencies", "skip"):
-            check_size(f"{field}.{name}", getattr(self, name), least=0)
+        check_size(f"{field}.skip", self.skip, least=0)
         if self.skip >= self.depth:
             raise InvalidInput(f"{field}.skip", f"fewer than the {self.depth} hidden layers of `depth`", self.skip)
 
@@ -110,9 +109,8 @@ class MLPLayer(DeformationLayer):
         for linear in (self.time_hidden, self.first, *trunk):
             nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
             nn.init.constant_(linear.bias, HIDDEN_BIAS)
-        for linear in trunk[
-            1:
-        ]:  # negative biases add up over the depth: at 4 no unit of the last layer would be active
+        # negative biases add up over the depth: at 4 no unit of the last layer would be active
+        for linear in trunk[1:]:
             nn.init.zeros_(linear.bias)
         nn.init.kaiming_normal_(self.time_output.weight, nonlinearity="linear")
         nn.init.zeros_(self.time_output.bias)

@@ -91,6 +91,7 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
         ("[a]\nlayers = ['mlp:width=0']", r"system `a`.*width"),
         ("[a]\nlayers = ['mlp:width=wide']", r"system `a`.*width"),
         ("[a]\nlayers = 'mlp'", r"system `a`.*layers"),
+        ("[a]\nsize = 99.5", r"system `a`.*size"),
         ("[a]\nsh_degree_fraction = 'long'", r"system `a`.*sh_degree_fraction"),
         ("a = 3", r"`a`"),
         ("['../up']\nsteps = 3", r"up"),

@@ -126,6 +126,13 @@ def test_incomplete_files_are_refused(model_file: Path, key: str):
         load_model(model_file)
 
 
+@pytest.mark.parametrize("step", ["first", float("inf"), []])
+def test_a_step_that_is_no_number_is_refused(model_file: Path, step: object):
+    rewritten(model_file, step=step)
+    with pytest.raises(CheckpointInvalid, match="isn't a complete model"):
+        load_model(model_file)
+
+
 @pytest.mark.parametrize("name", ["cameras", "training_cameras"])
 @pytest.mark.parametrize("cameras", [None, 5, [1], [{}], [{**SCENE.cameras[0], "fx": float("nan")}]])
 def test_damaged_cameras_are_named(model_file: Path, name: str, cameras: Any):
