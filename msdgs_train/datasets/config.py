@@ -15,8 +15,8 @@ class DataConfig(Checked):
     size: int | None = None
     """Width of the images in pixels, height in proportion; their own if not given."""
     llffhold: int = 0
-    """Hold out every so many-th training image, the first included, as test images, and those halfway between as
-    validation images, instead of the dataset's own; 0: the dataset's splits."""
+    """N: the first training image and every N-th after it are held out for testing, and those halfway between for
+    validation, in place of the dataset's splits; if it names none, these are of all images. 0: the dataset's splits."""
     background: Literal["white", "black", "random"] = "white"
     """Color behind the scene; random: another one each step, white in evaluation."""
     scene_half_size: float | None = None

@@ -25,6 +25,7 @@ from msdgs_train.datasets.common.scene_data import SPLITS, Frame, SceneData, hol
 from msdgs_train.datasets.common.transforms import check_times, entries_of, file_path, read_frame
 
 TRANSFORMS_FILE = "transforms.json"
+SPLIT_KEYS = {split: f"{split}_filenames" for split in SPLITS}
 CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -34,10 +35,12 @@ def load_nerfstudio(folder: Path, size: int | None = None) -> SceneData:
     entries = sorted(entries_of(content), key=file_path)
     check_times(entries)
     frames = [_frame(entry, size) for entry in entries]
-    splits = _splits(content, [PurePosixPath(file_path(entry)) for entry in entries], frames)
+    is_split = any(key in content.values for key in SPLIT_KEYS.values())
+    paths = [PurePosixPath(file_path(entry)) for entry in entries]
+    splits = _listed_splits(content, paths, frames) if is_split else hold_out(frames)
     points, colors = _points(content)
-    cameras = [frame.camera for split in SPLITS for frame in splits[split]]
-    return SceneData(splits, scene_half_size(points, cameras), points, colors)
+    half_size = scene_half_size(points, [frame.camera for split in SPLITS for frame in splits[split]])
+    return SceneData(splits, half_size, points, colors, unsplit=None if is_split else frames)
 
 
 def _frame(entry: JsonObject, size: int | None) -> Frame:
@@ -55,12 +58,9 @@ def _frame(entry: JsonObject, size: int | None) -> Frame:
     return replace(frame, name=name, distortion=distortion)
 
 
-def _splits(content: JsonObject, paths: list[PurePosixPath], frames: list[Frame]) -> dict[str, list[Frame]]:
-    keys = {split: f"{split}_filenames" for split in SPLITS}
-    if not any(key in content.values for key in keys.values()):
-        return hold_out(frames)
+def _listed_splits(content: JsonObject, paths: list[PurePosixPath], frames: list[Frame]) -> dict[str, list[Frame]]:
     splits, known = {}, set(paths)
-    for split, key in keys.items():
+    for split, key in SPLIT_KEYS.items():
         names = [PurePosixPath(name) for name in content.names(key)] if key in content.values else []
         for index, name in enumerate(names):
             if name not in known:

@@ -45,7 +45,8 @@ def load_colmap(folder: Path, size: int | None = None) -> SceneData:
         for image, t in zip(images, _times(files[1], images), strict=True)
     ]
     points, colors = _points(files[2], list(read.read_points(files[2])))
-    return SceneData(hold_out(frames), scene_half_size(points, [frame.camera for frame in frames]), points, colors)
+    half_size = scene_half_size(points, [frame.camera for frame in frames])
+    return SceneData(hold_out(frames), half_size, points, colors, unsplit=frames)
 
 
 def _model_files(folder: Path) -> list[Path]:

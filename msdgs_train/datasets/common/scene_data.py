@@ -45,6 +45,7 @@ class SceneData:
     scene_half_size: float  # half the side of the cube around the origin that holds the scene, in scene units
     points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
     point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None if `points` have no colors
+    unsplit: list[Frame] | None = None  # all frames in their order, if the dataset itself names no splits
 
     @cached_property
     def time_range(self) -> tuple[float, float]:
@@ -53,11 +54,14 @@ class SceneData:
         return min(times), max(times)
 
     def split_again(self, every: int) -> "SceneData":
-        """Hold out every so many-th training frame as a test frame and those halfway between as validation frames, in
-        place of the dataset's own. Raises `InvalidInput` if no training frame is left."""
-        splits = _held_out(self.splits["train"], every, {0: "test", every // 2: "val"})
+        """Split the training frames, or all frames of a dataset that names no splits, as `DataConfig.llffhold` says.
+
+        Raises `InvalidInput` if no training frame is left.
+        """
+        frames = self.splits["train"] if self.unsplit is None else self.unsplit
+        splits = _held_out(frames, every, {0: "test", every // 2: "val"})
         if not splits["train"]:
-            raise InvalidInput("llffhold", f"fewer than the {len(self.splits['train'])} training images", every)
+            raise InvalidInput("llffhold", f"fewer than the {len(frames)} training images", every)
         return replace(self, splits=splits)
 
 

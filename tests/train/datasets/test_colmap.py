@@ -31,6 +31,13 @@ def test_times_are_the_last_numbers_of_the_names_and_every_8th_image_is_for_test
     assert [frame.t for frame in scene.splits["train"]] == [index / 8 for index in range(1, 8)]
 
 
+def test_every_nth_of_all_images_is_held_out(tmp_path: Path):
+    names = tuple(f"v_{index:02}.png" for index in range(9))
+    splits = load_scene(write_colmap(tmp_path, names=names, ending="txt"), llffhold=4).splits
+    held_out = {split: [int(frame.name[2:]) for frame in frames] for split, frames in splits.items()}
+    assert held_out == {"test": [0, 4, 8], "val": [2, 6], "train": [1, 3, 5, 7]}
+
+
 def test_times_are_linear_in_the_numbers_found(tmp_path: Path):
     names = ["cam2/take 3 frame 100.png", "cam1/take 3 frame 110.png", "cam1/take 3 frame 140.jpg.png"]
     scene = load_scene(write_colmap(tmp_path, names=tuple(names), ending="txt"))

@@ -119,6 +119,9 @@ def test_every_8th_frame_by_name_is_for_testing(tmp_path: Path):
     assert [frame.name for frame in splits["test"]] == ["images_f_00", "images_f_08", "images_f_16"]
     assert len(splits["train"]) == 14
     assert splits["val"] == []
+    splits = load_scene(tmp_path, llffhold=6).splits
+    assert [frame.name[-2:] for frame in splits["test"]] == ["00", "06", "12"]
+    assert sum(map(len, splits.values())) == 17
 
 
 def test_lists_of_file_names_make_the_splits(tmp_path: Path):
