@@ -1,1 +1,1 @@
-"""Measurements; `python -m benchmarks.NAME --help` describes each. Tests don't import them."""
+"""Measurements: `python -m benchmarks.PACKAGE.MODULE --help` describes each. Tests don't import them."""

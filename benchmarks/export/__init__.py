@@ -1,1 +1,1 @@
-"""Imports and exports: `imported_formats`, `nodes`, `paper_sized`."""
+"""Imports and exports: `imported_formats`, `nodes`, `paper_sized`, `scene_file`."""

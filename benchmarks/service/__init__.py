@@ -1,1 +1,1 @@
-"""The service over HTTP: service levels (run the package), `scaling`."""
+"""The service over HTTP: service levels (run the package), `scaling`, `soak`."""

@@ -50,7 +50,7 @@ class BenchScene:
     llffhold: int = 0
     splits: tuple[str, ...] = SPLITS
     short: bool = False
-    """Whether the short form has it."""
+    """Whether it is trained on without `--whole`."""
 
 
 def read_scenes(data: Path, *, short: bool, names: Sequence[str] = (), file: Path = SCENES) -> list[BenchScene]:

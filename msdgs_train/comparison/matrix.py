@@ -23,7 +23,7 @@ class Budget:
     steps: int | None = 3000
     """Optimizer steps of each run, instead of the preset's. All schedules are fractions of a run and scale with it."""
     minutes: float | None = None
-    """Length of each run by the clock, instead of --steps."""
+    """Length of each run, counted as --time says, instead of --steps."""
     size: int | None = None
     """Width of all images in pixels."""
     init_num_pts: int | None = None

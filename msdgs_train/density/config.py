@@ -28,9 +28,10 @@ class DensityConfig(Checked):
     refine_stop_fraction: float = 0.7
     """Density control ends after this fraction of the run."""
     grow_grad2d: float = 4e-4
-    """gradient: a projected mean of a larger mean gradient norm, in normalized device coordinates, is densified."""
+    """gradient: Gaussians whose projected means have gradients of a larger mean norm, in normalized device coordinates,
+    are densified."""
     grow_scale3d: float = 0.01
-    """gradient: one with a larger scale than this fraction of the scene's scale is split, a smaller one is cloned."""
+    """gradient: of these, Gaussians larger than this fraction of the scene's scale are split, smaller ones cloned."""
     prune_opa: float = 0.005
     """Gaussians of a lower opacity are removed, or relocated."""
     prune_unseen_passes: float = 0.0
@@ -42,7 +43,7 @@ class DensityConfig(Checked):
     """gradient: opacities are reset to at most 0.01 after each such fraction of the run, while density control lasts;
     0: never."""
     noise_lr: float = 5e5
-    """mcmc: factor of the noise that is injected into means, in their learning rates times their covariance."""
+    """mcmc: factor of the noise added to means, whose size follows from their learning rate and covariance."""
     opacity_reg: float | None = None
     """Weight of the mean opacity, which makes Gaussians that aren't needed transparent; 0.01 with mcmc and 0 with
     gradient if not given."""

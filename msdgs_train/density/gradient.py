@@ -22,7 +22,7 @@ SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this factor."""
 RESET_OPACITY = 0.01
 MIN_PATIENCE = 40
-"""Images of the cameras, drawn at random, that count as one pass at least."""
+"""A pass over fewer cameras counts as this many images, since images are drawn at random."""
 
 
 class DensityChange(NamedTuple):

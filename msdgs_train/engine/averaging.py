@@ -14,7 +14,7 @@ class WeightAverage(Generic[M]):
     older than `steps`."""
 
     def __init__(self, steps: int) -> None:
-        self.model: M | None = None  # None: of no step
+        self.model: M | None = None  # None before the first step
         self._most, self._count = steps, 0
 
     @torch.no_grad()

@@ -25,8 +25,7 @@ def scene_scale(cameras: Sequence[Camera]) -> float:
 
 
 def first_by_pose(items: Iterable[T], camera: Callable[[T], Camera]) -> list[T]:
-    """The first item of each position and direction of a camera, in their order: one of a video camera that stands
-    still."""
+    """The first item of each camera pose, in their order: a video camera that stands still counts once."""
     found: dict[bytes, T] = {}
     for item in items:
         found.setdefault(camera(item).camera_to_world.tobytes(), item)

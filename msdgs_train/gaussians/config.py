@@ -38,7 +38,7 @@ class ModelConfig:
     modulation_lr_init: float = 8e-4
     """Learning rate of the modulation network and its embeddings."""
     modulation_lr_final: float = 1.6e-6
-    """At the last step, to which it decays exponentially."""
+    """Learning rate of the modulation at the last step, to which it decays exponentially."""
     scale_space: ScaleSpace = "log"
     """`log`: deltas are added to logarithms of scales; `linear`: to the scales, as in DeformGS."""
     opacity_head: bool = False

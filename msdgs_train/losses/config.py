@@ -14,8 +14,8 @@ class LossConfig(Checked):
     mse_fraction: float = 0.0
     """Fraction of the loss that is replaced by MSE, which emphasizes large errors, such as those of motion."""
     alpha_weight: float = 0.0
-    """Weight of L1 between alpha and the image's, if any pixel of it is transparent: without it, Gaussians of the
-    background's color appear as fog in other views."""
+    """Weight of the L1 error of alpha of images with transparent pixels; without, Gaussians of the background's color
+    appear as fog in other views."""
 
     def __post_init__(self) -> None:
         self.require_fractions("ssim_lambda", "mse_fraction")
