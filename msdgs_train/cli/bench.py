@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from msdgs_train.cli.compare import comparison_progress
+from msdgs_train.cli.compare import check_jobs, comparison_progress
 from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console
 from msdgs_train.comparison.matrix import Budget, read_systems
 
@@ -25,7 +25,7 @@ class Bench:
     systems: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG...")]
     """Presets and TOML files; gains are over the first system."""
     data: Path
-    """The folder that holds the datasets, named as the benchmark names them."""
+    """The folder that holds the datasets; an error names those that are missing."""
     out: Path
     """The folder of all runs and results."""
     csv: Path | None = None
@@ -35,7 +35,7 @@ class Bench:
     minutes: float | None = None
     """Minutes per run; 5 if not given."""
     scenes: tuple[str, ...] = ()
-    """Scenes by name, in place of those of the short or the whole form."""
+    """Scenes by name; if not given, eight of the benchmark's, or with --whole all."""
     seeds: tuple[int, ...] = (0,)
     """One run per seed; the table shows mean and standard deviation."""
     threads: int = 2
@@ -49,7 +49,10 @@ class Bench:
         from msdgs_train.comparison.bench import make_bench_runs, read_scenes, rows_of, runs_left, train_and_measure
         from msdgs_train.comparison.bench_report import write_bench
 
-        minutes, csv = self.minutes or (30.0 if self.whole else 5.0), self.csv or self.out / "bench.csv"
+        check_jobs(self.jobs)
+        minutes, csv = self.minutes, self.csv or self.out / "bench.csv"
+        if minutes is None:
+            minutes = 30.0 if self.whole else 5.0
         budget = Budget(steps=None, minutes=minutes, threads=self.threads, time=self.time)
         scenes = read_scenes(self.data, short=not self.whole, names=self.scenes)
         runs = make_bench_runs(read_systems(self.systems, budget), scenes, self.seeds, self.out)
@@ -58,7 +61,7 @@ class Bench:
         rows = rows_of(runs, csv)
         if rows:
             paths = write_bench(self.out, rows)
-            console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, markup=False, highlight=False)
+            console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, highlight=False)
             console.print("wrote " + ", ".join(map(str, [csv, *paths])), soft_wrap=True)
         if not complete:
             console.print("interrupted; the same command continues", soft_wrap=True)

@@ -54,9 +54,8 @@ class Compare:
         from msdgs_train.comparison.results import collect
         from msdgs_train.comparison.runner import train_all
 
+        check_jobs(self.jobs)
         runs = make_runs(read_systems(self.systems, self.budget), self.data, self.seeds, self.out)
-        if self.jobs is not None and self.jobs < 1:
-            raise InvalidInput("jobs", "1 or more", self.jobs)
         if self.ray is None:
             pool = processes(self.jobs or max(1, thread_count() // self.budget.threads))
         else:
@@ -69,12 +68,18 @@ class Compare:
             if console.is_terminal:
                 console.print(rich_table(HEADINGS, table(results), names=2))
             else:  # the table is wider than 80 columns
-                console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, markup=False, highlight=False)
+                console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, highlight=False)
             console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
         if not complete:
             console.print("interrupted; the same command continues", soft_wrap=True)
             return EXIT_INTERRUPTED
         return 0 if len(results) == len(runs) else EXIT_INVALID
+
+
+def check_jobs(jobs: int | None) -> None:
+    """Raise `InvalidInput` unless a run can be trained at a time."""
+    if jobs is not None and jobs < 1:
+        raise InvalidInput("jobs", "1 or more", jobs)
 
 
 @contextmanager
@@ -87,6 +92,6 @@ def comparison_progress(total: int) -> "Iterator[Callable[[Run, RunEnd], None]]"
         def on_end(run: Run, end: "RunEnd") -> None:
             bar.advance(task)
             line = f"{run.name}: {end.status}" + (f", {end.message}" if end.message else "")
-            console.print(line, soft_wrap=True, markup=False, style="red" if end.status == "failed" else None)
+            console.print(line, soft_wrap=True, style="red" if end.status == "failed" else None)
 
         yield on_end

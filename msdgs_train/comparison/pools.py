@@ -5,20 +5,22 @@ import multiprocessing
 import os
 import signal
 import time
+import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from msdgs_serve.ray_tasks import RayTasks, ray_cluster
-from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.threads import THREADS_VARIABLE
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.engine.observer import Observer
-from msdgs_train.engine.run import fit
+from msdgs_train.engine.run import EVAL_SPLITS, fit
 from msdgs_train.engine.run_record import CHECKPOINT
+from msdgs_train.engine.trainer import Trainer
 
 POLL_SECONDS = 0.5
 _stop: Event | None = None  # set in a worker process by its parent
@@ -48,9 +50,18 @@ class Processes:
         self._going[self._executor.submit(_train_here, run)] = run
 
     def finished(self, timeout: float | None = None) -> Iterator[tuple[Run, RunEnd]]:
-        """Yield the runs that have ended, after waiting for the first of them, up to `timeout` seconds."""
+        """Yield the runs that have ended, after waiting for the first of them, up to `timeout` seconds.
+
+        Raises `MsdgsError` if the process of a run was killed.
+        """
         for future in wait(self._going, timeout=timeout, return_when=FIRST_COMPLETED).done:
-            yield self._going.pop(future), future.result()
+            run = self._going.pop(future)
+            try:
+                end = future.result()
+            except BrokenExecutor:
+                problem = f"{run.name}: a training process was killed, perhaps for lack of memory"
+                raise MsdgsError(f"{problem}; continue by the same command, with fewer --jobs") from None
+            yield run, end
 
     def stop(self) -> None:
         """Make all runs save their checkpoint and end."""
@@ -108,11 +119,15 @@ class _Flag:
         return self._is_set
 
 
-class _StopObserver(Observer):
-    """Stops a run when `is_stopped` returns true; it is called every `POLL_SECONDS`."""
+class _ComparisonObserver(Observer):
+    """Stops a run when `is_stopped`, called every `POLL_SECONDS`, returns true; refuses one that can't be evaluated."""
 
     def __init__(self, is_stopped: Callable[[], bool]) -> None:
         self._is_stopped, self._called = is_stopped, 0.0
+
+    def on_train_start(self, trainer: Trainer) -> None:
+        if not any(trainer.scene.splits.get(split) for split in EVAL_SPLITS):
+            raise InvalidInput("data", "a dataset with held-out images, or split by llffhold", "training images alone")
 
     def should_stop(self) -> bool:
         now = time.monotonic()
@@ -148,9 +163,12 @@ def _train(run: Run, is_stopped: Callable[[], bool]) -> RunEnd:
     run.folder.mkdir(parents=True, exist_ok=True)
     resume = (run.folder / CHECKPOINT).exists()
     try:
-        result = fit(run.config, run.data, run.folder, resume=resume, observer=_StopObserver(is_stopped))
+        result = fit(run.config, run.data, run.folder, resume=resume, observer=_ComparisonObserver(is_stopped))
     except MsdgsError as error:
         return RunEnd("failed", str(error))
+    except Exception as error:  # of a plugin or the operating system; other runs continue
+        traceback.print_exc()
+        return RunEnd("failed", repr(error))
     return RunEnd(result.status)
 
 

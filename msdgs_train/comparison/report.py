@@ -76,9 +76,11 @@ def mean_and_deviation(values: Sequence[float], digits: int) -> str:
 def as_markdown(results: Sequence[Result], missing: int) -> str:
     """Return the table and the conditions of the measurement as Markdown."""
     run = results[0].run.config.run
-    length = f"{run.steps:,} steps" if run.minutes is None else f"{run.minutes:g} minutes per run"
-    conditions = f"{length}; {run.threads} thread(s) per run; held-out images of "
-    conditions += f"`{results[0].split}`; mean ± standard deviation over the seeds; the last model of each run."
+    kind = "minutes of CPU time" if run.time == "cpu" else "minutes"
+    length = f"{run.steps:,} steps" if run.minutes is None else f"{run.minutes:g} {kind} per run"
+    splits = " or ".join(f"`{split}`" for split in dict.fromkeys(result.split for result in results))
+    conditions = f"{length}; {run.threads} thread(s) per run; held-out images of {splits}; "
+    conditions += "mean ± standard deviation over the seeds; the last model of each run."
     machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     notes = [conditions, f"Measured on {date.today().isoformat()}: {machine}."]
     skipped = sum(result.skipped for result in results)

@@ -9,18 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.runner import final_metrics, is_finished
 from msdgs_train.engine.metrics_log import read_metrics
-from msdgs_train.engine.run import SELECTION_SPLITS
+from msdgs_train.engine.run import EVAL_SPLITS
 from msdgs_train.engine.run_record import MODEL
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 
 TIMED_FRAMES = 8
-FIRST_SPLIT = "test"
 
 
 class CurvePoint(NamedTuple):
@@ -55,9 +53,7 @@ def collect(runs: Sequence[Run]) -> list[Result]:
 
 def _result(run: Run) -> Result:
     metrics = final_metrics(run) or {}
-    split = next((name for name in (FIRST_SPLIT, *SELECTION_SPLITS) if name in metrics["splits"]), None)
-    if split is None:
-        raise InvalidInput("data", "scenes with held-out images", run.data)
+    split = next(name for name in EVAL_SPLITS if name in metrics["splits"])
     lines = read_metrics(run.folder)
     loaded = load_model(run.folder / MODEL)
     return Result(

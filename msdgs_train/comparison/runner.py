@@ -42,6 +42,9 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
                     trainers.submit(waiting.pop(0))
                 for run, end in trainers.finished(POLL_SECONDS):
                     on_end(run, end)
+        except BaseException:
+            trainers.stop()  # or the pool would wait until its runs have ended
+            raise
         finally:
             signal.signal(signal.SIGINT, old)
     return not interrupted.is_set()

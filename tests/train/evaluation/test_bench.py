@@ -79,6 +79,13 @@ def test_the_same_command_goes_on_from_its_rows(data: Path, capsys: pytest.Captu
     assert [r["settings"] == first["settings"] for r in read_rows(data / "out" / "bench.csv")] == [True, False]
 
 
+@pytest.mark.parametrize("option", ["--jobs=0", "--minutes=0"])
+def test_no_job_and_no_time_are_refused(option: str, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "static", "--data", str(data), "--out", str(data / "no"), option]) == cli.EXIT_INVALID
+    assert option[2:6] in capsys.readouterr().err
+    assert not (data / "no").exists()
+
+
 def test_runs_are_of_each_scene_at_its_size(data: Path) -> None:
     scenes = [*read_scenes(data, short=True), bench.BenchScene("held_out", data / "one", 12, 4, ("val",))]
     runs = make_bench_runs({"a": preset("static"), "b": preset("static")}, scenes, (0, 1), data / "out")

@@ -3,18 +3,23 @@
 import contextlib
 import dataclasses
 import json
+import multiprocessing
+import os
 import signal
 import subprocess
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
-from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.cli import main as cli
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
-from msdgs_train.comparison.pools import RunEnd, processes
+from msdgs_train.comparison.pools import Processes, RunEnd, processes
 from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
 from msdgs_train.comparison.results import CurvePoint, Result
 from msdgs_train.comparison.runner import train_all
@@ -149,6 +154,12 @@ def test_the_table_has_a_row_for_each_system_and_scene() -> None:
     text = as_markdown(RESULTS, missing=2)
     assert "| k2 | toy | 1 | 30.00 | 0.9000 | 2,000 | 2,050 | 300 | 60 | 4.0 |" in text
     assert "2 runs are not finished" in text
+    assert "held-out images of `test`;" in text
+    config = RESULTS[0].run.config.updated(minutes=2, time="cpu")
+    timed = dataclasses.replace(RESULTS[0], run=dataclasses.replace(RESULTS[0].run, config=config))
+    text = as_markdown([timed, dataclasses.replace(RESULTS[1], split="val")], missing=0)
+    assert "2 minutes of CPU time per run" in text
+    assert "held-out images of `test` or `val`;" in text
 
 
 def test_the_plots_show_errors() -> None:
@@ -215,10 +226,36 @@ def test_from_nothing_to_the_table_and_not_again(
 
 def test_a_run_that_fails_is_reported_and_the_others_continue(systems_file: Path, tmp_path: Path) -> None:
     ended: list[tuple[str, RunEnd]] = []
-    runs = make_runs(read_systems([str(systems_file)], BUDGET), [tmp_path / "nowhere"], [0], tmp_path / "out")
+    (write_scene(tmp_path / "unevaluated", train=2, test=0) / "transforms_val.json").unlink()
+    (tmp_path / "out" / "static" / "unevaluated_0" / "config.json").mkdir(parents=True)
+    scenes = [tmp_path / "nowhere", tmp_path / "unevaluated"]
+    runs = make_runs(read_systems([str(systems_file)], BUDGET), scenes, [0], tmp_path / "out")
     assert train_all(runs, processes(1), lambda run, how: ended.append((run.system, how)))
-    assert [system for system, _ in ended] == ["static", "k1", "k2 w=1"]
-    assert all(how.status == "failed" and "nowhere" in how.message for _, how in ended)
+    assert [system for system, _ in ended] == ["static", "k1", "k2 w=1"] * 2
+    assert all(how.status == "failed" for _, how in ended)
+    messages = (*["nowhere"] * 3, "IsADirectoryError", *["held-out images"] * 2)
+    assert all(message in how.message for message, (_, how) in zip(messages, ended, strict=True))
+
+
+def test_a_killed_process_is_named(tmp_path: Path) -> None:
+    (run,) = make_runs({"mine": preset("static")}, [tmp_path], [0], tmp_path)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context) as executor:
+        pool = Processes(1, executor, context.Event())
+        killed: Any = executor.submit(os._exit, 1)
+        pool._going[killed] = run
+        with pytest.raises(MsdgsError, match=r"mine.*was killed.*--jobs"):
+            list(pool.finished())
+
+
+def test_an_error_while_others_train_stops_them(tmp_path: Path) -> None:
+    runs = make_runs({"mine": preset("static")}, [tmp_path], [0], tmp_path / "out")
+    pool = MagicMock(jobs=1)
+    pool.finished.side_effect = MsdgsError("no more memory")
+    pool.__len__.return_value = 1
+    with pytest.raises(MsdgsError):
+        train_all(runs, contextlib.nullcontext(pool), lambda *_: None)
+    pool.stop.assert_called_once()
 
 
 @contextlib.contextmanager
