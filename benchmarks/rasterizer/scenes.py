@@ -67,15 +67,15 @@ def median_scale(count: int) -> float:
     return float(np.exp(np.interp(np.log(count), counts, scales)))
 
 
-def object_camera(width: int, height: int, azimuth: float = 0.6) -> Camera:
-    """A camera at distance 4, `azimuth` radians around the object and a little above it, `CAMERA_ANGLE_X` wide."""
-    eye = DISTANCE * np.array([np.sin(azimuth) * np.cos(0.4), -np.sin(0.4), -np.cos(azimuth) * np.cos(0.4)])
+def object_camera(width: int, height: int) -> Camera:
+    """A camera at distance 4, 0.6 radians around the object and 0.4 above it, `CAMERA_ANGLE_X` wide."""
+    eye = DISTANCE * np.array([np.sin(0.6) * np.cos(0.4), -np.sin(0.4), -np.cos(0.6) * np.cos(0.4)])
     focal = 0.5 * width / np.tan(0.5 * CAMERA_ANGLE_X)
     pose = Camera.from_look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), width, height, 40.0).camera_to_world
     return Camera(focal, focal, width / 2, height / 2, width, height, pose)
 
 
-def around(gaussians: Gaussians, width: int = 800, height: int = 800) -> Camera:
+def around(gaussians: Gaussians, width: int, height: int) -> Camera:
     """A camera that looks along +z, so far away that 90 % of the Gaussians are in an image `CAMERA_ANGLE_X` wide."""
     target = np.median(gaussians.means, axis=0).astype(float)
     radius = np.quantile(np.linalg.norm(gaussians.means - target, axis=1), 0.9)

@@ -57,9 +57,9 @@ class Outcome(NamedTuple):
         return len(self.latencies) / self.seconds
 
 
-def zipf_trace(count: int, scenes: int, times: int, seed: int = 0) -> Trace:
-    """Requests whose scenes have frequency 1 / rank, and so have the times of each scene, in a random order."""
-    rng = np.random.default_rng(seed)
+def zipf_trace(count: int, scenes: int, times: int) -> Trace:
+    """Seeded requests: scenes have frequency 1 / rank, and so have the times of each scene, in a random order."""
+    rng = np.random.default_rng(0)
     inverse = [1 / np.arange(1, n + 1) for n in (scenes, times)]
     scene, rank = (rng.choice(len(weights), count, p=weights / float(weights.sum())) for weights in inverse)
     orders = rng.permuted(np.tile(np.arange(times), (scenes, 1)), axis=1)
@@ -94,12 +94,10 @@ class _Replica:
         return self.free_at
 
 
-def simulate(
-    trace: Trace, fleet: Fleet, stages: Stages, *, clients: int = 0, rate: float = 0.0, seed: int = 0
-) -> Outcome:
+def simulate(trace: Trace, fleet: Fleet, stages: Stages, *, clients: int = 0, rate: float = 0.0) -> Outcome:
     """Replay a trace with `clients` that send the next request when they are answered, or with random arrivals at
     `rate` requests per second."""
-    rng, count = np.random.default_rng(seed), len(trace.scenes)
+    rng, count = np.random.default_rng(0), len(trace.scenes)
     arrivals = [] if clients else np.cumsum(rng.exponential(1 / rate, count)).tolist()
     keys = trace.scenes.astype(np.uint64) * 1_000_003 + trace.times.astype(np.uint64)
     hashes = keys * np.uint64(0x9E3779B97F4A7C15)

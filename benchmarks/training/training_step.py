@@ -22,6 +22,7 @@ from msdgs_train.datasets import load_scene
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.datasets.synthetic.generate import generate
 from msdgs_train.engine.trainer import Trainer
+from msdgs_train.layers.arrays import to_array
 from msdgs_train.losses.photometric import photometric_loss
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from msdgs_train.systems.registry import preset
@@ -116,7 +117,7 @@ def measure(trainer: Trainer, several: Trainer, times: Times) -> None:
     size, black = (camera.width, camera.height), np.zeros(3, np.float32)
     target = ImageCache().image(frame, torch.zeros(3))
     posed = times.time("deformation", system.model.pose, frame.t)
-    gaussians = Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
+    gaussians = Gaussians(*map(to_array, posed))
     splats = times.time("projection", project, gaussians, camera, GSPLAT)
     tiles = times.time("tiles", bin_into_tiles, splats, *size)
     drawn = times.time("blending", composite, splats, tiles, *size, black, GSPLAT)

@@ -13,6 +13,7 @@ from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
 from msdgs_train.supports.base import Attribute
 
 INITIAL_OPACITY = 0.1
+NEIGHBORS = 3
 MIN_NEIGHBOR_DISTANCE = 1e-7  # scene units; coincident points still get a scale above 0
 MAX_DRAWS = 16
 """Random points per Gaussian, of which those in view are kept."""
@@ -145,8 +146,8 @@ class CanonicalGaussians(nn.Module):
         return cls.from_points(means, known, sh_degree, generator, attributes)
 
 
-def neighbor_distances(points: Tensor, neighbors: int = 3) -> Tensor:
-    """[N] mean distance of each point, [N, 3], to its nearest `neighbors`; 1 if there is no other point.
+def neighbor_distances(points: Tensor) -> Tensor:
+    """[N] mean distance of each point, [N, 3], to its three nearest neighbors; 1 if there is no other point.
 
     Raises `InvalidInput` if a coordinate is not finite.
     """
@@ -159,5 +160,5 @@ def neighbor_distances(points: Tensor, neighbors: int = 3) -> Tensor:
     from scipy.spatial import KDTree  # not needed to load a model, so not in the export extra
 
     positions = points.detach().cpu().numpy()
-    distances, _ = KDTree(positions).query(positions, k=min(neighbors, n - 1) + 1)
+    distances, _ = KDTree(positions).query(positions, k=min(NEIGHBORS, n - 1) + 1)
     return torch.from_numpy(distances[:, 1:].mean(axis=1)).to(points)  # the first is the point itself

@@ -11,6 +11,7 @@ from msdgs_train.supports.base import Attribute
 
 ModulationTarget = Literal["means", "scales", "quats"]
 
+HIDDEN_UNITS = 32
 MAX_LOG_FACTOR = 2.0
 """Factors are clamped to [e^-2, e^2]. Unbounded they grew to 5,000 in 2,000 steps on one scene and the loss diverged:
 a small change of a layer then changes some scale by orders of magnitude."""
@@ -32,13 +33,11 @@ class Modulation(nn.Module):
     For scales alone, the paper's, it has 1,155 parameters besides the embeddings. Table 5 has the other targets.
     """
 
-    def __init__(
-        self, embedding_dim: int = 32, hidden: int = 32, targets: Sequence[ModulationTarget] = ("scales",)
-    ) -> None:
+    def __init__(self, embedding_dim: int = 32, targets: Sequence[ModulationTarget] = ("scales",)) -> None:
         super().__init__()
         self.targets = [name for name in get_args(ModulationTarget) if name in targets]
-        self.hidden = nn.Linear(embedding_dim, hidden)
-        self.output = nn.Linear(hidden, sum(COLUMNS[name] for name in self.targets))
+        self.hidden = nn.Linear(embedding_dim, HIDDEN_UNITS)
+        self.output = nn.Linear(HIDDEN_UNITS, sum(COLUMNS[name] for name in self.targets))
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 

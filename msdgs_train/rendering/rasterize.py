@@ -16,6 +16,7 @@ from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers.arrays import to_array
 
 
 class RasterizationInfo:
@@ -91,9 +92,9 @@ class _Rasterize(torch.autograd.Function):
         background: Tensor,
         *gaussians: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        splats = project(Gaussians(*map(_array, gaussians)), camera, options)
+        splats = project(Gaussians(*map(to_array, gaussians)), camera, options)
         tiles = bin_into_tiles(splats, camera.width, camera.height)
-        frame = composite(splats, tiles, camera.width, camera.height, _array(background), options)
+        frame = composite(splats, tiles, camera.width, camera.height, to_array(background), options)
         info.radii = torch.from_numpy(np.maximum(splats.extents[:, 0], splats.extents[:, 1]))
         image = torch.from_numpy(frame.rgb)
         # saved as tensors: autograd then notices if one is written to before the backward pass
@@ -105,7 +106,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
-        *arrays, rgb = map(_array, ctx.saved_tensors)
+        *arrays, rgb = map(to_array, ctx.saved_tensors)
         splats, tiles, alpha = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
         unused = np.empty((0, 0), rgb.dtype)
@@ -118,7 +119,3 @@ class _Rasterize(torch.autograd.Function):
         if ctx.needs_input_grad[BACKGROUND]:
             grad_background = torch.from_numpy(np.einsum("hw,hwc->c", 1 - alpha, grad_rgb))
         return None, None, None, grad_background, *(torch.from_numpy(array) for array in arrays)
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()

@@ -12,6 +12,7 @@ from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.arrays import to_array
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 
 Channel = Literal["rgb", "alpha", "depth"]
@@ -43,7 +44,7 @@ class Snapshot:
         """Deform the Gaussians. The last result is kept: a moving camera needs the same Gaussians for each frame."""
         if self._posed is None or self._posed[0] != (t, layers):
             posed = self.model.pose(t, num_layers=layers, deform=self.deform, sh_degree=self.sh_degree)
-            self._posed = (t, layers), Gaussians(*(tensor.detach().contiguous().numpy() for tensor in posed))
+            self._posed = (t, layers), Gaussians(*map(to_array, posed))
         return self._posed[1]
 
 
