@@ -10,7 +10,7 @@ from rich.table import Table
 EXIT_INVALID = 2
 EXIT_INTERRUPTED = 130  # the exit code of a shell for a program that Ctrl-C has stopped
 
-console = Console()
+console = Console(markup=False)  # names of files may have brackets
 
 
 def rich_table(

@@ -36,9 +36,12 @@ class Eval:
     def execute(self) -> int:
         from msdgs_train.evaluation.evaluate import evaluate_run
         from msdgs_train.evaluation.report import HEADINGS, cells, draw_runs, notes, write_evaluation
+        from msdgs_train.evaluation.sheets import check_sheet
 
         if not self.runs:
             raise InvalidInput("RUN", "the folder of one run or more", "none")
+        if len(self.runs) > 1:
+            check_sheet("sheet", self.sheet)
         evaluations = {}
         for run in self.runs:
             with frame_progress(0) as progress:

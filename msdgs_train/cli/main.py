@@ -21,7 +21,7 @@ from msdgs_train.layers.plugins import add_plugin
 Commands = Fit | Synthetic | Eval | Steps | View | Compare | Bench
 """Each command has the name of its class in lower case."""
 
-EPILOG = "--plugin MODULE, before the command: a module or Python file that registers layers or systems (repeatable)."
+EPILOG = "--plugin MODULE, for any command: a module or Python file that registers layers or systems (repeatable)."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted")
         return EXIT_INTERRUPTED
-    except MsdgsError as error:
+    except (MsdgsError, OSError) as error:
         Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         return EXIT_INVALID
 

@@ -8,7 +8,7 @@ import numpy as np
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.metrics_log import to_bytes
-from msdgs_train.evaluation.sheets import Panel, draw_sheet
+from msdgs_train.evaluation.sheets import Panel, check_sheet, draw_sheet
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 
 DEFAULT_TIME = 0.3  # fraction of the scene's time; in the middle, where the time window starts, deformations are small
@@ -23,8 +23,7 @@ def write_steps(
 
     Raises `CheckpointInvalid` if the model can't be read, `InvalidInput` naming an argument that is out of range.
     """
-    if out.suffix.lower() != ".png":
-        raise InvalidInput("out", "a .png file", out)
+    check_sheet("out", out)
     loaded = load_model(path)
     first, last = loaded.scene.time_range
     t = first + DEFAULT_TIME * (last - first) if t is None else t
@@ -34,7 +33,6 @@ def write_steps(
     images = render_steps(loaded, t, camera_of(entry, size))
     captions = ["k = 0, canonical", *(f"k = {k}" for k in range(1, len(images)))]
     panels = [Panel(pixels, caption) for pixels, caption in zip(images, captions, strict=True)]
-    out.parent.mkdir(parents=True, exist_ok=True)
     draw_sheet(out, f"t = {t:g}, camera {entry['name']}, step {loaded.step:,}", [panels])
     return images
 

@@ -24,6 +24,13 @@ class Panel(NamedTuple):
     caption: str
 
 
+def check_sheet(field: str, path: Path) -> None:
+    """Create the folder of a sheet. Raises `InvalidInput` naming `field` unless it is a PNG."""
+    if path.suffix.lower() != ".png":
+        raise InvalidInput(field, "a .png file", path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
 def draw_sheet(path: Path, title: str, rows: list[list[Panel]]) -> None:
     """Write a PNG of `rows` of panels with a caption above each. Atomic.
 

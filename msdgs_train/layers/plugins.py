@@ -46,6 +46,9 @@ def _import(name: str) -> None:
             return
         stem = Path(name).stem
         if stem in sys.modules:
+            known = getattr(sys.modules[stem], "__file__", None)
+            if known is None or Path(known).resolve() != Path(name).resolve():
+                raise InvalidInput("plugin", f"a file of another name: there is a module `{stem}`", name)
             return
         spec = importlib.util.spec_from_file_location(stem, name)
         assert spec is not None

@@ -50,7 +50,9 @@ class SplineConfig(LayerConfig):
     def check(self, field: str, moves_nodes: bool) -> None:
         check_size(f"{field}.num_knots", self.num_knots, least=0)
         if not moves_nodes:
-            raise InvalidInput(field, "of another kind, or with --model.support nodes: curves are of nodes", self.kind)
+            raise InvalidInput(
+                field, "of another kind without --support nodes: each control node has a spline", self.kind
+            )
 
 
 class SplineLayer(DeformationLayer):

@@ -202,7 +202,7 @@ def _serve(host: str, port: int) -> Any:
     except ImportError:
         raise ExtraMissing("the viewer", "viser", "viewer") from None
     if not 0 <= port <= 65535:
-        raise InvalidInput("viewer_port", "in [0, 65535]", port)
+        raise InvalidInput("port", "in [0, 65535]", port)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints its address
         server = viser.ViserServer(host=host, port=port, label="msdgs", verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)

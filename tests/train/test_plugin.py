@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -102,6 +103,9 @@ def test_without_the_plugin_the_missing_part_is_named(data: Path, trained: Path,
     assert "--plugin MODULE, got fourier" in run("msdgs_train", "eval", trained, code=2)
     missing = run("msdgs_train", *fit, "--plugin", tmp_path / "none.py", code=2)
     assert "`plugin` must be a module that can be imported, or a Python file" in missing
+    shutil.copyfile(PLUGIN, tmp_path / "random.py")
+    same_name = run("msdgs_train", *fit, "--plugin", tmp_path / "random.py", code=2)
+    assert "`plugin` must be a file of another name: there is a module `random`" in same_name
 
 
 @pytest.fixture(scope="module")

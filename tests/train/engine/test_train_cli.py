@@ -96,7 +96,7 @@ def test_an_extra_that_is_missing_is_named_before_anything_is_done(
         ("--layers mlp mlp:lr_init=0", "model.layers.1.lr_init"),
         ("--layers plane:plane_tv_weight=-1.0", "model.layers.0.plane_tv_weight"),
         ("--support nodes:skinning_lr_final=-1.0", "model.support.skinning_lr_final"),
-        ("--support gaussians --layers spline", "--model.support nodes"),
+        ("--support gaussians --layers spline", "without --support nodes"),
         ("--support cage", "gaussians, nodes"),
     ],
 )
@@ -114,6 +114,8 @@ def test_data_and_options_that_are_not_there_are_named(tmp_path: Path, capsys: p
     command = ["fit", str(tmp_path / "nowhere"), str(tmp_path / "run")]
     assert cli.main(command) == cli.EXIT_INVALID
     assert "does not exist" in capsys.readouterr().err.replace("\n", "")
+    assert cli.main(["synthetic", "/dev/null/scene"]) == cli.EXIT_INVALID
+    assert "error: [Errno 17] File exists" in capsys.readouterr().err
     with pytest.raises(SystemExit) as exit_info:
         cli.main([*command, "--no-such-option"])
     assert exit_info.value.code == cli.EXIT_INVALID

@@ -355,15 +355,19 @@ def test_a_run_from_before_there_was_a_best_model(data: Path, run: Path, tmp_pat
 
 
 def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    other, path = tmp_path / "other", tmp_path / "sheet.png"
+    other, path = tmp_path / "other [2]", tmp_path / "new" / "sheet.png"
     shutil.copytree(run, other)
     shutil.copyfile(run / "best.pt", other / "model.pt")
     assert cli.main(["eval", str(run), str(other), "--sheet", str(path)]) == 0
-    assert f"wrote {path}" in capsys.readouterr().out.replace("\n", "")
+    shown = capsys.readouterr().out
+    assert f"wrote {path}" in shown
+    assert str(other / "eval" / "test.md") in shown
     frame = evaluate_run(run).frames[0]
     for image in (_read(frame.image_path), *(_render(each / "model.pt", frame) for each in (run, other))):
         assert _contains(_read(path), image)
     assert cli.main(["eval"]) == cli.EXIT_INVALID
+    assert cli.main(["eval", str(run), str(other), "--sheet", str(tmp_path / "sheet.gif")]) == cli.EXIT_INVALID
+    assert "`sheet` must be a .png file" in capsys.readouterr().err
 
 
 def test_split_without_images_is_named(run: Path, tmp_path: Path) -> None:
