@@ -12,15 +12,8 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.baked import SceneCamera, SceneMetadata
 from msdgs_serve.scene.camera import look_at, orbit
 from tests.support.scene_files import UP, metadata
-from tests.support.scenes import random_camera
+from tests.support.scenes import pixel_of, random_camera
 from tests.support.tolerances import assert_close
-
-
-def pixel_of(camera: Camera, point: object) -> np.ndarray:
-    """Return the pixel [2] of a world point."""
-    x, y, z = (camera.world_to_camera @ [*np.asarray(point, float), 1.0])[:3]
-    assert z > 0, "behind the camera"
-    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
 
 def test_identity_pose_is_opencv():

@@ -12,6 +12,7 @@ from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import orbit
 from tests.support.images import decode
 from tests.support.scene_files import UP, level_camera
+from tests.support.scenes import pixel_of
 from tests.support.service import serving
 from tests.support.tolerances import assert_close
 
@@ -20,21 +21,16 @@ ORBIT = {"type": "orbit", "azimuth": 40, "elevation": 10, "distance": 5, "fov_y"
 FRAME = {"camera": ORBIT, "width": SIZE, "height": SIZE, "t": 0.1, "channels": ["motion"], "dt": 0.2}
 
 
-def place(camera: Camera, point: list[float]) -> np.ndarray:
-    x, y, z = (camera.world_to_camera @ [*point, 1])[:3]
-    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
-
-
 @pytest.mark.parametrize(("t", "dt"), [(0.1, 0.2), (0.9, -0.3), (0.0, 1.0)])
 def test_motion_of_the_ball_is_that_of_its_center(scene: Path, t: float, dt: float):
     camera = Camera.from_fov(orbit(np.zeros(3), 5.0, 40, 10, UP), SIZE, SIZE, 40.0)
     session = DeformationSession(scene)
     image = Renderer().render(session, camera, t, RenderOptions(motion_dt=dt))
     assert image.motion is not None
-    column, row = np.floor(place(camera, [0, 0, 2 * t - 1])).astype(int)
-    moved = place(camera, [0, 0, 2 * (t + dt) - 1]) - place(camera, [0, 0, 2 * t - 1])
+    column, row = np.floor(pixel_of(camera, [0, 0, 2 * t - 1])).astype(int)
+    moved = pixel_of(camera, [0, 0, 2 * (t + dt) - 1]) - pixel_of(camera, [0, 0, 2 * t - 1])
     assert_close(image.motion[row, column], moved, "motion_vector")
-    resting = place(camera, [0, 0, 0])
+    resting = pixel_of(camera, [0, 0, 0])
     assert_close(image.motion[int(resting[1]), int(resting[0])], np.zeros(2), "motion_vector")
     assert (image.motion[image.alpha == 0] == 0).all()
 
@@ -50,7 +46,7 @@ def test_a_frame_warped_by_its_motion_is_the_later_frame(scene: Path):
     ends = np.stack([columns, rows], axis=1) + now.motion[rows, columns]
     whole = np.round(ends).astype(int)
     np.testing.assert_allclose(later.alpha[whole[:, 1], whole[:, 0]], now.alpha[rows, columns], atol=0.2)
-    expected = place(camera, [0, 0, -0.8]) - place(camera, [0, 0, -1])
+    expected = pixel_of(camera, [0, 0, -0.8]) - pixel_of(camera, [0, 0, -1])
     errors = np.linalg.norm(now.motion[rows, columns] - expected, axis=1)
     assert np.median(errors) < 0.25
 

@@ -49,6 +49,13 @@ def random_camera(rng: np.random.Generator, width: int, height: int) -> Camera:
     return Camera(focal[0], focal[1], center[0], center[1], width, height, pose)
 
 
+def pixel_of(camera: Camera, point: object) -> np.ndarray:
+    """The pixel [2] of a world point before a pinhole camera."""
+    x, y, z = (camera.world_to_camera @ [*np.asarray(point, float), 1.0])[:3]
+    assert z > 0, "behind the camera"
+    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+
 def random_scene(seed: int, count: int, width: int = 53, height: int = 37, *, sh_degree: int = 3) -> Scene:
     """float32, as in the service. The default size is no multiple of the tile's."""
     rng = np.random.default_rng(seed)
