@@ -18,33 +18,40 @@ from tests.support.sound_scenes import sound_scenes
 
 CONTRACT = Path(__file__).parents[2] / "docs" / "contract.md"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "toys.onnx"
-SCENES = {**sound_scenes(), "example": EXAMPLE.read_bytes()}
+
+pytestmark = pytest.mark.xdist_group("sound scenes")  # one worker makes them
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_the_graph_that_is_written_again_computes_the_same_bits(name: str):
-    session = DeformationSession(f"{name}.onnx", contents=SCENES[name])
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    plain = onnxruntime.InferenceSession(SCENES[name], options)
-    outputs = [output.name for output in plain.get_outputs()]
-    moving = session.scene.moving_count
-    for t in np.linspace(*session.scene.metadata.time_range, 3):
-        want = dict(zip(outputs, plain.run(None, {"t": np.array([t], np.float32)}), strict=True))
-        got = session.gaussians(float(t))
-        for part, values in vars(got).items():
-            if f"static_{part}" not in want:
-                np.testing.assert_array_equal(values, want[part])
-                continue
-            np.testing.assert_array_equal(values[moving:], want[f"static_{part}"])
-            if session.cost.calls <= 1:  # rows of a product may differ between calls of different lengths
-                np.testing.assert_array_equal(values[:moving], want[part])
+def scenes() -> dict[str, bytes]:
+    return {**sound_scenes(), "example": EXAMPLE.read_bytes()}
+
+
+@pytest.mark.slow
+def test_graphs_that_are_written_again_compute_the_same_bits():
+    for name, contents in scenes().items():
+        session = DeformationSession(f"{name}.onnx", contents=contents)
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        plain = onnxruntime.InferenceSession(contents, options)
+        outputs = [output.name for output in plain.get_outputs()]
+        moving = session.scene.moving_count
+        for t in np.linspace(*session.scene.metadata.time_range, 3):
+            want = dict(zip(outputs, plain.run(None, {"t": np.array([t], np.float32)}), strict=True))
+            got = session.gaussians(float(t))
+            for part, values in vars(got).items():
+                place = f"{name}, {part}"
+                if f"static_{part}" not in want:
+                    np.testing.assert_array_equal(values, want[part], place)
+                    continue
+                np.testing.assert_array_equal(values[moving:], want[f"static_{part}"], place)
+                if session.cost.calls <= 1:  # rows of a product may differ between calls of different lengths
+                    np.testing.assert_array_equal(values[:moving], want[part], place)
 
 
 def emitted() -> dict[str, dict[str, set[Any]]]:
     """Return the operators of all valid scenes and their attributes."""
     found: dict[str, dict[str, set[Any]]] = {}
-    for contents in SCENES.values():
+    for contents in scenes().values():
         for node in onnx.load_from_string(contents).graph.node:
             attributes = found.setdefault(node.op_type, {})
             for attribute in node.attribute:
@@ -52,6 +59,7 @@ def emitted() -> dict[str, dict[str, set[Any]]]:
     return found
 
 
+@pytest.mark.slow
 def test_the_table_has_exactly_the_operators_of_exporters():
     found = emitted()
     assert sorted(found) == sorted(OPERATORS)

@@ -19,6 +19,8 @@ from tests.support.processes import ROOT
 from tests.support.scene_mutations import CANARY
 from tests.support.sound_scenes import sound_scenes
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sound scenes")]  # one worker makes them
+
 FILES = int(os.environ.get("MSDGS_HOSTILE", "300"))
 MEMORY_MEGABYTES = 64.0
 """Memory beyond that of the graph: a session of onnxruntime, the file, buffers of the kernels."""
