@@ -1,11 +1,8 @@
 """A layer kind and a system from outside the package train, resume, are evaluated, compared, exported and served."""
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +11,15 @@ import torch
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.renderer import Renderer
+from msdgs_train.cli import main as cli
+from msdgs_train.cli.fit_progress import FitProgress
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import load_model
+from msdgs_train.layers.registry import LAYERS
+from msdgs_train.systems import registry
 from tests.support import plugin_example
 from tests.support.images import decode
-from tests.support.processes import ROOT, bodies, chromium, image, run_python, wait_until_still
+from tests.support.processes import ROOT, bodies, chromium, image, program, run_python, wait_until_still
 from tests.support.service import serving
 from tests.support.tolerances import assert_close, tolerance
 from tests.support.training_scene import assert_same_bits, state_of
@@ -27,50 +28,38 @@ PLUGIN = Path(plugin_example.__file__)
 SMALL = ["--steps=24", "--threads=1", "--init-num-pts=60", "--max-gaussians=90", "--eval-every=0", "--sh-degree=1"]
 SMALL += ["--static-fraction=0.2", "--refine-start-fraction=0.17", "--refine-every-fraction=0.17"]
 
-STOP_AFTER_A_STEP = """
-import sys
-from unittest.mock import patch
-from msdgs_train.cli import fit_progress, main
-with patch.object(fit_progress.FitProgress, "should_stop", lambda progress: True):
-    assert main.main(sys.argv[1:]) == main.EXIT_INTERRUPTED
-"""
-
 pytestmark = pytest.mark.slow
 
 
-def run(module: str, *arguments: object, code: int = 0) -> str:
-    """The output of a command in a subprocess with only the given plugins."""
-    environment = {name: value for name, value in os.environ.items() if name != "MSDGS_PLUGINS"}
-    done = subprocess.run(
-        [sys.executable, "-m", module, *map(str, arguments)],
-        cwd=ROOT,
-        env=environment | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout + done.stderr
+def train(*arguments: object) -> int:
+    """Run a command in this process, which has imported the plugin."""
+    return cli.main(list(map(str, arguments)))
 
 
-def train(*arguments: object, code: int = 0) -> str:
-    return run("msdgs_train", *arguments, "--plugin", PLUGIN, code=code)
+def train_with_plugin(*arguments: object) -> None:
+    """Run a command in another process, which knows the plugin from `--plugin` alone."""
+    with program("msdgs_train", *arguments, "--plugin", PLUGIN) as process:
+        output = process.communicate(timeout=600)[0]
+    assert process.returncode == 0, output
 
 
 @pytest.fixture(scope="module")
 def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run."""
     folder = tmp_path_factory.mktemp("plugin") / "whole"
-    train("fit", data, folder, "--preset", "sparse-fourier", *SMALL)
+    train_with_plugin("fit", data, folder, "--preset", "sparse-fourier", *SMALL)
     return folder
 
 
-def test_a_stopped_run_resumes_with_the_same_bits(data: Path, trained: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_resumes_with_the_same_bits(
+    data: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     stopped = tmp_path / "stopped"
-    arguments = ["fit", data, stopped, "--preset", "sparse-fourier", *SMALL]
-    run_python(STOP_AFTER_A_STEP, *arguments, MSDGS_PLUGINS=str(PLUGIN))
-    assert "resumed after step 1" in train("fit", data, stopped, "--resume")
+    with monkeypatch.context() as patch:
+        patch.setattr(FitProgress, "should_stop", lambda progress: True)
+        assert train("fit", data, stopped, "--preset", "sparse-fourier", *SMALL) == cli.EXIT_INTERRUPTED
+    assert train("fit", data, stopped, "--resume") == 0
+    assert "resumed after step 1" in capsys.readouterr().out
     assert_same_bits(state_of(stopped), state_of(trained))
     config = json.loads((trained / "config.json").read_text())
     assert [layer["kind"] for layer in config["model"]["layers"]] == ["fourier", "fourier"]
@@ -79,11 +68,11 @@ def test_a_stopped_run_resumes_with_the_same_bits(data: Path, trained: Path, tmp
 
 
 def test_it_is_evaluated_and_compared_in_worker_processes(data: Path, trained: Path, tmp_path: Path) -> None:
-    train("eval", trained)
+    assert train("eval", trained) == 0
     report = json.loads((trained / "eval" / "test.json").read_text())
     assert report["models"]["last"]["mean"]["psnr"] > 5
     options = ["--seeds", 0, "--steps", 6, "--init-num-pts", 60, "--max-gaussians", 90, "--jobs", 1]
-    train("compare", "sparse-fourier", "--data", data, "--out", tmp_path / "out", *options)
+    train_with_plugin("compare", "sparse-fourier", "--data", data, "--out", tmp_path / "out", *options)
     (compared,) = json.loads((tmp_path / "out" / "comparison.json").read_text())["runs"]
     assert compared["system"] == "sparse-fourier"
     assert compared["deformation_parameters"] > 0
@@ -91,21 +80,30 @@ def test_it_is_evaluated_and_compared_in_worker_processes(data: Path, trained: P
 
 def test_its_layers_stand_beside_others_on_the_command_line(data: Path, tmp_path: Path) -> None:
     layers = ["--support", "nodes:num_nodes=5", "--layers", "spline", "fourier:frequencies=2", "mlp:width=8"]
-    train("fit", data, tmp_path / "run", *SMALL, "--steps=3", *layers)
+    assert train("fit", data, tmp_path / "run", *SMALL, "--steps=3", *layers) == 0
     stored = json.loads((tmp_path / "run" / "config.json").read_text())["model"]["layers"]
     assert [layer["kind"] for layer in stored] == ["spline", "fourier", "mlp"]
 
 
-def test_without_the_plugin_the_missing_part_is_named(data: Path, trained: Path, tmp_path: Path) -> None:
+def test_without_the_plugin_the_missing_part_is_named(
+    data: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(registry._ENTRIES, "sparse-fourier")
+    monkeypatch.delitem(LAYERS, "fourier")
     fit = ["fit", data, tmp_path / "run"]
-    assert "--plugin MODULE, got sparse-fourier" in run("msdgs_train", *fit, "--preset", "sparse-fourier", code=2)
-    assert "--plugin MODULE, got fourier" in run("msdgs_train", *fit, "--layers", "fourier", code=2)
-    assert "--plugin MODULE, got fourier" in run("msdgs_train", "eval", trained, code=2)
-    missing = run("msdgs_train", *fit, "--plugin", tmp_path / "none.py", code=2)
-    assert "`plugin` must be a module that can be imported, or a Python file" in missing
     shutil.copyfile(PLUGIN, tmp_path / "random.py")
-    same_name = run("msdgs_train", *fit, "--plugin", tmp_path / "random.py", code=2)
-    assert "`plugin` must be a file of another name: there is a module `random`" in same_name
+    for command, message in (
+        ([*fit, "--preset", "sparse-fourier"], "--plugin MODULE, got sparse-fourier"),
+        ([*fit, "--layers", "fourier"], "--plugin MODULE, got fourier"),
+        (["eval", trained], "--plugin MODULE, got fourier"),
+        ([*fit, "--plugin", tmp_path / "none.py"], "`plugin` must be a module that can be imported, or a Python file"),
+        (
+            [*fit, "--plugin", tmp_path / "random.py"],
+            "`plugin` must be a file of another name: there is a module `random`",
+        ),
+    ):
+        assert train(*command) == cli.EXIT_INVALID
+        assert message in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
