@@ -36,6 +36,12 @@ from tests.support.tolerances import tolerance
 QUIET = Console(quiet=True)
 
 
+@pytest.fixture(autouse=True)
+def _networks_are_read_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not in processes of their own, which first load torch: test_importers_guarded.py is about those."""
+    monkeypatch.setattr("export.importers.runs.state.read_guarded", lambda read, file: read(file))
+
+
 def imported(run: Path, kind: str) -> tuple[DynamicGaussians, list[dict[str, Any]]]:
     lost = write_model(run, kind, run.parent / "model.pt", QUIET)
     return load_model(run.parent / "model.pt").model, lost
