@@ -1,9 +1,12 @@
 """Shared settings of the tests of training."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_train.comparison import pools
 from msdgs_train.engine import run as run_module
 from tests.support.training_scene import write_scene
 
@@ -18,3 +21,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip plots, which take longer than the rest of a tiny run."""
     monkeypatch.setattr(run_module, "draw_curve", lambda run: None)
+
+
+@pytest.fixture
+def in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train the runs of comparisons in threads of this process, which need no start of Python and torch."""
+    monkeypatch.setenv(THREADS_VARIABLE, "1")  # as a run sets it, and undone
+    monkeypatch.setattr(pools, "ProcessPoolExecutor", lambda jobs, *_: ThreadPoolExecutor(jobs))

@@ -198,6 +198,7 @@ def arguments(systems_file: Path, data: Path, out: Path, *more: str) -> list[str
     return ["compare", str(systems_file), "--data", str(data), "--out", str(out), *options]
 
 
+@pytest.mark.usefixtures("in_threads", "no_curve")
 def test_from_nothing_to_the_table_and_not_again(
     systems_file: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -224,6 +225,7 @@ def test_from_nothing_to_the_table_and_not_again(
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_run_that_fails_is_reported_and_the_others_continue(systems_file: Path, tmp_path: Path) -> None:
     ended: list[tuple[str, RunEnd]] = []
     (write_scene(tmp_path / "unevaluated", train=2, test=0) / "transforms_val.json").unlink()
