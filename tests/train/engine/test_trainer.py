@@ -71,20 +71,22 @@ RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
 
 
 @pytest.mark.usefixtures("no_curve")
-@pytest.mark.parametrize(("case", "stop"), [(case, stop) for case, (_, stops) in RESUMED.items() for stop in stops])
-def test_resuming_changes_no_bit(data: Path, tmp_path: Path, case: str, stop: int) -> None:
+@pytest.mark.parametrize(("changes", "stops"), RESUMED.values(), ids=RESUMED)
+def test_resuming_changes_no_bit(data: Path, tmp_path: Path, changes: dict[str, Any], stops: tuple[int, ...]) -> None:
     """Stopped in the middle of a pass over the images."""
-    config = small_config(**RESUMED[case][0])
+    config = small_config(**changes)
     fit(config, data, tmp_path / "whole")
-    outcome = fit(config, data, tmp_path / "parts", observer=StopAfter(stop))
-    assert (outcome.status, outcome.step, outcome.metrics) == ("interrupted", stop, {})
-    torch.manual_seed(stop)
-    assert fit(config, data, tmp_path / "parts", resume=True).status == "finished"
-    whole, parts = (state_of(tmp_path / name) for name in ("whole", "parts"))
+    whole = state_of(tmp_path / "whole")
     assert len(whole["/system/model/gaussians.means"]) != config.density.init_num_pts, "density control took no part"
-    assert_same_bits(whole, parts)
-    lines = [[{**line, "seconds": 0} for line in read_metrics(tmp_path / name)] for name in ("whole", "parts")]
-    assert lines[0] == lines[1]
+    for stop in stops:
+        parts = tmp_path / f"stopped after {stop}"
+        outcome = fit(config, data, parts, observer=StopAfter(stop))
+        assert (outcome.status, outcome.step, outcome.metrics) == ("interrupted", stop, {})
+        torch.manual_seed(stop)
+        assert fit(config, data, parts, resume=True).status == "finished"
+        assert_same_bits(whole, state_of(parts))
+        lines = [[{**line, "seconds": 0} for line in read_metrics(run)] for run in (tmp_path / "whole", parts)]
+        assert lines[0] == lines[1]
 
 
 def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
