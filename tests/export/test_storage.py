@@ -36,7 +36,7 @@ from tests.support.scenes import unit_quats
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_candidates")]
 
 FINE = {name: list(group.kinds)[-1] for name, group in GROUPS.items()}
 

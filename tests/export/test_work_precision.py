@@ -1,7 +1,6 @@
 """The sweep and its report: dominated points are never chosen, errors repeat, invalid options are refused."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +25,11 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("work precision")]  # one worker, so that the sweep runs once
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.usefixtures("few_candidates"),
+    pytest.mark.xdist_group("work precision"),  # one worker, so that the sweep runs once
+]
 
 POINT_FIELDS = {
     "front": bool,
@@ -82,14 +85,6 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_p
 def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tuple[ExportJob, SweepResult]:
     job = new_job(tmp_path_factory.mktemp("swept"))
     return job, Sweep(job).run()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_candidates() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("export.jobs.sweep.PRUNING_STEPS", (5.0, 1.0, -5.0))
-        patch.setitem(PLANS, "compact", replace(PLANS["compact"], candidates=lambda layers: ["compact:50"]))
-        yield
 
 
 def new_job(folder: Path) -> ExportJob:

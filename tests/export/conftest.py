@@ -1,0 +1,20 @@
+"""Shared settings of the tests of export."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from export.plans.registry import PLANS
+
+
+@pytest.fixture(scope="module")
+def few_candidates() -> Iterator[None]:
+    """Sweeps of few candidates, each compared in few frames and timed a few times."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("export.jobs.sweep.PRUNING_STEPS", (5.0, 1.0, -5.0))
+        patch.setattr("export.jobs.sweep.SMALLER_STEPS", (-15.0,))
+        patch.setitem(PLANS, "compact", replace(PLANS["compact"], candidates=lambda layers: ["compact:50"]))
+        patch.setattr("export.jobs.job.EVALUATION_TIMES", 6)
+        patch.setattr("export.measure.timing.REPEATS", 3)
+        yield
