@@ -100,14 +100,16 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
     trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold))
     seconds = trainer.load_checkpoint(folder / CHECKPOINT) if resume else 0.0
     folder.mkdir(parents=True, exist_ok=True)
-    lock = _locked(folder)
-    write_config(folder, config)
-    best = _best_so_far(folder, trainer.scene) if resume else None
-    if best is None:
-        (folder / BEST).unlink(missing_ok=True)
-    record = RunRecord(data.absolute(), best)
-    write_record(folder, record)
-    log = MetricsLog(folder, keep_until=trainer.step_count, tensorboard=tensorboard)
+    with contextlib.ExitStack() as on_error:
+        lock = on_error.enter_context(_locked(folder))
+        write_config(folder, config)
+        best = _best_so_far(folder, trainer.scene) if resume else None
+        if best is None:
+            (folder / BEST).unlink(missing_ok=True)
+        record = RunRecord(data.absolute(), best)
+        write_record(folder, record)
+        log = MetricsLog(folder, keep_until=trainer.step_count, tensorboard=tensorboard)
+        on_error.pop_all()
     return RunState(folder, trainer, log, record, seconds, lock)
 
 
