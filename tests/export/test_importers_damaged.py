@@ -1,6 +1,7 @@
 """Damaged files of every imported kind are refused or rendered finite, in bounded time and memory.
 
-`MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` tests 5,000 larger files of each kind.
+`MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` tests 5,000 larger files of each
+kind, and 500 of each kind of run.
 """
 
 import os
