@@ -1,5 +1,6 @@
 """Shared settings of the tests."""
 
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,16 @@ def tiny_numbers_stay():
     """A process that flushes denormals would change the results of all later tests on this worker."""
     yield
     assert np.float32(1e-38) * np.float32(1e-2) > 0
+
+
+@pytest.fixture(autouse=True)
+def no_log_handler_stays():
+    """What `msdgs_serve.api.cli.main` sets up would write logs of later tests to a stream that is closed by then."""
+    level = logging.root.level
+    yield
+    for handler in [found for found in logging.root.handlers if type(found) is logging.StreamHandler]:
+        logging.root.removeHandler(handler)
+    logging.root.setLevel(level)
 
 
 @pytest.fixture(scope="session")

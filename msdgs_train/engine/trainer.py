@@ -144,17 +144,12 @@ class Trainer:
         state: dict[str, Any] = safe_load.load(path)
         if not isinstance(state, dict) or state.get("format") != FORMAT:
             raise safe_load.CheckpointInvalid(path, f"isn't of format {FORMAT}: train again in a new folder")
-        self.step_count, self._averages = state["step_count"], state["averages"]
-        self.optimizer_steps, self.reached = state["optimizer_steps"], range(*state["reached"])
-        self.system.load_state(state["system"], self.step_count)
-        self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
-        self.optimizer.load_state_dict(state["optimizer"])
-        self._curriculum.order = state["curriculum"]
-        self.skipped, self._skipped_in_a_row = state["skipped"]
-        self.rollbacks = state["rollbacks"]
-        for generator, stored in zip(self._generators(), state["generators"], strict=True):
-            generator.set_state(stored)
-        return float(state["seconds"])
+        try:
+            self._restore(state)
+            return float(state["seconds"])
+        except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
+            problem = f"isn't a complete checkpoint of these settings ({error!r}): train again in a new folder"
+            raise safe_load.CheckpointInvalid(path, problem) from error
 
     def roll_back(self, checkpoint: Path) -> None:
         """Return to a checkpoint, or to the start if there is no such file, after training has diverged: with half the
@@ -166,6 +161,18 @@ class Trainer:
         self.skipped, self.rollbacks, self._skipped_in_a_row = skipped, rollbacks, 0
         self._generator.manual_seed(self.config.run.seed + ROLLBACK_SEED * rollbacks)
         self._curriculum.order = torch.empty(0, dtype=torch.int64)
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.step_count, self._averages = state["step_count"], state["averages"]
+        self.optimizer_steps, self.reached = state["optimizer_steps"], range(*state["reached"])
+        self.system.load_state(state["system"], self.step_count)
+        self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self._curriculum.order = state["curriculum"]
+        self.skipped, self._skipped_in_a_row = state["skipped"]
+        self.rollbacks = state["rollbacks"]
+        for generator, stored in zip(self._generators(), state["generators"], strict=True):
+            generator.set_state(stored)
 
     @property
     def is_skipping(self) -> bool:

@@ -22,6 +22,7 @@ from msdgs_train.engine.run import Observer, fit
 from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model_file import load_model
+from msdgs_train.gaussians.safe_load import CheckpointInvalid
 from msdgs_train.layers.parameters import exponential
 from msdgs_train.layers.plane import PlaneConfig, PlaneLayer
 from msdgs_train.supports.nodes import NodesConfig
@@ -231,6 +232,20 @@ def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
     assert watched.seen == [(10, 0.5), (10, 0.25), (10, 0.125)]
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step_count"] == 10
     load_model(tmp_path / "run" / "model.pt")
+
+
+@pytest.mark.usefixtures("no_curve")
+def test_a_checkpoint_without_one_of_its_values_is_refused(data: Path, tmp_path: Path) -> None:
+    config, checkpoint = small_config(steps=2), tmp_path / "run" / "checkpoint.pt"
+    fit(config, data, tmp_path / "run")
+    state = torch.load(checkpoint, weights_only=True)
+    for part in (state, state["system"]):
+        for name in set(part) - {"average"}:  # a longer run of these settings has none
+            value = part.pop(name)
+            torch.save(state, checkpoint)
+            with pytest.raises(CheckpointInvalid, match=r"checkpoint\.pt: isn't (of format|a complete checkpoint)"):
+                fit(config.updated(steps=4), data, tmp_path / "run", resume=True)
+            part[name] = value
 
 
 def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_path: Path) -> None:
