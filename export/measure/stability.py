@@ -131,8 +131,8 @@ class _Assessment:
 
     @torch.no_grad()
     def _growth(self, ids: np.ndarray, t: float) -> Growth:
-        """Growth of the Gaussians `ids`; on control nodes that of the nodes, plus the measured round-off of skinning in
-        float32."""
+        """Growth of the Gaussians `ids`; on control nodes that of the nodes, plus the measured distance of float32
+        means from float64, to which rotations and stretches of the nodes contribute too."""
         double, single, rows = self.double, self.single, torch.from_numpy(ids)
         points = canonical_points(double.gaussians.rows(rows))
         found = growth(double.deformation, single.deformation, double.support.points(points.means), t)

@@ -41,7 +41,8 @@ def as_markdown(rows: Sequence[Row]) -> str:
         shown.append(markdown_table(["scene", *systems[1:]], gains))
     first = rows[0]
     kind = "minutes of CPU time" if first["time"] == "cpu" else "minutes"
-    budget = f"{first['minutes']} {kind} per run on {first['threads']} thread(s) of {first['machine']}"
+    machines = " and ".join(sorted({row["machine"] for row in rows}))
+    budget = f"{first['minutes']} {kind} per run on {first['threads']} thread(s) of {machines}"
     days = sorted({row["date"] for row in rows})
     notes = f"PSNR in dB of the last model, mean ± standard deviation over seeds; {budget}; {days[0]} to {days[-1]}. "
     notes += "Settings are chosen on val, results reported on test; the mean is over scenes that all systems have, "

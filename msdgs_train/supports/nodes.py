@@ -1,7 +1,8 @@
 """The support `nodes`: the chain moves control nodes, and the Gaussians follow by linear blend skinning.
 
-At one time a node has a translation, a rotation and a stretch about its position. Each Gaussian follows its nearest
-nodes with weights that don't depend on time. The cost of the chain is independent of the number of Gaussians.
+At one time a node has a translation, a rotation and a stretch about its position. Each Gaussian follows nodes that are
+the nearest when the deformation starts, with weights that don't depend on time. The cost of the chain is independent of
+the number of Gaussians.
 """
 
 from dataclasses import dataclass
@@ -142,6 +143,8 @@ class NodesSupport(Support):
         their canonical distance."""
         matrices, offsets, _ = motions.split((9, 3, 4), dim=1)
         near = self.neighbors
+        if not near.numel():  # one node
+            return motions.new_zeros(())
         own = torch.einsum("bij,bj->bi", matrices.view(-1, 3, 3), self.nodes) + offsets
         moved = torch.einsum("bij,bkj->bki", matrices.view(-1, 3, 3), self.nodes[near]) + offsets[:, None]
         lengths = torch.linalg.vector_norm(self.nodes[near] - self.nodes[:, None], dim=2)

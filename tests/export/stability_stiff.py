@@ -65,6 +65,28 @@ def saturated(logit: float) -> Change:
     return change
 
 
+def nodes_at_one_place(model: DynamicGaussians) -> None:
+    nodes = model.support.get_buffer("nodes")
+    nodes[:] = nodes[0]
+
+
+def follow_one_node(model: DynamicGaussians) -> None:
+    """Set the skinning logits so that weights are exactly 0 and 1 in float32."""
+    logits = model.gaussians.get_parameter("skinning_logits")
+    logits.fill_(-200)[:, 0] = 200
+
+
+def far_from_nodes(model: DynamicGaussians) -> None:
+    """Move the first Gaussian 20 scene units away: rotations of its nodes move it as far."""
+    model.gaussians.means[0] += 20
+
+
+def flattened(model: DynamicGaussians) -> None:
+    """Shrink the nodes' surroundings below the smallest stretch."""
+    for layer in model.deformation.layers:
+        layer.get_parameter("heads.bias")[3:6] = -1
+
+
 def layers(count: int, kind: str = "mlp") -> dict[str, Any]:
     """Many layers are small ones: only their number matters here."""
     small = {"mlp": replace(MLP, depth=1), "plane": replace(PLANE, resolution=6, time_resolution=6)}
@@ -89,8 +111,14 @@ CASES: dict[str, Callable[[], DynamicGaussians]] = {
     "K = 2, planes": lambda: changed(**layers(2, "plane")),
     "K = 8, planes": lambda: changed(**layers(8, "plane")),
     "K = 8, planes, steps × 64": lambda: changed(steps_times(64), **layers(8, "plane")),
-    **{f"K = 2 on nodes, steps × {s}": lambda s=s: changed(steps_times(s), support=NODES) for s in (1, 16)},
+    **{f"K = 2 on nodes, steps × {s}": lambda s=s: changed(steps_times(s), support=NODES) for s in (1, 16, 64)},
     "K = 8, planes on nodes": lambda: changed(support=NODES, **layers(8, "plane")),
+    "K = 64 on nodes": lambda: changed(support=NODES, **layers(64)),
+    "K = 2 on one node": lambda: changed(support=replace(NODES, num_nodes=1)),
+    "K = 2 on nodes at one place": lambda: changed(nodes_at_one_place, support=NODES),
+    "K = 2 on nodes, skinning weights of 0 and 1": lambda: changed(follow_one_node, support=NODES),
+    "K = 2 on nodes, a Gaussian far from them": lambda: changed(far_from_nodes, support=NODES),
+    "K = 2 on nodes, stretches below their bound": lambda: changed(flattened, support=NODES),
 }
 
 

@@ -79,7 +79,7 @@ def test_a_scene_on_nodes_is_posed_in_one_call():
         with torch.no_grad():
             posed = model.pose(0.3, layers, ids=torch.from_numpy(ids))
         for got, want in zip(session.pose(0.3, ids, steps), (posed.means, posed.quats, posed.scales), strict=True):
-            np.testing.assert_allclose(got, want.numpy(), rtol=0, atol=tolerance("export.nodes.relative"))
+            np.testing.assert_allclose(got, want.numpy(), rtol=0, atol=tolerance("export.relative"))
     for some, every in zip(session.pose(0.3, ids), session.pose(0.3), strict=True):
         np.testing.assert_array_equal(some, every[ids])
     assert [part.shape for part in session.pose(0.3, [])] == [(0, 3), (0, 4), (0, 3)]
@@ -123,5 +123,5 @@ def test_rotations_that_cancel_are_the_identity(embedding_dim: int):
         want = model.pose(0.3)
     session = session_of(model)
     for got, values in zip(session.pose(0.3), (want.means, want.quats, want.scales), strict=True):
-        np.testing.assert_allclose(got, values.numpy(), rtol=0, atol=tolerance("export.nodes.relative"))
+        np.testing.assert_allclose(got, values.numpy(), rtol=0, atol=tolerance("export.relative"))
     np.testing.assert_allclose(session.pose(0.3)[1], np.tile([1, 0, 0, 0], (20, 1)), atol=1e-6)

@@ -295,7 +295,7 @@ def test_layers_on_nodes_keep_all_heads(tmp_path: Path, kind: str):
     start, end = (posed(model, t) for t in SCENE.time_range)
     assert np.abs(end.means - start.means).max() > 0.01
     for got, want in zip(candidate.session.pose(1.0), (end.means, end.quats, end.scales), strict=True):
-        np.testing.assert_allclose(got, want[order], rtol=0, atol=tolerance("export.nodes.relative"))
+        np.testing.assert_allclose(got, want[order], rtol=0, atol=tolerance("export.relative"))
 
 
 def with_hidden_one(model: DynamicGaussians) -> DynamicGaussians:

@@ -76,7 +76,6 @@ TABLE = (
     Row("shared_scale.relative", 3e-6, "a float32 logarithm of size 5, shifted and rounded, back through exp"),
     Row("neighbor_distances", 1e-6, "differences of float32 coordinates of size 5"),
     Row("export.relative", 3e-5, "float32 through frequencies of 512, step after step; export itself allows 1e-4"),
-    Row("export.nodes.relative", 1e-4, "16-bit weights, off by 1.5e-5 each, times motions; and as export.relative"),
     Row("redrawn", 0.1, "dB; a frame is drawn in float32, and again by gsplat's reference in float64"),
     Row("stored_scale", 1e-5, "logarithms up to 18, and the exponential, in float32"),
     Row("stored_16bit", 1e-3, "half a step of a range of 3 is 2e-5; a network without high frequencies multiplies it"),

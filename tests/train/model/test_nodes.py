@@ -171,3 +171,11 @@ def test_a_body_that_moves_as_one_is_rigid() -> None:
         assert float(support.local_rigidity(motions)) == pytest.approx(float(expected))
         weighted = support.regularizers(motions)
         assert {name: float(term) for name, term in weighted.items()} == {"arap": pytest.approx(0.1 * float(expected))}
+
+
+def test_one_node_has_no_neighbor_to_move_with() -> None:
+    model = random_model(5, support=NodesConfig(num_nodes=1))
+    support = model.support
+    assert isinstance(support, NodesSupport)
+    motions = support.motions(model.deformation, model.gaussians.means, torch.tensor(0.4))
+    assert {name: float(term) for name, term in support.regularizers(motions).items()} == {"arap": 0.0}
