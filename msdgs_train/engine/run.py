@@ -39,6 +39,7 @@ SELECTION_SPLITS = ("val", "test")  # the first of these that the dataset has se
 RENDERS_PER_EVAL = 4
 MAX_ROLLBACKS = 3
 TRIAL_STEPS = 4  # of a trainer that is thrown away, across the schedule
+MAX_EVALUATION_SHARE = 0.03  # of the time so far, in a run of given minutes; the last evaluation is not counted
 PAUSE_SECONDS = 0.05  # between two calls of `Observer.is_paused`
 
 Status = Literal["finished", "interrupted"]
@@ -135,6 +136,7 @@ class Run:
         self._now = time.process_time if self.config.run.time == "cpu" else time.perf_counter
         self.started = self._now() - state.seconds
         self.clock, self.advance = self._new_clock(), 1
+        self.evaluation_seconds = 0.0
 
     def execute(self) -> RunResult:
         """Train until the last step or an interruption, then evaluate and save."""
@@ -214,12 +216,17 @@ class Run:
         self.observer.step(result, self._seconds())
         if is_last:
             return
-        if _is_due(self.trainer.reached, every.eval_every) and self.splits:
+        if _is_due(self.trainer.reached, every.eval_every) and self.splits and self._has_time_to_evaluate():
+            before = self._now()
             for split in self.splits:
                 self._evaluate(split, renders=RENDERS_PER_EVAL)
             draw_curve(self.folder)
+            self.evaluation_seconds += self._now() - before
         if _is_due(self.trainer.reached, every.checkpoint_every) and not self.trainer.is_skipping:
             self._save()
+
+    def _has_time_to_evaluate(self) -> bool:
+        return self.clock is None or self.evaluation_seconds <= MAX_EVALUATION_SHARE * self._seconds()
 
     def _evaluate(self, split: str, *, renders: int | None) -> ImageMetrics:
         """The mean metrics of a split; `renders` renderings, or all, are written beside their images."""

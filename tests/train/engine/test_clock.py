@@ -3,6 +3,7 @@
 import itertools
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.run import fit
-from msdgs_train.engine.trainer import StepResult, Trainer
+from msdgs_train.engine.trainer import EvaluatedFrame, StepResult, Trainer
 from msdgs_train.supports.nodes import NodesSupport
 from tests.support.training_scene import MODELS, small_config
 
@@ -69,6 +70,38 @@ def test_compiling_kernels_does_not_count_as_training_time(
     outcome = fit(small_config(minutes=0.5), data, tmp_path / "run")
     assert outcome.status == "finished"
     assert outcome.seconds == pytest.approx(30, rel=0.1)
+
+
+@pytest.mark.usefixtures("no_curve")
+def test_evaluations_take_a_small_part_of_a_timed_run(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps take 10 s, an evaluation 24 s: of nine that are due, the second waits until that is 3 % of the time."""
+    now, step, evaluate = 0.0, Trainer.step, Trainer.evaluate
+    evaluated: list[float] = []
+
+    def timed(trainer: Trainer, advance: int) -> StepResult:
+        nonlocal now
+        now += 10
+        return step(trainer, advance)
+
+    def slow(trainer: Trainer, split: str) -> Iterator[EvaluatedFrame]:
+        nonlocal now
+        evaluated.append(now)
+        now += 12
+        return evaluate(trainer, split)
+
+    monkeypatch.setattr(Trainer, "step", timed)
+    monkeypatch.setattr(Trainer, "evaluate", slow)
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    config = small_config(minutes=20, steps=50, eval_every=5, checkpoint_every=0)
+    outcome = fit(config, data, tmp_path / "run")
+    assert outcome.seconds == pytest.approx(1200, rel=0.05)
+    trial, *during, last_test, last_val = evaluated
+    first, second = during[::2]
+    assert 24 / 0.03 < second < last_test
+    assert [first + 12, second + 12, last_test + 12] == [*during[1::2], last_val]
+    assert trial < first < 200
 
 
 def test_steps_that_the_clock_passes_over_take_effect_once(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
