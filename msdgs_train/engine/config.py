@@ -92,8 +92,8 @@ class LoggingConfig(Checked):
     log_every: int = 20
     """Steps between lines in metrics.jsonl."""
     eval_every: int = 1_000
-    """Steps between evaluations of held-out images; with `minutes` fewer, so that they take about 3 % of the time; 0: only
-    at the end."""
+    """Steps between evaluations of held-out images; with `minutes` fewer, so that they take about 3 % of the time; 0:
+    only at the end."""
     checkpoint_every: int = 1_000
     """Steps between checkpoints; 0: only at the end."""
 
