@@ -17,6 +17,7 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.quaternions import rotate
+from msdgs_train.rendering.rasterize import RasterizationInfo
 
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this factor."""
@@ -40,8 +41,8 @@ class GradientStrategy(DensityStrategy):
     scene_scale: float  # radius of the cameras' positions, scene units
     gradients: Tensor  # [N] sums of norms
     counts: Tensor  # [N] images in which each was drawn
-    unseen: Tensor  # [N] images since each contributed to a pixel; infinite once it was outside of the whole scene
-    patience: float  # images after which a Gaussian that contributes to none is removed; 0: never
+    unseen: Tensor  # [N] images since each was seen; infinite once it was outside of the whole scene
+    patience: float  # images after which a Gaussian that none shows is removed; 0: never
     is_rig: bool  # cameras that stand still: a time window has images of all of them
 
     @classmethod
@@ -52,15 +53,16 @@ class GradientStrategy(DensityStrategy):
         gradients, counts, unseen = torch.zeros(3, count, device=schedule.config.run.device)
         return cls(schedule, generator, scene_scale, gradients, counts, unseen, patience, is_rig)
 
-    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
-        """Add one image: gradients [N, 2] in pixels, radii [N] that are 0 where a Gaussian was not drawn; `shows_all`
-        if nothing of the scene is outside the image."""
-        drawn = radii > 0
-        norms = torch.hypot(means2d_grads[:, 0] * (0.5 * width), means2d_grads[:, 1] * (0.5 * height))
+    def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
+        """Accumulate one view. gsplat has no blending weights: on CUDA any gradient counts as seen."""
+        grads, weights, drawn = screen.means2d_grads, screen.weights, screen.radii > 0
+        assert grads is not None
+        norms = torch.hypot(grads[:, 0] * (0.5 * width), grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
         if self.patience:
-            self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
+            shown = norms > 0 if weights is None else weights > self.config.min_visible * screen.radii.square()
+            self.unseen = torch.where(shown & self.unseen.isfinite(), 0.0, self.unseen + 1)
             if shows_all:
                 self.unseen[~drawn] = torch.inf
 

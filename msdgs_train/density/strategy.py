@@ -8,6 +8,7 @@ from torch import Tensor
 from msdgs_train.density.config import DensityConfig
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.surgery import RowSurgery
+from msdgs_train.rendering.rasterize import RasterizationInfo
 
 
 @dataclass
@@ -22,9 +23,8 @@ class DensityStrategy:
         """The settings."""
         return self.schedule.config.density
 
-    def accumulate(self, means2d_grads: Tensor, radii: Tensor, width: int, height: int, shows_all: bool) -> None:
-        """Accumulate one view: gradients [N, 2] in pixels, radii [N] that are 0 if a Gaussian was not drawn;
-        `shows_all` if nothing of the scene is outside the image."""
+    def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
+        """Accumulate one view after its backward pass; `shows_all` if nothing of the scene is outside the image."""
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """Density control after an optimizer step, which stands for these steps of the schedule, counted from 1."""

@@ -188,7 +188,7 @@ def test_no_gradient_is_infinite_at_the_ends_of_opacity(opacity: float):
     assert_as_autograd(parameters_of(gaussians), front_camera(9, 7))
 
 
-def test_gradients_of_projected_means_and_radii():
+def test_gradients_of_projected_means_and_blending_weights():
     parameters, camera, _ = small_scene(56)
     loss = weighted(np.ones((13, 21)))
     args = (parameters.means, parameters.quats, parameters.scales, parameters.opacities, parameters.sh)
@@ -204,6 +204,11 @@ def test_gradients_of_projected_means_and_radii():
     assert info.means2d_grads is not None
     assert_close(info.means2d_grads.numpy() / np.abs(want).max(), want / np.abs(want).max(), "gradient.autograd")
     np.testing.assert_array_equal(info.means2d_grads.numpy()[info.radii.numpy() == 0], 0)
+    colors = splats.colors.detach().requires_grad_()
+    rgb = reference_torch.render(splats._replace(colors=colors), parameters.opacities, camera, parameters.background)[0]
+    weights = torch.autograd.grad(rgb.sum(), colors)[0][:, 0].numpy()
+    assert info.weights is not None
+    assert_close(info.weights.numpy() / weights.max(), weights / weights.max(), "gradient.autograd")
 
 
 def test_radii_are_zero_where_nothing_is_drawn_and_bound_what_is():

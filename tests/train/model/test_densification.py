@@ -10,6 +10,7 @@ from msdgs_train.density.gradient import MIN_PATIENCE, SPLIT_SHRINK, GradientStr
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
+from msdgs_train.rendering.rasterize import RasterizationInfo
 from tests.support.training_scene import moment_rows, small_config, with_moments
 
 EXTENT = 4.0
@@ -31,14 +32,22 @@ def _schedule(**changes: Any) -> Schedule:
 def _accumulate(control: GradientStrategy, pixels: list[float]) -> None:
     """A gradient for each, in NDC units at 2 × 2 pixels."""
     grads = torch.tensor(pixels)
-    control.accumulate(torch.stack([grads, torch.zeros_like(grads)], dim=1), torch.ones(len(pixels)), 2, 2, False)
+    control.accumulate(_screen(torch.stack([grads, torch.zeros_like(grads)], dim=1)), 2, 2, False)
+
+
+def _screen(grads: torch.Tensor, radii: list[float] | None = None, weights: list[float] | None = None) -> Any:
+    """One image of the Gaussians: drawn with a radius of one pixel, and seen, unless stated."""
+    info = RasterizationInfo()
+    info.radii = torch.tensor(radii or [1.0] * len(grads))
+    info.means2d_grads, info.weights = grads, torch.tensor(weights or [1.0] * len(grads))
+    return info
 
 
 def test_gradients_are_scaled_to_ndc_and_averaged_over_where_drawn() -> None:
     _, _, control = _setup(2)
     grads = torch.tensor([[0.3, 0.4], [1.0, 1.0]])
-    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20, False)
-    control.accumulate(grads, torch.tensor([1.0, 0.0]), 20, 20, False)
+    control.accumulate(_screen(grads, [1.0, 0.0]), 20, 20, False)
+    control.accumulate(_screen(grads, [1.0, 0.0]), 20, 20, False)
     assert torch.allclose(control.gradients, torch.tensor([10.0, 0.0]))
     assert control.counts.tolist() == [2.0, 0.0]
 
@@ -80,18 +89,23 @@ def test_low_opacity_gaussians_are_pruned_at_once_and_huge_ones_after_a_reset() 
     assert moment_rows(surgery, "means") == [3, 4, 5, 6]
 
 
-def test_gaussians_that_no_image_shows_are_removed() -> None:
-    gaussians, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.0, refine_every_fraction=0.0)
-    seen, nothing = torch.tensor([[1e-6, 0.0]] * 4 + [[0.0, 0.0]] * 2), torch.tensor([1.0] * 5 + [0.0])
+@pytest.mark.parametrize("on_cuda", [False, True])
+def test_gaussians_that_no_image_shows_are_removed(on_cuda: bool) -> None:
+    """Of six, four are seen, one is hidden and one isn't drawn; without weights a gradient counts as seen."""
+    gaussians, surgery, control = _setup(
+        prune_unseen_passes=1.5, min_visible=0.1, window_full_fraction=0.0, refine_every_fraction=0.0
+    )
+    grads = torch.tensor([[1e-6, 0.0]] * 4 + [[0.0 if on_cuda else 1e-6, 0.0], [0.0, 0.0]])
+    screen = _screen(grads, [2.0] * 5 + [0.0], [0.41] * 4 + [0.39, 0.0])
+    screen.weights = None if on_cuda else screen.weights
     for _ in range(round(1.5 * MIN_PATIENCE)):
-        control.accumulate(seen, nothing, 2, 2, False)
+        control.accumulate(screen, 2, 2, False)
         control.after_step(surgery, range(1, 2))
     assert control.densify(surgery, 4).pruned == 0
-    control.accumulate(seen, nothing, 2, 2, False)
+    control.accumulate(screen, 2, 2, False)
     assert control.densify(surgery, 4).pruned == 2
-    drawn = torch.tensor([1.0, 1.0, 0.0, 1.0])
-    control.accumulate(seen[:4], drawn, 2, 2, True)
-    control.accumulate(seen[:4], torch.ones(4), 2, 2, True)
+    control.accumulate(_screen(grads[:4], [1.0, 1.0, 0.0, 1.0]), 2, 2, True)
+    control.accumulate(_screen(grads[:4]), 2, 2, True)
     assert control.densify(surgery, 4).pruned == 1, "one that was outside of an image that shows everything"
     assert len(gaussians) == 3
 
@@ -101,7 +115,7 @@ def test_a_growing_window_may_hide_gaussians() -> None:
         _, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.9, refine_every_fraction=0.0)
         control.is_rig = is_rig
         for _ in range(2 * MIN_PATIENCE):
-            control.accumulate(torch.zeros(6, 2), torch.ones(6), 2, 2, False)
+            control.accumulate(_screen(torch.zeros(6, 2), weights=[0.0] * 6), 2, 2, False)
             control.after_step(surgery, range(12, 13))
         assert int(control._to_prune(surgery.gaussians, 12).sum()) == 0
         assert int((control.unseen > control.patience).sum()) == pruned
