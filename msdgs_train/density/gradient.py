@@ -54,14 +54,15 @@ class GradientStrategy(DensityStrategy):
         return cls(schedule, generator, scene_scale, gradients, counts, unseen, patience, is_rig)
 
     def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
-        """Accumulate one view. gsplat has no blending weights: on CUDA any gradient counts as seen."""
-        grads, weights, drawn = screen.means2d_grads, screen.weights, screen.radii > 0
-        assert grads is not None
+        """Accumulate one view. Where transmittances aren't known, on CUDA, an image shows what has a gradient."""
+        grads, transmittance, drawn = screen.means2d_grads, screen.transmittance, screen.radii > 0
+        if grads is None:
+            return
         norms = torch.hypot(grads[:, 0] * (0.5 * width), grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
         if self.patience:
-            shown = norms > 0 if weights is None else weights > self.config.min_visible * screen.radii.square()
+            shown = norms > 0 if transmittance is None else transmittance > self.config.min_transmittance
             self.unseen = torch.where(shown & self.unseen.isfinite(), 0.0, self.unseen + 1)
             if shows_all:
                 self.unseen[~drawn] = torch.inf

@@ -39,7 +39,7 @@ SELECTION_SPLITS = ("val", "test")  # the first of these that the dataset has se
 RENDERS_PER_EVAL = 4
 MAX_ROLLBACKS = 3
 TRIAL_STEPS = 4  # of a trainer that is thrown away, across the schedule
-MAX_EVALUATION_SHARE = 0.03  # of the time so far, in a run of given minutes; the last evaluation is not counted
+MAX_EVALUATION_SHARE = 0.03  # of the time of a run of given minutes: after more, no evaluation begins until the last
 PAUSE_SECONDS = 0.05  # between two calls of `Observer.is_paused`
 
 Status = Literal["finished", "interrupted"]
@@ -136,7 +136,7 @@ class Run:
         self._now = time.process_time if self.config.run.time == "cpu" else time.perf_counter
         self.started = self._now() - state.seconds
         self.clock, self.advance = self._new_clock(), 1
-        self.evaluation_seconds = 0.0
+        self.evaluation_seconds = MAX_EVALUATION_SHARE * state.seconds
 
     def execute(self) -> RunResult:
         """Train until the last step or an interruption, then evaluate and save."""

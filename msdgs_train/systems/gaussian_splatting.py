@@ -101,9 +101,7 @@ class GaussianSplatting:
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
         for frame, view in views:
-            if view.screen.means2d_grads is not None:
-                size = frame.camera.width, frame.camera.height
-                self.density.accumulate(view.screen, *size, view.shows_all)
+            self.density.accumulate(view.screen, frame.camera.width, frame.camera.height, view.shows_all)
         self.density.after_step(RowSurgery(self.model.gaussians, optimizer), steps)
         if self.schedule.averages_at(steps.stop - 1):
             self.average.add(self.model, len(steps))
