@@ -33,7 +33,6 @@ register_system(
         init_min_views=0.5,
         max_gaussians=18_000,
         prune_unseen_passes=1.5,
-        min_transmittance=0.2,
         grow_grad2d=8e-4,
         means_lr_final=5e-5,
         mse_fraction=0.8,
