@@ -38,8 +38,8 @@ class DensityConfig(Checked):
     """gradient: Gaussians that no image shows in so many passes over the cameras are removed, and those outside an
     image whose border is empty all around; 0: never."""
     min_transmittance: float = 0.0
-    """gradient, on a CPU: an image shows a Gaussian if the mean transmittance in front of it is above this. 0.1 removes
-    what opaque surfaces hide; more may remove what soft ones consist of."""
+    """gradient, on a CPU: an image shows a Gaussian if the mean transmittance in front of it is above this. 0.1 helps
+    objects with alpha; it harms opaque videos, whose surfaces are soft layers."""
     prune_scale3d: float = 0.1
     """gradient: Gaussians larger than this fraction of the scene's scale are removed after a reset of opacities."""
     reset_every_fraction: float = 0.0
