@@ -20,7 +20,7 @@ from msdgs_train.layers.arrays import to_array
 
 
 class RasterizationInfo:
-    """Radii and gradients of one rendering, for density control."""
+    """Radii, gradients and transmittances of one rendering, for density control."""
 
     radii: Tensor
     """[N] larger half-extent of the footprint in pixels; 0 for Gaussians that are not drawn."""
@@ -67,7 +67,7 @@ def rasterize(
         options: rasterizer constants; on CUDA gsplat's limits of alpha and transmittance are fixed.
 
     Returns:
-        rgb [H, W, 3] with the background, alpha [H, W], and radii and gradients for density control.
+        rgb [H, W, 3] with the background, alpha [H, W], and what density control reads of the rendering.
     """
     info = RasterizationInfo()
     gaussians = (means, quats, scales, opacities, sh)
