@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from export.measure.amplification import UNIT_ROUNDOFF, Growth, growth
+from export.measure.amplification import Growth, growth
 from export.measure.frames import NEAR, FrameDifference, PoseRenderer, compare
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed, usable_rows
 from export.measure.verify import times_to_verify
@@ -20,7 +20,7 @@ from export.precision.report import FormatGap, Samples, StabilityReport, WorstGa
 from export.progress import Track, no_progress
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.gaussians.model import DynamicGaussians, canonical_points
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 
 MIN_PSNR = 50.0
@@ -125,31 +125,9 @@ class _Assessment:
         exact = posed(self.double, t, ids)
         poses = {name: posed(model, t, ids) for name, model in self.models.items()}
         errors = {name: largest_error(pose_errors(pose, exact, self.size)) for name, pose in poses.items()}
-        found = self._growth(ids, float(np.float32(t)))
+        found = growth(self.double, self.single, torch.from_numpy(ids), float(np.float32(t)))
         found = found._replace(predicted=found.predicted * self.mean_factors[ids])
         return _TimeSample(t, ids, found, exact, poses[FLOAT32.name].means, errors)
-
-    @torch.no_grad()
-    def _growth(self, ids: np.ndarray, t: float) -> Growth:
-        """Growth of the Gaussians `ids`; on control nodes that of the nodes, plus the measured distance of float32
-        means from float64, to which rotations and stretches of the nodes contribute too."""
-        double, single, rows = self.double, self.single, torch.from_numpy(ids)
-        points = canonical_points(double.gaussians.rows(rows))
-        found = growth(double.deformation, single.deformation, double.support.points(points.means), t)
-        if double.support.num_points is None:
-            return found
-
-        def spread(values: np.ndarray) -> np.ndarray:
-            return double.support.spread(torch.from_numpy(values), points.attributes).numpy()
-
-        moved = [
-            model.support(model.deformation, canonical_points(model.gaussians.rows(rows)), time).means
-            for model, time in ((double, torch.tensor(t, dtype=torch.float64)), (single, torch.tensor(t)))
-        ]
-        own = torch.linalg.vector_norm(moved[0] - moved[1].double(), dim=1).numpy()
-        own += UNIT_ROUNDOFF * torch.linalg.vector_norm(points.means, dim=1).numpy()
-        after = np.stack([spread(values) for values in found.after])
-        return Growth(after, spread(found.amplification), spread(found.predicted) + own)
 
     def _unstable(self, gap: FormatGap, predicted: float) -> list[str]:
         if gap.overflowed:

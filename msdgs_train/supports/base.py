@@ -92,6 +92,20 @@ class Support(nn.Module):
         """Numbers of the points, [P], as numbers of the Gaussians, [N], that follow them."""
         return values
 
+    def transforms(self, deltas: Deltas) -> Any:
+        """Motions of the points, given the chain's deltas."""
+        return deltas
+
+    def displacements(self, errors: Tensor, deltas: Deltas, gaussians: CanonicalPoints) -> Tensor:
+        """[N] bounds to first order of the errors of the Gaussians' means.
+
+        Args:
+            errors: [P, 3] norms of the errors of the points' deltas: means, scales and quaternions.
+            deltas: Those of the points.
+            gaussians: N canonical Gaussians.
+        """
+        return errors[:, 0]
+
     def operations(self) -> int:
         """Floating-point operations per Gaussian, besides those of the chain."""
         return 0

@@ -5,6 +5,7 @@ the nearest when the deformation starts, with weights that don't depend on time.
 the number of Gaussians.
 """
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import check_size
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
@@ -99,9 +101,11 @@ class NodesSupport(Support):
         return self.nodes
 
     def motions(self, chain: MultiStepDeformation, means: Tensor, t: Tensor, num_layers: int | None = None) -> Tensor:
-        """[M, 16] matrices, offsets and quaternions of the nodes at time `t`: x → matrix x + offset."""
-        deltas = chain(self.nodes, t, num_layers)
-        rots = unit(deltas.quats + deltas.quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
+        return self.transforms(chain(self.nodes, t, num_layers))
+
+    def transforms(self, deltas: Deltas) -> Tensor:
+        """[M, 16] matrices, offsets and quaternions of the nodes: x → matrix x + offset."""
+        rots = unit(_quaternions(deltas))
         matrices = rotation_matrices(rots) @ stretch_matrices(deltas.scales)
         offsets = self.nodes + deltas.means - torch.einsum("bij,bj->bi", matrices, self.nodes)
         return torch.cat([matrices.flatten(1), offsets, rots], dim=1)
@@ -159,6 +163,16 @@ class NodesSupport(Support):
         weights = skinning_weights(attributes["skinning_logits"])
         return (weights * values[attributes["node_ids"]]).sum(dim=1)
 
+    def displacements(self, errors: Tensor, deltas: Deltas, gaussians: CanonicalPoints) -> Tensor:
+        of_means, of_scales, of_quats = errors.unbind(dim=1)
+        angles = 2 * of_quats / torch.linalg.vector_norm(_quaternions(deltas), dim=1).clamp_min(MIN_NORM)
+        stretches = torch.linalg.matrix_norm(stretch_matrices(deltas.scales), ord=2)
+        of_matrices = angles * stretches + math.sqrt(2) * of_scales  # entries beside the diagonal count twice
+        ids = gaussians.attributes["node_ids"]
+        lever_arms = torch.linalg.vector_norm(gaussians.means[:, None] - self.nodes[ids], dim=2)
+        weights = skinning_weights(gaussians.attributes["skinning_logits"])
+        return (weights * (of_means[ids] + lever_arms * of_matrices[ids])).sum(dim=1)
+
     def operations(self) -> int:
         return 2 * MOTION * self.config.followed
 
@@ -166,6 +180,11 @@ class NodesSupport(Support):
 def _first_nodes(n: int, columns: int, _: torch.Generator) -> Tensor:
     """[N, F] placeholders until nodes are initialized."""
     return torch.arange(columns).repeat(n, 1)
+
+
+def _quaternions(deltas: Deltas) -> Tensor:
+    """[M, 4] rotations of the nodes, not normalized."""
+    return deltas.quats + deltas.quats.new_tensor([1.0, 0.0, 0.0, 0.0])
 
 
 def skinning_weights(logits: Tensor) -> Tensor:

@@ -69,6 +69,7 @@ TABLE = (
     Row("loss_gradient", 1e-7, "central differences with steps of 1e-7 and 1e-6 of a loss of size 1"),
     # the deformation network
     Row("skinning_gradient", 2e-7, "central differences with a step of 1e-6: 1e-13 / 1e-6; relative if above 1"),
+    Row("first_order", 1e-4, "of errors of 1e-6; their displacement is not quite linear"),
     Row("encoding.float64", 1e-12, "sines of phases up to 1024, each rounded once"),
     Row("encoding.float32", 1e-5, "phases are exact products; what is left is the sine's own rounding"),
     Row("network.float64", 1e-11, "matrix products in another order, five deep, through frequencies up to 512"),
