@@ -13,11 +13,11 @@ import tyro
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from benchmarks.measuring import machine, report_console, table
+from benchmarks.measuring import report_console, table
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.compare import comparison_progress
 from msdgs_train.comparison.bench import Row, make_bench_runs, read_scenes, rows_of, runs_left, train_and_measure
-from msdgs_train.comparison.bench_report import gain, values_of
+from msdgs_train.comparison.bench_report import gain, machines_of, values_of
 from msdgs_train.comparison.matrix import Budget
 from msdgs_train.comparison.report import mean_and_deviation, save_figure
 from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
@@ -32,6 +32,7 @@ CHAIN, WIDE = "K layers", "1 layer of as many parameters"
 UNWEIGHTED, MODULATED = "K layers, w = 1", "K layers, modulated"
 FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED)
 GAINS = {f"of {CHAIN} over {WIDE}": (CHAIN, WIDE), "of w": (CHAIN, UNWEIGHTED), "of modulation": (MODULATED, CHAIN)}
+OVER_ONE = f"of {CHAIN} over one of them"
 
 
 def main(
@@ -50,8 +51,9 @@ def main(
 
     python -m benchmarks.training.k_steps --data data --csv docs/data/k_steps.csv
 
-    Each run has one thread, and as many steps or as much CPU time as the others. The bits of a run of a number of steps
-    don't depend on what else the machine does. Runs that have a row in the file are not trained again.
+    Each run has one thread. The bits of a run of a number of steps don't depend on what else the machine does. With
+    `--minutes` the runs are of equal time, and only the K layers themselves are trained: whether more of them pay
+    although each step takes longer. Runs that have a row in the file are not trained again.
 
     Args:
         data: The folder that holds the datasets of `msdgs-train bench`.
@@ -70,7 +72,8 @@ def main(
     try:
         found = read_scenes(data, short=False, names=scenes, file=SCENES_FILE)
         budget = Budget(steps if minutes is None else None, minutes, time="cpu").settings() | {"eval_every": 0}
-        runs = make_bench_runs({name: c.updated(**budget) for name, c in systems().items()}, found, seeds, out)
+        families = FAMILIES if minutes is None else (CHAIN,)
+        runs = make_bench_runs({name: c.updated(**budget) for name, c in systems(families).items()}, found, seeds, out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
             complete = train_and_measure(runs, found, csv, jobs, on_end)
     except InvalidInput as error:
@@ -81,7 +84,7 @@ def main(
     return 0 if complete and len(rows) == len(runs) else 1
 
 
-def systems() -> dict[str, TrainConfig]:
+def systems(families: Sequence[str] = FAMILIES) -> dict[str, TrainConfig]:
     """The default system with other layers, by the names that `name_of` gives."""
     base = preset(DEFAULT)
     chains = {k: base.updated(layers=(SMALL_LAYER,) * k) for k in NUM_LAYERS}
@@ -89,7 +92,7 @@ def systems() -> dict[str, TrainConfig]:
     made |= {name_of(WIDE, k): base.updated(layers=(wide_layer(k),)) for k in NUM_LAYERS[1:]}
     made |= {name_of(UNWEIGHTED, k): config.updated(weights=False) for k, config in chains.items()}
     made |= {name_of(MODULATED, k): config.updated(embedding_dim=32) for k, config in chains.items()}
-    return made
+    return {name: config for name, config in made.items() if name.split(", K = ")[0] in families}
 
 
 def name_of(family: str, num_layers: int) -> str:
@@ -110,16 +113,19 @@ def parameters(layer: MLPConfig) -> int:
 
 
 def report(rows: Sequence[Row], scenes: Sequence[str], out: Path, console: Console) -> None:
-    """Print a table of PSNR and one of gains, and draw the figure."""
-    absolute = table("PSNR on test images, dB", "scene", "K", *FAMILIES)
-    gains = table("Gains, dB (95 % over images)", "scene", "K", *GAINS)
+    """Print a table of PSNR, also of the moving region where it is known from the images, and one of gains; draw the
+    figure."""
+    absolute = table("PSNR on test images, dB", "scene", "K", *FAMILIES, f"moving region, {CHAIN}")
+    gains = table("Gains, dB (95 % over images)", "scene", "K", *GAINS, OVER_ONE)
     for scene, k in itertools.product(scenes, NUM_LAYERS):
         values = [psnrs(rows, scene, name_of(family, k)) for family in FAMILIES]
+        values.append(psnrs(rows, scene, name_of(CHAIN, k), "test_moving_psnr"))
         absolute.add_row(scene, str(k), *(mean_and_deviation(found, 2) if found else "–" for found in values))
-        pairs = ((name_of(one, k), name_of(other, k)) for one, other in GAINS.values())
+        pairs = [(name_of(one, k), name_of(other, k)) for one, other in GAINS.values()]
+        pairs.append((name_of(CHAIN, k), name_of(CHAIN, NUM_LAYERS[0])))
         gains.add_row(scene, str(k), *(gain(rows, [scene], *pair) for pair in pairs))
     console.print(absolute, gains)
-    console.print(machine())
+    console.print(f"machine: {machines_of(rows)}")
     out.mkdir(parents=True, exist_ok=True)
     save_figure(draw(rows, scenes), out / "k_steps.png")
     console.print(f"wrote {out / 'k_steps.png'}")
@@ -144,9 +150,9 @@ def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
     return figure
 
 
-def psnrs(rows: Sequence[Row], scene: str, system: str) -> list[float]:
-    """PSNR on test images, one per seed."""
-    return [float(value) for value in values_of(rows, scene, system, "test_psnr")]
+def psnrs(rows: Sequence[Row], scene: str, system: str, column: str = "test_psnr") -> list[float]:
+    """Values of a column, one per seed; none where the runs have none."""
+    return [float(value) for value in values_of(rows, scene, system, column)]
 
 
 def self_test() -> int:
@@ -159,7 +165,9 @@ def self_test() -> int:
             "scene": scene,
             "system": name,
             "seed": "0",
+            "machine": "a CPU",
             "test_psnr": f"{30 - index}",
+            "test_moving_psnr": f"{20 - index}" if scene == SCENES[0] else "",
             "test_images": f"{29 - index} {31 - index}",
         }
         for scene in SCENES[:2]
@@ -169,7 +177,9 @@ def self_test() -> int:
     with tempfile.TemporaryDirectory() as folder:
         report(rows, SCENES[:2], Path(folder), console)
         assert (Path(folder) / "k_steps.png").stat().st_size > 1000
-    assert "+3.00 (+3.00 to +3.00)" in console.export_text()
+    text = console.export_text()
+    assert "+3.00 (+3.00 to +3.00)" in text
+    assert text.count("20.00") == 1
     print("ok: equal parameters, a table and a figure")
     return 0
 

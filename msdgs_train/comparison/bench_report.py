@@ -41,8 +41,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
         shown.append(markdown_table(["scene", *systems[1:]], gains))
     first = rows[0]
     kind = "minutes of CPU time" if first["time"] == "cpu" else "minutes"
-    machines = " and ".join(sorted({row["machine"] for row in rows}))
-    budget = f"{first['minutes']} {kind} per run on {first['threads']} thread(s) of {machines}"
+    budget = f"{first['minutes']} {kind} per run on {first['threads']} thread(s) of {machines_of(rows)}"
     days = sorted({row["date"] for row in rows})
     notes = f"PSNR in dB of the last model, mean ± standard deviation over seeds; {budget}; {days[0]} to {days[-1]}. "
     notes += "Settings are chosen on val, results reported on test; the mean is over scenes that all systems have, "
@@ -83,6 +82,11 @@ def paired_gain(gains: Sequence[np.ndarray]) -> tuple[float, float, float]:
 def _names(rows: Sequence[Row], column: str) -> list[str]:
     """The different values of a column, in order."""
     return list(dict.fromkeys(row[column] for row in rows))
+
+
+def machines_of(rows: Sequence[Row]) -> str:
+    """The machines on which the rows were measured."""
+    return " and ".join(sorted({row["machine"] for row in rows}))
 
 
 def values_of(rows: Sequence[Row], scene: str, system: str, name: str) -> list[str]:
