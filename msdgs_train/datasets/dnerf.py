@@ -6,11 +6,12 @@ frames have no `time` is static, t = 0. If a frame, or the file, has `fl_x`, `fl
 these are used instead of the angle. The time range of the scene runs from the first to the last frame of all splits.
 """
 
-from pathlib import Path
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
 
 from msdgs_train.datasets.common.readers import JsonObject, read_json
 from msdgs_train.datasets.common.scene_data import SPLITS, Frame, SceneData
-from msdgs_train.datasets.common.transforms import check_times, entries_of, read_frame
+from msdgs_train.datasets.common.transforms import check_times, entries_of, file_path, read_frame
 
 TRAIN_FILE = "transforms_train.json"
 SCENE_HALF_SIZE = 1.3
@@ -24,7 +25,8 @@ def load_dnerf(folder: Path, size: int | None = None) -> SceneData:
     """Read the cameras, times and image sizes of a D-NeRF scene, as `load_scene` does; val and test may be missing."""
     entries = {split: _read_split(folder, split) for split in SPLITS}
     check_times([entry for split in SPLITS for entry in entries[split]])
-    return SceneData({split: [_frame(entry, size) for entry in entries[split]] for split in SPLITS}, SCENE_HALF_SIZE)
+    splits = {split: [_frame(entry, split, size) for entry in entries[split]] for split in SPLITS}
+    return SceneData(splits, SCENE_HALF_SIZE)
 
 
 def _read_split(folder: Path, split: str) -> list[JsonObject]:
@@ -34,8 +36,10 @@ def _read_split(folder: Path, split: str) -> list[JsonObject]:
     return entries_of(read_json(file), may_be_empty=split != "train")
 
 
-def _frame(entry: JsonObject, size: int | None) -> Frame:
+def _frame(entry: JsonObject, split: str, size: int | None) -> Frame:
     for key in DISTORTION:
         if entry.get(key):
             raise entry.invalid(key, "must be 0: undistort the images first")
-    return read_frame(entry, size)
+    frame = read_frame(entry, size)
+    folders = [part for part in PurePosixPath(file_path(entry)).parts[:-1] if part not in ("/", "..", split)]
+    return replace(frame, name="_".join([*folders, frame.name]))

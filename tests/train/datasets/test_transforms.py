@@ -43,6 +43,14 @@ def test_splits_times_and_names(tmp_path: Path):
     assert (scene.splits["train"][1].load_rgba()[..., :3] == 1).all()
 
 
+def test_images_of_one_name_in_two_folders_keep_the_folders_name(tmp_path: Path):
+    content = dnerf_json("train", (0.2, 0.9))
+    for camera, frame in enumerate(content["frames"]):
+        frame["file_path"] = f"./train/cam{camera}/0001"
+    folder = write_dnerf(tmp_path, splits={"train": content})
+    assert [frame.name for frame in load_scene(folder).splits["train"]] == ["cam0_0001", "cam1_0001"]
+
+
 def test_every_nth_training_image_is_held_out(tmp_path: Path):
     times = tuple(i / 10 for i in range(10))
     folder = write_dnerf(tmp_path, splits={split: dnerf_json(split, times) for split in ("train", "test")})
