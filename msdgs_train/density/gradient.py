@@ -46,12 +46,14 @@ class GradientStrategy(DensityStrategy):
     is_rig: bool  # cameras that stand still: a time window has images of all of them
 
     @classmethod
-    def start(cls, schedule: Schedule, scene_scale: float, count: int, views: int, is_rig: bool) -> "GradientStrategy":
+    def start(
+        cls, schedule: Schedule, max_gaussians: int, scene_scale: float, count: int, views: int, is_rig: bool
+    ) -> "GradientStrategy":
         """A new strategy for `count` Gaussians and so many cameras."""
         patience = schedule.config.density.prune_unseen_passes * max(views, MIN_PATIENCE)
         generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
         gradients, counts, unseen = torch.zeros(3, count, device=schedule.config.run.device)
-        return cls(schedule, generator, scene_scale, gradients, counts, unseen, patience, is_rig)
+        return cls(schedule, generator, max_gaussians, scene_scale, gradients, counts, unseen, patience, is_rig)
 
     def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
         """Accumulate one view. Where transmittances aren't known, on CUDA, an image shows what has a gradient."""
@@ -120,7 +122,7 @@ class GradientStrategy(DensityStrategy):
         """[N] bool: large gradients, the largest first up to the maximum number."""
         mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
         chosen = mean >= self.config.grow_grad2d
-        room = self.config.max_gaussians - int((~pruned).sum())
+        room = self.max_gaussians - int((~pruned).sum())
         if int(chosen.sum()) > room:
             strongest = torch.sort(mean, descending=True, stable=True).indices[: max(room, 0)]
             chosen = torch.zeros_like(chosen).index_fill_(0, strongest, True)

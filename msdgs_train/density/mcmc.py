@@ -38,9 +38,9 @@ class MCMCStrategy(DensityStrategy):
     """Periodically relocates low-opacity Gaussians and adds new ones, never more than `max_gaussians` in all."""
 
     @classmethod
-    def start(cls, schedule: Schedule) -> "MCMCStrategy":
+    def start(cls, schedule: Schedule, max_gaussians: int) -> "MCMCStrategy":
         """A new strategy, with a generator of its own."""
-        return cls(schedule, torch.Generator().manual_seed(schedule.config.run.seed + 1))
+        return cls(schedule, torch.Generator().manual_seed(schedule.config.run.seed + 1), max_gaussians)
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """Relocate if a round is due, then inject noise in proportion to the learning rate of means."""
@@ -55,7 +55,7 @@ class MCMCStrategy(DensityStrategy):
         opacities = gaussians.raw_opacities.double().sigmoid()
         alive = torch.nonzero(opacities > self.config.prune_opa)[:, 0]
         count = len(opacities)
-        added = max(0, min(self.config.max_gaussians, int(GROWTH * count)) - count)
+        added = max(0, min(self.max_gaussians, int(GROWTH * count)) - count)
         moved = count - len(alive)
         if moved + added == 0 or len(alive) == 0:  # a scene that is wholly transparent may recover
             return Relocated(0, 0)

@@ -17,6 +17,7 @@ class DensityStrategy:
 
     schedule: Schedule
     generator: torch.Generator  # all of its randomness
+    max_gaussians: int
 
     @property
     def config(self) -> DensityConfig:

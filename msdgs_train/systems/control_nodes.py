@@ -31,7 +31,7 @@ register_system(
         refine_every_fraction=1 / 400,
         refine_stop_fraction=0.75,
         init_min_views=0.5,
-        max_gaussians=18_000,
+        max_gaussians=None,
         prune_unseen_passes=1.5,
         grow_grad2d=8e-4,
         means_lr_final=5e-5,

@@ -49,10 +49,11 @@ class GaussianSplatting:
         self.schedule, self.config, self.scene = schedule, config, scene
         bounds = SceneBounds(self.scene_half_size, scene.time_range)
         self.model = _new_model(schedule, scene, bounds, distinct).to(config.run.device)
+        most = config.density.bound(max(camera.width * camera.height for camera in cameras))
         self.density: DensityStrategy = (
-            MCMCStrategy.start(schedule)
+            MCMCStrategy.start(schedule, most)
             if is_mcmc
-            else GradientStrategy.start(schedule, scale, self.size, views, is_rig)
+            else GradientStrategy.start(schedule, most, scale, self.size, views, is_rig)
         )
         self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
 

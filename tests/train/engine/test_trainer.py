@@ -13,6 +13,8 @@ from torch import Tensor
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.datasets import load_scene
+from msdgs_train.density import config as density_module
+from msdgs_train.density.gradient import GradientStrategy
 from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.gradients import average_gradients
@@ -59,6 +61,17 @@ def test_sparse_points_of_a_dataset_are_the_first_gaussians(data: Path, found: i
     np.testing.assert_allclose(first.means.detach(), points[nearest], atol=1e-6)
     np.testing.assert_allclose(first.sh_dc.detach()[:, 0] * SH_C0 + 0.5, colors[nearest], atol=1e-6)
     trainer.step()
+
+
+@pytest.mark.parametrize(("given", "wanted"), [(None, 0.45 * SIZE * SIZE), (90, 90)])
+def test_the_cap_follows_the_size_of_the_images(
+    data: Path, monkeypatch: pytest.MonkeyPatch, given: int | None, wanted: float
+) -> None:
+    monkeypatch.setattr(density_module, "FEWEST", 1)
+    trainer = Trainer(small_config(max_gaussians=given), load_scene(data))
+    density = splatting(trainer).density
+    assert isinstance(density, GradientStrategy)
+    assert density.max_gaussians == round(wanted)
 
 
 RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {

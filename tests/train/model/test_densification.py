@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 
+from msdgs_train.density.config import DensityConfig
 from msdgs_train.density.gradient import MIN_PATIENCE, SPLIT_SHRINK, GradientStrategy
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -22,7 +23,8 @@ def _setup(count: int = 6, **changes: Any) -> tuple[CanonicalGaussians, RowSurge
     gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, 0, schedule.config.model.attributes())
     with torch.no_grad():
         gaussians.log_scales.fill_(math.log(0.001))
-    return gaussians, with_moments(gaussians, schedule), GradientStrategy.start(schedule, EXTENT, count, 5, False)
+    most = schedule.config.density.bound(0)
+    return gaussians, with_moments(gaussians, schedule), GradientStrategy.start(schedule, most, EXTENT, count, 5, False)
 
 
 def _schedule(**changes: Any) -> Schedule:
@@ -132,13 +134,21 @@ def test_a_transparent_scene_is_not_changed() -> None:
 
 
 def test_strongest_gradients_come_first_under_the_cap() -> None:
-    gaussians, surgery, control = _setup()
-    control.schedule = _schedule(init_num_pts=6, max_gaussians=8, static_fraction=0.0)
+    gaussians, surgery, control = _setup(max_gaussians=8, static_fraction=0.0)
     _accumulate(control, [0.6, 0.9, 0.7, 0.8, 0.6, 0.6])
     assert control.densify(surgery, 4).cloned == 2
     assert torch.equal(gaussians.means[6:], gaussians.means[[1, 3]])
     _accumulate(control, [1.0] * 8)
     assert control.densify(surgery, 8) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "bound"), [(100, 18_000), (200 * 200, 18_000), (400 * 400, 72_000), (1920 * 1080, 100_000)]
+)
+def test_the_cap_follows_the_size_of_the_images_unless_it_is_given(pixels: int, bound: int) -> None:
+    assert DensityConfig(max_gaussians=None).bound(pixels) == bound
+    assert DensityConfig(max_gaussians=9_000).bound(pixels) == 9_000
+    assert DensityConfig(init_num_pts=200_000, max_gaussians=None).bound(pixels) == 200_000
 
 
 def test_opacities_are_reset_and_so_are_their_moments() -> None:

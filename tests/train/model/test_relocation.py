@@ -67,7 +67,7 @@ def setup(count: int = 100, **changes: Any) -> tuple[CanonicalGaussians, RowSurg
     with torch.no_grad():
         gaussians.raw_opacities[:] = torch.randn(count, generator=torch.Generator().manual_seed(1))
         gaussians.raw_opacities[:10] = -9.0
-    return gaussians, with_moments(gaussians, schedule), MCMCStrategy.start(schedule)
+    return gaussians, with_moments(gaussians, schedule), MCMCStrategy.start(schedule, schedule.config.density.bound(0))
 
 
 def test_low_opacity_gaussians_are_relocated_to_others() -> None:
