@@ -139,6 +139,8 @@ def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
         for family in FAMILIES:
             found = {k: psnrs(rows, scene, name_of(family, k)) for k in NUM_LAYERS}
             known = {k: np.array(values) for k, values in found.items() if values}
+            if not known:
+                continue
             mean, low, high = np.array([(v.mean(), v.min(), v.max()) for v in known.values()]).reshape(-1, 3).T
             bars = [mean - low, high - mean]
             axes.errorbar(list(known), mean, bars, marker="o", ms=4, capsize=3, label=family)
