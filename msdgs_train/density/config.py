@@ -44,7 +44,7 @@ class DensityConfig(Checked):
     image whose border is empty all around; 0: never."""
     min_transmittance: float = 0.0
     """gradient, on a CPU: an image shows a Gaussian if the mean transmittance in front of it is above this. 0.1 helps
-    objects with alpha; it harms opaque videos, whose surfaces are soft layers."""
+    views far from all cameras if images have alpha; it harms opaque videos, whose surfaces are soft layers."""
     prune_scale3d: float = 0.1
     """gradient: Gaussians larger than this fraction of the scene's scale are removed after a reset of opacities."""
     reset_every_fraction: float = 0.0
