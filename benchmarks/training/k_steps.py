@@ -25,6 +25,7 @@ from msdgs_train.layers.base import PAPER_HEADS
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.systems.registry import DEFAULT, preset
 
+STEPS = 2500
 NUM_LAYERS = (1, 2, 4, 10)
 SCENES_FILE = Path(__file__).with_name("k_steps.toml")
 SCENES = ("toybench_100", "toybench_slow_100", "lego_100")
@@ -41,7 +42,7 @@ def main(
     csv: Path | None = None,
     scenes: tuple[str, ...] = SCENES,
     seeds: tuple[int, ...] = (0, 1, 2),
-    steps: int = 2500,
+    steps: int | None = None,
     minutes: float | None = None,
     jobs: int = 1,
     check: bool = False,
@@ -61,7 +62,7 @@ def main(
         csv: The file with a row per finished run; OUT/k_steps.csv if not given.
         scenes: Scenes of k_steps.toml, which are 100 pixels wide.
         seeds: One run per seed.
-        steps: Optimizer steps of each run.
+        steps: Optimizer steps of each run; 2,500 without minutes.
         minutes: CPU time of each run, instead of steps.
         jobs: Runs in parallel, no more than the machine has cores.
         check: Test this benchmark: widths give equal parameters, and figure and table show what a file holds.
@@ -71,7 +72,9 @@ def main(
     csv = csv or out / "k_steps.csv"
     try:
         found = read_scenes(data, short=False, names=scenes, file=SCENES_FILE)
-        budget = Budget(steps if minutes is None else None, minutes, time="cpu").settings() | {"eval_every": 0}
+        if steps is None and minutes is None:
+            steps = STEPS
+        budget = Budget(steps, minutes, time="cpu").settings() | {"eval_every": 0}
         families = FAMILIES if minutes is None else (CHAIN,)
         runs = make_bench_runs({name: c.updated(**budget) for name, c in systems(families).items()}, found, seeds, out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
@@ -80,13 +83,13 @@ def main(
         report_console().print(f"error: {error}", style="red", markup=False)
         return 1
     rows = rows_of(runs, csv)
-    report(rows, scenes, out, report_console())
+    report(rows, scenes, out / ("k_steps.png" if minutes is None else "k_steps_time.png"), report_console())
     return 0 if complete and len(rows) == len(runs) else 1
 
 
 def systems(families: Sequence[str] = FAMILIES) -> dict[str, TrainConfig]:
     """The default system with other layers, by the names that `name_of` gives."""
-    base = preset(DEFAULT)
+    base = preset(DEFAULT).updated(max_gaussians=18_000)
     chains = {k: base.updated(layers=(SMALL_LAYER,) * k) for k in NUM_LAYERS}
     made = {name_of(CHAIN, k): config for k, config in chains.items()}
     made |= {name_of(WIDE, k): base.updated(layers=(wide_layer(k),)) for k in NUM_LAYERS[1:]}
@@ -112,7 +115,7 @@ def parameters(layer: MLPConfig) -> int:
     return sum(parameter.numel() for parameter in MLPLayer(layer, PAPER_HEADS).parameters())
 
 
-def report(rows: Sequence[Row], scenes: Sequence[str], out: Path, console: Console) -> None:
+def report(rows: Sequence[Row], scenes: Sequence[str], figure_file: Path, console: Console) -> None:
     """Print a table of PSNR, also of the moving region where it is known from the images, and one of gains; draw the
     figure."""
     absolute = table("PSNR on test images, dB", "scene", "K", *FAMILIES, f"moving region, {CHAIN}")
@@ -126,9 +129,9 @@ def report(rows: Sequence[Row], scenes: Sequence[str], out: Path, console: Conso
         gains.add_row(scene, str(k), *(gain(rows, [scene], *pair) for pair in pairs))
     console.print(absolute, gains)
     console.print(f"machine: {machines_of(rows)}")
-    out.mkdir(parents=True, exist_ok=True)
-    save_figure(draw(rows, scenes), out / "k_steps.png")
-    console.print(f"wrote {out / 'k_steps.png'}")
+    figure_file.parent.mkdir(parents=True, exist_ok=True)
+    save_figure(draw(rows, scenes), figure_file)
+    console.print(f"wrote {figure_file}")
 
 
 def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
@@ -177,11 +180,12 @@ def self_test() -> int:
     ]
     console = Console(file=io.StringIO(), record=True, width=200)
     with tempfile.TemporaryDirectory() as folder:
-        report(rows, SCENES[:2], Path(folder), console)
-        assert (Path(folder) / "k_steps.png").stat().st_size > 1000
+        report(rows, SCENES[:2], Path(folder) / "a.png", console)
+        assert (Path(folder) / "a.png").stat().st_size > 1000
     text = console.export_text()
     assert "+3.00 (+3.00 to +3.00)" in text
     assert text.count("20.00") == 1
+    assert list(systems((CHAIN,))) == [name_of(CHAIN, k) for k in NUM_LAYERS]
     print("ok: equal parameters, a table and a figure")
     return 0
 

@@ -2,7 +2,8 @@
 
 Layer k moves a point by x_k = x_{k-1} + w_k f_k(x_{k-1}, t) (equation 8). A small error before layer k is multiplied by
 the product of the later Jacobians, J_K … J_{k+1} with J = I + ∂(w f)/∂x. Each is 3 × 3 per point, and the rows of a
-batch are independent, so three backward passes through a layer give it exactly for all points at once.
+batch are independent, so three backward passes through a layer give it exactly for all points at once. Deltas of scales
+and rotations, which displace the Gaussians that follow a node, are sums over layers: ten more passes give theirs.
 """
 
 import math
@@ -21,6 +22,7 @@ UNIT_ROUNDOFF = 2.0**-24
 """Largest relative error of one rounding to float32."""
 
 MEANS, SCALES, QUATS = slice(0, 3), slice(3, 9), slice(9, 13)  # columns of the sums over layers
+OFF_DIAGONAL = slice(6, 9)  # xy, xz, yz of stretch tensors: twice in a matrix, so √2 times in its Frobenius norm
 
 
 class Growth(NamedTuple):
@@ -28,7 +30,7 @@ class Growth(NamedTuple):
 
     after: np.ndarray  # [K, M] ‖J_k … J_1‖: growth of a displacement of the canonical mean after layer k
     amplification: np.ndarray  # [M] the largest ‖J_j … J_i‖ of products that end at the last layer, at least 1
-    predicted: np.ndarray  # [M] expected distance of the float32 mean
+    predicted: np.ndarray  # [M] bound to first order of the error of the float32 mean
 
 
 class PointGrowth(NamedTuple):
@@ -48,12 +50,13 @@ def growth(double: DynamicGaussians, single: DynamicGaussians, ids: Tensor, t: f
     points = canonical_points(double.gaussians.rows(ids))
     support, on_nodes = double.support, double.support.num_points is not None
     start = support.points(points.means)
-    found = through_layers(double.deformation, single.deformation, start, t, with_rotations=on_nodes)
+    found = through_layers(double.deformation, single.deformation, start, t, all_deltas=on_nodes)
     predicted = found.errors[:, 0]
     with torch.no_grad():
         if on_nodes:
             deltas = double.deformation(start, torch.tensor(t, dtype=start.dtype))
-            predicted = support.displacements(found.errors, deltas, points) + _following_error(double, single, ids, t)
+            predicted = support.mean_error_bounds(found.errors, deltas, points)
+            predicted += _following_error(double, single, ids, t)
         after = [support.spread(values, points.attributes).numpy() for values in found.after]
         amplification = support.spread(found.amplification, points.attributes).numpy()
     predicted = torch.nan_to_num(predicted.detach(), nan=math.inf, posinf=math.inf).numpy()
@@ -61,21 +64,23 @@ def growth(double: DynamicGaussians, single: DynamicGaussians, ids: Tensor, t: f
 
 
 def through_layers(
-    double: MultiStepDeformation, single: MultiStepDeformation, means: Tensor, t: float, *, with_rotations: bool
+    double: MultiStepDeformation, single: MultiStepDeformation, means: Tensor, t: float, *, all_deltas: bool
 ) -> PointGrowth:
     """Follow float64 `means`, [P, 3], through the layers at time `t`; `single` are the same layers in float32.
 
     δ_k is the error of layer k alone, measured from the same float32 means in both precisions, and u‖x_k‖ the error of
     rounding its results. To first order Σ_k ‖J_K … J_{k+1}‖ · (δ_k + u‖x_k‖) bounds the error of the whole chain. The
-    sums of wΔS and wΔR, with `with_rotations`, have own errors, and others because the layers read wrong positions.
+    sums of wΔS and wΔR, with `all_deltas`, have own errors, and others because the layers read inexact positions.
     """
-    parts = (MEANS, SCALES, QUATS) if with_rotations else (MEANS,)
+    parts = (MEANS, SCALES, QUATS) if all_deltas else (MEANS,)
     sums = pad(means.detach(), (0, parts[-1].stop - 3))
     jacobians, own_errors = [], []
     for layer, rounded in zip(double, single, strict=True):
         own = _own_error(layer, rounded, sums, t)
         sums, jacobian = _moved_and_jacobian(layer, sums, t)
         own += UNIT_ROUNDOFF * sums.abs()
+        for values in (own, jacobian):
+            values[:, OFF_DIAGONAL] *= math.sqrt(2)
         own_errors.append(torch.stack([torch.linalg.vector_norm(own[:, part], dim=1) for part in parts], dim=1))
         jacobians.append(jacobian)
     after, product = [], torch.eye(3, dtype=means.dtype).expand(len(means), 3, 3)

@@ -1,9 +1,10 @@
 """D-NeRF layout: `transforms_{train,val,test}.json` beside the images.
 
 Each JSON has `camera_angle_x` (horizontal field of view, radians) and `frames`; each frame has `file_path` (with or
-without extension, relative to the folder), `transform_matrix` (camera to world, OpenGL axes) and `time`. A scene whose
-frames have no `time` is static, t = 0. If a frame, or the file, has `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in pixels,
-these are used instead of the angle. The time range of the scene runs from the first to the last frame of all splits.
+without extension, relative to the folder), `transform_matrix` (camera to world, OpenGL axes) and `time`. A frame's name
+is its path without the split's folder. A scene whose frames have no `time` is static, t = 0. If a frame, or the file,
+has `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in pixels, these are used instead of the angle. The time range of the scene
+runs from the first to the last frame of all splits.
 """
 
 from dataclasses import replace
@@ -41,5 +42,6 @@ def _frame(entry: JsonObject, split: str, size: int | None) -> Frame:
         if entry.get(key):
             raise entry.invalid(key, "must be 0: undistort the images first")
     frame = read_frame(entry, size)
-    folders = [part for part in PurePosixPath(file_path(entry)).parts[:-1] if part not in ("/", "..", split)]
-    return replace(frame, name="_".join([*folders, frame.name]))
+    path = PurePosixPath(file_path(entry))
+    folders = () if path.is_absolute() else path.parts[:-1]
+    return replace(frame, name="_".join([*folders[folders[:1] == (split,) :], frame.name]))

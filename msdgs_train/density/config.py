@@ -8,8 +8,8 @@ from torch import Tensor
 from msdgs_train.settings import Checked
 
 GAUSSIANS_PER_PIXEL, FEWEST, MOST = 0.45, 18_000, 100_000
-"""The upper bound of the number of Gaussians if none is given. At 320 to 400 pixels 72,000 instead of 18,000 gain 0.1
-to 0.5 dB in as many steps."""
+"""The upper bound of the number of Gaussians if none is given. A bound of 72,000 instead of 18,000 gains 0.1 to 0.5 dB
+on `val` images of four scenes, 320 to 400 pixels wide, in as many steps."""
 
 
 @dataclass(frozen=True)

@@ -93,18 +93,18 @@ class Support(nn.Module):
         return values
 
     def transforms(self, deltas: Deltas) -> Any:
-        """Motions of the points, given the chain's deltas."""
-        return deltas
+        """The motions of control nodes, given their deltas."""
+        raise NotImplementedError
 
-    def displacements(self, errors: Tensor, deltas: Deltas, gaussians: CanonicalPoints) -> Tensor:
-        """[N] bounds to first order of the errors of the Gaussians' means.
+    def mean_error_bounds(self, errors: Tensor, deltas: Deltas, gaussians: CanonicalPoints) -> Tensor:
+        """[N] bounds to first order of the errors of the Gaussians' means, given those of the control nodes' deltas.
 
         Args:
-            errors: [P, 3] norms of the errors of the points' deltas: means, scales and quaternions.
-            deltas: Those of the points.
+            errors: [P, 3] norms of the errors of means, of stretch tensors (Frobenius) and of quaternions.
+            deltas: Those of the P nodes.
             gaussians: N canonical Gaussians.
         """
-        return errors[:, 0]
+        raise NotImplementedError
 
     def operations(self) -> int:
         """Floating-point operations per Gaussian, besides those of the chain."""

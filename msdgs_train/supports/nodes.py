@@ -5,7 +5,6 @@ the nearest when the deformation starts, with weights that don't depend on time.
 the number of Gaussians.
 """
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -163,11 +162,12 @@ class NodesSupport(Support):
         weights = skinning_weights(attributes["skinning_logits"])
         return (weights * values[attributes["node_ids"]]).sum(dim=1)
 
-    def displacements(self, errors: Tensor, deltas: Deltas, gaussians: CanonicalPoints) -> Tensor:
+    def mean_error_bounds(self, errors: Tensor, deltas: Deltas, gaussians: CanonicalPoints) -> Tensor:
         of_means, of_scales, of_quats = errors.unbind(dim=1)
         angles = 2 * of_quats / torch.linalg.vector_norm(_quaternions(deltas), dim=1).clamp_min(MIN_NORM)
-        stretches = torch.linalg.matrix_norm(stretch_matrices(deltas.scales), ord=2)
-        of_matrices = angles * stretches + math.sqrt(2) * of_scales  # entries beside the diagonal count twice
+        identity = torch.eye(3, dtype=angles.dtype)
+        stretches = 1 + torch.linalg.matrix_norm(stretch_matrices(deltas.scales) - identity)
+        of_matrices = angles * stretches + of_scales
         ids = gaussians.attributes["node_ids"]
         lever_arms = torch.linalg.vector_norm(gaussians.means[:, None] - self.nodes[ids], dim=2)
         weights = skinning_weights(gaussians.attributes["skinning_logits"])

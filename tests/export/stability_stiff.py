@@ -77,8 +77,8 @@ def follow_one_node(model: DynamicGaussians) -> None:
 
 
 def far_from_nodes(model: DynamicGaussians) -> None:
-    """Move the first Gaussian 20 scene units away: rotations of its nodes move it as far."""
-    model.gaussians.means[0] += 20
+    """Move the first Gaussian 2 scene units away along each axis: rotations of its nodes move it as far."""
+    model.gaussians.means[0] += 2
 
 
 def flattened(model: DynamicGaussians) -> None:
@@ -153,7 +153,7 @@ def jacobian_rows() -> Iterator[Row]:
         model = changed(layers=(layer,) * 3).double()
         means = model.gaussians.means.detach()
         single = in_format(model, FLOAT32).deformation
-        found = through_layers(model.deformation, single, means, 0.3, with_rotations=False)
+        found = through_layers(model.deformation, single, means, 0.3, all_deltas=False)
         step, columns, t = 1e-7, [], torch.tensor(0.3, dtype=torch.double)
         with torch.no_grad():
             for axis in torch.eye(3, dtype=torch.double) * step:

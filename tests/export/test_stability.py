@@ -17,7 +17,7 @@ from export.stability import UNSTABLE, main
 from tests.export import stability_extreme, stability_rows, stability_stiff
 from tests.export.stability_rows import FAILS, Row
 from tests.export.stability_suite import TABLE
-from tests.support.models import SCENE, export_scene, random_model, saved
+from tests.support.models import NODES, SCENE, export_scene, random_model, saved
 from tests.support.tolerances import assert_close, tolerance
 
 pytestmark = pytest.mark.slow
@@ -117,6 +117,14 @@ def test_static_models_are_stable(count: int, layers: tuple[str, ...]):
     assert report.stable
     assert report.refusal("network") is None
     assert "nothing moves" in report.verdict
+
+
+@pytest.mark.parametrize("on_nodes", [False, True])
+def test_poses_that_are_nan_in_float64_are_counted(on_nodes: bool):
+    model = random_model(20, **({"support": NODES, "embedding_dim": 0} if on_nodes else {}))
+    with torch.no_grad():
+        model.get_parameter("deformation.layers.0.heads.bias")[3] = torch.nan
+    assert assess(model, SCENE, times=2).broken == ["40 poses are NaN or infinite even in float64"]
 
 
 def test_bounds_that_hold_a_gaussian_back_are_counted():
