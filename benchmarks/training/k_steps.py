@@ -91,11 +91,13 @@ def systems(families: Sequence[str] = FAMILIES) -> dict[str, TrainConfig]:
     """The default system with other layers, by the names that `name_of` gives."""
     base = preset(DEFAULT).updated(max_gaussians=18_000)
     chains = {k: base.updated(layers=(SMALL_LAYER,) * k) for k in NUM_LAYERS}
-    made = {name_of(CHAIN, k): config for k, config in chains.items()}
-    made |= {name_of(WIDE, k): base.updated(layers=(wide_layer(k),)) for k in NUM_LAYERS[1:]}
-    made |= {name_of(UNWEIGHTED, k): config.updated(weights=False) for k, config in chains.items()}
-    made |= {name_of(MODULATED, k): config.updated(embedding_dim=32) for k, config in chains.items()}
-    return {name: config for name, config in made.items() if name.split(", K = ")[0] in families}
+    made = {
+        CHAIN: chains,
+        WIDE: {k: base.updated(layers=(wide_layer(k),)) for k in NUM_LAYERS[1:]},
+        UNWEIGHTED: {k: config.updated(weights=False) for k, config in chains.items()},
+        MODULATED: {k: config.updated(embedding_dim=32) for k, config in chains.items()},
+    }
+    return {name_of(family, k): config for family in families for k, config in made[family].items()}
 
 
 def name_of(family: str, num_layers: int) -> str:

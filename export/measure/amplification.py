@@ -59,7 +59,7 @@ def growth(double: DynamicGaussians, single: DynamicGaussians, ids: Tensor, t: f
             predicted += _following_error(double, single, ids, t)
         after = [support.spread(values, points.attributes).numpy() for values in found.after]
         amplification = support.spread(found.amplification, points.attributes).numpy()
-    predicted = torch.nan_to_num(predicted.detach(), nan=math.inf, posinf=math.inf).numpy()
+    predicted = torch.nan_to_num(predicted, nan=math.inf, posinf=math.inf).numpy()
     return Growth(np.array(after).reshape(-1, len(ids)), amplification, predicted)
 
 

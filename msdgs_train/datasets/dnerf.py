@@ -44,4 +44,6 @@ def _frame(entry: JsonObject, split: str, size: int | None) -> Frame:
     frame = read_frame(entry, size)
     path = PurePosixPath(file_path(entry))
     folders = () if path.is_absolute() else path.parts[:-1]
-    return replace(frame, name="_".join([*folders[folders[:1] == (split,) :], frame.name]))
+    if folders[:1] == (split,):
+        folders = folders[1:]
+    return replace(frame, name="_".join([*folders, frame.name]))
