@@ -42,9 +42,6 @@ class DensityConfig(Checked):
     prune_unseen_passes: float = 0.0
     """gradient: Gaussians that no image shows in so many passes over the cameras are removed, and those outside an
     image whose border is empty all around; 0: never."""
-    min_transmittance: float = 0.0
-    """gradient, on a CPU: an image shows a Gaussian if the mean transmittance in front of it is above this. 0.1 helps
-    views far from all cameras if images have alpha; it harms opaque videos, whose surfaces are soft layers."""
     prune_scale3d: float = 0.1
     """gradient: Gaussians larger than this fraction of the scene's scale are removed after a reset of opacities."""
     reset_every_fraction: float = 0.0
@@ -61,7 +58,7 @@ class DensityConfig(Checked):
     def __post_init__(self) -> None:
         self.require_counts("init_num_pts")
         self.require_fractions("refine_start_fraction", "refine_every_fraction", "refine_stop_fraction")
-        self.require_fractions("reset_every_fraction", "prune_opa", "min_transmittance", "init_min_views")
+        self.require_fractions("reset_every_fraction", "prune_opa", "init_min_views")
         self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
         self.require_weights("noise_lr", "prune_unseen_passes")
         self.require_weights(*(n for n in ("opacity_reg", "scale_reg") if getattr(self, n) is not None))

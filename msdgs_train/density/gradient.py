@@ -56,16 +56,15 @@ class GradientStrategy(DensityStrategy):
         return cls(schedule, generator, max_gaussians, scene_scale, gradients, counts, unseen, patience, is_rig)
 
     def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
-        """Accumulate one view. Where transmittances aren't known, on CUDA, an image shows what has a gradient."""
-        grads, transmittance, drawn = screen.means2d_grads, screen.transmittance, screen.radii > 0
+        """Accumulate one view, which shows the Gaussians that have a gradient."""
+        grads, drawn = screen.means2d_grads, screen.radii > 0
         if grads is None:
             return
         norms = torch.hypot(grads[:, 0] * (0.5 * width), grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
         if self.patience:
-            shown = norms > 0 if transmittance is None else transmittance > self.config.min_transmittance
-            self.unseen = torch.where(shown & self.unseen.isfinite(), 0.0, self.unseen + 1)
+            self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
             if shows_all:
                 self.unseen[~drawn] = torch.inf
 

@@ -93,7 +93,7 @@ def test_each_preset_trains(name: str, data: Path) -> None:
     [
         ("steps", 0), ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
         ("mse_fraction", 1.1), ("alpha_weight", -1.0), ("prune_unseen_passes", -1.0),
-        ("init_min_views", 1.1), ("min_transmittance", 1.1), ("ema_fraction", -0.1),
+        ("init_min_views", 1.1), ("ema_fraction", -0.1),
         ("max_gaussians", 10), ("background", "green"), ("minutes", 0.0), ("refine_every_fraction", -0.1),
         ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),
         *(("eps2d_init", eps2d) for eps2d in (-0.1, float("nan"), float("inf"))),

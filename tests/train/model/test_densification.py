@@ -37,13 +37,11 @@ def _accumulate(control: GradientStrategy, pixels: list[float]) -> None:
     control.accumulate(_screen(torch.stack([grads, torch.zeros_like(grads)], dim=1)), 2, 2, False)
 
 
-def _screen(
-    grads: torch.Tensor, radii: list[float] | None = None, transmittance: list[float] | None = None
-) -> RasterizationInfo:
-    """One image of the Gaussians: drawn with a radius of one pixel, and hidden by nothing, unless stated."""
+def _screen(grads: torch.Tensor, radii: list[float] | None = None) -> RasterizationInfo:
+    """One image of the Gaussians, drawn with a radius of one pixel unless stated."""
     info = RasterizationInfo()
     info.radii = torch.tensor(radii or [1.0] * len(grads))
-    info.means2d_grads, info.transmittance = grads, torch.tensor(transmittance or [1.0] * len(grads))
+    info.means2d_grads = grads
     return info
 
 
@@ -93,15 +91,11 @@ def test_low_opacity_gaussians_are_pruned_at_once_and_huge_ones_after_a_reset() 
     assert moment_rows(surgery, "means") == [3, 4, 5, 6]
 
 
-@pytest.mark.parametrize("on_cuda", [False, True])
-def test_gaussians_that_no_image_shows_are_removed(on_cuda: bool) -> None:
-    """Of six, four are seen, one is hidden and one isn't drawn; on CUDA a gradient counts as seen."""
-    gaussians, surgery, control = _setup(
-        prune_unseen_passes=1.5, min_transmittance=0.1, window_full_fraction=0.0, refine_every_fraction=0.0
-    )
-    grads = torch.tensor([[1e-6, 0.0]] * 4 + [[0.0 if on_cuda else 1e-6, 0.0], [0.0, 0.0]])
-    screen = _screen(grads, [2.0] * 5 + [0.0], [0.11] * 4 + [0.09, 0.0])
-    screen.transmittance = None if on_cuda else screen.transmittance
+def test_gaussians_that_no_image_shows_are_removed() -> None:
+    """Of six, four are seen, one has no gradient and one isn't drawn."""
+    gaussians, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.0, refine_every_fraction=0.0)
+    grads = torch.tensor([[1e-6, 0.0]] * 4 + [[0.0, 0.0]] * 2)
+    screen = _screen(grads, [2.0] * 5 + [0.0])
     for _ in range(round(1.5 * MIN_PATIENCE)):
         control.accumulate(screen, 2, 2, False)
         control.after_step(surgery, range(1, 2))
@@ -119,7 +113,7 @@ def test_a_growing_window_may_hide_gaussians() -> None:
         _, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.9, refine_every_fraction=0.0)
         control.is_rig = is_rig
         for _ in range(2 * MIN_PATIENCE):
-            control.accumulate(_screen(torch.zeros(6, 2), transmittance=[0.0] * 6), 2, 2, False)
+            control.accumulate(_screen(torch.zeros(6, 2)), 2, 2, False)
             control.after_step(surgery, range(12, 13))
         assert int(control._to_prune(surgery.gaussians, 12).sum()) == 0
         assert int((control.unseen > control.patience).sum()) == pruned
