@@ -1,11 +1,8 @@
 """The order of the images.
 
 First all images train a static scene. Then motion is tracked from the middle of the scene's time in a window that
-grows in both directions. While it grows, half of the images are drawn from the newest ones, at its border, and train
-the deformation alone: canonical Gaussians would overfit to these few images and lose their textures.
+grows in both directions. While it grows, half of the images are drawn from the newest ones, at its border.
 """
-
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,13 +16,6 @@ MIN_NEW_FRAME_DISTANCE = 0.7
 """New frames are at least this fraction of the half width from the middle; the outermost image always is one."""
 
 
-class Draw(NamedTuple):
-    """An image to train on."""
-
-    frame: Frame
-    is_new: bool  # whether it trains the deformation alone
-
-
 class WindowCurriculum:
     """A time window that grows from the middle. `order` holds the indices that remain in a pass over its images."""
 
@@ -34,17 +24,17 @@ class WindowCurriculum:
         self.distances = distances_from_middle(time_range, frames)
         self.order = torch.empty(0, dtype=torch.int64)
 
-    def next(self, number: int, step: int, generator: torch.Generator) -> Draw:
+    def next(self, number: int, step: int, generator: torch.Generator) -> Frame:
         window = self._schedule.window(step)
         if window < 0.5 and number % 2 == 1 and step >= self._schedule.deform_start_step:
             new = self._new_frames(window)
-            return Draw(self._frames[int(new[torch.randint(len(new), (), generator=generator)])], is_new=True)
+            return self._frames[int(new[torch.randint(len(new), (), generator=generator)])]
         self.order = self.order[self.distances[self.order] <= window]
         if not len(self.order):
             inside = torch.nonzero(self.distances <= window)[:, 0]
             self.order = inside[torch.randperm(len(inside), generator=generator)]
         chosen, self.order = self.order[0], self.order[1:]
-        return Draw(self._frames[int(chosen)], is_new=False)
+        return self._frames[int(chosen)]
 
     def _new_frames(self, window: float) -> Tensor:
         outermost = float(self.distances[self.distances <= window].max())

@@ -15,7 +15,7 @@ from msdgs_serve.threads import sharing_cores
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.engine.config import TrainConfig
-from msdgs_train.engine.curriculum import Draw, WindowCurriculum
+from msdgs_train.engine.curriculum import WindowCurriculum
 from msdgs_train.engine.gradients import ViewGradients, average_gradients, differentiate
 from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.schedule import Schedule
@@ -205,11 +205,10 @@ class Trainer:
         return ThreadPoolExecutor(self.config.run.threads, "image", torch.set_num_threads, (1,))
 
     @sharing_cores()
-    def _differentiate(self, groups: Sequence[ParamGroup], draw: Draw, background: Tensor) -> ViewGradients:
-        target = Target.over(self._images.rgba(draw.frame), background, self.config.run.device)
-        view = self.system.loss(draw.frame, target, background.to(target.rgb.device), self.step_count)
-        trained = [group for group in groups if not (draw.is_new and group.is_canonical)] or groups
-        return differentiate(trained, draw.frame, view, target.rgb)
+    def _differentiate(self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor) -> ViewGradients:
+        target = Target.over(self._images.rgba(frame), background, self.config.run.device)
+        view = self.system.loss(frame, target, background.to(target.rgb.device), self.step_count)
+        return differentiate(groups, frame, view, target.rgb)
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":

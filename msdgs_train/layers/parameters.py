@@ -35,4 +35,3 @@ class ParamGroup(NamedTuple):
     params: list[nn.Parameter]
     lr: LearningRate
     is_clipped: bool = False  # whether their gradients are clipped, all clipped groups of a model together
-    is_canonical: bool = False  # whether images that train the deformation alone leave them as they are

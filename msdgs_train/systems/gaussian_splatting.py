@@ -76,7 +76,7 @@ class GaussianSplatting:
             "sh_dc": constant(o.sh_dc_lr),
             "sh_rest": constant(o.sh_rest_lr),
         }
-        own = [ParamGroup(name, [g.get_parameter(name)], lr, is_canonical=True) for name, lr in rates.items()]
+        own = [ParamGroup(name, [g.get_parameter(name)], lr) for name, lr in rates.items()]
         return own + self.model.motion_groups()
 
     @torch.no_grad()

@@ -10,11 +10,10 @@ import torch
 from msdgs_train.datasets import Frame, SceneData, load_scene
 from msdgs_train.engine.curriculum import MIN_NEW_FRAME_DISTANCE, NEW_FRAME_BORDER, WindowCurriculum
 from msdgs_train.engine.schedule import Schedule
-from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.spline import SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
-from tests.support.training_scene import SPLINES, small_config, splatting, trained, write_scene
+from tests.support.training_scene import SPLINES, small_config, trained, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,7 @@ def frames_drawn(scene: SceneData, numbers: range, **changes: Any) -> list[Frame
     schedule = Schedule.from_config(small_config(**{**PHASES, "steps": 1000, "window_start_width": 0.1, **changes}))
     curriculum = WindowCurriculum(schedule, scene.splits["train"], scene.time_range)
     generator = torch.Generator().manual_seed(0)
-    return [curriculum.next(number, number // schedule.config.run.batch_size, generator).frame for number in numbers]
+    return [curriculum.next(number, number // schedule.config.run.batch_size, generator) for number in numbers]
 
 
 def distance(scene: SceneData, t: float) -> float:
@@ -78,25 +77,8 @@ def test_regularizers_begin_with_the_deformation(scene: SceneData, monkeypatch: 
     monkeypatch.setattr(SplineLayer, "temporal_smoothness", lambda _, t: smooth.append(float(t)) or 0.0)
     monkeypatch.setattr(NodesSupport, "local_rigidity", lambda _, motions: rigid.append(motions) or 0.0)
     trained(small_config(model=SPLINES, steps=100, **PHASES), scene, 40)
-    assert smooth == pytest.approx([draw.frame.t for draw in drawn[20:]])
+    assert smooth == pytest.approx([frame.t for frame in drawn[20:]])
     assert len(rigid) == len(drawn[20:])
-
-
-@pytest.mark.parametrize("model", [SPLINES, small_config().model])
-def test_new_frames_train_the_deformation_alone(scene: SceneData, model: ModelConfig) -> None:
-    """In the steps 8 to 24, every second image is a new frame; none changes the number of Gaussians here."""
-    config = small_config(model=model, steps=40, static_fraction=0.2, window_full_fraction=0.6)
-    trainer = Trainer(config.updated(refine_every_fraction=0.0, reset_every_fraction=0.0), scene)
-    for step in range(26):
-        before = {name: value.clone() for name, value in splatting(trainer).model.state_dict().items()}
-        trainer.step()
-        changed = {n for n, value in splatting(trainer).model.state_dict().items() if not torch.equal(value, before[n])}
-        assert (
-            ("gaussians.means" in changed)
-            == ("gaussians.sh_dc" in changed)
-            == (step < 8 or step >= 24 or step % 2 == 0)
-        )
-        assert any(name.startswith("deformation") for name in changed) == (step >= 8)
 
 
 def test_phases_follow_each_other_and_cover_the_run() -> None:

@@ -264,7 +264,7 @@ def test_a_checkpoint_without_one_of_its_values_is_refused(data: Path, tmp_path:
 
 def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_path: Path) -> None:
     def next_frames(trainer: Trainer) -> list[str]:
-        return [trainer._curriculum.next(0, 0, trainer._generator).frame.name for _ in range(7)]
+        return [trainer._curriculum.next(0, 0, trainer._generator).name for _ in range(7)]
 
     trainer, other = (Trainer(small_config(window_full_fraction=0.0), load_scene(data)) for _ in range(2))
     first = next_frames(trainer)
