@@ -5,6 +5,7 @@ reported. A run that has a row isn't trained again.
 """
 
 import csv
+import fcntl
 import hashlib
 import io
 import json
@@ -118,13 +119,18 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def append_row(path: Path, row: Row) -> None:
-    """Add a row, atomically."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows([*read_rows(path), row])
+    """Add a row, atomically, also while other processes add theirs."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, text.getvalue())
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*read_rows(path), row])
+        write_text(path, text.getvalue())
+    finally:
+        os.close(folder)
 
 
 def train_and_measure(

@@ -1,6 +1,7 @@
 """The benchmark of many scenes: its rows, its table and its continuation from the CSV file."""
 
 import csv
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,13 @@ def test_an_interval_covers_the_mean_gain() -> None:
     assert low < mean < high
     assert mean == pytest.approx(0.5, abs=0.15)
     assert 0.05 < high - low < 0.25
+
+
+def test_rows_of_several_benchmarks_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "bench.csv"
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda seed: append_row(path, row("s", "a", seed, [1.0])), range(40)))
+    assert sorted(int(found["seed"]) for found in read_rows(path)) == list(range(40))
 
 
 def test_a_csv_file_of_other_columns_is_refused(tmp_path: Path) -> None:
