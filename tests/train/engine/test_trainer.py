@@ -77,7 +77,7 @@ def test_the_cap_follows_the_size_of_the_images(
 RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "white": ({"background": "white"}, (3, 11, 16)),  # in the static phase, between and after densifications
     "random": ({"background": "random"}, (3, 11, 16)),
-    "hidden removed": ({"prune_unseen_passes": 0.1}, (11, 16)),
+    "unseen removed": ({"prune_unseen_passes": 0.05, "window_full_fraction": 0.0, "scene_half_size": 2.0}, (11, 16)),
     "mlp on nodes": ({"model": MODELS["mlp on nodes"]}, (3, 13)),
     "mixed on nodes": ({"model": MODELS["mixed on nodes"], "batch_size": 2}, (8, 13)),
     "mixed on gaussians": ({"model": MODELS["mixed on gaussians"]}, (13,)),
