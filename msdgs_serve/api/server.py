@@ -66,6 +66,12 @@ class Server(uvicorn.Server):
         self._drain_deadline = time.monotonic() + self._drain_seconds
         self.service.drain()
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Close the connections, then the application; uvicorn doesn't close that after a second signal."""
+        await super().shutdown(sockets)
+        if self.force_exit:
+            await self.lifespan.shutdown()
+
     def on_ready(self) -> None:
         """Called once when the service is ready."""
 

@@ -48,7 +48,8 @@ def read_until(process: subprocess.Popen[str], pattern: str) -> str:
     raise AssertionError(f"it ended: {printed}{process.stderr.read()}")
 
 
-def test_it_prints_its_address_and_an_example_and_stops_at_ctrl_c(process: subprocess.Popen[str]):
+@pytest.mark.parametrize("signals", [[signal.SIGINT], [signal.SIGINT, signal.SIGTERM]])
+def test_it_prints_its_address_and_an_example_and_stops_at_ctrl_c(process: subprocess.Popen[str], signals: list[int]):
     printed = read_until(process, r"-d '")
     match = re.search(r"Listening on (http://127\.0\.0\.1:\d+)", printed)
     assert match
@@ -58,7 +59,8 @@ def test_it_prints_its_address_and_an_example_and_stops_at_ctrl_c(process: subpr
     response = httpx.post(words[1], content=body, headers=headers)
     assert response.status_code == 200, response.text
     assert decode(response.content, "png")[0].shape == (400, 400, 3)
-    process.send_signal(signal.SIGINT)
+    for number in (signal.SIGSTOP, *signals, signal.SIGCONT):  # stopped, it receives all of them before it can end
+        process.send_signal(number)
     out, err = process.communicate(timeout=600)
     assert (process.returncode, out.strip(), err) == (0, "Stopped.", "")
 
