@@ -89,7 +89,7 @@ def main(
 
 def systems(families: Sequence[str] = FAMILIES) -> dict[str, TrainConfig]:
     """The default system with other layers, by the names that `name_of` gives."""
-    base = preset(DEFAULT).updated(max_gaussians=18_000)
+    base = preset(DEFAULT).updated(max_gaussians=18_000, grow_grad2d=8e-4, opacity_reg=None)
     chains = {k: base.updated(layers=(SMALL_LAYER,) * k) for k in NUM_LAYERS}
     made = {
         CHAIN: chains,

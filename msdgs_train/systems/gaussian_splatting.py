@@ -94,7 +94,7 @@ class GaussianSplatting:
         posed = self._pose(self.model, frame.t, step, motions)
         rgb, alpha, info = rasterize(*posed, frame.camera, background, self._options(step + 1))
         loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
-        loss = loss + self._regularizers(posed, motions, frame.t)
+        loss = loss + self._regularizers(posed, motions, frame.t, step)
         if c.alpha_weight:
             loss = loss + c.alpha_weight * target.alpha_error(alpha)
         clamped = count_clamped(self.config.model.scale_space, posed.scales)
@@ -163,9 +163,10 @@ class GaussianSplatting:
         means = self.model.gaussians.means
         return self.model.support.motions(self.model.deformation, means, means.new_tensor(t))
 
-    def _regularizers(self, posed: PosedGaussians, motions: Any, t: float) -> Tensor | float:
+    def _regularizers(self, posed: PosedGaussians, motions: Any, t: float, step: int) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
-        terms = list(self.config.density.regularizers(posed.opacities, posed.scales).values())
+        density, refining = self.config.density, step < self.schedule.refine_stop
+        terms = list(density.regularizers(posed.opacities, posed.scales, refining=refining).values())
         if motions is not None:
             time = posed.means.new_tensor(t)
             terms += self.model.support.regularizers(motions).values()

@@ -274,15 +274,17 @@ def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_pat
     assert (trainer.rollbacks, trainer.lr_factor) == (1, 0.5)
 
 
-@pytest.mark.parametrize("mcmc", [False, True])
-def test_weighted_regularizers_are_added_to_the_loss(data: Path, monkeypatch: pytest.MonkeyPatch, mcmc: bool) -> None:
+@pytest.mark.parametrize(("strategy", "refining"), [("gradient", True), ("gradient", False), ("mcmc", False)])
+def test_weighted_regularizers_are_added_to_the_loss(
+    data: Path, monkeypatch: pytest.MonkeyPatch, strategy: str, refining: bool
+) -> None:
     plane = PlaneConfig(
         resolution=5, multires=(1, 2), time_smoothness_weight=1.0, l1_time_planes_weight=1e3, plane_tv_weight=10.0,
         plane_smoothness_weight=100.0,
     )  # fmt: skip
-    strategy: dict[str, Any] = {"density_strategy": "mcmc", "opacity_reg": 2e4, "scale_reg": 3e5} if mcmc else {}
+    density: dict[str, Any] = {"density_strategy": strategy, "opacity_reg": 2e4, "scale_reg": 3e5}
     model = dataclasses.replace(small_config().model, layers=(plane, MLP))
-    system = splatting(Trainer(small_config(model=model, static_fraction=0.0, **strategy), load_scene(data)))
+    system = splatting(Trainer(small_config(model=model, static_fraction=0.0, **density), load_scene(data)))
     expected, layer = 0.0, system.model.deformation.layers[0]
     assert isinstance(layer, PlaneLayer)
     with torch.no_grad():
@@ -291,13 +293,14 @@ def test_weighted_regularizers_are_added_to_the_loss(data: Path, monkeypatch: py
             expected += grid.time_smoothness() + 1e3 * grid.l1_time_planes()
             expected += 10 * grid.plane_tv() + 100 * grid.plane_smoothness()
         posed = system.model.pose(0.3, sh_degree=0)
-        if mcmc:
+        if strategy == "mcmc" or refining:
             expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(layer.plane_grids()) == 2
         frame = load_scene(data).splits["train"][0]
         target, black = Target(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE)), torch.zeros(3)
         monkeypatch.setattr(system_module, "photometric_loss", lambda *arguments: torch.zeros(()))
-        loss = system.loss(dataclasses.replace(frame, t=0.3), target, black, 0).loss
+        step = system.schedule.refine_stop - refining
+        loss = system.loss(dataclasses.replace(frame, t=0.3), target, black, step).loss
         assert float(loss) == pytest.approx(float(expected), rel=tolerance("float32.relative"))
 
 
