@@ -233,7 +233,7 @@ def test_a_limit_of_bytes_is_kept_with_the_error_that_the_file_says(
     assert "`max_mb` must be at least" in refused
     smallest = float(refused.split("at least ")[1].split(",")[0])
     reached = []
-    for max_mb in (smallest, 1.3 * smallest, 10.0)[:: 1 if plan else 2]:
+    for max_mb in (smallest, 10.0):
         assert not exported(max_mb)
         assert output.stat().st_size <= 1e6 * max_mb
         session = DeformationSession(output)
