@@ -48,6 +48,9 @@ def main(
             raise InvalidInput("times", "2 or more", times)
         if not 0 < min_psnr < 100:
             raise InvalidInput("min_psnr", "between 0 and 100 dB", min_psnr)
+        for name, path in (("json", json), ("plot", plot)):
+            if path and not path.absolute().parent.is_dir():
+                raise InvalidInput(name, "in a folder that exists", str(path))
         with messages.status("loading torch and the kernels"):
             from export.precision.show import assess_and_show  # slow to import: not before --help
         report = assess_and_show(model, times, min_psnr, json, plot, messages)

@@ -46,6 +46,10 @@ def convert(options: ConvertOptions, console: Console) -> None:
     out = options.out
     if out.suffix in VIDEOS:
         raise InvalidInput("out", f"other than a video: msdgs-render {options.scene} {out} writes one", out.name)
+    if not out.absolute().parent.is_dir() and out.suffix:
+        raise InvalidInput("out", "in a folder that exists", str(out))
+    if out.suffix == ONNX and options.t is not None:
+        raise InvalidInput("t", "left out for a file that holds all times", options.t)
     session = DeformationSession(options.scene)
     if out.name.endswith(VISIONARY):
         written = _visionary(session, options, console)

@@ -33,7 +33,7 @@ def detect_format(path: Path) -> str:
 def checked_format(text: str) -> str:
     """One of `FORMATS`. Raises `InvalidInput` for anything else."""
     if text not in FORMATS:
-        raise InvalidInput("--format", f"detect or one of {', '.join(FORMATS)}", repr(text))
+        raise InvalidInput("format", f"detect or one of {', '.join(FORMATS)}", repr(text))
     return text
 
 

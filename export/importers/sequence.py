@@ -86,7 +86,7 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     """
     files = frame_files(folder)
     if len(files) < 2:
-        raise ImportFailed(folder, "holds no sequence of two or more numbered .ply, .sog, .spz or .splat files")
+        raise ImportFailed(folder, "holds no two or more numbered .ply, .sog, .spz, .splat or .ksplat files")
     read: list[Splats] = []
     for file in files:
         read.append(read_splats(file))

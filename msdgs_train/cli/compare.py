@@ -77,7 +77,7 @@ class Compare:
 
 
 def check_jobs(jobs: int | None) -> None:
-    """Raise `InvalidInput` unless a run can be trained at a time."""
+    """Raise `InvalidInput` if `jobs` is below 1."""
     if jobs is not None and jobs < 1:
         raise InvalidInput("jobs", "1 or more", jobs)
 

@@ -1,5 +1,6 @@
 """Terminal output of `msdgs-train fit`: phases, a progress bar, metrics, and Ctrl-C as a clean stop."""
 
+import shlex
 import signal
 import threading
 import time
@@ -104,4 +105,5 @@ def print_result(result: RunResult, data: Path, run: Path) -> None:
         best = f"{result.best.split} PSNR {result.best.psnr:.2f} dB at step {result.best.step:,}"
         console.print(f"best:  {run / BEST}, {best}", soft_wrap=True)
     if result.status != "finished":
-        console.print(f"continue with: msdgs-train fit {data} {run} --resume", soft_wrap=True)
+        command = shlex.join(["msdgs-train", "fit", str(data), str(run), "--resume"])
+        console.print(f"continue with: {command}", soft_wrap=True)

@@ -77,7 +77,8 @@ def make_bench_runs(
     """One run per seed, scene and system, in this order: a benchmark that is stopped compares all systems."""
     require_unique("seed", map(str, seeds))
     return [
-        Run(name, scene.name, seed, scene.folder.resolve(), out / name / f"{scene.name}_{seed}_{_digest(config)}",
+        Run(name, scene.name, seed, scene.folder.resolve(),
+            out / name / "_".join([scene.name, str(seed), *filter(None, _budget(config)), _digest(config)]),
             config.updated(seed=seed, size=scene.size, llffhold=scene.llffhold))
         for seed in seeds
         for scene in scenes
@@ -87,10 +88,13 @@ def make_bench_runs(
 
 def key_of(run: Run) -> tuple[str, ...]:
     """The values of `KEY`, which tell the rows of a CSV file apart."""
-    config = run.config.run
-    minutes = "" if config.minutes is None else f"{config.minutes:g}"
-    shared = minutes, config.time, str(config.threads)
-    return run.scene, run.system, str(run.seed), *shared, _digest(run.config)
+    return run.scene, run.system, str(run.seed), *_budget(run.config), _digest(run.config)
+
+
+def _budget(config: TrainConfig) -> tuple[str, str, str]:
+    """Minutes, their kind, and threads."""
+    minutes = "" if config.run.minutes is None else f"{config.run.minutes:g}"
+    return minutes, config.run.time, str(config.run.threads)
 
 
 def key_of_row(row: Row) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ INTERVAL = (2.5, 97.5)  # percentiles of the bootstrap
 
 def write_bench(out: Path, rows: Sequence[Row]) -> list[Path]:
     """Write the table and the figure into the folder `out`, each atomically; returns their paths."""
+    out.mkdir(parents=True, exist_ok=True)
     write_text(out / TABLE, as_markdown(rows))
     save_figure(draw(rows), out / PLOT)
     return [out / TABLE, out / PLOT]

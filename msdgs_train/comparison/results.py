@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.runner import final_metrics, is_finished
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.engine.run import EVAL_SPLITS
 from msdgs_train.engine.run_record import MODEL
-from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 
@@ -83,7 +83,7 @@ def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
     torch.set_num_threads(threads)
     times = []
     for i, entry in enumerate([loaded.scene.cameras[0], *loaded.scene.cameras[:TIMED_FRAMES]]):
-        camera = camera_of(entry, entry["width"])
+        camera = SceneCamera.from_plain(entry).camera
         start = time.perf_counter()
         loaded.render(camera, entry["t"])
         if i:

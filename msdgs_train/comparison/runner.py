@@ -11,7 +11,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import POLL_SECONDS, Pool, RunEnd
 from msdgs_train.engine.config import differences
-from msdgs_train.engine.run_record import CHECKPOINT, CONFIG, FINAL_METRICS, stored_config
+from msdgs_train.engine.run_record import CHECKPOINT, CONFIG, FINAL_METRICS, read_config
 
 
 def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: Callable[[Run, RunEnd], None]) -> bool:
@@ -67,9 +67,10 @@ def final_metrics(run: Run) -> dict[str, Any] | None:
 
 
 def _check_settings(run: Run) -> None:
-    if not (run.folder / CONFIG).exists() or not (run.folder / CHECKPOINT).exists():
+    has_config, *has_results = ((run.folder / name).exists() for name in (CONFIG, CHECKPOINT, FINAL_METRICS))
+    if not (has_config and any(has_results)):
         return
-    changed = [name for name, *_ in differences(stored_config(run.folder), run.config) if name != "threads"]
+    changed = [name for name, *_ in differences(read_config(run.folder), run.config) if name != "threads"]
     if changed:
         problem = f"{run.folder} with other settings: {', '.join(changed)}"
         raise InvalidInput("out", "a new folder, or one of the same comparison", problem)

@@ -38,7 +38,7 @@ class DensityChange(NamedTuple):
 class GradientStrategy(DensityStrategy):
     """Accumulates gradients over many images and periodically adds and removes Gaussians."""
 
-    scene_scale: float  # radius of the cameras' positions, scene units
+    scene_scale: float  # of the cameras' positions or of the scene, scene units
     gradients: Tensor  # [N] sums of norms
     counts: Tensor  # [N] images in which each was drawn
     unseen: Tensor  # [N] images since each was seen; infinite once it was outside of the whole scene

@@ -82,7 +82,7 @@ class OptimizerConfig(Checked):
     def __post_init__(self) -> None:
         self.require_positive(*(name for name in self.names() if "_lr" in name))
         self.require_fractions("sh_degree_fraction", "ema_fraction")
-        self.require(("eps2d_init",), "finite and 0 or above, or not given", lambda v: v is None or 0 <= v < 1e9)
+        self.require_weights(*(["eps2d_init"] if self.eps2d_init is not None else []))
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,9 @@ class TrainConfig:
         groups: dict[str, dict[str, Any]] = {"model": {}}
         config = self
         if "model" in settings:
-            config = dataclasses.replace(config, model=settings.pop("model"))
+            whole = settings.pop("model")
+            whole = whole if isinstance(whole, ModelConfig) else ModelConfig.from_dict(whole)
+            config = dataclasses.replace(config, model=whole)
         for name, value in settings.items():
             groups.setdefault(_group_of(name), {})[name] = value
         model = groups.pop("model")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from msdgs_train.datasets.common.files import write_text
+from msdgs_train.datasets.common.files import replacing, write_text
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine.tensorboard_events import FOLDER, add_scalars, open_events
 from msdgs_train.engine.trainer import EvaluatedFrame, StepResult
@@ -103,7 +103,8 @@ def draw_curve(run: Path) -> None:
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     count.set_xlabel("step")
-    figure.savefig(run / CURVE, dpi=110)
+    with replacing(run / CURVE) as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
 def write_side_by_side(run: Path, split: str, evaluated: EvaluatedFrame) -> Path:
@@ -111,7 +112,8 @@ def write_side_by_side(run: Path, split: str, evaluated: EvaluatedFrame) -> Path
     folder = run / RENDERS
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{split}_{_stem(evaluated)}.png"
-    write_png(path, side_by_side(evaluated))
+    with replacing(path) as temporary:
+        write_png(temporary, side_by_side(evaluated))
     return path
 
 

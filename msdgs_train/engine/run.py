@@ -29,6 +29,7 @@ from msdgs_train.engine.run_record import (
     write_config,
     write_record,
 )
+from msdgs_train.engine.schedule import Schedule, require_same_phase
 from msdgs_train.engine.tensorboard_events import require_tensorboard
 from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
 from msdgs_train.evaluation.metrics import ImageMetrics, mean_metrics
@@ -94,15 +95,19 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
     require_device(config.run.device)
     if tensorboard:
         require_tensorboard()
-    if resume:
-        check_resumable(stored_config(folder), config)
+    stored = stored_config(folder) if resume else None
+    if stored:
+        check_resumable(stored, config)
     elif (folder / CHECKPOINT).exists():
         raise InvalidInput("run", "a new folder, or --resume to continue the run in it", f"{folder}, which holds a run")
-    trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold))
-    seconds = trainer.load_checkpoint(folder / CHECKPOINT) if resume else 0.0
-    folder.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as on_error:
-        lock = on_error.enter_context(_locked(folder))
+        lock = on_error.enter_context(_locked(folder)) if stored else None
+        trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold))
+        seconds = trainer.load_checkpoint(folder / CHECKPOINT) if stored else 0.0
+        if stored:
+            require_same_phase(Schedule.from_config(stored), Schedule.from_config(config), trainer.step_count)
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = lock or on_error.enter_context(_locked(folder))
         write_config(folder, config)
         best = _best_so_far(folder, trainer.scene) if resume else None
         if best is None:
@@ -144,10 +149,11 @@ class Run:
         if self.clock and self.trainer.step_count < self.config.run.steps:
             self._compile_kernels()
         status = self._train()
+        self._save()
         metrics = {}
         if status != "interrupted":
             metrics = {split: self._evaluate(split, renders=None) for split in self.splits}
-        self._save()
+        self.log.flush()
         draw_curve(self.folder)
         if metrics:
             self._write_final_metrics(metrics)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
 
 
@@ -100,6 +101,14 @@ class Schedule(NamedTuple):
         """Whether the model after this step, counted from 1, is part of the average."""
         last = max(self.deform_start_step, self.full_window_step, self.refine_stop)
         return self.ema_steps > 0 and step > last
+
+
+def require_same_phase(before: Schedule, after: Schedule, step: int) -> None:
+    """Raise `InvalidInput` unless a run that has taken `step` steps can go on with another number of them: layers are
+    initialized where motion begins and where the time window grows."""
+    if (before.deforms(step), before.window(step)) != (after.deforms(step), after.window(step)):
+        expected = f"{before.num_steps:,}, or so near it that step {step:,} stays in its phase"
+        raise InvalidInput("config.steps", expected, f"{after.num_steps:,}")
 
 
 def _interval(fraction: float, steps: int) -> int:

@@ -25,13 +25,15 @@ class SceneInfo:
     """Time range, background, bounds and cameras of a model's scene; plain values only."""
 
     time_range: tuple[float, float] = (0.0, 1.0)
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sRGB in [0, 1], as trained
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sRGB in [0, 1], as evaluated
     bounds: list[list[float]] = field(default_factory=lambda: [[-1.0] * 3, [1.0] * 3])  # corners, scene units
     cameras: list[dict[str, Any]] = field(default_factory=list)
     """Those of the viewer. Each has name, fx, fy, cx, cy (pixels), width, height, camera_to_world (4×4 nested lists,
     OpenCV) and t."""
     training_cameras: list[dict[str, Any]] = field(default_factory=list)
     """Others, of training images, from which export also measures errors."""
+    llffhold: int = 0
+    """Every so many images were held out, as in `DataConfig`."""
 
 
 class LoadedModel(NamedTuple):
@@ -93,6 +95,7 @@ def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
         DynamicGaussians(config, CanonicalGaussians(**gaussians)).load_state_dict(state, assign=True)
     model = DynamicGaussians(config, CanonicalGaussians(**gaussians))
     model.load_state_dict(state)
+    model.support.check_attributes(model.gaussians.attributes)
     return model
 
 

@@ -75,7 +75,7 @@ def plane_gradients(
 def _locate(position: np.ndarray, size: int, cells: np.ndarray, parts: np.ndarray) -> None:
     """The cell [3] of a position, [3], and the fraction of the cell before it, [3] in [0, 1]."""
     for axis in range(3):
-        inside = min(max(position[axis], 0), size - 1)
+        inside = min(max(0, position[axis]), size - 1)  # in this order NaN becomes 0 instead of an index
         cells[axis] = min(int(inside), size - 2)
         parts[axis] = inside - cells[axis]
 

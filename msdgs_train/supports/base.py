@@ -58,6 +58,10 @@ class Support(nn.Module):
     num_points: int | None = None
     """Number of control nodes; None if the points are the Gaussians themselves."""
 
+    def check_attributes(self, attributes: dict[str, Tensor]) -> None:
+        """Raise `InvalidInput` naming an attribute, of those that `SupportConfig.attributes` names, that can't be
+        used."""
+
     def forward(
         self, chain: MultiStepDeformation, gaussians: CanonicalPoints, t: Tensor, num_layers: int | None = None
     ) -> Deltas:

@@ -91,6 +91,11 @@ class NodesSupport(Support):
         neighbors = min(ARAP_NEIGHBORS, config.num_nodes - 1)
         self.register_buffer("neighbors", torch.zeros(config.num_nodes, neighbors, dtype=torch.int64))
 
+    def check_attributes(self, attributes: dict[str, Tensor]) -> None:
+        ids = attributes.get("node_ids", torch.zeros(0, dtype=torch.int64))
+        if ids.dtype != torch.int64 or not bool(((ids >= 0) & (ids < self.config.num_nodes)).all()):
+            raise InvalidInput("node_ids", f"integers in [0, {self.config.num_nodes})", "others")
+
     def follow(self, gaussians: CanonicalPoints, motions: Tensor) -> Deltas:
         weights = skinning_weights(gaussians.attributes["skinning_logits"])
         columns = skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions)

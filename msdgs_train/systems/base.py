@@ -70,7 +70,8 @@ class System(Protocol):
         ...
 
     def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
-        """Render a frame and compare it with its image; called from several threads at once."""
+        """Render a frame over `background`, [3], and compare it with its image; `step` is counted from 0. Called from
+        several threads at once."""
         ...
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
@@ -79,7 +80,7 @@ class System(Protocol):
         ...
 
     def render(self, camera: Camera, t: float, background: Tensor, step: int) -> Tensor:
-        """Render the model that is evaluated and saved, [H, W, 3]."""
+        """Render the model that is evaluated and saved, [H, W, 3], over `background`, [3], after `step` steps."""
         ...
 
     def generators(self) -> list[torch.Generator]:

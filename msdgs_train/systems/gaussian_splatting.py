@@ -146,6 +146,7 @@ class GaussianSplatting:
             ),
             cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in shown],
             training_cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in others[len(shown) :]],
+            llffhold=self.config.data.llffhold,
         )
 
     def _options(self, step: int) -> RasterizerOptions:

@@ -8,8 +8,8 @@ import numpy as np
 
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import orbit
+from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.datasets import SceneData
-from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.model_file import LoadedModel
 
 DEFAULT_FOV = 50.0  # degrees, vertical
@@ -36,7 +36,7 @@ def view_of_data(scene: SceneData, layers: int) -> SceneView:
 def view_of_file(loaded: LoadedModel) -> SceneView:
     """Return the view of the first camera in the model, or one from the side with z up if it has none."""
     low, high = np.array(loaded.scene.bounds)
-    cameras = [camera_of(entry, entry["width"]) for entry in loaded.scene.cameras]
+    cameras = [SceneCamera.from_plain(entry).camera for entry in loaded.scene.cameras]
     if not cameras:
         distance = max(float(np.linalg.norm(high - low)), 1e-3)
         pose = orbit((low + high) / 2, distance, 30.0, 20.0, np.array([0.0, 0.0, 1.0]))

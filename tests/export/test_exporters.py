@@ -279,3 +279,11 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
 def test_what_cannot_be_written_is_refused_with_an_alternative(tmp_path: Path, plan: str, out: str, message: str):
     with pytest.raises(InvalidInput, match=message):
         run(scene_file(tmp_path, plan), tmp_path / out)
+
+
+def test_an_option_without_effect_and_a_missing_folder_are_refused(tmp_path: Path):
+    scene = scene_file(tmp_path, "network")
+    with pytest.raises(InvalidInput, match=r"`t` must be left out for a file that holds all times, got 0\.5"):
+        run(scene, tmp_path / "b.onnx", 0.5)
+    with pytest.raises(InvalidInput, match="`out` must be in a folder that exists"):
+        run(scene, tmp_path / "nowhere" / "a.ply")

@@ -22,6 +22,7 @@ from export.importers.splats.formats import read_splats
 from export.measure.poses import posed
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
 
@@ -103,9 +104,8 @@ def _cameras(file: Path) -> list[dict[str, Any]]:
             pose[:3, :3], pose[:3, 3] = stored["rotation"], stored["position"]
             size = int(stored["width"]), int(stored["height"])
             camera = Camera(stored["fx"], stored["fy"], size[0] / 2, size[1] / 2, *size, pose)
-            intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
             name = re.sub(r"\s+", " ", str(stored["img_name"])) or "camera"
-            cameras.append({"name": name, "t": 0.0, **intrinsics, "camera_to_world": pose.tolist()})
+            cameras.append(SceneCamera(name, 0.0, camera).to_plain())
         return cameras
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError, InvalidInput) as error:
         raise ImportFailed(file, f"isn't a list of cameras as INRIA's trainer writes it: {error!r}") from error

@@ -21,6 +21,9 @@ SMALL = [
     *("--layers", *["mlp:width=16,depth=2,time_width=8"] * 2),
 ]
 
+STATIONARY = ["--static-fraction=0", "--window-full-fraction=0"]
+"""Phases that don't move with the number of steps."""
+
 
 @pytest.mark.parametrize(
     ("command", "words"),
@@ -126,7 +129,7 @@ def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
     """Ctrl-C finishes the step, saves, and prints the command to resume, which uses the run's settings."""
     run = tmp_path / "run"
     log = run / "metrics.jsonl"
-    with program("msdgs_train.cli.main", "fit", data, run, "--steps=100000", *SMALL) as process:
+    with program("msdgs_train.cli.main", "fit", data, run, "--steps=100000", *STATIONARY, *SMALL) as process:
         wait_for(lambda: process.poll() is not None or (log.exists() and log.read_text().count("\n") >= 3), 300)
         process.send_signal(signal.SIGINT)
         output = process.communicate(timeout=600)[0]

@@ -123,6 +123,7 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     assert [camera["t"] for camera in loaded.scene.cameras] == [0.25, 0.75]
     kept = [camera["camera_to_world"] for camera in loaded.scene.training_cameras]
     assert kept == [frame.camera.camera_to_world.tolist() for frame in load_scene(data).splits["train"]]
+    assert loaded.scene.llffhold == 0
     low, high = loaded.scene.bounds
     assert all(a < b for a, b in zip(low, high, strict=True))
 
@@ -138,6 +139,18 @@ def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: P
     with pytest.raises(InvalidInput, match=r"`config\.ssim_lambda`"):
         fit(small_config(steps=2, ssim_lambda=0.5), data, run, resume=True)
     assert fit(small_config(steps=3), data, run, resume=True).step == 3
+    with pytest.raises(InvalidInput, match=r"`config\.steps` must be 3, or so near it that step 3 stays in its phase"):
+        fit(small_config(steps=300), data, run, resume=True)
+
+
+def test_a_run_is_saved_before_its_last_evaluation(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def evaluate(*_: object, **__: object) -> None:
+        raise OSError("an image can't be read")
+
+    monkeypatch.setattr("msdgs_train.engine.run.Run._evaluate", evaluate)
+    with pytest.raises(OSError, match="an image"):
+        fit(small_config(steps=2, checkpoint_every=0, eval_every=0), data, tmp_path / "run")
+    assert load_model(tmp_path / "run" / "model.pt").step == 2
 
 
 def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,6 +75,8 @@ def test_the_same_command_goes_on_from_its_rows(data: Path, capsys: pytest.Captu
     assert len(first["val_images"].split()) > 0
     assert cli.main(command) == 0
     assert read_rows(data / "out" / "bench.csv") == [first]
+    assert cli.main([*command, f"--csv={data / 'out' / 'bench.csv'}", f"--out={data / 'other'}"]) == 0
+    assert (data / "other" / "bench.md").exists()
     assert "tiny, small, seed 0" in capsys.readouterr().out
     systems.write_text(systems.read_text() + "sh_degree = 0\n")
     assert cli.main(command) == 0
@@ -96,6 +98,8 @@ def test_runs_are_of_each_scene_at_its_size(data: Path) -> None:
     ]  # fmt: skip
     assert [run.config.data.llffhold for run in runs[:4]] == [0, 0, 4, 4]
     assert len({run.folder for run in runs}) == 8
+    slower = make_bench_runs({"a": preset("static").updated(threads=7)}, scenes, (0,), data / "out")
+    assert not {run.folder for run in slower} & {run.folder for run in runs}
 
 
 def test_the_table_has_means_over_scenes_that_all_have_and_gains_of_seeds_that_both_have() -> None:

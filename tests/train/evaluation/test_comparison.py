@@ -97,6 +97,8 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
         ("[a]\nlayers = ['mlp:width=wide']", r"system `a`.*width"),
         ("[a]\nlayers = 'mlp'", r"system `a`.*layers"),
         ("[a]\nsize = 99.5", r"system `a`.*size"),
+        ("[a]\neps2d_init = '0.3'", r"system `a`.*eps2d_init"),
+        ("[a.model]\nsh_dgree = 1", r"system `a`.*sh_dgree"),
         ("[a]\nsh_degree_fraction = 'long'", r"system `a`.*sh_degree_fraction"),
         ("a = 3", r"`a`"),
         ("['../up']\nsteps = 3", r"up"),

@@ -52,6 +52,16 @@ def test_a_saved_model_is_loaded_unchanged(tmp_path: Path, changes: dict[str, An
         assert torch.equal(got, want)
 
 
+@pytest.mark.parametrize("wrong", [NODES.num_nodes, -1, 10**9, 0.5])
+def test_a_gaussian_that_follows_no_node_is_refused(tmp_path: Path, wrong: float):
+    save_model(tmp_path / "model.pt", random_model(support=NODES, layers=("mlp",)), SCENE, 42)
+    ids = torch.load(tmp_path / "model.pt", weights_only=True)["state"]["gaussians.node_ids"]
+    ids = ids + (wrong - ids) * (torch.arange(len(ids)) == 7)[:, None]
+    rewritten(tmp_path / "model.pt", "state", **{"gaussians.node_ids": ids})
+    with pytest.raises(CheckpointInvalid, match=r"`node_ids` must be integers in \[0, "):
+        load_model(tmp_path / "model.pt")
+
+
 @pytest.mark.parametrize("part", [None, 0.0, 0.001, 0.3, 0.9, 0.9999])
 def test_cut_off_files_and_those_of_other_kinds_are_refused(model_file: Path, part: float | None):
     contents = model_file.read_bytes()

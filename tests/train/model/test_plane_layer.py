@@ -46,6 +46,12 @@ def test_the_whole_time_range_is_used() -> None:
         torch.testing.assert_close(planes.lines(torch.tensor(t)), torch.full((3, 32, 16), expected))
 
 
+def test_a_mean_that_is_no_number_is_read_inside_the_grid() -> None:
+    planes, means = layer(), places(3)
+    means[1] = torch.nan
+    assert torch.isfinite(torch.cat(planes(means, torch.tensor(0.4, dtype=torch.float64))[:4], dim=1)[[0, 2]]).all()
+
+
 @pytest.mark.slow
 def test_gradients_match_finite_differences() -> None:
     planes = layer(multires=(1, 2))
