@@ -51,10 +51,14 @@ FORMATS: dict[str, dict[str, Any]] = {
 
 
 @cache
-def made(kind: str, count: int = 60) -> tuple[DynamicGaussians, Baked, Trajectories]:
+def made(kind: str, count: int = 60) -> tuple[DynamicGaussians, Baked]:
     model = random_model(count, **FORMATS[kind])
-    baked = bake(model, SCENE, "0" * 64)
-    return model, baked, Trajectories(baked)
+    return model, bake(model, SCENE, "0" * 64)
+
+
+@cache
+def sampled(kind: str, count: int = 60) -> Trajectories:
+    return Trajectories(made(kind, count)[1])
 
 
 def opened(path: Path, contents: onnx.ModelProto) -> DeformationSession:
@@ -89,20 +93,20 @@ def test_an_unknown_plan_is_refused_with_those_that_exist(text: str):
 
 
 def test_a_plan_that_this_model_cannot_have_says_what_it_can():
-    _, baked, trajectories = made("plane")
+    _, baked = made("plane")
     with pytest.raises(InvalidInput, match=r"prefix:k with k from 1 to 1"):
-        build("prefix:2", baked, trajectories)
+        build("prefix:2", baked)
     with pytest.raises(InvalidInput, match=r"any but int8"):
-        build("int8", baked, trajectories)
+        build("int8", baked)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_compact_has_about_its_predicted_error_in_frames_and_fewer_bytes_for_more(tmp_path: Path, kind: str):
-    model, baked, trajectories = made(kind)
+    model, baked = made(kind)
     views = evaluation_views(cameras_of(SCENE), SCENE.time_range, 16, 2)
     exact, sizes = ExactFrames(in_float64(model), views, SCENE.background, GSPLAT), []
     for db in (60, 50, 40, 30):
-        session = opened(tmp_path / "scene.onnx", build(f"compact:{db}", baked, trajectories))
+        session = opened(tmp_path / "scene.onnx", build(f"compact:{db}", baked, sampled(kind)))
         sizes.append((tmp_path / "scene.onnx").stat().st_size)
         assert session.scene.metadata.plan == f"compact:{db}"
         measured = verify(session, model, times=9)
@@ -115,8 +119,8 @@ def test_compact_has_about_its_predicted_error_in_frames_and_fewer_bytes_for_mor
 
 
 def test_distances_in_the_file_are_those_of_a_plain_comparison_with_the_model(tmp_path: Path):
-    model, baked, trajectories = made("mlp")
-    session = opened(tmp_path / "scene.onnx", build("compact:50", baked, trajectories))
+    model, baked = made("mlp")
+    session = opened(tmp_path / "scene.onnx", build("compact:50", baked, sampled("mlp")))
     double = random_model(60, **FORMATS["mlp"]).double()
     worst = 0.0
     for t in times_to_verify(0.0, 1.0, 12):
@@ -136,15 +140,15 @@ def test_plans_that_run_layers_can_stop_after_each(tmp_path: Path, plan: str, mo
 @pytest.mark.parametrize("plan", ["prefix:1", "prefix:2", "int8", "compact:45"])
 @pytest.mark.parametrize("ids", [[], [7], [59, 0, 5, 5]])
 def test_rows_are_those_asked_for(tmp_path: Path, plan: str, ids: list[int]):
-    _, baked, trajectories = made("mlp")
-    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    _, baked = made("mlp")
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, sampled("mlp")))
     for some, every in zip(session.pose(0.3, ids), session.pose(0.3), strict=True):
         assert np.abs(some - every[ids]).max(initial=0) <= tolerance("export.relative")
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_prefix_is_the_model_stopped_early_and_network_the_whole_of_it(tmp_path: Path, kind: str):
-    model, baked, _ = made(kind)
+    model, baked = made(kind)
     plans = {f"prefix:{k}": k for k in range(1, len(baked.layers) + 1)} | {"network": None}
     for plan, num_layers in plans.items():
         session = opened(tmp_path / "scene.onnx", build(plan, baked))
@@ -154,7 +158,7 @@ def test_prefix_is_the_model_stopped_early_and_network_the_whole_of_it(tmp_path:
 
 @pytest.mark.parametrize("kind", ["mlp", "mixed", "mlp on nodes", "mixed on nodes"])
 def test_int8_rounds_wide_products_and_nothing_before_them(tmp_path: Path, kind: str):
-    model, baked, _ = made(kind)
+    model, baked = made(kind)
     contents = build("int8", baked)
     assert properties(contents) == properties(network(baked, "int8"))
     eight_bits = [c.name for c in contents.graph.initializer if c.data_type == onnx.TensorProto.INT8 and c.dims]
@@ -179,8 +183,8 @@ def test_a_scene_that_does_not_move_has_no_graph_under_any_plan(tmp_path: Path, 
 
 @pytest.mark.parametrize("plan", ["int8", "compact:30", "compact:70"])
 def test_one_gaussian(tmp_path: Path, plan: str):
-    model, baked, trajectories = made("mlp", 1)
-    session = opened(tmp_path / "scene.onnx", build(plan, baked, trajectories))
+    model, baked = made("mlp", 1)
+    session = opened(tmp_path / "scene.onnx", build(plan, baked, sampled("mlp", 1)))
     assert len(session.gaussians(0.5).validate()) == 1
     visible = np.linalg.norm(np.diff(SCENE.bounds, axis=0)) / 400  # a pixel
     assert verify(session, model, times=9)["displacement"] < (1 if plan == "int8" else visible)

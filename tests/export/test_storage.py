@@ -25,6 +25,7 @@ from export.plans.registry import build
 from export.storage.choice import COARSEST, GROUPS, fewest_bytes, packed, smallest_error
 from export.storage.kinds import Pack, directions, fractions, in_range, logarithms, low_rank
 from export.to_onnx import main
+from export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
@@ -33,6 +34,7 @@ from tests.support import reference_torch
 from tests.support.images import psnr
 from tests.support.models import MLP, NODES, SCENE, moving_object, random_model, saved
 from tests.support.scenes import unit_quats
+from tests.support.sound_scenes import RESOLVED
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
@@ -106,7 +108,8 @@ PLANS = ("network", "prefix:1", "int8", "compact:40", "compact:60")
     ("kind", "plan"), [(kind, plan) for kind in MODELS for plan in PLANS if (kind, plan) != ("plane", "int8")]
 )
 def test_every_plan_works_with_storage(tmp_path: Path, kind: str, plan: str):
-    contents = build(plan, bake(random_model(400, **MODELS[kind]), SCENE, "0" * 64))
+    baked = bake(random_model(400, **MODELS[kind]), SCENE, "0" * 64)
+    contents = build(plan, baked, Trajectories(baked, resolved=RESOLVED))
     (tmp_path / "exact.onnx").write_bytes(contents.SerializeToString())
     exact = DeformationSession(tmp_path / "exact.onnx")
     sizes, errors = [contents.ByteSize()], []

@@ -20,7 +20,7 @@ from tests.support.processes import run_python
 from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, check_problem, eventually, in_this_process, serving
 
-MUTATED = 20
+MUTATED = 8
 
 
 def frame(client: httpx.Client) -> bytes:
@@ -97,6 +97,7 @@ def test_poisoned_files_are_listed_as_broken_and_nothing_else_changes(tmp_path: 
         eventually(lambda: frame(client) != before)
 
 
+@pytest.mark.xdist_group("sound scenes")  # one worker makes them
 def test_mutated_files_are_refused_or_served_without_a_server_error(folder: Path):
     write_scene(folder / "good.onnx")
     with serving(folder, uploads=True) as client:

@@ -22,7 +22,7 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, MAX_SECONDS, ORBIT, check_problem, serving
 
-CASES = int(os.environ.get("MSDGS_FUZZ", "400"))
+CASES = int(os.environ.get("MSDGS_FUZZ", "200"))
 SEEDED: dict[str, Any] = {
     "database": None,
     "derandomize": True,

@@ -141,7 +141,7 @@ def saved(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE) -> Pat
     return folder / "model.pt"
 
 
-STABILITY_TIMES = 8
+STABILITY_TIMES = 3
 
 
 def export_scene(

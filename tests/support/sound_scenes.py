@@ -67,7 +67,8 @@ def _packed() -> Iterator[tuple[str, bytes]]:
         ("mixed", "compact:60"),
         ("static", "network"),
     ):
-        contents = build(plan, bake(random_model(PACKED_COUNT, **MODELS[name]), SCENE, "0" * 64))
+        baked = bake(random_model(PACKED_COUNT, **MODELS[name]), SCENE, "0" * 64)
+        contents = build(plan, baked, Trajectories(baked, resolved=RESOLVED))
         for kinds in (COARSEST, finest):
             yield f"{name} {plan}, packed in {kinds['quats']}", packed(contents, kinds).SerializeToString()
 

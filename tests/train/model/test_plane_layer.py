@@ -1,5 +1,7 @@
 """The plane layer against a slow float64 version, and its gradients against finite differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,10 +11,11 @@ from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.plane import PlaneConfig, PlaneGrid, PlaneLayer
 from tests.support.reference_deformation import plain_features
 
+SIZES = PlaneConfig(features=5, resolution=6, time_resolution=7, width=8, multires=(1,))
 
-def layer(dtype: torch.dtype = torch.float64, multires: tuple[int, ...] = (1,)) -> PlaneLayer:
+
+def layer(config: PlaneConfig = SIZES, dtype: torch.dtype = torch.float64) -> PlaneLayer:
     torch.manual_seed(0)
-    config = PlaneConfig(features=5, resolution=6, time_resolution=7, width=8, multires=multires)
     made = PlaneLayer(config, SceneBounds(1.3))
     with torch.no_grad():
         for parameter in made.parameters():
@@ -30,7 +33,7 @@ def places(n: int = 40) -> Tensor:
 @pytest.mark.parametrize("multires", [(1,), (1, 2), (2, 1, 3)])
 @pytest.mark.parametrize("t", [0.0, 0.37, 0.5, 1.0, -0.2, 1.7])
 def test_features_are_products_of_interpolated_planes(t: float, multires: tuple[int, ...]) -> None:
-    planes, seen = layer(multires=multires), {}
+    planes, seen = layer(replace(SIZES, multires=multires)), {}
     planes.features.register_forward_pre_hook(lambda _, inputs: seen.update(features=inputs[0]))
     planes(places(), torch.tensor(t, dtype=torch.float64))
     slow = np.concatenate([plain_features(grid, places().numpy(), t) for grid in planes.plane_grids()], axis=1)
@@ -54,7 +57,7 @@ def test_a_mean_that_is_no_number_is_read_inside_the_grid() -> None:
 
 @pytest.mark.slow
 def test_gradients_match_finite_differences() -> None:
-    planes = layer(multires=(1, 2))
+    planes = layer(PlaneConfig(features=3, resolution=3, time_resolution=4, width=4, multires=(1, 2)))
     means = places(6).requires_grad_(True)
     t = torch.tensor(0.43, dtype=torch.float64)
 
@@ -79,7 +82,7 @@ def test_a_place_outside_has_no_slope() -> None:
 def test_the_same_bits_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     def gradients(threads: str) -> list[Tensor]:
         monkeypatch.setenv("MSDGS_THREADS", threads)
-        planes = layer(torch.float32)
+        planes = layer(dtype=torch.float32)
         torch.cat(planes(places(500).float(), torch.tensor(0.3))[:4], dim=1).square().sum().backward()
         return [p.grad for p in planes.grids.parameters() if p.grad is not None]
 
