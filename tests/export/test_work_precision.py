@@ -232,13 +232,12 @@ def test_a_limit_of_bytes_is_kept_with_the_error_that_the_file_says(
     refused = exported(0.001)
     assert "`max_mb` must be at least" in refused
     smallest = float(refused.split("at least ")[1].split(",")[0])
-    reached = []
+    reached, exact = [], ExportJob(checkpoint, tmp_path).exact
     for max_mb in (smallest, 10.0):
         assert not exported(max_mb)
         assert output.stat().st_size <= 1e6 * max_mb
         session = DeformationSession(output)
         rendered = session.scene.metadata.measured_error["rendered"]
-        exact = ExportJob(checkpoint, tmp_path).exact
         assert exact.measure(session.gaussians, np.zeros(len(session.scene), int)).psnr_worst == rendered["psnr_worst"]
         reached.append(rendered["psnr_worst"])
         if plan is None:
@@ -284,6 +283,7 @@ def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.Capt
     chosen = next(p for p in contents["points"] if p["chosen"])
     assert chosen["moving"] == scene.moving_count
     assert chosen["error"] == scene.metadata.measured_error["rendered"]
+    assert chosen["left_out"] == list(scene.metadata.left_out)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "model.onnx", "model.pt", "model.report.json", "model.report.md", "model.report.png",
     ]  # fmt: skip
