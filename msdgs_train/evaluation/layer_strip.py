@@ -7,7 +7,6 @@ import numpy as np
 
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.sheets import Panel, check_sheet, draw_sheet
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
@@ -58,5 +57,6 @@ def camera_of(entry: dict[str, Any], width: int) -> Camera:
     """Return a camera from a model file, for images `width` pixels wide."""
     if width < 1:
         raise InvalidInput("size", "a width of 1 pixel or more", width)
-    camera = SceneCamera.from_plain(entry).camera
+    values = {name: entry[name] for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    camera = Camera(**values, camera_to_world=np.array(entry["camera_to_world"]))
     return camera.resized(width, max(1, round(camera.height * width / camera.width)))
