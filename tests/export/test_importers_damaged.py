@@ -33,7 +33,7 @@ from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
 QUIET = Console(quiet=True)
-DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "30"))
+DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "20"))
 """Damaged files of each kind; a tenth of them of runs, whose networks are read in a process that first loads torch."""
 
 COUNT = 300 if DAMAGED < 1000 else 1_000
