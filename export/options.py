@@ -6,6 +6,8 @@ from typing import Annotated
 
 import tyro
 
+from msdgs_serve.scene.errors import InvalidInput
+
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
@@ -124,3 +126,9 @@ class ConvertOptions:
     min_psnr: float | None = None
     """PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and Visionary,
     50 for scene files, and 60 for the others, which are lossless."""
+
+
+def require_folder_of(field: str, file: Path | None) -> None:
+    """Raise `InvalidInput` naming `field` if the folder in which a file is to be written doesn't exist."""
+    if file is not None and not file.parent.is_dir():
+        raise InvalidInput(field, "in a folder that exists", str(file))

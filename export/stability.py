@@ -9,6 +9,7 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
 from export.command_line import Console, run, tyro
+from export.options import require_folder_of
 from msdgs_serve.scene.errors import InvalidInput
 
 UNSTABLE = 3
@@ -48,9 +49,8 @@ def main(
             raise InvalidInput("times", "2 or more", times)
         if not 0 < min_psnr < 100:
             raise InvalidInput("min_psnr", "between 0 and 100 dB", min_psnr)
-        for name, path in (("json", json), ("plot", plot)):
-            if path and not path.absolute().parent.is_dir():
-                raise InvalidInput(name, "in a folder that exists", str(path))
+        require_folder_of("json", json)
+        require_folder_of("plot", plot)
         with messages.status("loading torch and the kernels"):
             from export.precision.show import assess_and_show  # slow to import: not before --help
         report = assess_and_show(model, times, min_psnr, json, plot, messages)

@@ -20,7 +20,7 @@ from export.importers.splats.formats import read_splats
 from export.jobs.store import stored_anew
 from export.jobs.write import set_properties, storage_differences, write_measured
 from export.measure.stability import MIN_PSNR
-from export.options import ConvertOptions
+from export.options import ConvertOptions, require_folder_of
 from export.plans.registry import PLANS
 from export.progress import tracked
 from msdgs_serve.deformation import DeformationSession
@@ -46,8 +46,8 @@ def convert(options: ConvertOptions, console: Console) -> None:
     out = options.out
     if out.suffix in VIDEOS:
         raise InvalidInput("out", f"other than a video: msdgs-render {options.scene} {out} writes one", out.name)
-    if not out.absolute().parent.is_dir() and out.suffix:
-        raise InvalidInput("out", "in a folder that exists", str(out))
+    if out.suffix:
+        require_folder_of("out", out)
     if out.suffix == ONNX and options.t is not None:
         raise InvalidInput("t", "left out for a file that holds all times", options.t)
     session = DeformationSession(options.scene)

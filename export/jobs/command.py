@@ -18,7 +18,7 @@ from export.jobs.store import METADATA_BYTES, PLAN_PART, check_min_psnr, squared
 from export.jobs.sweep import Sweep, pruning_levels
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
-from export.options import ExportOptions
+from export.options import ExportOptions, require_folder_of
 from export.plans.registry import parse
 from export.progress import Track, tracked
 from export.pruning import RULES
@@ -92,8 +92,7 @@ def _check(options: ExportOptions) -> None:
         raise InvalidInput("times", "2 or more", options.times)
     if options.chosen_plan is not None:
         parse(options.chosen_plan)
-    if not options.scene_file.parent.is_dir():
-        raise InvalidInput("output", "in a folder that exists", str(options.scene_file))
+    require_folder_of("output", options.scene_file)
 
 
 def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutImages | None:

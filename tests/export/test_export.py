@@ -14,6 +14,7 @@ import torch
 
 from export.jobs.bake import bake, starting_cameras
 from export.layers.graph import GraphBuilder
+from export.measure.images import HeldOutImages
 from export.measure.verify import VerificationFailed, times_to_verify, verify
 from export.options import ExportOptions
 from export.plans.registry import build
@@ -127,6 +128,11 @@ def test_each_preset_exports(name: str, data: Path, tmp_path: Path):
     for field in ("means", "quats", "scales"):
         want = getattr(posed, field).detach().numpy()
         np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))
+
+
+def test_images_that_the_run_held_out_are_no_training_images(data: Path):
+    counts = [len(HeldOutImages(data, SceneInfo(llffhold=n), lambda _: lambda: None).training) for n in (0, 3)]
+    assert counts[1] < counts[0]
 
 
 def test_embeddings_and_their_network_are_gone(scene_file: Path, model: DynamicGaussians):

@@ -31,7 +31,7 @@ OF_THE_SYSTEM = ("/proc/", "/sys/", "/dev/")
 
 def test_a_seed_determines_the_file():
     assert hostile_file(7) == hostile_file(7)
-    assert len({hostile_file(seed) for seed in range(40)}) > 30
+    assert len({hostile_file(seed) for seed in range(40)}) > 36
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the process's memory from /proc")

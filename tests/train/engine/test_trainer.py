@@ -123,7 +123,6 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     assert [camera["t"] for camera in loaded.scene.cameras] == [0.25, 0.75]
     kept = [camera["camera_to_world"] for camera in loaded.scene.training_cameras]
     assert kept == [frame.camera.camera_to_world.tolist() for frame in load_scene(data).splits["train"]]
-    assert loaded.scene.llffhold == 0
     low, high = loaded.scene.bounds
     assert all(a < b for a, b in zip(low, high, strict=True))
 
@@ -149,8 +148,9 @@ def test_a_run_is_saved_before_its_last_evaluation(data: Path, tmp_path: Path, m
 
     monkeypatch.setattr("msdgs_train.engine.run.Run._evaluate", evaluate)
     with pytest.raises(OSError, match="an image"):
-        fit(small_config(steps=2, checkpoint_every=0, eval_every=0), data, tmp_path / "run")
-    assert load_model(tmp_path / "run" / "model.pt").step == 2
+        fit(small_config(steps=2, llffhold=3, checkpoint_every=0, eval_every=0), data, tmp_path / "run")
+    saved = load_model(tmp_path / "run" / "model.pt")
+    assert (saved.step, saved.scene.llffhold) == (2, 3)
 
 
 def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
