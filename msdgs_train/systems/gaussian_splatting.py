@@ -166,8 +166,7 @@ class GaussianSplatting:
 
     def _regularizers(self, posed: PosedGaussians, motions: Any, t: float, step: int) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
-        density, refining = self.config.density, step < self.schedule.refine_stop
-        terms = list(density.regularizers(posed.opacities, posed.scales, refining=refining).values())
+        terms = list(self.density.regularizers(posed.opacities, posed.scales, step).values())
         if motions is not None:
             time = posed.means.new_tensor(t)
             terms += self.model.support.regularizers(motions).values()
