@@ -96,9 +96,14 @@ def make_trainer(options: Options, made: Path, images: int, device: str = "cpu")
         threads=options.threads,
         device=device,
         static_fraction=0.0,
+        static_window_fraction=0.0,
+        sh_degree_fraction=0.0,
         refine_stop_fraction=0.0,
     )
-    return Trainer(config, load_scene(data, options.size))
+    trainer = Trainer(config, load_scene(data, options.size))
+    assert trainer.schedule.deforms(0)
+    assert trainer.schedule.sh_degree(0) == config.model.sh_degree
+    return trainer
 
 
 def step_on_gpu(trainer: Trainer) -> None:

@@ -41,7 +41,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text=True,
         check=False,
     )
-    if "No matching distribution" in installed.stderr and not os.environ.get("CI"):
+    if "No matching distribution" in installed.stderr and "connection broken" in installed.stderr:
         pytest.skip(f"no package index can be reached: {installed.stderr.strip().splitlines()[-1]}")
     assert installed.returncode == 0, installed.stdout + installed.stderr
     (site,) = folder.glob("lib/python*/site-packages")

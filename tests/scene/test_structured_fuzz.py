@@ -57,7 +57,7 @@ def test_mutated_files_make_no_code_open_a_file(tmp_path: Path):
     if "ptrace" in done.stderr and "not permitted" in done.stderr:
         pytest.skip("strace may not trace here")
     assert done.returncode == 0, done.stderr
-    opened = re.findall(r'open(?:at2?)?\([^"]*"([^"]*)"', trace.read_text())
+    opened = re.findall(r'(?:open(?:at2?)?|creat)\([^"]*"([^"]*)"', trace.read_text())
     after = opened[opened.index(str(marker)) + 1 :]
     assert len(after) < len(opened)
     assert [path for path in after if not path.startswith(OF_THE_SYSTEM)] == []

@@ -16,6 +16,7 @@ from msdgs_serve.api.cli import main
 from msdgs_serve.api.settings import Settings
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
+from tests.support.service import MAX_SECONDS
 
 pytestmark = pytest.mark.slow
 
@@ -53,10 +54,10 @@ def test_it_prints_its_address_and_an_example_and_stops_at_ctrl_c(process: subpr
     printed = read_until(process, r"-d '")
     match = re.search(r"Listening on (http://127\.0\.0\.1:\d+)", printed)
     assert match
-    assert httpx.get(f"{match[1]}/ready").status_code == 200
+    assert httpx.get(f"{match[1]}/ready", timeout=MAX_SECONDS).status_code == 200
     words = shlex.split(printed[printed.index("curl") :])
     body, headers = words[words.index("-d") + 1], dict([words[words.index("-H") + 1].split(": ")])
-    response = httpx.post(words[1], content=body, headers=headers)
+    response = httpx.post(words[1], content=body, headers=headers, timeout=MAX_SECONDS)
     assert response.status_code == 200, response.text
     assert decode(response.content, "png")[0].shape == (400, 400, 3)
     for number in (signal.SIGSTOP, *signals, signal.SIGCONT):  # stopped, it receives all of them before it can end

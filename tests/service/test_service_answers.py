@@ -64,7 +64,7 @@ def test_headers_name_plan_channels_and_stages(client: httpx.Client):
     response = post(client, t=0.123, channels=["depth"])
     stages = dict(re.findall(r"(\w+);dur=([\d.]+)", response.headers["Server-Timing"]))
     assert set(stages) == {"queue", "pose", "draw", "encode"}
-    assert all(float(value) < 10_000 for value in stages.values())
+    assert all(float(value) >= 0 for value in stages.values())
     assert "pose;dur=" in response.headers["Server-Timing"]
     assert 'desc="hit"' in response.headers["Server-Timing"]
     assert response.headers["Msdgs-Plan"] == metadata().plan
