@@ -1,5 +1,6 @@
 """The time of a training step by part: deformation, projection, tiles, blending, loss, their gradients, optimizer."""
 
+import os
 import sys
 import tempfile
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from msdgs_serve.rasterizer.projection_backward import project_backward
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT
 from msdgs_serve.scene import Gaussians
+from msdgs_serve.threads import THREADS_VARIABLE
 from msdgs_train.datasets import load_scene
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.datasets.synthetic.generate import generate
@@ -64,6 +66,7 @@ def main(options: Options) -> int:
     """Measure and print."""
     if options.check:
         options = replace(options, check=False, gaussians=300, size=32, repeats=2, threads=1)
+    os.environ[THREADS_VARIABLE] = str(options.threads)
     with tempfile.TemporaryDirectory() as made:
         several, trainer = (make_trainer(options, Path(made), n) for n in (options.images, 1))
         on_gpu = make_trainer(options, Path(made), 1, "cuda") if options.gpu else None
