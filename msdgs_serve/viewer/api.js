@@ -40,7 +40,7 @@ export async function call(path, { headers = {}, ...options } = {}) {
 
 export const scenePath = (name) => `scenes/${encodeURIComponent(name)}`;
 
-export const getJson = async (path) => (await call(path)).json();
+export const getJson = async (path, options) => (await call(path, options)).json();
 
 /** POST /render. */
 export function render(body, { signal, etag } = {}) {

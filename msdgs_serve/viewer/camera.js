@@ -3,6 +3,7 @@
 import { add, cross, dot, length, scaled, unit } from "./vector.js";
 
 const STEEPEST = 89;
+const MIN_RADIUS = 1e-3; // of depth ranges, as a fraction of the scene's distance
 const DEGREES = 180 / Math.PI;
 
 export class Camera {
@@ -122,7 +123,8 @@ export class Camera {
 /** Return a depth range of the scene that is stable while the camera moves; ignores a few distant Gaussians. */
 export function depthRange(camera, bounds) {
   const [low, high] = bounds;
-  const radius = Math.min(length(add(high, low, -1)) / 2, camera.view.distance / 2);
+  const { distance } = camera.view;
+  const radius = Math.min(Math.max(length(add(high, low, -1)) / 2, MIN_RADIUS * distance), distance / 2);
   const middle = dot(add(camera.view.target, camera.eye, -1), camera.axes.forward);
   const near = Math.max(middle - radius, 0);
   return [near, Math.max(middle, near) + radius].map((x) => short(x, radius));
@@ -130,7 +132,7 @@ export function depthRange(camera, bounds) {
 
 const limited = (elevation) => Math.min(Math.max(elevation, -STEEPEST), STEEPEST);
 
-/** Round numbers of a copied request to readable lengths, far below a pixel at `size`, in scene units. */
+/** Round a number to a readable length: 1e-5 of `size` or less, which is far below a pixel. */
 export function short(x, size = 1) {
   return Number(x.toFixed(Math.min(Math.max(5 - Math.floor(Math.log10(size)), 0), 12)));
 }

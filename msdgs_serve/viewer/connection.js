@@ -27,7 +27,7 @@ export class Connection {
   }
 
   say(text) {
-    this.banner.textContent = text;
+    if (this.banner.textContent !== text) this.banner.textContent = text; // else it is read aloud again
     this.banner.hidden = !text;
   }
 

@@ -20,7 +20,8 @@ export class Frames {
     this.wanted = false;
     this.changedAt = 0;
     this.timer = 0;
-    this.paused = true;
+    this.paused = true; // until the scene is opened
+    this.refused = false; // whether the service refused the last request; the next one waits for a change
   }
 
   /** The view has changed. `cut`: the frame in progress is useless. */
@@ -33,20 +34,9 @@ export class Frames {
     this.#next();
   }
 
-  pause() {
-    this.paused = true;
-    this.inFlight?.abort.abort();
-    clearTimeout(this.timer);
-  }
-
-  resume() {
-    this.paused = false;
-    this.change();
-  }
-
   /** Revalidate the frame that is shown, by its ETag. */
   async check() {
-    if (this.paused || this.inFlight || !this.shown || this.#isMoving()) return;
+    if (this.paused || this.refused || this.inFlight || !this.shown || this.#isMoving()) return;
     await this.#fetch({ full: true, etag: this.shown.etag });
   }
 
@@ -67,7 +57,7 @@ export class Frames {
     if (this.wanted && this.#isMoving()) {
       this.wanted = false;
       this.#fetch({ full: false });
-    } else if (this.wanted || !this.shown) {
+    } else if (this.wanted || (!this.shown && !this.refused)) {
       const wait = this.host.isMoving() ? FULL_AFTER : FULL_AFTER - (performance.now() - this.changedAt);
       if (wait > 0) {
         this.timer = setTimeout(() => this.#next(), wait + 1);
@@ -104,6 +94,7 @@ export class Frames {
     if (!full) this.pace.measured(size.width * size.height, seconds, (stages.draw ?? 0) + (stages.encode ?? 0));
     this.host.show(bitmap, { ...size, full, seconds, stages, isNews });
     bitmap.close();
+    this.refused = false;
     if (full && !this.wanted) this.shown = { etag: response.headers.get("ETag") };
   }
 
@@ -112,18 +103,16 @@ export class Frames {
       this.wanted = true;
       return;
     }
-    if (error instanceof Unreachable) {
-      this.wanted = true;
-      this.paused = true;
-    } else if (error instanceof Refusal && this.#isTooLarge(error)) {
+    if (error instanceof Refusal && this.#isTooLarge(error)) {
       this.maxPixels *= SHRINK;
       this.wanted = true;
       return;
-    } else if (error instanceof Refusal && error.status === 503) {
+    }
+    if (error instanceof Unreachable || error.status === 503) {
       this.wanted = true;
       this.paused = true;
     } else {
-      this.paused = true;
+      this.refused = true;
     }
     this.host.failed(error);
   }

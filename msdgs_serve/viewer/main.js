@@ -26,7 +26,7 @@ const state = { scene: null, camera: null, player: new Player(), layers, view: "
 const pace = new Pace();
 const stage = new Stage(find("image"), find("status"));
 const timeline = new Timeline(state.player, { changed: () => changed(), started: run });
-const connection = new Connection(find("banner"), { recovered, keyNeeded: () => find("key-dialog").showModal() });
+const connection = new Connection(find("banner"), { recovered: lookAgain, keyNeeded });
 const scenes = new SceneList(find("scenes"), { open: (name) => guarded(() => open(name)), isIdle });
 const controls = new Controls(find("image"), { camera: () => state.camera, moved: () => moved(), command });
 const frames = new Frames(
@@ -39,11 +39,16 @@ const frames = new Frames(
   },
   pace,
 );
+let opening = null; // the AbortController of a scene that is being opened
+let needsKey = false; // whether the service has asked for a key, until the user acts
 let isFast = false;
 let running = 0;
 
 async function open(name, look = {}) {
-  const scene = await getJson(scenePath(name));
+  opening?.abort();
+  const { signal } = (opening = new AbortController());
+  const scene = await getJson(scenePath(name), { signal }).finally(() => signal.aborted || (opening = null));
+  needsKey = false;
   const isAnother = state.scene?.name !== name;
   state.scene = scene;
   state.player.range = scene.time_range;
@@ -54,6 +59,7 @@ async function open(name, look = {}) {
     state.player.seek(0);
     layers.set(null);
   }
+  if (state.camera.sceneCamera >= scene.cameras.length) state.camera.sceneCamera = null;
   layers.open(scene.steps);
   applyLook(look);
   describe();
@@ -61,6 +67,11 @@ async function open(name, look = {}) {
   frames.paused = false;
   frames.change({ cut: true });
   await showReport(scene);
+}
+
+/** Open the current scene again, unless another one is being opened. */
+async function reopen() {
+  if (!opening) await open(state.scene.name);
 }
 
 function applyLook({ t = null, steps = null, at = null, sceneCamera = null, view = null }) {
@@ -82,7 +93,9 @@ function describe() {
   const options = scene.cameras.map((camera, i) => new Option(camera.name, i));
   find("camera").replaceChildren(new Option("Free view", ""), ...options);
   find("camera").hidden = scene.cameras.length === 0;
+  find("camera").value = state.camera.sceneCamera ?? "";
   find("view").elements.view.value = state.view;
+  find("docs").hidden = readKey() !== ""; // a link sends no key
   timeline.show();
 }
 
@@ -103,23 +116,23 @@ function changed() {
 }
 
 function moved() {
-  const { sceneCamera } = state.camera;
-  find("camera").value = sceneCamera === null ? "" : String(sceneCamera);
+  find("camera").value = state.camera.sceneCamera ?? "";
   changed();
   if (controls.flying.size > 0) run();
 }
 
 function show(bitmap, facts) {
   stage.show(bitmap, facts);
+  if (frames.refused) connection.say("");
   if (!facts.full) return;
   history.replaceState(null, "", toHash(state));
-  if (facts.isNews) guarded(() => open(state.scene.name));
+  if (facts.isNews) guarded(reopen);
   if (facts.isNews) scenes.renew(state.scene.name);
 }
 
 /** Whether thumbnails may be rendered now. */
 function isIdle() {
-  return !connection.isLost && (frames.shown || frames.paused) && !frames.inFlight;
+  return !connection.isLost && (frames.shown || frames.paused || frames.refused) && !frames.inFlight;
 }
 
 /** Advance playback and flight with animation frames, while either is active. */
@@ -159,28 +172,31 @@ function setView(view) {
 }
 
 function resetCamera() {
+  if (!state.camera) return;
   state.camera.reset();
   moved();
 }
 
-async function recovered() {
+/** Check for added, changed and removed scenes. */
+async function lookAgain() {
+  if (document.hidden || connection.isLost || needsKey) return;
   await guarded(async () => {
     await scenes.refresh();
-    if (state.scene) await open(state.scene.name);
-    else await start();
+    scenes.mark(state.scene?.name);
+    if (opening) return;
+    if (!state.scene) await start();
+    else if (!scenes.names.includes(state.scene.name)) {
+      frames.paused = true;
+      connection.say(`${state.scene.name} is gone.`);
+    } else if (frames.paused || (await isReplaced())) await reopen();
+    else await frames.check();
   });
 }
 
-/** Check for added, changed and removed scenes. */
-async function lookAgain() {
-  if (document.hidden || connection.isLost || find("key-dialog").open) return;
-  await guarded(async () => {
-    await scenes.refresh();
-    if (state.scene && !scenes.names.includes(state.scene.name)) connection.say(`${state.scene.name} is gone.`);
-    else if (!state.scene && scenes.names.length) await start();
-    else if (state.scene) await frames.check();
-    scenes.mark(state.scene?.name);
-  });
+/** Whether the current scene, a frame of which was refused, has another file now. */
+async function isReplaced() {
+  const { name, sha256 } = state.scene;
+  return frames.refused && (await getJson(scenePath(name))).sha256 !== sha256;
 }
 
 async function start() {
@@ -195,8 +211,13 @@ async function guarded(action) {
   try {
     await action();
   } catch (error) {
-    connection.failed(error);
+    if (error.name !== "AbortError") connection.failed(error);
   }
+}
+
+function keyNeeded() {
+  needsKey = true;
+  find("key-dialog").showModal();
 }
 
 function notice(text) {
@@ -238,6 +259,7 @@ function listen() {
   find("key-form").addEventListener("submit", () => {
     keepKey(find("key").value.trim());
     connection.say("");
+    needsKey = false;
     guarded(start);
   });
   for (const event of ["keydown", "keyup"]) document.addEventListener(event, ({ shiftKey }) => (isFast = shiftKey));

@@ -1,5 +1,7 @@
 // Playback of the scene's time.
 
+import { short } from "./camera.js";
+
 const RUN_SECONDS = 4; // for the whole time range at speed 1, if the scene doesn't say how long it lasts
 const TIME_STEPS = 240; // distinct times during playback, whose poses the service caches
 export const SPEEDS = [0.25, 0.5, 1, 2];
@@ -21,8 +23,9 @@ export class Player {
   /** Return the scene's time at a fraction of its range, exact at both ends. */
   at(place) {
     const [first, last] = this.range;
+    if (place <= 0) return first;
     if (place >= 1) return last;
-    return Number(Math.min(Math.max(first + place * (last - first), first), last).toPrecision(6));
+    return Math.min(Math.max(short(first + place * (last - first), last - first), first), last);
   }
 
   seek(place) {

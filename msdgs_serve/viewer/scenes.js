@@ -11,6 +11,7 @@ export class SceneList {
     this.host = host;
     this.items = new Map();
     this.waiting = new Set();
+    this.failed = new Set();
     this.isDrawing = false;
     this.observer = new IntersectionObserver((entries) => {
       for (const { target, isIntersecting } of entries) {
@@ -32,9 +33,10 @@ export class SceneList {
     for (const [name, item] of this.items) {
       if (!names.has(name)) this.#remove(name, item);
     }
-    for (const scene of scenes) {
+    for (const [i, scene] of scenes.entries()) {
       const item = this.items.get(scene.name) ?? this.#add(scene.name);
-      this.list.append(item);
+      if (this.list.children[i] !== item) this.list.insertBefore(item, this.list.children[i]); // moving drops the focus
+      if (this.failed.delete(scene.name)) this.waiting.add(scene.name);
       item.classList.toggle("broken", scene.problem);
       item.querySelector(".note").textContent = scene.problem ? "file is broken" : "";
       item.title = scene.reason ?? "";
@@ -86,7 +88,7 @@ export class SceneList {
       image.getContext("2d").drawImage(bitmap, 0, 0);
       this.observer.unobserve(this.items.get(name) ?? image);
     } catch {
-      // the request for the frame itself reports the error
+      this.failed.add(name); // the request for the frame itself reports the error
     } finally {
       this.isDrawing = false;
     }

@@ -11,13 +11,13 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, Route
 
 from msdgs_serve.api.routes.viewer import FILES, FOLDER
 from msdgs_serve.imaging import ImageFormat
 from tests.support.images import decode
 from tests.support.processes import bodies, chromium, forget, image, wait_for, wait_until_still
-from tests.support.scene_files import write_scene
+from tests.support.scene_files import metadata, write_scene
 from tests.support.service import serving
 
 pytestmark = pytest.mark.slow
@@ -43,7 +43,7 @@ REPORT = {
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
     write_scene(folder / "balls.onnx", steps=True)
-    write_scene(folder / "it's.onnx", static_color=(0.0, 0.0, 1.0), moving=False)
+    write_scene(folder / "it's.onnx", static_color=(0.0, 0.0, 1.0), moving=0)
     (folder / "balls.report.json").write_text(json.dumps(REPORT))
     return folder
 
@@ -267,6 +267,38 @@ def test_another_scene_and_the_address_of_this_one(opened: Page):
     assert opened.get_by_label("Depth").is_checked()
 
 
+def test_the_scene_that_was_chosen_last_is_opened(opened: Page):
+    held: list[Route] = []
+    opened.route("**/scenes/it*", lambda route: held.append(route))
+    opened.locator("#scenes").get_by_text("it's").click()
+    forget(opened)
+    with opened.expect_event("requestfailed", lambda request: "scenes/it" in request.url):
+        opened.locator("#scenes").get_by_text("balls").click()
+    held[0].abort()
+    wait_until_still(opened)
+    assert not opened.locator("#banner").is_visible()
+
+
+def test_after_a_refused_frame_others_are_asked_for(page: Page, client: httpx.Client):
+    page.goto(f"{client.base_url}/#scene=balls&at=0,95,4,0,0,0")
+    page.get_by_text("elevation").wait_for()
+    page.locator("#image").focus()
+    page.keyboard.press("ArrowDown")
+    wait_until_still(page)
+    assert not page.locator("#banner").is_visible()
+
+
+def test_a_later_look_draws_missing_thumbnails_and_keeps_the_focus(page: Page, client: httpx.Client):
+    answers: list[bool] = []
+    page.route(re.compile(r"/render\?"), lambda route: route.continue_() if answers else route.abort())
+    open_page(page, client)
+    with page.expect_event("requestfailed", lambda request: "render?" in request.url):
+        page.locator("#scenes button").first.focus()  # scrolls to the list
+    with page.expect_response(re.compile(r"/render\?scene=balls")):
+        answers.append(True)
+    assert page.evaluate("document.activeElement.innerText.trim()") == "balls"
+
+
 def test_the_report_is_drawn(opened: Page):
     dots = opened.locator("#diagram .dot")
     assert dots.count() == 2
@@ -315,7 +347,16 @@ def test_it_reports_an_unavailable_service_and_recovers(page: Page, scenes: Path
 def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_path: Path):
     (tmp_path / "keys").write_text(f"read {KEY}")
     with serving(scenes, api_keys_file=tmp_path / "keys") as client:
+        page.clock.install()
         page.goto(f"{client.base_url}/#scene=balls")
+        page.locator("#key").wait_for()
+        page.keyboard.press("Escape")
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.clock.fast_forward(MILLISECONDS)
+        page.get_by_role("button", name="Reset").click()
+        page.get_by_role("button", name="API key").click()
+        assert asked == [], "it waits for the user"
         page.locator("#key").fill("wrong")
         page.get_by_role("button", name="Use it").click()
         page.get_by_text("The service asks for a key.").wait_for()
@@ -325,19 +366,30 @@ def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_p
         page.reload()
         wait_until_still(page)
         assert not page.locator("#key-dialog").is_visible()
+        assert not page.locator("#docs").is_visible(), "a link without the key"
 
 
 def strongest_in_the_middle(image: np.ndarray) -> int:
     return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
 
 
-def test_a_changed_file_is_shown(page: Page, tmp_path: Path):
-    write_scene(tmp_path / "ball.onnx", static_color=(1.0, 0.0, 0.0), moving=False)
+def test_changed_files_are_shown(page: Page, tmp_path: Path):
+    file = write_scene(tmp_path / "ball.onnx", static_color=(1.0, 0.0, 0.0), moving=0)
     with serving(tmp_path) as client:
-        open_page(page, client, "")
+        open_page(page, client, "#camera=1")
         wait_for(lambda: strongest_in_the_middle(image(page)) == 0)
-        write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=False).rename(tmp_path / "ball.onnx")
+        assert page.locator("#camera").input_value() == "1"
+        write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=0).rename(file)
         wait_for(lambda: strongest_in_the_middle(image(page)) == 1)
+        write_scene(tmp_path / "new", moving=0, cameras=metadata().cameras[:1]).rename(file)
+        page.wait_for_function("() => location.hash.includes('at=')")
+        assert page.locator("#camera option").all_inner_texts() == ["Free view", "view_0"]
+        away = file.rename(tmp_path / "away")
+        page.get_by_text("ball is gone.").wait_for()
+        forget(page)
+        away.rename(file)
+        wait_until_still(page)
+        assert not page.locator("#banner").is_visible()
 
 
 def test_a_service_that_allows_fewer_pixels(page: Page, scenes: Path):

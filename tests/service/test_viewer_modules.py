@@ -1,4 +1,4 @@
-"""The page's modules: the camera equals the service's, and frame sizes follow the frame time."""
+"""The page's modules: the camera equals the service's, times are in range, and frame sizes follow the frame time."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,6 +50,30 @@ def test_a_pose_from_the_scene_is_kept(modules: Page):
     view = {"target": [0.5, 0, 0.25], "distance": 3, "up": [0, 0, 1], "fov_y": 40, "width": 4, "height": 3}
     columns = np.array(modules.evaluate(script, [view, stored.to_plain()])).T
     assert np.abs(columns - stored.camera.camera_to_world[:3]).max() < tolerance("rotation")
+
+
+@pytest.mark.parametrize("size", [0, 1e-15, 1, 1e6])
+def test_the_range_of_depths_has_an_extent(modules: Page, size: float):
+    script = """async ([view, bounds]) => {
+        const { Camera, depthRange } = await import("/viewer/camera.js");
+        return depthRange(new Camera(view), bounds); }"""
+    view = {"target": [0.5, 0, 0.25], "distance": 3, "up": [0, 0, 1], "fov_y": 40, "width": 4, "height": 3}
+    near, far = modules.evaluate(script, [view, [[0, 0, 0], [size, 0, 0]]])
+    assert 0 <= near < 3 < far
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 1), (1 / 30, 1), (2 / 3, 7 / 3), (123456.78, 123456.9), (-1e9, 1e9)])
+def test_times_are_distinct_in_range_and_exact_at_both_ends(modules: Page, first: float, last: float):
+    script = """async (range) => {
+        const { Player } = await import("/viewer/player.js");
+        const player = new Player();
+        player.range = range;
+        const times = Array.from({ length: 1001 }, (_, i) => player.at(i / 1000));
+        return [times, times.map((t) => (player.seekTime(t), player.t))]; }"""
+    times, sought = modules.evaluate(script, [first, last])
+    assert (times[0], times[-1]) == (first, last)
+    assert times == sorted(set(times))
+    assert sought == times, "as the address gives them"
 
 
 @pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
