@@ -13,7 +13,7 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
 
 DEFAULT_FPS = 24.0
-MAX_FPS = 240.0
+MIN_FPS, MAX_FPS = 0.01, 240.0
 MAX_NUMBER = 1e9
 """Limit of all numbers in a path, within which single precision neither overflows nor underflows."""
 
@@ -28,8 +28,13 @@ class CameraPath:
     def __post_init__(self) -> None:
         if not self.frames:
             raise InvalidInput("path", "a path of at least one frame", 0)
-        if not (math.isfinite(self.fps) and 0 < self.fps <= MAX_FPS):
-            raise InvalidInput("fps", f"in (0, {MAX_FPS:g}]", self.fps)
+        check_fps(self.fps)
+
+
+def check_fps(fps: float) -> None:
+    """Raise `InvalidInput` if a video can't have this number of frames per second."""
+    if not MIN_FPS <= fps <= MAX_FPS:
+        raise InvalidInput("fps", f"in [{MIN_FPS:g}, {MAX_FPS:g}]", fps)
 
 
 def orbit_path(
@@ -64,6 +69,9 @@ def read_nerfstudio(
     cameras = document.get("camera_path")
     if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
         raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
+    kind = document.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise InvalidInput("camera_type", "perspective", kind if isinstance(kind, str) else type(kind).__name__)
     width, height = size or (_integer(document, "render_width"), _integer(document, "render_height"))
     even = even_times(len(cameras), time_range)
     frames = []

@@ -12,8 +12,10 @@ ClientError
 import base64
 import io
 import json
+import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
@@ -81,7 +83,10 @@ class LookAt:
 
 @dataclass(frozen=True)
 class Matrix:
-    """A pose and intrinsics: `fov_y` in degrees, or `fx` and optionally `fy`, `cx`, `cy` in pixels."""
+    """A pose and intrinsics: `fov_y` in degrees, or `fx` and optionally `fy`, `cx`, `cy` in pixels.
+
+    `fx` is in pixels per scene unit if orthographic. `distortion` is k1 to k4 of a fisheye camera, as in OpenCV.
+    """
 
     camera_to_world: npt.ArrayLike  # [4, 4]
     axes: Literal["opencv", "opengl"] = "opencv"
@@ -90,6 +95,8 @@ class Matrix:
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
+    model: Literal["pinhole", "orthographic", "fisheye"] = "pinhole"
+    distortion: Sequence[float] | None = None
     type: str = field(default="matrix", init=False)
 
 
@@ -139,11 +146,11 @@ class Client:
         tries: int = TRIES,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        """`seconds` is the time limit of a call. While the service is overloaded, a call is repeated up to `tries`
-        times, after the delay that the service asks for."""
+        """`seconds` is the time limit of a call. While the service is overloaded, a call is tried up to `tries` times,
+        1 or more, after the seconds that the service asks for."""
         headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
         self._http = httpx.Client(base_url=url, headers=headers, timeout=seconds, transport=transport)
-        self._tries = tries
+        self._tries = max(tries, 1)
 
     def __enter__(self) -> Self:
         return self
@@ -190,7 +197,8 @@ class Client:
 
         A frame that fails yields a `Problem`; the others are drawn.
         """
-        with self._http.stream("POST", "/render/batch", json={"frames": [dict(body) for body in bodies]}) as response:
+        frames = [dict(body) for body in bodies]
+        with self._connected(), self._http.stream("POST", "/render/batch", json={"frames": frames}) as response:
             if response.is_error:
                 response.read()
                 raise _problem(response)
@@ -226,16 +234,22 @@ class Client:
         except httpx.TransportError:
             return False
 
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        """Raise `Unreachable` if the connection fails."""
+        try:
+            yield
+        except httpx.TransportError as error:
+            raise Unreachable(f"{self._http.base_url}: {error or type(error).__name__}") from error
+
     def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         for number in range(self._tries):
-            try:
+            with self._connected():
                 response = self._http.request(method, path, **arguments)
-            except httpx.TransportError as error:
-                raise Unreachable(f"{self._http.base_url}: {error or type(error).__name__}") from error
-            wait = response.headers.get("Retry-After")
-            if response.status_code != OVERLOADED or wait is None or number == self._tries - 1:
-                break
-            time.sleep(float(wait))
+            wait = response.headers.get("Retry-After", "")
+            if response.status_code != OVERLOADED or not wait.isdecimal() or number == self._tries - 1:
+                break  # a proxy may state a date instead of seconds
+            time.sleep(int(wait))
         if response.is_error:
             raise _problem(response)
         return response
@@ -277,8 +291,8 @@ def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Heade
     edges = np.cumsum([WIDTHS[channel] for channel in channels])[:-1]
     parts = dict(zip(channels, np.split(pixels, edges, axis=2), strict=True))
     found = {name: part if WIDTHS[name] > 1 else part[..., 0] for name, part in parts.items()}
-    stages = [stage.split(";") for stage in headers.get("Server-Timing", "").split(", ") if stage]
-    milliseconds = {name: float(duration.removeprefix("dur=")) for name, duration, *_ in stages}
+    durations = re.findall(r'([\w-]+)[^,]*?; *dur="?(\d+\.?\d*)', headers.get("Server-Timing", ""))
+    milliseconds = {name: float(duration) for name, duration in durations}
     drawn = {name: found.get(name) for name in WIDTHS}
     return Frame(**drawn, plan=headers.get("Msdgs-Plan", ""), milliseconds=milliseconds)
 

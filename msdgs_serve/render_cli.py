@@ -20,7 +20,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from msdgs_serve.blocks import Block, OutputOptions, View, draw_block, plan_blocks
-from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, orbit_path, read_path_file, read_scene_names
+from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, check_fps, orbit_path, read_path_file, read_scene_names
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
@@ -135,14 +135,14 @@ def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
     ranges = {scene: DeformationSession(scene).scene.metadata.time_range for scene in dict.fromkeys(scenes)}
     paths = {scene: read_path_file(options.scene, time_range, _size(options)) for scene, time_range in ranges.items()}
     views = [View(scene, *paths[scene].frames[number]) for number, scene in enumerate(scenes)]
-    return views, options.fps or paths[scenes[0]].fps
+    return views, _fps(options, paths[scenes[0]].fps)
 
 
 def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPath:
     metadata, size = session.scene.metadata, _size(options)
     if options.path is not None:
         path = read_path_file(options.path, metadata.time_range, size)
-        return CameraPath(path.frames, options.fps or path.fps)
+        return CameraPath(path.frames, _fps(options, path.fps))
     if options.frames < 1:
         raise InvalidInput("--frames", "at least 1", options.frames)
     view = framing(metadata)
@@ -150,7 +150,14 @@ def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPat
     frames = orbit_path(
         view.target, view.distance, options.elevation, view.up, view.fov_y, size, options.frames, metadata.time_range
     )
-    return CameraPath(tuple(frames), options.fps or DEFAULT_FPS)
+    return CameraPath(tuple(frames), _fps(options, DEFAULT_FPS))
+
+
+def _fps(options: argparse.Namespace, default: float) -> float:
+    if options.fps is None:
+        return default
+    check_fps(options.fps)
+    return options.fps
 
 
 def _size(options: argparse.Namespace) -> tuple[int, int] | None:
@@ -199,10 +206,14 @@ def _images(files: Sequence[Path]) -> Iterator[np.ndarray]:
     """Yield the images, [H, W, 3] uint8."""
     for file in files:
         reader = oiio.ImageInput.open(str(file))
-        if not reader:
+        pixels = None
+        if reader:
+            pixels = reader.read_image(oiio.UINT8)
+            reader.close()
+        if pixels is None:
+            oiio.geterror()  # otherwise the library prints it at the end
             raise InvalidInput("frame", "a readable image; delete it to have it drawn again", file)
-        yield np.asarray(reader.read_image(oiio.UINT8))[..., :3]
-        reader.close()
+        yield pixels[..., :3]
 
 
 def _record(options: argparse.Namespace, views: Sequence[View], image_format: str, transparent: bool) -> str:

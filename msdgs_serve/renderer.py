@@ -77,7 +77,7 @@ class Renderer:
         `job` times the stages `pose` and `draw`.
 
         Raises:
-            InvalidInput: if `t`, the shutter or `steps` are outside the scene's range.
+            InvalidInput: if `t`, the shutter or `steps` are outside the scene's range, or its plan has no motion.
             RenderCancelled: if the job was cancelled.
             SceneFileInvalid: if the scene's Gaussians at that time are not valid.
         """
@@ -138,10 +138,12 @@ def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarra
 def check_times(
     session: DeformationSession, t: float, shutter: Shutter | None = None, motion_dt: float | None = None
 ) -> None:
-    """Raise `InvalidInput`, naming the field, for times outside the scene's range."""
+    """Raise `InvalidInput`, naming the field, for times outside the scene's range, or motion of switched frames."""
     first, last = session.scene.metadata.time_range
     if shutter is not None and motion_dt is not None:
         raise InvalidInput("shutter", "left out if motion is drawn", "given")
+    if motion_dt is not None and session.scene.metadata.plan.startswith("frames:"):
+        raise InvalidInput("dt", "left out: this scene switches from frame to frame, nothing moves", motion_dt)
     for field, time in _times(t, shutter, motion_dt):
         if not first <= time <= last:
             expected = f"in the scene's range [{first}, {last}]"

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from export.importers.splats.axes import from_right_up_back
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 
 EXTENSION = "KHR_gaussian_splatting"
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+MAX_BYTES = 2**32 - 1
 FLOAT, BYTE, POINTS, VERTICES = 5126, 5121, 0, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 COLUMNS = {name: columns for columns, name in TYPES.items()}
@@ -25,7 +27,12 @@ PRIMITIVE = {
 
 
 def write_gltf(file: Path, gaussians: Gaussians) -> None:
-    """Write all Gaussians, activated, float32; axes right, up, back. Viewers without the extension show points."""
+    """Write all Gaussians, activated, float32; axes right, up, back. Viewers without the extension show points.
+
+    Raises `InvalidInput` for none, which glTF can't hold, and for more than 4 GiB.
+    """
+    if not len(gaussians):
+        raise InvalidInput("scene", "of one or more Gaussians for glTF", 0)
     means, quats, sh = from_right_up_back(gaussians.means, gaussians.quats, gaussians.sh)
     colors = np.concatenate([SH_C0 * sh[:, 0] + 0.5, gaussians.opacities[:, None]], axis=1)
     attributes = {
@@ -56,8 +63,11 @@ def write_gltf(file: Path, gaussians: Gaussians) -> None:
     }
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
+    size = HEADER.size + 2 * CHUNK.size + len(text) + at
+    if size > MAX_BYTES:
+        raise InvalidInput("scene", f"at most {MAX_BYTES:,} bytes as glTF; a PLY may be larger", f"{size:,}")
     with file.open("wb") as stream:
-        stream.write(HEADER.pack(b"glTF", 2, HEADER.size + 2 * CHUNK.size + len(text) + at))
+        stream.write(HEADER.pack(b"glTF", 2, size))
         stream.write(CHUNK.pack(len(text), b"JSON") + text + CHUNK.pack(at, b"BIN\0"))
         for part in parts:
             stream.write(part)

@@ -13,6 +13,7 @@ from export.importers.runs.model import RUNS, write_model
 from export.importers.scene import digest, note_left_out, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
 from export.importers.splats.formats import READERS, read_splats
+from export.importers.splats.sog import META
 from export.measure.stability import MIN_PSNR
 from export.options import ExportOptions
 from export.progress import tracked
@@ -58,6 +59,8 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
 
 
 def _splats(path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None) -> BakedScene:
+    if file_format == "sog" and path.name == META:
+        path = path.parent  # its limits and its digest are those of all files
     with console.status(f"reading {path}"):
         source = read_splats(path, file_format)
         contents = static_scene(source, digest(path))

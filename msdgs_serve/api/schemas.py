@@ -273,15 +273,14 @@ class PathCamera(BaseModel):
         description="4×4 by rows", examples=[[0, 0, 1, 4, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]]
     )
     fov: FieldOfView = Field(description="vertical, degrees")
-    render_time: Unit | None = Field(
-        default=None, description="fraction of the scene's time range; default: evenly spaced"
-    )
+    render_time: Unit | None = Field(default=None, description="fraction of the time range; default: evenly spaced")
 
 
 class NerfstudioPath(BaseModel):
     """The contents of nerfstudio's camera_path.json; other keys are ignored."""
 
     camera_path: Annotated[list[PathCamera], Field(min_length=1, max_length=MAX_TIMES)]
+    camera_type: Literal["perspective"] = Field(default="perspective", description="no other can be drawn")
     render_width: Pixels | None = Field(default=None, description="pixels; required if the request has no size")
     render_height: Pixels | None = Field(default=None, description="pixels; see `render_width`")
     fps: FramesPerSecond | None = Field(default=None, description="frames per second")

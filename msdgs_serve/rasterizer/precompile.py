@@ -39,8 +39,9 @@ def compile_kernels() -> Path:
         )
     pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
     for count in COUNTS:
-        for depth in (False, True):
-            rasterize(_gaussians(count), Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose), depth=depth)
+        camera = Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose)
+        for more in (False, True):
+            rasterize(_gaussians(count), camera, depth=more, counts=more)
     return folder
 
 

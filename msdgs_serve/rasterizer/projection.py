@@ -4,6 +4,7 @@ Computed in float64, so that extreme shapes and sizes lose nothing to cancellati
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -49,6 +50,8 @@ MIN_PARTS = 8
 def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) -> Splats:
     """Project N Gaussians into the camera's image."""
     gaussians = _kernel_arrays(gaussians)
+    if any(camera.distortion):
+        gaussians = _without_ghosts(gaussians, camera)
     count, dtype = len(gaussians), gaussians.means.dtype
     view = view_of(camera, options)
     records = empty_records(-(-count // NUM_LANES) * NUM_LANES, dtype)  # whole vectors: stores need no mask
@@ -75,6 +78,18 @@ def part_range(part: int, parts: int, count: int) -> tuple[int, int]:
     """Return start and stop of a part of `range(count)`; all parts but the last are whole vectors of 16."""
     groups = -(-count // NUM_LANES)
     return groups * part // parts * NUM_LANES, min(groups * (part + 1) // parts * NUM_LANES, count)
+
+
+def _without_ghosts(gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """Return the Gaussians with opacity 0 from the angle on where the image of a fisheye folds back: where the
+    derivative of rho(theta) first is 0."""
+    k1, k2, k3, k4 = camera.distortion
+    roots = np.roots([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])  # 1 / theta²
+    fold = roots.real[roots.imag == 0].max(initial=0)
+    world_to_camera = camera.world_to_camera
+    x, y, z = world_to_camera[:3, :3] @ gaussians.means.T.astype(np.float64) + world_to_camera[:3, 3:]
+    drawn = fold * np.arctan2(np.hypot(x, y), z) ** 2 < 1
+    return replace(gaussians, opacities=np.where(drawn, gaussians.opacities, gaussians.opacities.dtype.type(0)))
 
 
 def _kernel_arrays(gaussians: Gaussians) -> Gaussians:

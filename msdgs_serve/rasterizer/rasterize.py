@@ -1,5 +1,6 @@
 """Render an image of Gaussians with a camera."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -8,13 +9,16 @@ import numpy.typing as npt
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.counts import count_splats
 from msdgs_serve.rasterizer.projection import project
-from msdgs_serve.rasterizer.splats import BLUE, RED, Splats
-from msdgs_serve.rasterizer.tiles import TileLists, bin_into_tiles
-from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
+from msdgs_serve.rasterizer.splats import BLUE, RED, Splats, X, Y
+from msdgs_serve.rasterizer.tiles import TileLists, TooManyPairs, bin_into_tiles
+from msdgs_serve.rasterizer.view import GSPLAT, TILE, RasterizerOptions
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.threads import sharing_cores
+
+MAX_PAIRS = 1 << 28
+"""Pairs of a splat and a tile, a GiB of ids. Images with more are drawn in parts."""
 
 
 class Rendering(NamedTuple):
@@ -57,13 +61,43 @@ def rasterize(
     splats = project(gaussians, camera, options)
     if not splats.valid:
         gaussians.validate()
-    extra = _checked_extra(extra, gaussians)
-    tiles = bin_into_tiles(splats, camera.width, camera.height)
-    size = (camera.width, camera.height)
-    frame = composite(splats, tiles, *size, background, options, depth=depth, median_depth=median_depth)
-    dtype = splats.records.dtype
-    counted = count_splats(splats, tiles, *size, options).blended if counts else np.empty((0, 0), dtype)
-    return Rendering(*frame, _drawn_extra(extra, splats, tiles, camera, options), counted)
+    channels = _checked_extra(extra, gaussians)
+
+    def draw(left: int, top: int, right: int, bottom: int) -> Rendering:
+        size = right - left, bottom - top
+        part = splats if size == (camera.width, camera.height) else _cut(splats, left, top, right, bottom)
+        tiles = bin_into_tiles(part, *size, MAX_PAIRS)
+        frame = composite(part, tiles, *size, background, options, depth=depth, median_depth=median_depth)
+        counted = count_splats(part, tiles, *size, options).blended if counts else np.empty((0, 0), part.records.dtype)
+        return Rendering(*frame, _drawn_extra(channels, part, tiles, size, options), counted)
+
+    return _in_parts(draw, 0, 0, camera.width, camera.height)
+
+
+def _in_parts(draw: Callable[..., Rendering], left: int, top: int, right: int, bottom: int) -> Rendering:
+    """Return what `draw` returns for an area in pixels, from halves if it raises `TooManyPairs`."""
+    try:
+        return draw(left, top, right, bottom)
+    except TooManyPairs:
+        pass  # after the handler, so that the area's splats are freed
+    across = right - left > bottom - top
+    middle = TILE * -(-(right - left if across else bottom - top) // (2 * TILE))
+    if across:
+        areas = (left, top, left + middle, bottom), (left + middle, top, right, bottom)
+    else:
+        areas = (left, top, right, top + middle), (left, top + middle, right, bottom)
+    halves = (_in_parts(draw, *area) for area in areas)
+    return Rendering(*(np.concatenate(pair, axis=int(across)) for pair in zip(*halves, strict=True)))
+
+
+def _cut(splats: Splats, left: int, top: int, right: int, bottom: int) -> Splats:
+    """Return the splats relative to the corner of an area of whole tiles, each with the tiles that are inside."""
+    records = splats.records.copy()
+    records[:, X] -= left
+    records[:, Y] -= top
+    first = np.array([left, left, top, top], np.uint16) // TILE
+    past = (np.array([right, right, bottom, bottom], np.uint16) + (TILE - 1)) // TILE
+    return splats._replace(records=records, rectangles=splats.rectangles.clip(first, past) - first)
 
 
 def _checked_extra(extra: np.ndarray | None, gaussians: Gaussians) -> np.ndarray:
@@ -80,19 +114,17 @@ def _checked_extra(extra: np.ndarray | None, gaussians: Gaussians) -> np.ndarray
 
 
 def _drawn_extra(
-    extra: np.ndarray, splats: Splats, tiles: TileLists, camera: Camera, options: RasterizerOptions
+    extra: np.ndarray, splats: Splats, tiles: TileLists, size: tuple[int, int], options: RasterizerOptions
 ) -> np.ndarray:
     """Return the blended extra channels, drawn three at a time in place of the colors."""
     channels = extra.shape[1]
-    dtype = splats.records.dtype
-    drawn = np.empty((camera.height, camera.width, channels), dtype)
+    dtype, (width, height) = splats.records.dtype, size
+    drawn = np.empty((height, width, channels), dtype)
     for first in range(0, channels, 3):
         part = extra[:, first : first + 3]
         records = splats.records.copy()
         records[:, RED : BLUE + 1] = 0
         records[:, RED : RED + part.shape[1]] = part
-        frame = composite(
-            splats._replace(records=records), tiles, camera.width, camera.height, np.zeros(3, dtype), options
-        )
+        frame = composite(splats._replace(records=records), tiles, width, height, np.zeros(3, dtype), options)
         drawn[:, :, first : first + 3] = frame.rgb[:, :, : part.shape[1]]
     return drawn

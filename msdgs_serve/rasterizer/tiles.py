@@ -4,6 +4,7 @@ The visible splats are sorted by depth once, then appended to the lists of their
 parallel parts: each part counts, prefix sums of the counts give each part its write positions, then each part writes.
 """
 
+import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -33,13 +34,21 @@ class TileLists(NamedTuple):
     rows: int
 
 
-def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
-    """Sort the visible splats by float32 depth, equal depths by index, and list those of each tile."""
+class TooManyPairs(Exception):
+    """The lists of an image's tiles would be too long."""
+
+
+def bin_into_tiles(splats: Splats, width: int, height: int, max_pairs: int = sys.maxsize) -> TileLists:
+    """Sort the visible splats by float32 depth, equal depths by index, and list those of each tile.
+
+    Raises `TooManyPairs` instead of making lists of more than `max_pairs` ids, or more than one tile may need.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
     count, (nearest, farthest) = splats.visible, splats.depth_range
     digits = _digits(np.uint64(nearest), max(farthest - nearest, 0).bit_length())
     offsets = np.empty(columns * rows + 1, np.int64)
-    if count < SPLATS_PER_PART:
+    max_pairs = max(max_pairs, count)
+    if count < SPLATS_PER_PART and count * columns * rows <= max_pairs:
         few = (count, splats.keys, splats.drawn, digits, splats.rectangles, rows, columns, offsets)
         (splat_ids,) = run_serially(_bin_few, [few])
         return TileLists(offsets, splat_ids, columns, rows)
@@ -53,6 +62,8 @@ def bin_into_tiles(splats: Splats, width: int, height: int) -> TileLists:
     )
     cursors = np.empty((len(parts), columns * rows), np.int64)
     _place_parts(corners, offsets, cursors)
+    if offsets[-1] > max_pairs:
+        raise TooManyPairs
     splat_ids = np.empty(offsets[-1], np.uint32)
     run_parallel(
         _append_to_tiles, [(*part, order, rectangles, cursors[k], columns, splat_ids) for k, part in enumerate(parts)]

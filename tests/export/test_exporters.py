@@ -15,8 +15,9 @@ from onnx import TensorProto, numpy_helper
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from export.exporters import gltf
 from export.exporters.command import LOSSLESS, LOSSY, convert
-from export.exporters.gltf import EXTENSION, read_gltf
+from export.exporters.gltf import EXTENSION, read_gltf, write_gltf
 from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
@@ -134,6 +135,16 @@ def test_gltf_holds_one_time(tmp_path: Path, degree: int):
     assert {"mode": 0, "kernel": "ellipse"}.items() <= {**primitive, **primitive["extensions"][EXTENSION]}.items()
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
     assert (20 + text) % 4 == 0
+
+
+def test_what_gltf_cannot_hold_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(InvalidInput, match="`scene` must be of one or more Gaussians for glTF, got 0"):
+        write_gltf(tmp_path / "a.glb", some_gaussians(0, 0))
+    write_gltf(tmp_path / "a.glb", some_gaussians(20, 0))
+    monkeypatch.setattr(gltf, "MAX_BYTES", (tmp_path / "a.glb").stat().st_size - 1)
+    with pytest.raises(InvalidInput, match="`scene` must be at most"):
+        write_gltf(tmp_path / "b.glb", some_gaussians(20, 0))
+    assert not (tmp_path / "b.glb").exists()
 
 
 def assert_same(got: Gaussians, expected: Gaussians) -> None:

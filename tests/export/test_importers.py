@@ -14,6 +14,7 @@ import pytest
 from rich.console import Console
 
 from export.exporters.spz import write_spz
+from export.importers import command
 from export.importers.command import model_or_import
 from export.importers.detect import detect_format, frame_files
 from export.importers.errors import ImportFailed
@@ -160,6 +161,18 @@ def test_a_sog_reads_no_files_outside_of_its_folder(tmp_path: Path):
     (folder / "meta.json").write_text(meta.replace('"quats.webp"', '"../sog/quats.webp"'))
     with pytest.raises(ImportFailed, match=r"`quats.files` must be a list of 1 names of files beside it"):
         read_splats(folder)
+
+
+def test_a_sog_named_by_its_meta_json_is_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its limits and its digest are those of all its files."""
+    folder, read = write_sog(tmp_path / "sog", some_gaussians(20, 0)), list[Path]()
+    monkeypatch.setattr(command, "read_splats", lambda path, *more: read.append(path) or read_splats(path, *more))
+    digests = set()
+    for path in (folder, folder / "meta.json"):
+        with model_or_import(ExportOptions(path, tmp_path / "scene.onnx"), Console(quiet=True)):
+            digests.add(DeformationSession(tmp_path / "scene.onnx").scene.metadata.checkpoint_sha256)
+    assert read == [folder, folder]
+    assert len(digests) == 1
 
 
 @pytest.mark.parametrize("ending", [".sog", ".zip"])

@@ -69,6 +69,15 @@ def test_a_path_through_several_scenes_draws_each_frame_of_its_own(folder: Path)
             assert (folder / "out" / frame).read_bytes() == (alone / frame).read_bytes()
 
 
+@pytest.mark.parametrize("fps", ["nan", "0", "-1"])
+def test_frames_per_second_that_cannot_be_are_refused_before_drawing(
+    folder: Path, fps: str, capsys: pytest.CaptureFixture[str]
+):
+    assert main([str(folder / "views.json"), str(folder / "out.mp4"), "--fps", fps]) == 2
+    assert "`fps` must be in" in capsys.readouterr().err
+    assert not (folder / "out.mp4.frames").exists()
+
+
 @pytest.mark.parametrize("name", [None, 3, "one.pt"])
 def test_a_camera_without_a_scene_is_named(folder: Path, name: object):
     document = json.loads((folder / "views.json").read_text())

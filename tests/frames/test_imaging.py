@@ -1,6 +1,7 @@
 """Encoders: decoded images equal the original to the format's precision."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import OpenImageIO as oiio
@@ -8,7 +9,8 @@ import pytest
 
 from msdgs_serve.imaging import FORMATS, EncodingFailed, Image, encode, srgb_to_linear
 from msdgs_serve.imaging.formats import ImageFormat
-from msdgs_serve.scene import InvalidInput
+from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.camera import CameraModel, orbit
 from tests.support.images import decode, linear_to_srgb, psnr
 
 WIDTH, HEIGHT = 40, 30
@@ -83,6 +85,27 @@ def test_opaque_exr_is_the_display_image_linearised(brightness: float):
     np.testing.assert_allclose(spec.getattribute("chromaticities")[:2], (0.64, 0.33), rtol=1e-6)
     eight_bits, _ = decode(encode(image, "png"), "png")
     assert (eight_bits[image.rgb > 1] == 255).all()
+
+
+@pytest.mark.parametrize("model", ["pinhole", "orthographic", "fisheye"])
+def test_exr_names_its_camera(model: CameraModel):
+    distortion = (0.25, 0.5, 0.0, -1.0) if model == "fisheye" else (0.0, 0.0, 0.0, 0.0)
+    pose = orbit(np.array([0.1, 0.2, 0.3]), 4.0, 30, 20, np.array([0.0, 0.0, 1.0]))
+    camera = Camera(50.0, 60.0, 18.0, 16.0, WIDTH, HEIGHT, pose, model, distortion)
+    _, spec = decode(encode(replace(make_image(), camera=camera, t=0.5), "exr"), "exr")
+    assert spec.getattribute("msdgs:camera_model") == model
+    assert spec.getattribute("msdgs:distortion") == distortion
+    assert spec.getattribute("msdgs:intrinsics") == (50, 60, 18, 16)
+    if model == "fisheye":
+        assert spec.getattribute("worldToNDC") is None
+        return
+    to_ndc = np.array(spec.getattribute("worldToNDC")).reshape(4, 4)
+    points = np.array([[0.3, -0.2, 0.1], [0.0, 0.5, 1.0]])
+    pixels, depths = camera.project(points)
+    x, y, z, w = (np.column_stack([points, np.ones(2)]) @ to_ndc).T
+    np.testing.assert_allclose(np.column_stack([x / w * WIDTH, y / w * HEIGHT]), pixels, rtol=1e-5)
+    np.testing.assert_allclose(z / w, depths if model == "orthographic" else 1 / depths, rtol=1e-5)
+    assert np.linalg.matrix_rank(to_ndc) == 4
 
 
 @pytest.mark.parametrize("image_format", FORMATS)

@@ -87,6 +87,15 @@ def test_the_least_recently_used_pose_is_evicted_first(counting: CountingSession
     assert counting.times == [0.0, 0.1, 0.2, 0.1]
 
 
+def test_a_static_scene_takes_nothing_of_the_cache(tmp_path: Path):
+    renderer, static = Renderer(), DeformationSession(write_scene(tmp_path / "static.onnx", moving=0))
+    for t in (0.0, 0.5):
+        assert renderer.posed(static, t).means is static.scene.static_means
+    assert renderer.cache.use.poses == 0
+    with pytest.raises(InvalidInput, match="in the scene's range"):
+        renderer.posed(static, 2.0)
+
+
 def test_scenes_do_not_share_poses(session: DeformationSession, counting: CountingSession):
     renderer, other = Renderer(), CountingSession(session.gaussians(1.0), session.scene)
     assert renderer.posed(counting, 0.0) is not renderer.posed(other, 0.0)

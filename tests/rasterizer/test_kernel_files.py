@@ -230,7 +230,7 @@ for model in ("pinhole", "orthographic", "fisheye"):
     view = dataclasses.replace(camera, model=model)
     for options in (
         RenderOptions(),
-        RenderOptions(depth=True),
+        RenderOptions(depth=True, counts=True),
         RenderOptions(background="transparent"),
         RenderOptions(background=(1.0, 0.5, 0.0), motion_dt=0.1),
         RenderOptions(shutter=Shutter(0.0, 0.1, 3)),

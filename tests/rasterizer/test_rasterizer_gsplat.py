@@ -131,6 +131,19 @@ def test_distorted_fisheye_is_its_formula():
     assert_conics(got, inverse, "conic.finite_differences")
 
 
+@pytest.mark.parametrize(
+    ("distortion", "fold"), [((-0.3, 0, 0, 0), 60.39), ((0, -0.1, 0, 0), 68.13), ((0.2, 1e-300, 0, 0), 90)]
+)
+def test_nothing_is_drawn_where_a_fisheye_folds_back(distortion: tuple[float, float, float, float], fold: float):
+    """`fold` is the angle in degrees at which 1 + 3 k1 theta² + 5 k2 theta⁴ is 0."""
+    degrees = np.arange(0.0, 90.0)
+    around, angles = np.radians(100 * degrees), np.radians(degrees)
+    means = np.column_stack([np.sin(angles) * np.cos(around), np.sin(angles) * np.sin(around), np.cos(angles)])
+    camera = replace(front_camera(600, 600), fx=100.0, fy=100.0, model="fisheye", distortion=distortion)
+    got = project(gaussians_of(means, scales=0.01, dtype=np.float64), camera, GSPLAT)
+    np.testing.assert_array_equal(got.extents[:, 0] > 0, degrees < fold)
+
+
 @pytest.mark.parametrize("model", ["orthographic", "fisheye"])
 def test_a_point_on_the_axis_is_drawn_in_the_centre(model: str):
     gaussians = gaussians_of([[0, 0, 2.0]], scales=0.1, dtype=np.float64)

@@ -1,11 +1,14 @@
 """Laws that hold for every scene, tested without a reference image."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import GSPLAT, INRIA, Rendering, rasterize
+from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.tiles import SPLATS_PER_PART, TooManyPairs, bin_into_tiles
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 from tests.support import reference
@@ -165,6 +168,35 @@ def test_crops_show_the_same_pixels(dtype: type):
         part = np.s_[top : top + height, left : left + width]
         expected = Rendering(*(channel[part] for channel in whole))
         assert_same(draw(gaussians, crop, background=BACKGROUND), expected, clear[part])
+
+
+@DTYPES
+@pytest.mark.parametrize("max_pairs", [1, 300])
+def test_an_image_drawn_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch, max_pairs: int, dtype: type):
+    gaussians, camera = scene(21, dtype)
+    extra = np.random.default_rng(0).uniform(size=(len(gaussians), 2)).astype(dtype)
+    all_channels = {"background": BACKGROUND, "extra": extra, "median_depth": True, "counts": True}
+    clear, whole = clear_pixels(gaussians, camera), draw(gaussians, camera, **all_channels)
+    monkeypatch.setattr(sys.modules[rasterize.__module__], "MAX_PAIRS", max_pairs)
+    parts = draw(gaussians, camera, **all_channels)
+    assert_same(parts, whole, clear)
+    assert_close(parts.extra[clear], whole.extra[clear], f"rgb.{np.dtype(dtype).name}")
+    np.testing.assert_array_equal(parts.counts[clear], whole.counts[clear])
+    assert parts.median_depth.shape == whole.median_depth.shape
+    assert [channel.shape for channel in draw(gaussians, camera)] == [
+        *(channel.shape for channel in whole[:3]), (0, 0), (*whole.alpha.shape, 0), (0, 0)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [10, SPLATS_PER_PART])
+def test_lists_beyond_the_limit_are_not_made(count: int):
+    """Each splat covers all tiles. The list of a single tile is made in any case."""
+    gaussians = gaussians_of([[0, 0, 2]] * count, scales=10)
+    splats, of_one_tile = (project(gaussians, front_camera(*size), GSPLAT) for size in ((53, 37), (16, 16)))
+    assert len(bin_into_tiles(splats, 53, 37, 12 * count).splat_ids) == 12 * count
+    with pytest.raises(TooManyPairs):
+        bin_into_tiles(splats, 53, 37, 12 * count - 1)
+    assert len(bin_into_tiles(of_one_tile, 16, 16, 1).splat_ids) == count
 
 
 @SEEDS

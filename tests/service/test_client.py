@@ -9,6 +9,7 @@ import pytest
 
 from msdgs_serve.client import Client, LookAt, Matrix, Orbit, Problem, SceneCamera, Shutter, Unreachable, request_body
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.imaging.encode import npy
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from tests.support.images import decode
 from tests.support.scene_files import UP, level_camera, metadata, write_scene
@@ -48,6 +49,7 @@ def test_every_kind_of_camera(client: Client):
         Matrix(pose, fov_y=40),
         Matrix(pose, fx=focal, fy=focal, cx=SIZE / 2, cy=SIZE / 2),
         Matrix(pose @ OPENGL_TO_OPENCV, "opengl", fx=focal),
+        Matrix(pose, fx=focal, model="fisheye", distortion=[1 / 3, 2 / 15, 17 / 315, 62 / 2835]),  # of the tangent
     ]
     for camera in cameras:
         rgb = client.render(camera, 0.0, width=SIZE, height=SIZE).rgb
@@ -106,6 +108,22 @@ def test_an_unreachable_service():
     with Client("http://127.0.0.1:9", seconds=1) as client:
         assert not client.ready()
         with pytest.raises(Unreachable, match=r"127\.0\.0\.1:9"):
+            client.scenes()
+        with pytest.raises(Unreachable, match=r"127\.0\.0\.1:9"):
+            list(client.render_many([request_body(LEVEL, 0.0)]))
+
+
+def test_answers_of_proxies_are_understood():
+    timing = 'cache;desc=hit, edge; dur=3, pose;dur=1.25;desc="cached", draw;desc="a b";dur="7."'
+    pixels = npy(np.zeros((2, 2, 1), np.float32))
+    answers = iter([
+        httpx.Response(200, headers={"Server-Timing": timing}, content=pixels),
+        httpx.Response(503, headers={"Retry-After": "Wed, 21 Oct 2015 07:28:00 GMT"}),
+    ])  # fmt: skip
+    with Client(transport=httpx.MockTransport(lambda _: next(answers)), tries=0) as client:
+        frame = client.render(LEVEL, 0.0, channels=("alpha",))
+        assert frame.milliseconds == {"edge": 3, "pose": 1.25, "draw": 7}
+        with pytest.raises(Problem, match="503"):
             client.scenes()
 
 

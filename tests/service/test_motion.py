@@ -8,10 +8,10 @@ import pytest
 from msdgs_serve.client import Client, Orbit
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.renderer import Renderer, RenderOptions
-from msdgs_serve.scene import Camera
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.camera import orbit
 from tests.support.images import decode
-from tests.support.scene_files import UP, level_camera
+from tests.support.scene_files import UP, level_camera, write_scene
 from tests.support.scenes import pixel_of
 from tests.support.service import serving
 from tests.support.tolerances import assert_close
@@ -56,6 +56,14 @@ def test_behind_the_camera_nothing_moves_and_nothing_breaks(scene: Path):
     image = Renderer().render(DeformationSession(scene), inside, 0.0, RenderOptions(motion_dt=1.0))
     assert image.motion is not None
     assert np.isfinite(image.motion).all()
+
+
+def test_there_is_no_motion_between_switched_frames(tmp_path: Path):
+    session = DeformationSession(write_scene(tmp_path / "scene.onnx", plan="frames:2"))
+    assert Renderer().render(session, level_camera(SIZE), 0.1).motion is None
+    with pytest.raises(InvalidInput, match="switches from frame to frame") as error:
+        Renderer().render(session, level_camera(SIZE), 0.1, RenderOptions(motion_dt=0.2))
+    assert error.value.field == "dt"
 
 
 def test_motion_over_http(scene: Path):
