@@ -208,7 +208,9 @@ def check_cache(url: str) -> None:
     time.sleep(2.2)  # nginx counts whole seconds: one that lasts 1 s may be fresh for 2
     expect(frame(url, 0.25).headers["x-cache"] == "REVALIDATED", "an expired frame is revalidated, not rendered again")
     keyed = frame(url, 0.25, headers={"X-API-Key": "some"})
-    expect(keyed.headers["x-cache"] == "BYPASS", "requests with a key bypass the cache")
+    expect((keyed.status, keyed.headers["x-cache"]) == (200, "BYPASS"), "requests with a key bypass the cache")
+    keyed = frame(url, 0.25, headers={"X-API-Key": "some", "If-None-Match": first.headers["etag"]})
+    expect((keyed.status, keyed.body) == (304, b""), "their own ETags count")
     expect(get(f"{url}/metrics").status == 404, "metrics are not public")
     expect(get(f"{url}/").status == 200, "the viewer is served")
 

@@ -47,9 +47,15 @@ class PoseCache:
             return CacheUse(len(self._sizes), sum(self._sizes.values()), self._hits, self._misses)
 
     def get(self, session: DeformationSession, t: float, job: RenderJob, steps: float | None = None) -> Gaussians:
-        """Return the scene's Gaussians at `t`, after `steps` layers or all; note `hit` or `miss` in the job."""
+        """Return the scene's Gaussians at `t`, after `steps` layers or all; note `hit` or `miss` in the job.
+
+        Those of a static scene are in memory already.
+        """
         key = (weakref.ref(session), t, steps)  # a replaced scene is not kept alive
         with job.stage(STAGE):
+            if not session.scene.moving_count:
+                job.notes[STAGE] = "hit"
+                return session.gaussians(t, steps)
             while True:
                 future, mine = self._claim(key)
                 job.notes[STAGE] = "miss" if mine else "hit"
@@ -103,7 +109,5 @@ class PoseCache:
 def _own_bytes(gaussians: Gaussians, session: DeformationSession) -> int:
     """Return the bytes of the arrays that are not shared with the scene."""
     scene = session.scene
-    if gaussians.means is scene.static_means:
-        return 0
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     return sum(array.nbytes for array in arrays if array is not scene.opacities and array is not scene.sh)

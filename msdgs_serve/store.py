@@ -3,7 +3,9 @@
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 from functools import cached_property
@@ -16,7 +18,10 @@ from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneN
 
 SUFFIX = ".onnx"
 INCOMING_PREFIX = ".incoming-"
-MAX_NAME_LENGTH = 200
+INCOMING_SECONDS = 3600.0
+"""Age of temporary files of uploads that have ended without a trace."""
+MAX_NAME_BYTES = 200
+"""Limit in UTF-8, so that a name with prefix and suffix is a valid file name on any file system."""
 MAX_OPEN_ATTEMPTS = 5
 
 logger = logging.getLogger("msdgs_serve")
@@ -96,25 +101,25 @@ class SceneStore:
 
     Folders are listed again by every call, so that files may be added, changed and removed. `refresh` reloads changed
     files; meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports.
+
+    Scenes are added to and removed from `folder`, the first one among the paths, whose files never hide others.
     """
 
     def __init__(
         self, paths: Sequence[Path | str], open_scene: Callable[[Path], DeformationSession] = DeformationSession
     ) -> None:
         self._paths = [_checked(Path(path)) for path in paths]
+        self.folder = next((path for path in self._paths if path.is_dir()), None)
+        self._paths.sort(key=lambda path: path == self.folder)
         self._open_scene = open_scene
         self._entries: dict[str, _Entry] = {}
         self._lock = threading.Lock()
         self._writing = threading.Lock()  # held while files are added or removed
+        self._hidden: set[Path] = set()  # files whose names others have
         by_name: dict[str, Path] = {}
         for file in self._scan():
-            if by_name.setdefault(file.stem, file) != file:
+            if by_name.setdefault(file.stem, file) != file and file.parent != self.folder:
                 raise InvalidInput("paths", "scenes of different names", f"{by_name[file.stem]} and {file}")
-
-    @property
-    def folder(self) -> Path | None:
-        """The folder in which scenes are added and removed: the first one among the paths."""
-        return next((path for path in self._paths if path.is_dir()), None)
 
     def names(self) -> list[str]:
         """Return the names of all scenes, sorted, without opening them."""
@@ -184,9 +189,23 @@ class SceneStore:
         return self._writable_folder() / f"{INCOMING_PREFIX}{token}"
 
     def clear_incoming(self) -> None:
-        """Remove temporary files that an earlier process has left."""
+        """Remove old temporary files, which a process has left."""
         for file in self._writable_folder().glob(f"{INCOMING_PREFIX}*"):
-            file.unlink(missing_ok=True)
+            with suppress(OSError):  # the upload ended meanwhile
+                if file.stat().st_mtime < time.time() - INCOMING_SECONDS:
+                    file.unlink()
+
+    def target(self, name: str, *, replace: bool = False) -> Path:
+        """Return the path of a scene to be added. Raises `InvalidInput` and `SceneExists` as `add`."""
+        if not is_servable_name(name) or "/" in name:
+            raise InvalidInput(
+                "name", f"printable text of at most {MAX_NAME_BYTES} bytes without separators", repr(name)
+            )
+        target = self._writable_folder() / f"{name}{SUFFIX}"
+        present = self._files().get(name, target)
+        if present != target or (present.exists() and not replace):
+            raise SceneExists(f"the scene `{name}` exists already")
+        return target
 
     def add(self, name: str, incoming: Path, *, replace: bool = False) -> ServedScene:
         """Open a file from `incoming`, and if it is valid, move it atomically to the scene `name`.
@@ -196,15 +215,8 @@ class SceneStore:
             SceneExists: if the scene exists and `replace` is false.
             SceneFileInvalid: if the file violates the contract.
         """
-        if not is_servable_name(name) or "/" in name:
-            raise InvalidInput(
-                "name", f"printable text of at most {MAX_NAME_LENGTH} characters without separators", repr(name)
-            )
-        target = self._writable_folder() / f"{name}{SUFFIX}"
         with self._writing:
-            present = self._files().get(name, target)
-            if present != target or (present.exists() and not replace):
-                raise SceneExists(f"the scene `{name}` exists already")
+            target = self.target(name, replace=replace)
             scene = self._open(incoming, name)
             _sync(incoming)
             entry = self._entry(name)
@@ -229,7 +241,8 @@ class SceneStore:
             _sync(folder)
 
     def _status(self, name: str) -> SceneStatus:
-        entry = self._entry(name)
+        with self._lock:
+            entry = self._entries.get(name, _Entry())
         return SceneStatus(name, entry.served is not None, entry.problem)
 
     def _writable_folder(self) -> Path:
@@ -281,9 +294,14 @@ class SceneStore:
     def _files(self) -> dict[str, Path]:
         """Return the files by scene name, and drop scenes whose file was removed."""
         files: dict[str, Path] = {}
-        for file in self._scan():
+        found = self._scan()
+        for file in found:
             files.setdefault(file.stem, file)
+        hidden = set(found) - set(files.values())
         with self._lock:
+            for file in hidden - self._hidden:
+                logger.warning("%s is not served, as %s has its name", file, files[file.stem])
+            self._hidden = hidden
             for name in self._entries.keys() - files.keys():
                 del self._entries[name]
         return files
@@ -302,7 +320,9 @@ class SceneStore:
 
 def is_servable_name(name: str) -> bool:
     """Whether a name is printable, without separators, and not hidden as temporary files are."""
-    return bool(name) and name[0] != "." and name.isprintable() and len(name) <= MAX_NAME_LENGTH and "\\" not in name
+    if not (name and name[0] != "." and name.isprintable() and "\\" not in name):
+        return False
+    return len(name.encode()) <= MAX_NAME_BYTES
 
 
 def _checked(path: Path) -> Path:

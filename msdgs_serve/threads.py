@@ -16,6 +16,8 @@ from contextvars import ContextVar
 from functools import cache
 from typing import Any
 
+from msdgs_serve.scene import InvalidInput
+
 THREADS_VARIABLE = "MSDGS_THREADS"
 NICENESS = 10
 """Niceness of render threads: under overload /live is answered in a quarter of the time or less; a niceness of 5 gains
@@ -28,12 +30,15 @@ _callers = 0  # number of callers within `sharing_cores`
 
 
 def thread_count() -> int:
-    """Return the size of the pool: `MSDGS_THREADS`, or the cores this process may use, read once."""
+    """Return the size of the pool: `MSDGS_THREADS`, or the cores this process may use, read once.
+
+    Raises `InvalidInput` naming the variable.
+    """
     setting = os.environ.get(THREADS_VARIABLE)
     if setting is None:
         return _cores()
     if not setting.isdecimal() or int(setting) < 1:
-        raise ValueError(f"{THREADS_VARIABLE} must be a whole number above 0, got {setting!r}")
+        raise InvalidInput(THREADS_VARIABLE, "a whole number above 0", repr(setting))
     return int(setting)
 
 

@@ -22,7 +22,8 @@ MAX_ANSWER = 1 << 16
 
 
 def try_scene(file: Path, limits: GraphLimits, seconds: float) -> None:
-    """Open `file` in a subprocess and pose its Gaussians in the middle of its time range, within `seconds`.
+    """Open `file` in a subprocess and pose its Gaussians at both ends and in the middle of its time range, within
+    `seconds`.
 
     Raises `SceneFileInvalid` with the subprocess's reason, or because it crashed or took too long.
     """
@@ -43,7 +44,9 @@ def open_and_pose(answer: BinaryIO, file: str, limits: dict[str, Any]) -> None:
     problem = {}
     try:
         session = DeformationSession(file, limits=GraphLimits(**limits))
-        session.pose(sum(session.scene.metadata.time_range) / 2)
+        t0, t1 = session.scene.metadata.time_range
+        for t in (t0, (t0 + t1) / 2, t1):
+            session.pose(t)
     except SceneFileInvalid as error:
         problem = {"field": error.field, "problem": error.problem, "details": error.details}
     answer.write(json.dumps(problem).encode())

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, BinaryIO, Literal, cast
 
 import numpy as np
 
+from msdgs_serve.camera_path import check_fps
 from msdgs_serve.scene import InvalidInput, MsdgsError
+from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
 
 if TYPE_CHECKING:
     from av.video.stream import VideoStream
@@ -17,11 +19,13 @@ VideoFormat = Literal["mp4", "webm", "webp"]
 
 @dataclass(frozen=True)
 class VideoTraits:
-    """Media type and encoder of a video format."""
+    """Media type, encoder and limits of a video format."""
 
     media_type: str
     codec: str
     options: dict[str, str]
+    names_colorspace: bool = True  # BT.709, which players assume; WebP is always BT.601
+    max_side: int = MAX_PIXELS_PER_SIDE
 
 
 # Lookahead and threads of an encoder keep frames in memory: 330 to 390 MB at 1920 × 1080 with x264's defaults, 190 MB
@@ -33,8 +37,12 @@ VIDEO_FORMATS: dict[VideoFormat, VideoTraits] = {
         "video/webm", "libvpx-vp9",
         {"crf": "24", "b": "0", "deadline": "realtime", "cpu-used": "6", "lag-in-frames": "0", **BOUNDED},
     ),
-    "webp": VideoTraits("image/webp", "libwebp_anim", {"quality": "70"}),
+    "webp": VideoTraits("image/webp", "libwebp_anim", {"quality": "70"}, names_colorspace=False, max_side=16383),
 }  # fmt: skip
+
+PIXELS = "yuv420p"
+BT709 = 1  # as colorspace, primaries and transfer function alike
+LIMITED_RANGE = 1
 
 # fragmented mp4 can be played while it is received; animated WebP loops forever
 MUXER_OPTIONS: dict[VideoFormat, dict[str, str]] = {
@@ -61,12 +69,15 @@ def check_video(video_format: str) -> None:
 class VideoWriter:
     """Encodes sRGB frames, [H, W, 3] uint8 of one size, into a file that may not support `seek`.
 
-    The codecs need even sizes: an odd last row or column is dropped. Not safe to use from several threads.
+    The codecs need even sizes: an odd last row or column is dropped. Not safe to use from several threads. Raises
+    `InvalidInput` for frames per second or sizes that the format doesn't have.
     """
 
     def __init__(self, file: BinaryIO, fps: float, video_format: VideoFormat) -> None:
         import av
 
+        check_fps(fps)
+        self._format: VideoFormat = video_format
         self._traits = VIDEO_FORMATS[video_format]
         self._rate = Fraction(fps).limit_denominator(1001)
         self._container = av.open(file, "w", format=video_format, options=MUXER_OPTIONS[video_format])
@@ -80,6 +91,8 @@ class VideoWriter:
         if self._stream is None:
             self._stream = self._open_stream(width, height)
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels[:height, :width]), format="rgb24")
+        if self._traits.names_colorspace:
+            frame = frame.reformat(format=PIXELS, dst_colorspace=BT709)
         self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
@@ -89,11 +102,15 @@ class VideoWriter:
         self._container.close()
 
     def _open_stream(self, width: int, height: int) -> "VideoStream":
-        if min(height, width) < 2:
-            raise InvalidInput("height" if height < width else "width", "at least 2 for a video", min(height, width))
+        for name, side in (("width", width), ("height", height)):
+            if not 2 <= side <= self._traits.max_side:
+                raise InvalidInput(name, f"in [2, {self._traits.max_side}] for {self._format}", side)
         options = dict(self._traits.options)
         stream = cast("VideoStream", self._container.add_stream(self._traits.codec, rate=self._rate, options=options))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = width, height, PIXELS
+        if self._traits.names_colorspace:
+            stream.colorspace = stream.color_primaries = stream.color_trc = BT709
+            stream.color_range = LIMITED_RANGE
         return stream
 
 

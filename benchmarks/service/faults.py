@@ -88,6 +88,7 @@ def kills(settings: Settings) -> Iterator[Row]:
     for number in range(KILLS + 1):
         with service(folder, uploads=True) as running:
             frame = running.ask("POST", "/render", {**SMALL, "scene": "scene"})
+            wait_for(lambda: not list(folder.glob(".incoming-*")))
             left = sorted(path.name for path in folder.iterdir() if path.suffix != ".other")
             whole += number > 0 and frame.status == 200 and scene.read_bytes() in contents and left == ["scene.onnx"]
             if number < KILLS:
@@ -210,6 +211,8 @@ def _uploads_until_killed(running: Running, folder: Path, contents: Sequence[byt
                 assert connection.send("POST", "/scenes?name=scene&replace=true", content).status == 201
                 uploads += 1
         kill.join()
+    for file in folder.glob(".incoming-*"):
+        os.utime(file, (0, 0))  # only old ones are removed
     return uploads
 
 

@@ -30,7 +30,7 @@ EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *FRAME_HEADERS, "Retry-A
 
 
 def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> FastAPI:
-    """Return the application that serves the scenes of `store`, which are loaded when it starts.
+    """Return the application that serves the scenes of `store`.
 
     Raises `InvalidInput` if the file of API keys is invalid.
     """

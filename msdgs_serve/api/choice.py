@@ -44,7 +44,8 @@ def _of_one_model(store: SceneStore, scene: ServedScene) -> Iterator[ServedScene
                 other = store.get(name)
             except SceneFileInvalid:
                 continue  # the store logs it
-            if _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
+            beside = other.signature.path.parent == scene.signature.path.parent
+            if beside and _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
                 yield other
 
 

@@ -55,7 +55,8 @@ def _settings(arguments: Sequence[str]) -> Settings:
     try:
         settings = Settings(_cli_parse_args=list(arguments))  # pyright: ignore[reportCallIssue]
     except ValidationError as error:
-        wrong = [f"--{item['loc'][0]}: {item['msg']}".replace("_", "-") for item in error.errors()]
+        errors = [item for item in error.errors() if item["type"] != "default_factory_not_called"]  # follows another
+        wrong = [f"--{item['loc'][0]}: {item['msg']}".replace("_", "-") for item in errors]
         raise UsageError("; ".join(wrong)) from None
     if not (settings.scenes or settings.compile):
         raise UsageError(f"no scene given; `{PROGRAM} scene.onnx` serves one, see `{PROGRAM} --help`")

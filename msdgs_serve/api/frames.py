@@ -4,10 +4,10 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, TypeVar
 from urllib.parse import quote
 
 import numpy as np
@@ -29,6 +29,7 @@ from msdgs_serve.store import ServedScene
 IfNoneMatch = Annotated[
     str | None, Header(max_length=8192, description="`ETag`s of the client's cached versions", examples=['"0123"'])
 ]
+Result = TypeVar("Result")
 ZIP = "application/zip"
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the first date that ZIP supports; equal requests give equal bytes
 
@@ -52,12 +53,14 @@ class FramePlan:
         several = isinstance(self.request.t, list) and self.request.format != "npy"
         return ZIP if several else FORMATS[self.request.format].media_type
 
-    def headers(self, max_age: int) -> dict[str, str]:
+    def headers(self, max_age: int, *, needs_key: bool = False) -> dict[str, str]:
         """Return the response headers, which don't depend on the rendering."""
         error = worst_decibels(self.scene)
+        caches = "private" if needs_key else "public"
         return {
             "ETag": self.etag,
-            "Cache-Control": f"public, max-age={max_age}" if max_age else "no-cache",
+            "Cache-Control": f"{caches}, max-age={max_age}" if max_age else "no-cache",
+            **({"Vary": "Authorization, X-API-Key"} if needs_key else {}),
             "Msdgs-Scene": quote(self.scene.name),
             "Msdgs-Plan": self.scene.session.scene.metadata.plan,
             "Msdgs-Channels": ",".join(self.channels),
@@ -106,17 +109,30 @@ def draw_frame(service: Service, plan: FramePlan, t: float, job: RenderJob) -> b
 
 
 async def draw_plan(service: Service, plan: FramePlan, job: RenderJob) -> bytes:
-    """Render a plan through the queue and return its file; each of several times is queued as a part."""
-    run = service.queue.run
+    """Render a plan through the queue and return its file; each of several times is queued as a part.
+
+    The stages of each frame are counted in the metrics, and added up in `job`.
+    """
     if not isinstance(plan.request.t, list):
-        return await run(lambda: draw_frame(service, plan, plan.times[0], job), job)
+        return await _queued(service, partial(draw_frame, service, plan, plan.times[0]), job, part=False)
     if plan.request.format == "npy":
-        draw = partial(_draw_numbers, service, plan, job=job)
-        arrays = [await run(partial(draw, t), job, part=True) for t in plan.times]
-        return await run(lambda: npy(np.stack(arrays)), job, part=True)
-    draw = partial(draw_frame, service, plan, job=job)
-    files = [await run(partial(draw, t), job, part=True) for t in plan.times]
-    return await run(lambda: _zipped(files, FORMATS[plan.request.format].extension), job, part=True)
+        draw = partial(_draw_numbers, service, plan)
+        arrays = [await _queued(service, partial(draw, t), job, part=True) for t in plan.times]
+        return await service.queue.run(lambda: npy(np.stack(arrays)), job, part=True)
+    draw = partial(draw_frame, service, plan)
+    files = [await _queued(service, partial(draw, t), job, part=True) for t in plan.times]
+    extension = FORMATS[plan.request.format].extension
+    return await service.queue.run(lambda: _zipped(files, extension), job, part=True)
+
+
+async def _queued(service: Service, draw: Callable[[RenderJob], Result], total: RenderJob, *, part: bool) -> Result:
+    job = RenderJob()
+    drawn = await service.queue.run(partial(draw, job), job, part=part)
+    service.metrics.count_stages(job.seconds)
+    for stage, seconds in job.seconds.items():
+        total.add(stage, seconds)
+    total.notes.update(job.notes)
+    return drawn
 
 
 def _draw(service: Service, plan: FramePlan, t: float, job: RenderJob) -> Image:

@@ -4,10 +4,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from msdgs_serve.camera_path import MAX_FPS, MIN_FPS
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
-
-MAX_NAME_BYTES = 200
-"""Limit in UTF-8, so that a name with prefix and suffix is a valid file name on any file system."""
+from msdgs_serve.store import MAX_NAME_BYTES
 
 # limits beyond any sensible value, within which single precision neither overflows nor underflows
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
@@ -15,7 +14,7 @@ Distance = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-6, le=
 Focal = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e8)]
 FieldOfView = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.01, le=179.0)]
 Elevation = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-89.9, le=89.9)]
-FramesPerSecond = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=240)]
+FramesPerSecond = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_FPS, le=MAX_FPS)]
 Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_PIXELS_PER_SIDE)]
 Index = Annotated[int, Field(strict=True, ge=0, le=1_000_000)]
 Samples = Annotated[int, Field(strict=True, ge=1, le=10_000)]

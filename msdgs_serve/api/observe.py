@@ -7,6 +7,7 @@ import random
 import re
 import time
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -42,7 +43,7 @@ class Observe:
         try:
             await self._app(scope, receive, answer.send)
         except Exception as error:
-            logger.error("%s %s failed", scope["method"], scope["path"], exc_info=error)
+            logger.error("%s %s failed", scope["method"], quote(scope["path"]), exc_info=error)
             scope[KIND] = "internal"
             if answer.status is not None:
                 raise  # the response has started: the server closes the connection
@@ -75,7 +76,7 @@ def record(metrics: Metrics, request: Answered, client: tuple[str, int] | None) 
     """Count and log a request."""
     method = request.method if request.method in METHODS else UNKNOWN_METHOD
     metrics.count_request(method, request.route, request.status, request.seconds, request.sent)
-    if request.status >= FIRST_ERROR:
+    if request.kind is not None or request.status >= FIRST_ERROR:  # a kind with status 200: it was cut off
         metrics.count_problem(request.kind or f"status_{request.status}")
     facts = {
         "method": method,
@@ -85,7 +86,7 @@ def record(metrics: Metrics, request: Answered, client: tuple[str, int] | None) 
         "bytes": request.sent,
         "client": (client or ("unknown",))[0],
     }
-    access_log.info("%s %s %d", method, request.path, request.status, extra={"facts": facts})
+    access_log.info("%s %s %d", method, quote(request.path), request.status, extra={"facts": facts})
 
 
 class _Answer:

@@ -1,4 +1,4 @@
-"""uvicorn's HTTP/1.1 protocol with time limits on request headers and on clients that don't read their responses.
+"""uvicorn's HTTP/1.1 protocol with time limits on request headers and on clients that hardly read their responses.
 
 The head of a response is written together with the first part of its body. Each write wakes up the client, which may
 preempt the event loop while that holds Python's interpreter: under 4x overload 10 % more frames are answered.
@@ -15,10 +15,13 @@ from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.errors import MEDIA_TYPE, problem_response
 
 NOTHING_BUFFERED = (b"", False)  # no data, and the connection is open
+READ_BYTES = 1 << 16
+"""Bytes of its response, or all that are left, that a client reads in each `read_seconds`."""
 
 
 class LimitedProtocol(H11Protocol):
-    """Closes connections whose headers take longer than `header_seconds` or that read nothing for `read_seconds`."""
+    """Closes connections whose headers take longer than `header_seconds` or that read less than `READ_BYTES` in
+    `read_seconds`. The rest of a body that was answered before it was complete has `header_seconds` too."""
 
     def __init__(
         self,
@@ -43,11 +46,11 @@ class LimitedProtocol(H11Protocol):
         self._start_header_timer()
 
     def data_received(self, data: bytes) -> None:
-        """Stop the time limit when h11 has left its idle state: then the headers are complete."""
+        """Stop the time limit when the headers are complete, and start one for what no application reads."""
         if self._is_rejected_early(data):
             return
         super().data_received(data)
-        if self.conn.their_state is not h11.IDLE:
+        if not self._is_unread():
             self._header_timer = _cancelled(self._header_timer)
         elif self._header_timer is None and not self.transport.is_closing():
             self._start_header_timer()
@@ -91,12 +94,16 @@ class LimitedProtocol(H11Protocol):
         self.timeout_keep_alive_task = self.loop.call_later(self.timeout_keep_alive, self.timeout_keep_alive_handler)
         return True
 
+    def _is_unread(self) -> bool:
+        """Whether no application reads what the client sends: headers, or the rest of a body after the response."""
+        return self.conn.their_state is h11.IDLE or self.conn.our_state is h11.DONE
+
     def _start_header_timer(self) -> None:
         self._header_timer = self.loop.call_later(self._header_seconds, self._on_headers_late)
 
     def _on_headers_late(self) -> None:
         self._header_timer = None
-        if not self.transport.is_closing() and self.conn.their_state is h11.IDLE:
+        if not self.transport.is_closing() and self._is_unread():
             detail = f"The headers must be complete within {self._header_seconds:g} s."
             self._send_problem(http.HTTPStatus.REQUEST_TIMEOUT, detail)
 
@@ -107,7 +114,7 @@ class LimitedProtocol(H11Protocol):
 
     def _check_reading(self) -> None:
         self._read_timer = None
-        if self.transport.get_write_buffer_size() >= self._unsent:
+        if self.transport.get_write_buffer_size() > self._unsent - READ_BYTES:
             self.transport.abort()
         else:
             self._start_read_timer()

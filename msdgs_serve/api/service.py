@@ -61,6 +61,7 @@ class Service:
         self.failure: MsdgsError | None = None
         self.start_seconds = 0.0
         self._stopped = threading.Event()
+        self._phase_lock = threading.RLock()  # a signal may interrupt `drain` for another
         self._reported: dict[str, str] = {}
 
     @asynccontextmanager
@@ -77,7 +78,8 @@ class Service:
 
     def drain(self) -> None:
         """Finish admitted requests and reject new ones."""
-        self.phase = Phase.DRAINING
+        with self._phase_lock:
+            self.phase = Phase.DRAINING
         self.queue.close()
 
     def scene(self, name: str | None) -> ServedScene:
@@ -122,32 +124,35 @@ class Service:
             self.failure, self.phase = MsdgsError("could not start; see the log"), Phase.FAILED
             return
         self.start_seconds = time.perf_counter() - started
-        if self.phase is Phase.STARTING:
-            self.phase = Phase.READY
+        with self._phase_lock:
+            if self.phase is Phase.STARTING:
+                self.phase = Phase.READY
         while not self._stopped.wait(self.settings.watch_seconds):
             self._refresh()
 
     def _warm_up(self) -> None:
-        """Load the scenes given as files, and render a small frame to compile the kernels."""
-        if self.settings.uploads:
-            self.store.clear_incoming()
+        """Load the scenes given as files, and render a small frame of any scene to compile the kernels."""
         files = [path.stem for path in self.settings.scenes if path.is_file()]
         for name in files:
             self.store.get(name)
         for name in files or self.store.names():
             try:
-                scene = self.store.get(name)
-            except SceneFileInvalid as error:
-                logger.error("%s", error)
-                continue
-            metadata = scene.session.scene.metadata
-            camera = {"type": "orbit", "azimuth": 0, "elevation": 0}
-            request = RenderRequest.model_validate({"camera": camera, "t": 0, "width": 32, "height": 32})
-            encode(self.renderer.render(scene.session, resolve_camera(request, scene), metadata.time_range[0]), "png")
-            return
+                self._render_small(self.store.get(name))
+            except MsdgsError as error:
+                logger.error("no frame of scene %r: %s", name, error)
+            else:
+                return
+
+    def _render_small(self, scene: ServedScene) -> None:
+        camera = {"type": "orbit", "azimuth": 0, "elevation": 0}
+        request = RenderRequest.model_validate({"camera": camera, "t": 0, "width": 32, "height": 32})
+        t0, _ = scene.session.scene.metadata.time_range
+        encode(self.renderer.render(scene.session, resolve_camera(request, scene), t0), "png")
 
     def _refresh(self) -> None:
         try:
+            if self.settings.uploads:
+                self.store.clear_incoming()
             self.store.refresh()
             problems = {each.name: str(each.problem) for each in self.store.statuses() if each.problem}
             for name, problem in problems.items():

@@ -22,9 +22,9 @@ from msdgs_serve.threads import thread_count
 PROGRAM = "msdgs-serve"
 
 
-def cores() -> int:
+def one_per_thread(settings: dict[str, Any]) -> int:
     """Return the default number of concurrent renders; more slow each other down."""
-    return min(thread_count(), 64)
+    return min(settings.get("threads") or thread_count(), 64)
 
 
 class Settings(BaseSettings):
@@ -57,8 +57,9 @@ class Settings(BaseSettings):
         default=4096 * 2160, ge=1, description="largest width × height of a frame, multiplied by the number of times"
     )
     max_body_bytes: int = Field(default=1 << 20, ge=1024, description="largest request body")
+    threads: int | None = Field(default=None, ge=1, le=256, description="render threads; default: one per core")
     concurrent_renders: int = Field(
-        default_factory=cores, ge=1, le=64, description="frames rendered at once; others wait"
+        default_factory=one_per_thread, ge=1, le=64, description="frames rendered at once; others wait"
     )
     queued_renders: int = Field(
         default=32,
@@ -86,7 +87,7 @@ class Settings(BaseSettings):
         default=1e13, gt=0, description="most operations of a scene's graph for one frame"
     )
     trial_seconds: float = Field(
-        default=60.0, gt=0, le=3600, description="time limit for opening and posing an uploaded scene once"
+        default=60.0, gt=0, le=3600, description="time limit for opening an uploaded scene and posing it at three times"
     )
     uploads: CliImplicitFlag[bool] = Field(
         default=False, description="let clients add and delete scenes, in the first folder given"
@@ -95,7 +96,7 @@ class Settings(BaseSettings):
     body_seconds: float = Field(
         default=10.0, gt=0, description="time limit for a request's body; for uploads, for each part of it"
     )
-    read_seconds: float = Field(default=10.0, gt=0, description="how long a client may not read its response")
+    read_seconds: float = Field(default=10.0, gt=0, description="time limit for reading each 64 KiB of a response")
     drain_seconds: float = Field(default=30.0, ge=0, description="how long a stopping service finishes its requests")
     watch_seconds: float = Field(default=1.0, gt=0, description="interval of checking files for changes")
     frame_max_age: int = Field(default=0, ge=0, description="seconds that caches may keep a frame without revalidation")
@@ -112,7 +113,6 @@ class Settings(BaseSettings):
     compile: CliImplicitFlag[bool] = Field(
         default=False, description="compile kernels for this kind of processor and exit; needs no scene"
     )
-    threads: int | None = Field(default=None, ge=1, le=256, description="render threads; default: one per core")
     log_format: Literal["text", "json"] = Field(default="text", description="`json`: one object per line")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="warning", description="`info` logs every request and invalid upload"

@@ -17,6 +17,9 @@ class Turns(Generic[Item]):
         self._parts: dict[str, deque[Item]] = {}
         self._singles_in_a_row = 0
 
+    def __len__(self) -> int:
+        return sum(map(len, self._singles.values())) + sum(map(len, self._parts.values()))
+
     def add(self, item: Item, client: str, *, part: bool) -> None:
         """Append an item to the client's queue. `part`: it belongs to a batch or a video."""
         queues = self._parts if part else self._singles

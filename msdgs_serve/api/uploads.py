@@ -56,13 +56,19 @@ class Uploads:
 
     @contextmanager
     def receiving(self, name: str, owner: str | None) -> Iterator[Stored]:
-        """Count an upload in the context, after `scan`. Raises `RequestRejected` (507) for quotas and full disks."""
+        """Count an upload in the context, after `scan`.
+
+        Raises `RequestRejected`: 507 for quotas and full disks, 503 if its file is removed meanwhile.
+        """
         upload = Stored(name, owner)
         with self._lock:
             self._incoming.add(upload)
         try:
             self.grow(upload, 0)
             yield upload
+        except FileNotFoundError:
+            detail = "The file was removed while it was received: send it again."
+            raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "lost_upload", detail, retry_after=1) from None
         except OSError as error:
             if error.errno not in DISK_IS_FULL:
                 raise
@@ -98,7 +104,9 @@ class Uploads:
             self._incoming.discard(upload)
 
     def removed(self, name: str) -> None:
-        """Record that a scene was deleted."""
+        """Record that a scene was deleted, unless another has its name by now."""
+        if (self._folder / f"{name}{SUFFIX}").exists():
+            return
         self._owner_file(name).unlink(missing_ok=True)
         with self._lock:
             self._stored.pop(name, None)

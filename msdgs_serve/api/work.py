@@ -62,8 +62,8 @@ _call: ContextVar[_Call | None] = ContextVar("call", default=None)
 class WorkQueue:
     """Runs `workers` pieces of work at once, with places for `waiting` more calls; further calls are rejected.
 
-    A client may hold at most as many places as are left for others, and streamed calls, whose work has several parts,
-    at most half of all places. `Turns` decides the order.
+    Streamed calls, whose work has several parts, hold at most half of all places. A client may hold at most as many
+    places as are left for others, also of those for streamed calls. `Turns` decides the order.
     """
 
     def __init__(self, workers: int, waiting: int, seconds: float) -> None:
@@ -74,15 +74,16 @@ class WorkQueue:
         self._lock = threading.Lock()
         self._turns: Turns[_Piece] = Turns()
         self._held: Counter[str] = Counter()  # places by client
-        self._streams = 0  # places of streamed calls
+        self._streams: Counter[str] = Counter()  # those of streamed calls
         self._running = 0
         self._mean_seconds = FIRST_GUESS
         self._closed = False
 
     @property
     def waiting(self) -> int:
-        """Number of admitted calls whose work isn't running."""
-        return max(0, self._held.total() - self._running)
+        """Number of pieces of work that wait for their turn."""
+        with self._lock:
+            return len(self._turns)
 
     @property
     def running(self) -> int:
@@ -187,35 +188,44 @@ class WorkQueue:
     def _take_place(self, call: _Call, *, admitted_before: bool = False) -> None:
         if not admitted_before:
             self._reject_if_full(call.client, streamed=call.streamed)
-        self._held[call.client] += 1
-        self._streams += call.streamed
+        for places in self._places_of(call):
+            places[call.client] += 1
         call.has_place = True
 
     def _leave(self, call: _Call) -> None:
         with self._lock:
             if call.has_place:
                 call.has_place = False
-                self._streams -= call.streamed
-                self._held[call.client] -= 1
-                if not self._held[call.client]:
-                    del self._held[call.client]
+                for places in self._places_of(call):
+                    places[call.client] -= 1
+                    if not places[call.client]:
+                        del places[call.client]
+
+    def _places_of(self, call: _Call) -> list[Counter[str]]:
+        return [self._held, self._streams] if call.streamed else [self._held]
 
     def _reject_if_full(self, client: str, *, streamed: bool = False) -> None:
         if self._closed:
             detail = "The service is stopping; try again, another instance may answer."
             raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "draining", detail, retry_after=1)
-        taken = self._held.total()
-        if taken >= self._places:
-            detail = f"All {self._places} places for work and in the queue are taken; try again later."
-        elif self._held[client] >= self._places - taken:
-            detail = f"You have {self._held[client]} places for work and in the queue, as many as are left for others."
-        elif streamed and self._streams >= max(1, self._places // 2):
-            detail = f"All {self._streams} places for batches and videos are taken; try again later."
-        else:
+        detail = _refusal(self._held, client, self._places, "work and in the queue")
+        if detail is None and streamed:
+            detail = _refusal(self._streams, client, max(1, self._places // 2), "batches and videos")
+        if detail is None:
             return
-        seconds = math.ceil(taken * self._mean_seconds / self._workers)
+        seconds = math.ceil(self._held.total() * self._mean_seconds / self._workers)
         retry_after = min(max(1, seconds), MAX_RETRY_SECONDS)
         raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "overloaded", detail, retry_after=retry_after)
+
+
+def _refusal(held: Counter[str], client: str, places: int, purpose: str) -> str | None:
+    """Return why a client gets none of the places, or None if it gets one."""
+    left = places - held.total()
+    if left <= 0:
+        return f"All {places} places for {purpose} are taken; try again later."
+    if held[client] >= left:
+        return f"You have {held[client]} places for {purpose}, as many as are left for others."
+    return None
 
 
 async def unless_gone(request: Request, call: Awaitable[Result]) -> Result:

@@ -16,6 +16,8 @@ CONTRACTS = CONTRACT, CHANGING_CONTRACT = "msdgs/1", "msdgs/2"
 """The second has opacities or SH that depend on time. Files that have neither are of the first."""
 MAX_NUMBER = 1e9
 """Limit of times, coordinates and pixels: beyond any sensible value, within single precision."""
+MIN_FOCAL = 1e-3
+"""Limit of focal lengths in pixels, as in requests: far below it, angles of view round to 180 degrees."""
 MAX_LIST = 1000
 """Limit of the length of lists, such as layers and cameras."""
 MAX_WORD = 100
@@ -41,7 +43,8 @@ class SceneCamera:
         """Return the camera from the values of `to_plain`. Raises ValueError or KeyError."""
         rows = _list(value["camera_to_world"])
         camera = Camera(
-            *(_number(value[key]) for key in ("fx", "fy", "cx", "cy")),
+            *(_focal(value[key]) for key in ("fx", "fy")),
+            *(_number(value[key]) for key in ("cx", "cy")),
             width=value["width"],
             height=value["height"],
             camera_to_world=np.array([_numbers(row, 4) for row in rows]),
@@ -104,6 +107,12 @@ def _number(value: Any) -> float:
     if abs(value) > MAX_NUMBER:
         raise ValueError(f"{value} isn't within ±{MAX_NUMBER:g}")
     return float(value)
+
+
+def _focal(value: Any) -> float:
+    if (number := _number(value)) < MIN_FOCAL:
+        raise ValueError(f"{value} isn't a focal length of at least {MIN_FOCAL:g} pixels")
+    return number
 
 
 def _numbers(value: Any, count: int) -> tuple[float, ...]:

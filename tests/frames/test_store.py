@@ -1,7 +1,10 @@
 """Scenes on disk: found, opened once, and served while a changed file is loaded."""
 
 import hashlib
+import logging
+import os
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,12 +12,12 @@ import pytest
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid, SceneNotFound
-from msdgs_serve.store import SceneStore
+from msdgs_serve.store import INCOMING_SECONDS, SceneExists, SceneStore
 from tests.support.scene_files import write_scene
 
 
 def test_names_are_stems_of_files_and_of_what_folders_hold(folder: Path, tmp_path: Path):
-    for name in ("walk", "jump", ".unfinished", "a\\b"):
+    for name in ("walk", "jump", ".unfinished", "a\\b", "ö" * 101):
         write_scene(folder / f"{name}.onnx")
     (folder / "notes.txt").write_text("not a scene")
     (folder / "folder.onnx").mkdir()
@@ -32,6 +35,8 @@ def test_a_scene_is_opened_when_first_asked_for_and_once(tmp_path: Path):
     write_scene(tmp_path / "walk.onnx")
     store = SceneStore([tmp_path], open_scene)
     assert not store.status("walk").loaded
+    assert [status.loaded for status in store.statuses()] == [False]
+    store.refresh()
     assert opened == []
     with ThreadPoolExecutor(8) as pool:
         sessions = list(pool.map(lambda _: store.get("walk"), range(8)))
@@ -142,3 +147,31 @@ def test_scenes_are_added_to_and_removed_from_folders_only(folder: Path, tmp_pat
     assert alone.exists()
     with pytest.raises(InvalidInput, match="folder"):
         SceneStore([alone]).incoming("token")
+
+
+def test_a_scene_that_is_added_hides_none_of_other_folders(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    caplog.set_level(logging.WARNING, "msdgs_serve")
+    (tmp_path / "ours").mkdir()
+    store = SceneStore([folder, tmp_path / "ours"])
+    added = store.add("walk", write_scene(store.incoming("token")))
+    assert store.get("walk") is added
+    ours = write_scene(tmp_path / "ours" / "walk.onnx", plan="prefix:1")
+    store.refresh()
+    for each in (store, SceneStore([folder, tmp_path / "ours"])):
+        assert each.get("walk").signature.path == each.file("walk") == ours
+        assert each.names() == ["walk"]
+        with pytest.raises(SceneExists):
+            each.target("walk", replace=True)
+    message = f"{folder / 'walk.onnx'} is not served, as {ours} has its name"
+    assert [record.getMessage() for record in caplog.records] == [message] * 2, "once for each start"
+
+
+def test_only_old_temporary_files_are_removed(folder: Path):
+    store = SceneStore([folder])
+    for token, age in (("old", INCOMING_SECONDS), ("new", 0)):
+        store.incoming(token).touch()
+        os.utime(store.incoming(token), (0, time.time() - age))
+    store.clear_incoming()
+    assert list(folder.iterdir()) == [store.incoming("new")]

@@ -11,17 +11,20 @@ import httpx
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from av.video.reformatter import ColorRange
 
-from msdgs_serve import blocks
+from msdgs_serve import blocks, render_cli
 from msdgs_serve.camera_path import read_nerfstudio
 from msdgs_serve.imaging import Image, encode
 from msdgs_serve.render_cli import INTERRUPTED, main
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
-from msdgs_serve.video import write_video
+from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_serve.video import BT709, VideoFormat, write_video
 from tests.support.images import decode, psnr
 from tests.support.scene_files import level_camera
 from tests.support.service import check_problem, serving
+from tests.support.tolerances import assert_close
 
 SIZE = 64
 POSE = level_camera().camera_to_world
@@ -55,7 +58,7 @@ def test_nerfstudios_path_is_read():
     camera, expected = path.frames[0][0], level_camera(SIZE)
     np.testing.assert_allclose(camera.camera_to_world, expected.camera_to_world, atol=1e-12)
     assert (camera.fx, camera.cx, camera.width) == pytest.approx((expected.fx, expected.cx, SIZE))
-    document = nerfstudio()
+    document = nerfstudio(camera_type="perspective")
     document["camera_path"][1]["render_time"] = 0.9
     assert read_nerfstudio(document, (0.0, 2.0)).frames[1][1] == pytest.approx(1.8)
     assert read_nerfstudio(document, (0.0, 2.0), (32, 16)).frames[0][0].height == 16
@@ -72,6 +75,9 @@ def test_nerfstudios_path_is_read():
         ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 180}]}, "camera_path.0.fov"),
         ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist()}]}, "camera_path.0.fov"),
         ({"fps": 0}, "fps"),
+        ({"fps": 1e-4}, "fps"),
+        ({"camera_type": "equirectangular"}, "camera_type"),
+        ({"camera_type": ["perspective"]}, "camera_type"),
         ({"render_width": None}, "render_width"),
         ({"render_height": 1.5}, "render_height"),
         ({"render_height": 10**400}, "render_height"),
@@ -107,6 +113,18 @@ def test_a_video_shows_the_frames(client: httpx.Client, video_format: str):
     assert len(frames_of(by_path.content)[0]) == 5
 
 
+@pytest.mark.parametrize("video_format", ["mp4", "webm"])
+def test_a_video_names_its_colors_as_players_expect(video_format: VideoFormat):
+    colors, file = np.uint8(255) * np.eye(3, dtype=np.uint8), io.BytesIO()
+    write_video((np.full((SIZE, SIZE, 3), color, np.uint8) for color in colors), 5.0, video_format, file)
+    for frame, color in zip(frames_of(file.getvalue())[0], colors, strict=True):
+        assert_close(frame[0, 0].astype(float), color, "video_color")
+    with av.open(io.BytesIO(file.getvalue()), "r") as container:
+        video = container.streams.video[0]
+        assert (video.colorspace, video.color_primaries, video.color_trc) == (BT709, BT709, BT709)
+        assert video.color_range == ColorRange.MPEG
+
+
 def test_an_animated_webp_shows_the_frames(tmp_path: Path):
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     path = tmp_path / "video.webp"
@@ -131,6 +149,8 @@ def test_an_animated_webp_shows_the_frames(tmp_path: Path):
         ({"path": nerfstudio(), "width": 10}, "width"),
         ({"path": nerfstudio(), "width": 1, "height": 1}, "width"),
         ({"path": nerfstudio(), "format": "gif"}, "format"),
+        ({"path": nerfstudio(), "format": "webp", "width": 16384, "height": 2}, "width"),
+        ({"path": nerfstudio(), "fps": 1e-4}, "fps"),
     ],
     ids=lambda value: str(value)[:30],
 )
@@ -181,6 +201,27 @@ def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pyt
     assert [path.name for path in tmp_path.iterdir()] == ["orbit.mp4"]
 
 
+def test_a_frame_that_was_cut_off_is_named(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    command = (scene, tmp_path / "orbit.mp4", "--frames", 2, "--width", 64, "--height", 64)
+    with monkeypatch.context() as stopped:
+        stopped.setattr(render_cli, "write_video", stop)
+        assert run(*command) == INTERRUPTED
+    frame = tmp_path / "orbit.mp4.frames" / "frame_00001.png"
+    whole = frame.read_bytes()
+    for size in (0, 50, len(whole) // 2):
+        frame.write_bytes(whole[:size])
+        capsys.readouterr()
+        assert run(*command) == 2
+        assert f"delete it to have it drawn again, got {frame}" in capsys.readouterr().err
+    frame.unlink()
+    assert run(*command) == 0
+
+
 def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
     (tmp_path / "path.json").write_text(json.dumps(nerfstudio()))
     assert run(scene, tmp_path / "out", "--path", tmp_path / "path.json", "--format", "exr") == 0
@@ -197,6 +238,8 @@ def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
         (["scene", "out", "--width", "10"], "--height"),
         (["scene", "video.gif"], "mp4, webm, webp"),
         (["scene", "video.mp4", "--transparent"], "--transparent"),
+        (["scene", "video.mp4", "--fps", "0.0001"], "fps"),
+        (["scene", "video.mp4", "--fps", "0"], "fps"),
         (["scene", "taken"], "an empty folder"),
         (["missing.onnx", "out"], "missing.onnx"),
         (["scene", "out", "--quality", "80"], "quality"),
@@ -214,6 +257,14 @@ def test_errors_are_one_line(
     assert complaint.startswith("msdgs-render: ")
     assert message in complaint
     assert complaint.count("\n") == 1
+
+
+def test_a_wrong_number_of_threads_is_named(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv(THREADS_VARIABLE, "abc")
+    assert run(scene, tmp_path / "out", "--frames", 1, "--width", 8, "--height", 8) == 2
+    assert f"`{THREADS_VARIABLE}` must be a whole number above 0, got 'abc'" in capsys.readouterr().err
 
 
 def test_frames_of_another_command_are_not_mixed(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -9,6 +9,7 @@ from pathlib import Path
 import httpx
 import onnx
 import pytest
+from onnx import helper, numpy_helper
 
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.scene import SceneFileInvalid
@@ -92,7 +93,7 @@ def test_poisoned_files_are_listed_as_broken_and_nothing_else_changes(tmp_path: 
             assert (bad["problem"], bad["loaded"]) == (True, False), what
             assert POISON[what][0] in bad["reason"]
             assert bad["reason"].isprintable(), what
-            (tmp_path / f"late {name}.onnx").write_bytes(contents[name])  # reloading checks later files
+            (tmp_path / f"{name}.onnx").touch()  # it is reloaded
         write_scene(good, static_color=(0, 0, 1))
         eventually(lambda: frame(client) != before)
 
@@ -110,6 +111,26 @@ def test_mutated_files_are_refused_or_served_without_a_server_error(folder: Path
                 drawn = client.post("/render", json={**FRAME, "scene": "mutated", "t": t})
                 assert drawn.status_code in (200, 422, 503), (seed, drawn.text)
         assert frame(client) == before
+
+
+def test_a_scene_that_overflows_at_its_start_alone_is_refused_and_stops_no_service(tmp_path: Path):
+    """Of the 65 moving Gaussians it is the last, which loading doesn't pose."""
+    model = onnx.load(write_scene(tmp_path / "bad.onnx", moving=65))
+    constants = {each.name: each for each in model.graph.initializer}
+    for name, value in (("base", 3e38), ("velocity", 5e37)):
+        array = numpy_helper.to_array(constants[name]).copy()
+        array[-1] = value
+        constants[name].CopyFrom(numpy_helper.from_array(array, name))
+    (place,) = (number for number, node in enumerate(model.graph.node) if node.output[0] == "applied")
+    model.graph.node[place].CopyFrom(helper.make_node("Sub", ["one", "t"], ["applied"]))
+    onnx.save(model, tmp_path / "bad.onnx")
+    with pytest.raises(SceneFileInvalid, match=r"infinite for 1 Gaussians at t = 0\.0"):
+        try_scene(tmp_path / "bad.onnx", GraphLimits(), 60)
+    write_scene(tmp_path / "good.onnx")
+    with serving(tmp_path) as client:
+        assert frame(client)
+        for t, status in ((0, 503), (0.5, 200)):
+            assert client.post("/render", json={**FRAME, "scene": "bad", "t": t}).status_code == status
 
 
 def test_a_file_that_takes_too_long_is_refused(tmp_path: Path):

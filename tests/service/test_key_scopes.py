@@ -32,7 +32,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def client(tmp_path_factory: pytest.TempPathFactory, keys: Path) -> Iterator[httpx.Client]:
     folder = tmp_path_factory.mktemp("scenes")
     write_scene(folder / "balls.onnx")
-    with serving(folder, uploads=True, api_keys_file=keys) as client:
+    with serving(folder, uploads=True, api_keys_file=keys, frame_max_age=60) as client:
         yield client
 
 
@@ -61,8 +61,15 @@ def test_without_a_key_nothing_but_health_is_answered(client: httpx.Client):
             response = client.request(method, path, headers=headers)
             check_problem(response, 401)
             assert response.headers["WWW-Authenticate"] == "Bearer"
-        for path in ("/live", "/ready"):
+        for path in ("/live", "/ready", "/"):
             assert client.get(path, headers=headers).status_code == 200
+            assert client.head(path, headers=headers).status_code == 200
+
+
+def test_shared_caches_keep_no_frame_that_needs_a_key(client: httpx.Client):
+    response = client.get("/render?width=16&height=16", headers={"X-API-Key": KEYS["read"]})
+    assert response.headers["Cache-Control"] == "private, max-age=60"
+    assert response.headers["Vary"] == "Authorization, X-API-Key"
 
 
 def test_under_a_prefix_paths_mean_the_same(keys: Path):

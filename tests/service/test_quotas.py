@@ -11,6 +11,7 @@ import pytest
 
 from msdgs_serve.api import uploads
 from msdgs_serve.api.server import Server
+from msdgs_serve.api.settings import Settings
 from tests.support.scene_files import write_scene
 from tests.support.service import check_problem, in_this_process, serving
 
@@ -70,6 +71,17 @@ def test_so_many_scenes_of_a_key_also_after_a_new_start(folder: Path, file: byte
         assert add(client, file, "d", TWO, replace=True) == 201, "replacing a scene makes the key its owner"
         assert add(client, file, "e") == 201
     assert ONE not in "".join(path.read_text() for path in folder.glob(".*.owner"))
+
+
+def test_a_scene_that_is_added_while_its_name_is_deleted_keeps_its_owner(folder: Path):
+    counted = uploads.Uploads(folder, Settings())
+    write_scene(folder / "a.onnx")
+    counted.added(uploads.Stored("a", ONE))
+    counted.removed("a")
+    assert (folder / ".a.owner").read_text() == ONE
+    (folder / "a.onnx").unlink()
+    counted.removed("a")
+    assert list(folder.iterdir()) == []
 
 
 def test_so_many_bytes_of_a_key(folder: Path, file: bytes, keys: Path):

@@ -14,6 +14,7 @@ import pytest
 
 from msdgs_serve.api.cli import main
 from msdgs_serve.api.settings import Settings
+from msdgs_serve.threads import THREADS_VARIABLE
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
 from tests.support.service import MAX_SECONDS
@@ -98,6 +99,23 @@ def test_errors_are_one_line(
     assert complaint.startswith("msdgs-serve: ")
     assert message in complaint
     assert complaint.count("\n") == 1
+
+
+def test_wrong_threads_in_the_environment_are_named(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv(THREADS_VARIABLE, "abc")
+    assert main([str(scene)]) == 2
+    complaint = capsys.readouterr().err
+    assert complaint.startswith("msdgs-serve: --threads: ")
+    assert complaint.count("--") == complaint.count("\n") == 1
+
+
+def test_threads_limit_concurrent_renders(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(THREADS_VARIABLE, "3")
+    assert Settings().concurrent_renders == 3
+    assert Settings(threads=1).concurrent_renders == 1
+    assert Settings(threads=1, concurrent_renders=2).concurrent_renders == 2
 
 
 def test_a_start_that_fails_ends_the_program(

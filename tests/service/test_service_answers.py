@@ -83,13 +83,15 @@ def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
     write_scene(tmp_path / "walk.other.onnx", **compared(70, checkpoint_sha256="1" * 64))
     write_scene(tmp_path / "plain.onnx")
     (tmp_path / "walk.broken.onnx").write_bytes(b"no scene")
+    (tmp_path / "uploads").mkdir()
+    write_scene(tmp_path / "uploads" / "walk.better.onnx", **compared(200))
     points = [
         {"plan": plan, "error": {"psnr_worst": psnr}, "milliseconds": {"total": {"min": milliseconds}}}
         for plan, psnr, milliseconds in (("network", 60, 20.0), ("compact:40", 40, 5.0), ("int8", 50, 30.0))
     ]
     report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": points}
     (tmp_path / "walk.report.json").write_text(json.dumps(report))
-    with serving(tmp_path) as client:
+    with serving(tmp_path / "uploads", tmp_path) as client:
         for min_psnr, name, error in ((30, "walk.fast", "40.00"), (45, "walk", "60.00"), (None, "walk", "60.00")):
             answer = post(client, scene="walk", min_psnr=min_psnr)
             assert (answer.status_code, answer.headers["Msdgs-Scene"]) == (200, name)
@@ -218,7 +220,7 @@ def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixtur
         made = client.get("/live", headers={"X-Request-ID": bad}).headers["X-Request-ID"]
         assert re.fullmatch("[0-9a-f]{32}", made)
     with caplog.at_level(logging.INFO, "msdgs_serve.access"):
-        client.get("/scenes/nothing")
+        client.get("/scenes/nothing%0A")
 
         def told() -> list[logging.LogRecord]:
             """A line is logged after its response, so lines of earlier requests may be late."""
@@ -229,12 +231,15 @@ def test_requests_have_ids(client: httpx.Client, caplog: pytest.LogCaptureFixtur
     line = json.loads(JsonLines().format(told()[0]))
     request_id.reset(token)
     assert (line["status"], line["method"], line["request_id"]) == (404, "GET", "the-id")
-    assert line["path"] == "/scenes/nothing"
+    assert line["path"] == "/scenes/nothing\n"
+    assert told()[0].getMessage() == "GET /scenes/nothing%0A 404"
 
 
 def test_other_web_pages_may_call_only_where_they_are_named(scene: Path, client: httpx.Client):
     origin = {"Origin": "https://example.org"}
     assert "access-control-allow-origin" not in client.post("/render", json=FRAME, headers=origin).headers
+    for simple in ({}, {"Content-Type": "text/plain"}):  # browsers send these without asking the service first
+        check_problem(client.post("/render", content=json.dumps(FRAME), headers=origin | simple), 422, "body")
     with serving(scene, cors_origins=["https://example.org"]) as open_client:
         answer = open_client.post("/render", json=FRAME, headers=origin)
         assert answer.headers["access-control-allow-origin"] == "https://example.org"
@@ -259,8 +264,11 @@ def test_metrics_are_what_the_client_counted(scene: Path):
         assert requests['{method="POST",route="/render",status="422"}'] == count
         assert numbers(client, "msdgs_problems_total")['{kind="invalid"}'] == count
         assert numbers(client, "msdgs_stage_seconds_count")['{stage="encode"}'] == count
+        video = {"frames": [{"camera": ORBIT, "t": t} for t in (0.0, 0.5, 1.0)], "width": 16, "height": 16}
+        assert post(client, t=[0.0, 0.5]).status_code == client.post("/render/video", json=video).status_code == 200
+        assert numbers(client, "msdgs_stage_seconds_count")['{stage="draw"}'] == count + 2 + 3, "by frame"
         lookups = numbers(client, "msdgs_pose_cache_lookups_total")
-        assert sum(lookups.values()) == count + 1, "and one frame drawn at the start"
+        assert sum(lookups.values()) == count + 2 + 3 + 1, "and one frame drawn at the start"
         assert numbers(client, "msdgs_scenes") == {'{state="known"}': 1, '{state="loaded"}': 1, '{state="broken"}': 0}
 
 

@@ -67,6 +67,16 @@ def test_a_drip_after_an_answer_is_closed_too(client: httpx.Client):
     connection.close()
 
 
+def test_a_drip_of_a_body_that_was_answered_is_closed_too(client: httpx.Client):
+    connection = connect(client, HEAD.replace(b"/render", b"/scenes?name=x").replace(b"1000", b"1000000"))
+    assert connection.recv(65536).startswith(b"HTTP/1.1 403"), "there are no uploads"
+    deadline = time.monotonic() + MAX_SECONDS
+    while takes(connection, b"x"):
+        assert time.monotonic() < deadline, "single bytes keep it open forever"
+        time.sleep(SECONDS / 10)
+    connection.close()
+
+
 def test_an_offer_of_http2_is_ignored(client: httpx.Client):
     offer = {"Connection": "Upgrade, HTTP2-Settings", "Upgrade": "h2c", "HTTP2-Settings": "AAMAAABkAAQCAAAAAAIAAAAA"}
     assert client.post("/render", json=FRAME, headers=offer).status_code == 200

@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def test_a_scene_is_replaced_only_on_request(client: httpx.Client, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    "name", [".", "../walk", "a/b", "/etc/walk", "a\\b", ".hidden", "..", "a\0b", "a\nb", "x" * 201, ""]
+    "name", [".", "../walk", "a/b", "/etc/walk", "a\\b", ".hidden", "..", "a\0b", "a\nb", "x" * 201, "ö" * 101, ""]
 )
 def test_names_with_separators_and_the_like_are_refused(client: httpx.Client, folder: Path, file: bytes, name: str):
     check_problem(add(client, file, name), 422, "name")
@@ -116,9 +117,50 @@ def test_without_uploads_nothing_is_added_or_deleted(folder: Path, file: bytes):
     assert files(folder) == ["walk.onnx"]
 
 
-def test_files_of_a_killed_process_are_removed_at_the_start(folder: Path):
-    (folder / ".incoming-token").write_bytes(b"half a scene")
+def test_old_files_of_a_killed_process_are_removed(folder: Path):
+    (folder / ".incoming-old").write_bytes(b"half a scene")
+    os.utime(folder / ".incoming-old", (0, 0))
+    (folder / ".incoming-new").write_bytes(b"another service receives it")
     write_scene(folder / "walk.onnx")
     with serving(folder, uploads=True) as client:
         assert client.get("/scenes").json()["scenes"][0]["name"] == "walk"
-    assert files(folder) == ["walk.onnx"]
+        eventually(lambda: files(folder) == [".incoming-new", "walk.onnx"])
+
+
+def test_a_file_that_is_removed_while_it_is_received_is_asked_for_again(
+    client: httpx.Client, folder: Path, file: bytes
+):
+    def parts() -> Iterator[bytes]:
+        yield file[:100]
+        eventually(lambda: len(files(folder)) == 1)
+        (folder / files(folder)[0]).unlink()
+        yield file[100:]
+
+    response = add(client, parts())
+    check_problem(response, 503)
+    assert response.headers["Retry-After"]
+    assert add(client, file).status_code == 201
+
+
+@own_connection
+def test_the_name_is_checked_before_the_file_is_received(client: httpx.Client, file: bytes):
+    assert add(client, file).status_code == 201
+    for name, status in (("walk", b"409"), ("a%2Fb", b"422")):
+        head = f"POST /scenes?name={name} HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
+        with connect(client, head.encode()) as connection:
+            assert connection.recv(65536).startswith(b"HTTP/1.1 " + status)
+
+
+def test_other_web_pages_add_scenes_only_where_they_are_named(folder: Path, file: bytes):
+    """Browsers send such a POST without asking the service first."""
+    with serving(folder, uploads=True, cors_origins=["https://example.org"]) as client:
+
+        def add_from(origin: str) -> httpx.Response:
+            return client.post("/scenes?name=walk&replace=true", content=file, headers={"Origin": origin})
+
+        host = client.base_url.netloc.decode()
+        for origin in ("https://example.net", "https://example.org:8000", f"http://{host}.net", "null", host, ""):
+            check_problem(add_from(origin), 403)
+        assert files(folder) == []
+        for origin in ("https://example.org", f"http://{host}", f"https://{host}"):
+            assert add_from(origin).status_code == 201, "named, or the service's own page, maybe behind a proxy"

@@ -58,31 +58,30 @@ def write_scene(
     path: Path,
     *,
     static_color: Color = RED,
-    moving: bool = True,
+    moving: int = 1,
     steps: bool = False,
     changing: Sequence[str] = (),
     **changes: Any,
 ) -> Path:
-    """A ball at the origin, `static_color`, and if `moving` a green one that goes from (0, 0, -1) to (0, 0, 1); with
-    `steps` by a layer that may be applied in part. What is `changing` of its `opacities` and `sh` is 1 - t of what it
-    was, contract `msdgs/2`."""
-    count = int(moving)
+    """A ball at the origin, `static_color`, and `moving` green ones that go from (0, 0, -1) to (0, 0, 1); with `steps`
+    by a layer that may be applied in part. What is `changing` of their `opacities` and `sh` is 1 - t of what it was,
+    contract `msdgs/2`."""
     constants = {
-        "base": np.array([[0, 0, -1]], np.float32)[:count],
-        "velocity": np.array([[0, 0, 2]], np.float32)[:count],
-        "moving_quats": np.array([[1, 0, 0, 0]], np.float32)[:count],
-        "moving_scales": np.full((count, 3), 0.15, np.float32),
-        "ids": np.arange(count, dtype=np.int64),
+        "base": np.array([[0, 0, -1]] * moving, np.float32).reshape(-1, 3),
+        "velocity": np.array([[0, 0, 2]] * moving, np.float32).reshape(-1, 3),
+        "moving_quats": np.array([[1, 0, 0, 0]] * moving, np.float32).reshape(-1, 4),
+        "moving_scales": np.full((moving, 3), 0.15, np.float32),
+        "ids": np.arange(moving, dtype=np.int64),
         "steps" if steps else "one": np.ones(1, np.float32),
         "all_static_means": np.zeros((1, 3), np.float32),
         "all_static_quats": np.array([[1, 0, 0, 0]], np.float32),
         "all_static_scales": np.full((1, 3), 0.15, np.float32),
-        "all_opacities": np.full(count + 1, OPACITY, np.float32),
-        "all_sh": np.concatenate([constant_color(GREEN)[:count], constant_color(static_color)]),
+        "all_opacities": np.full(moving + 1, OPACITY, np.float32),
+        "all_sh": np.concatenate([*[constant_color(GREEN)] * moving, constant_color(static_color)]),
     }
     for name in changing:
         constants["whole"] = np.ones(1, np.float32)
-        constants[f"moving_{name}"], constants[f"all_static_{name}"] = np.split(constants.pop(f"all_{name}"), [count])
+        constants[f"moving_{name}"], constants[f"all_static_{name}"] = np.split(constants.pop(f"all_{name}"), [moving])
     nodes = [
         helper.make_node("Gather", ["base", "ids"], ["at_rest"]),
         helper.make_node("Gather", ["velocity", "ids"], ["velocities"]),

@@ -53,12 +53,11 @@ async def answer(
     service: Service, request: Request, make_plan: Callable[[], FramePlan], if_none_match: str | None
 ) -> Response:
     """Render a plan, unless the client has the frame already or disconnects."""
-    plan = await anyio.to_thread.run_sync(make_plan)
-    headers = plan.headers(service.settings.frame_max_age)
+    plan, settings = await anyio.to_thread.run_sync(make_plan), service.settings
+    headers = plan.headers(settings.frame_max_age, needs_key=settings.api_keys_file is not None)
     if is_unchanged(if_none_match, plan.etag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     job = RenderJob()
     image = await unless_gone(request, draw_plan(service, plan, job))
-    service.metrics.count_stages(job.seconds)
     headers["Server-Timing"] = server_timing(job)
     return Response(image, media_type=plan.media_type, headers=headers)

@@ -4,7 +4,7 @@ import asyncio
 import hashlib
 import hmac
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path as FilePath
@@ -106,7 +106,7 @@ def scene_file(
     summary="Add a scene",
     status_code=HTTPStatus.CREATED,
     openapi_extra=SCENE_BODY,
-    responses=problems(400, 403, 408, 409, 413, 422, 507),
+    responses=problems(400, 403, 408, 409, 413, 422, 503, 507),
 )
 async def add_scene(
     name: NewName,
@@ -119,6 +119,8 @@ async def add_scene(
     """Takes a scene file as the body, which is checked and tested in a subprocess before it is added. Renders of a
     scene that it replaces are finished. Requires that the service runs with `--uploads`."""
     service.check_uploads()
+    _check_origin(request, service.settings.cors_origins)
+    await anyio.to_thread.run_sync(partial(service.store.target, name, replace=replace))
     incoming, uploads = service.store.incoming(uuid.uuid4().hex), service.uploads
     await anyio.to_thread.run_sync(uploads.scan)
     try:
@@ -150,6 +152,18 @@ async def delete_scene(name: SceneName, service: SharedService) -> None:
     service.check_uploads()
     await anyio.to_thread.run_sync(service.store.remove, name, limiter=service.uploads.opening)
     service.uploads.removed(name)
+
+
+def _check_origin(request: Request, allowed: Collection[str]) -> None:
+    """Raise `RequestRejected` for calls by web pages elsewhere: browsers send a POST without asking the service first.
+
+    A proxy may have another scheme than the service, so that only hosts are compared.
+    """
+    origin = request.headers.get("origin")
+    if origin is None or origin.partition("://")[2] == request.headers.get("host") or {origin, "*"} & set(allowed):
+        return
+    detail = "A web page of another origin may add scenes only if --cors-origins names it."
+    raise RequestRejected(HTTPStatus.FORBIDDEN, "forbidden", detail)
 
 
 async def _receive(request: Request, target: FilePath, service: Service, upload: Stored) -> str:

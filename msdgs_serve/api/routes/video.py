@@ -64,10 +64,10 @@ async def _stream_video(
     service: Service, body: VideoRequest, scene: ServedScene, path: CameraPath
 ) -> AsyncGenerator[bytes]:
     """Yield the file in pieces. Each frame is rendered when its turn comes and the previous piece was sent."""
-    options, job, unsent = RenderOptions(body.background), RenderJob(), _OutputBuffer()
+    options, unsent = RenderOptions(body.background), _OutputBuffer()
     writer = VideoWriter(cast(BinaryIO, unsent), body.fps or path.fps, body.format)
 
-    def add(camera: Camera, t: float) -> bytes:
+    def add(camera: Camera, t: float, job: RenderJob) -> bytes:
         pixels = service.renderer.render(scene.session, camera, t, options, job).display_pixels()
         with job.stage("encode"):
             writer.add(pixels)
@@ -78,9 +78,11 @@ async def _stream_video(
         return unsent.take()
 
     for camera, t in path.frames:
-        yield await service.queue.run(partial(add, camera, t), job, part=True)
-    yield await service.queue.run(close, job, part=True)
-    service.metrics.count_stages(job.seconds)
+        job = RenderJob()
+        piece = await service.queue.run(partial(add, camera, t, job), job, part=True)
+        service.metrics.count_stages(job.seconds)
+        yield piece
+    yield await service.queue.run(close, RenderJob(), part=True)
 
 
 async def _joined(first: bytes, rest: AsyncGenerator[bytes]) -> AsyncGenerator[bytes]:

@@ -4,16 +4,16 @@ import hashlib
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from typing import Annotated
 
-from fastapi import APIRouter, Header
+from fastapi import APIRouter
 from fastapi.responses import Response
 
 from msdgs_serve.api.errors import RequestRejected
-from msdgs_serve.api.frames import is_unchanged
+from msdgs_serve.api.frames import IfNoneMatch, is_unchanged
 
 FOLDER = Path(__file__).parents[2] / "viewer"
 PAGE = "index.html"
+METHODS = ["GET", "HEAD"]
 MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -22,7 +22,6 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
 }
-IfNoneMatch = Annotated[str | None, Header(max_length=8192)]
 
 
 @dataclass(frozen=True)
@@ -50,13 +49,13 @@ FILES = _read(FOLDER)
 router = APIRouter(include_in_schema=False)
 
 
-@router.get("/")
+@router.api_route("/", methods=METHODS)
 async def page(if_none_match: IfNoneMatch = None) -> Response:
     """Return the page."""
     return _answer(FILES[PAGE], if_none_match)
 
 
-@router.get("/viewer/{name}")
+@router.api_route("/viewer/{name}", methods=METHODS)
 async def page_file(name: str, if_none_match: IfNoneMatch = None) -> Response:
     """Return a file of the page."""
     if name not in FILES:
