@@ -31,11 +31,8 @@ LEFT, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_ALPHA, BEHIND, PIXEL_X, PIXEL_Y = (
     np.uint64(PIXELS * place) for place in range(8)
 )
 SUMS = NUM_LANES
-"""Numbers per pair of splat and tile, of which eleven are used: red, green, blue, the moments 1, x, y, xx, xy, yy of
-d loss / d sigma about the splat's mean, its blending weight, and its alpha."""
-WEIGHT, ALPHA = 9, 10
-"""Indices of the blending weight, which is alpha times transmittance, and of alpha; both are sums over pixels that
-aren't finished in front of the splat."""
+"""Numbers per pair of splat and tile, of which nine are used: red, green, blue, and the moments 1, x, y, xx, xy, yy of
+d loss / d sigma about the splat's mean."""
 
 PAIRS_PER_ROUND = 1 << 18
 """16 MB of sums; in one round of 1,400,000 pairs (85 MB) the gradient takes 1.1 times as long."""
@@ -215,7 +212,7 @@ def _splat_backward(
 ) -> np.uint64:
     """Write the sums of a splat over the blocks whose `bits` are set. Return the mask of blocks that it finishes."""
     zero = spread(record.dtype.type(0))
-    sum_red, sum_green, sum_blue, sum_weight, sum_alpha = zero, zero, zero, zero, zero
+    sum_red, sum_green, sum_blue = zero, zero, zero
     sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
     done = np.uint64(0)
     # read once: to the compiler, the stores below may change the record
@@ -237,7 +234,6 @@ def _splat_backward(
         goes_on = after > limits.transmittance_min
         store(state, LEFT + offset, select(goes_on, after, zero))
         weight = select(goes_on, alpha * left, zero)
-        sum_weight, sum_alpha = sum_weight + weight, sum_alpha + select(left > zero, alpha, zero)
         grad_red, grad_green = load(state, GRAD_RED + offset), load(state, GRAD_GREEN + offset)
         grad_blue = load(state, GRAD_BLUE + offset)
         share = fma(grad_red, red, load(state, GRAD_ALPHA + offset))
@@ -253,7 +249,7 @@ def _splat_backward(
         sum_xx, sum_xy, sum_yy = fma(along_x, dx, sum_xx), fma(along_x, dy, sum_xy), fma(along_y, dy, sum_yy)
         if bits_of(goes_on) == np.uint64(0):
             done |= np.uint64(1) << block
-    moments = (sum_red, sum_green, sum_blue, sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy, sum_weight, sum_alpha)
+    moments = (sum_red, sum_green, sum_blue, sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy)
     store(sums, place, sums_of(moments))
     return done
 

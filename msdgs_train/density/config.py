@@ -51,10 +51,10 @@ class DensityConfig(Checked):
     """mcmc: factor of the noise added to means, whose size follows from their learning rate and covariance."""
     opacity_reg: float | None = None
     """Weight of the mean opacity, which makes Gaussians that aren't needed transparent, so that they are removed; with
-    gradient until density control ends, and of a Gaussian as far as others hide it from the cameras. 0.01 with mcmc and
-    0 with gradient if not given."""
+    gradient until density control ends, but not while the time window grows, when it may take fast objects. 0.01 with
+    mcmc and 0 with gradient if not given."""
     scale_reg: float | None = None
-    """The same for the mean scale in scene units, hidden or not."""
+    """The same for the mean scale in scene units."""
 
     def __post_init__(self) -> None:
         self.require_counts("init_num_pts")
@@ -73,9 +73,13 @@ class DensityConfig(Checked):
             return self.max_gaussians
         return max(self.init_num_pts, min(max(round(GAUSSIANS_PER_PIXEL * pixels), FEWEST), MOST))
 
-    def regularizers(self, opacities: Tensor, scales: Tensor) -> dict[str, Tensor]:
-        """Weighted terms of the loss, by name, of [N] opacities and [N, 3] scales of posed Gaussians."""
-        default = 1e-2 if self.density_strategy == "mcmc" else 0.0
+    def regularizers(self, opacities: Tensor, scales: Tensor, *, pruning: bool) -> dict[str, Tensor]:
+        """Weighted terms of the loss, by name, of [N] opacities and [N, 3] scales of posed Gaussians; `pruning` as
+        `Schedule.prunes_hidden`."""
+        mcmc = self.density_strategy == "mcmc"
+        if not (mcmc or pruning):
+            return {}
+        default = 1e-2 if mcmc else 0.0
         weights = (default if weight is None else weight for weight in (self.opacity_reg, self.scale_reg))
         means = (("opacity", opacities), ("scale", scales))
         return {name: w * values.mean() for w, (name, values) in zip(weights, means, strict=True) if w}

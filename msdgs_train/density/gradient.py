@@ -24,8 +24,6 @@ SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
 MIN_PATIENCE = 40
 """A pass over fewer cameras counts as this many images, since images are drawn at random."""
-VISIBILITY_DECAY = 0.99
-"""Factor of a Gaussian's visibility per image in which it is drawn."""
 
 
 class DensityChange(NamedTuple):
@@ -44,7 +42,6 @@ class GradientStrategy(DensityStrategy):
     gradients: Tensor  # [N] sums of norms
     counts: Tensor  # [N] images in which each was drawn
     unseen: Tensor  # [N] images since each was seen; infinite once it was outside of the whole scene
-    visibility: Tensor  # [N] the largest mean transmittance in front of each, of which each image keeps 99 %
     patience: float  # images after which a Gaussian that none shows is removed; 0: never
     is_rig: bool  # cameras that stand still: a time window has images of all of them
 
@@ -55,11 +52,8 @@ class GradientStrategy(DensityStrategy):
         """A new strategy for `count` Gaussians and so many cameras."""
         patience = schedule.config.density.prune_unseen_passes * max(views, MIN_PATIENCE)
         generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
-        device = schedule.config.run.device
-        gradients, counts, unseen = torch.zeros(3, count, device=device)
-        visibility = torch.full((count,), float(device == "cpu"), device=device)
-        sums = (gradients, counts, unseen, visibility)
-        return cls(schedule, generator, max_gaussians, scene_scale, *sums, patience, is_rig)
+        gradients, counts, unseen = torch.zeros(3, count, device=schedule.config.run.device)
+        return cls(schedule, generator, max_gaussians, scene_scale, gradients, counts, unseen, patience, is_rig)
 
     def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
         """Accumulate one view, which shows the Gaussians that have a gradient."""
@@ -69,20 +63,10 @@ class GradientStrategy(DensityStrategy):
         norms = torch.hypot(grads[:, 0] * (0.5 * width), grads[:, 1] * (0.5 * height))
         self.gradients += torch.where(drawn, norms, 0.0)
         self.counts += drawn
-        if screen.transmittance is not None:
-            recent = torch.maximum(screen.transmittance, VISIBILITY_DECAY * self.visibility)
-            self.visibility = torch.where(drawn, recent, self.visibility)
         if self.patience:
             self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
             if shows_all:
                 self.unseen[~drawn] = torch.inf
-
-    def regularizers(self, opacities: Tensor, scales: Tensor, step: int) -> dict[str, Tensor]:
-        """Until density control ends, where opacities count as far as others hide a Gaussian in all recent images. If
-        transmittances aren't known, on CUDA, all count."""
-        if step >= self.schedule.refine_stop:
-            return {}
-        return super().regularizers(opacities * (1 - self.visibility), scales, step)
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """`densify` and `reset_opacities` when they are due."""
@@ -94,13 +78,12 @@ class GradientStrategy(DensityStrategy):
             self.reset_opacities(surgery)
 
     def state(self) -> tuple[Tensor, ...]:
-        """What is accumulated of each Gaussian."""
-        return self.gradients, self.counts, self.unseen, self.visibility
+        """The accumulated gradients."""
+        return self.gradients, self.counts, self.unseen
 
     def load_state(self, state: tuple[Tensor, ...]) -> None:
         """Continue from it."""
-        moved = (tensor.to(self.gradients.device) for tensor in state)
-        self.gradients, self.counts, self.unseen, self.visibility = moved
+        self.gradients, self.counts, self.unseen = (tensor.to(self.gradients.device) for tensor in state)
 
     def densify(self, surgery: RowSurgery, step: int) -> DensityChange:
         """Clone small and split large Gaussians of large gradients, remove low-opacity and huge ones, and reset."""
@@ -117,7 +100,6 @@ class GradientStrategy(DensityStrategy):
         count = len(cloned) + 2 * len(split)
         self.unseen = torch.cat([self.unseen[kept], self.unseen.new_zeros(count)])
         self.gradients, self.counts = self.unseen.new_zeros(2, len(kept) + count)
-        self.visibility = torch.cat([self.visibility[rows] for rows in (kept, cloned, split.repeat(2))])
         return DensityChange(len(cloned), len(split), int(pruned.sum()))
 
     def reset_opacities(self, surgery: RowSurgery) -> None:

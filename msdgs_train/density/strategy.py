@@ -27,11 +27,6 @@ class DensityStrategy:
     def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
         """Accumulate one view after its backward pass; `shows_all` if nothing of the scene is outside the image."""
 
-    def regularizers(self, opacities: Tensor, scales: Tensor, step: int) -> dict[str, Tensor]:
-        """Weighted terms of the loss in a step, counted from 0, by name, of [N] opacities and [N, 3] scales of posed
-        Gaussians."""
-        return self.config.regularizers(opacities, scales)
-
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """Density control after an optimizer step, which stands for these steps of the schedule, counted from 1."""
         raise NotImplementedError

@@ -92,6 +92,10 @@ class Schedule(NamedTuple):
         every = self.refine_every
         return every > 0 and self.refine_start <= step <= self.refine_stop and step % every == 0
 
+    def prunes_hidden(self, step: int) -> bool:
+        """Whether density control goes on and all times take part in this step: `gradient` regularizes then."""
+        return step < self.refine_stop and self.window(step) == 0.5
+
     def resets_at(self, step: int) -> bool:
         """Whether opacities are reset after this step, counted from 1."""
         every = self.reset_every

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from msdgs_serve.rasterizer.compositing import Frame, composite
-from msdgs_serve.rasterizer.compositing_backward import ALPHA, WEIGHT, composite_backward
+from msdgs_serve.rasterizer.compositing_backward import composite_backward
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.projection_backward import project_backward
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
@@ -20,15 +20,12 @@ from msdgs_train.layers.arrays import to_array
 
 
 class RasterizationInfo:
-    """Radii, gradients and transmittances of one rendering, for density control."""
+    """Radii and gradients of one rendering, for density control."""
 
     radii: Tensor
     """[N] larger half-extent of the footprint in pixels; 0 for Gaussians that are not drawn."""
     means2d_grads: Tensor | None = None
     """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
-    transmittance: Tensor | None = None
-    """[N] mean transmittance in front of each Gaussian over its pixels, weighted by its alpha: 1 if nothing hides it,
-    0 if it isn't drawn; None before the backward pass, and on CUDA."""
 
 
 def require_device(device: str) -> None:
@@ -117,7 +114,6 @@ class _Rasterize(torch.autograd.Function):
         sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
         grads = project_backward(Gaussians(*arrays), splats, sums, *ctx.view)
         ctx.info.means2d_grads = torch.from_numpy(grads.means2d)
-        ctx.info.transmittance = torch.from_numpy(sums[:, WEIGHT] / np.where(sums[:, ALPHA] > 0, sums[:, ALPHA], 1))
         arrays = (grads.means, grads.quats, grads.scales, grads.opacities, grads.sh)
         grad_background = None
         if ctx.needs_input_grad[BACKGROUND]:

@@ -34,7 +34,7 @@ register_system(
         max_gaussians=None,
         prune_unseen_passes=1.5,
         grow_grad2d=5e-4,
-        opacity_reg=0.02,
+        opacity_reg=0.01,
         means_lr_final=5e-5,
         mse_fraction=0.8,
         alpha_weight=0.1,

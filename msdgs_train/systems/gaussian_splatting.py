@@ -166,7 +166,8 @@ class GaussianSplatting:
 
     def _regularizers(self, posed: PosedGaussians, motions: Any, t: float, step: int) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
-        terms = list(self.density.regularizers(posed.opacities, posed.scales, step).values())
+        pruning = self.schedule.prunes_hidden(step)
+        terms = list(self.config.density.regularizers(posed.opacities, posed.scales, pruning=pruning).values())
         if motions is not None:
             time = posed.means.new_tensor(t)
             terms += self.model.support.regularizers(motions).values()

@@ -206,41 +206,6 @@ def test_gradients_of_projected_means_and_radii():
     np.testing.assert_array_equal(info.means2d_grads.numpy()[info.radii.numpy() == 0], 0)
 
 
-def test_mean_transmittance_in_front_of_each_gaussian():
-    gaussians, camera = random_scene(57, 60)
-    parameters = parameters_of(as_dtype(gaussians, np.float64))
-    args = parameters[:5]
-    rgb, _, info = rasterize(*args, camera, parameters.background)
-    assert info.transmittance is None
-    rgb.sum().backward()
-    assert info.transmittance is not None
-    splats = reference_torch.project(*args[:3], parameters.sh, camera)
-    want = transmittances(splats, gaussians.opacities, camera)
-    assert 0 < want[want > 0].min() < 0.5
-    assert_close(info.transmittance.numpy(), want, "gradient.autograd")
-
-
-def transmittances(splats: reference_torch.Projection, opacities: np.ndarray, camera: Camera) -> np.ndarray:
-    """Mean transmittance in front of each Gaussian, weighted by its alpha, pixel by pixel."""
-    means2d, conics, depths = (t.detach().numpy() for t in (splats.means2d, splats.conics, splats.depths))
-    alphas, weights = np.zeros((2, len(depths)))
-    for row, column in np.ndindex(camera.height, camera.width):
-        left = 1.0
-        for k in np.argsort(depths.astype(np.float32), kind="stable"):
-            dx, dy = column + 0.5 - means2d[k, 0], row + 0.5 - means2d[k, 1]
-            xx, xy, yy = conics[k]
-            alpha = opacities[k] * np.exp(-0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy))
-            if depths[k] > GSPLAT.near_plane and alpha >= GSPLAT.alpha_min:
-                alpha = min(alpha, GSPLAT.alpha_max)
-                alphas[k] += alpha
-                left_after = left * (1 - alpha)
-                if left_after <= GSPLAT.transmittance_min:
-                    break
-                weights[k] += alpha * left
-                left = left_after
-    return weights / np.where(alphas > 0, alphas, 1)
-
-
 def test_radii_are_zero_where_nothing_is_drawn_and_bound_what_is():
     gaussians = gaussians_of(
         [[0, 0, 2], [0, 0, -2], [50, 0, 2], [0, 0, 2]], scales=0.1, opacities=[0.9, 0.9, 0.9, 0.001]

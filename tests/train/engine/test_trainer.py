@@ -78,7 +78,6 @@ RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "white": ({"background": "white"}, (3, 11, 16)),  # in the static phase, between and after densifications
     "random": ({"background": "random"}, (3, 11, 16)),
     "unseen removed": ({"prune_unseen_passes": 0.05, "window_full_fraction": 0.0, "scene_half_size": 2.0}, (11, 16)),
-    "hidden made transparent": ({"opacity_reg": 100.0}, (11,)),
     "mlp on nodes": ({"model": MODELS["mlp on nodes"]}, (3, 13)),
     "mixed on nodes": ({"model": MODELS["mixed on nodes"], "batch_size": 2}, (8, 13)),
     "mixed on gaussians": ({"model": MODELS["mixed on gaussians"]}, (13,)),
@@ -288,10 +287,14 @@ def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_pat
     assert (trainer.rollbacks, trainer.lr_factor) == (1, 0.5)
 
 
-@pytest.mark.parametrize(("strategy", "refining"), [("gradient", True), ("gradient", False), ("mcmc", False)])
+@pytest.mark.parametrize(
+    ("strategy", "step", "pruning"),
+    [("gradient", 18, True), ("gradient", 19, False), ("gradient", 17, False), ("mcmc", 19, True)],
+)
 def test_weighted_regularizers_are_added_to_the_loss(
-    data: Path, monkeypatch: pytest.MonkeyPatch, strategy: str, refining: bool
+    data: Path, monkeypatch: pytest.MonkeyPatch, strategy: str, step: int, pruning: bool
 ) -> None:
+    """The time window is full from step 18 on, and density control ends with step 19."""
     plane = PlaneConfig(
         resolution=5, multires=(1, 2), time_smoothness_weight=1.0, l1_time_planes_weight=1e3, plane_tv_weight=10.0,
         plane_smoothness_weight=100.0,
@@ -307,17 +310,12 @@ def test_weighted_regularizers_are_added_to_the_loss(
             expected += grid.time_smoothness() + 1e3 * grid.l1_time_planes()
             expected += 10 * grid.plane_tv() + 100 * grid.plane_smoothness()
         posed = system.model.pose(0.3, sh_degree=0)
-        opacities, density_control = posed.opacities.double(), system.density
-        if isinstance(density_control, GradientStrategy):
-            density_control.visibility = torch.linspace(0, 1, len(opacities))
-            opacities = opacities * (1 - density_control.visibility)
-        if strategy == "mcmc" or refining:
-            expected += 2e4 * opacities.mean() + 3e5 * posed.scales.double().mean()
+        if pruning:
+            expected += 2e4 * posed.opacities.double().mean() + 3e5 * posed.scales.double().mean()
         assert len(layer.plane_grids()) == 2
         frame = load_scene(data).splits["train"][0]
         target, black = Target(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE)), torch.zeros(3)
         monkeypatch.setattr(system_module, "photometric_loss", lambda *arguments: torch.zeros(()))
-        step = system.schedule.refine_stop - refining
         loss = system.loss(dataclasses.replace(frame, t=0.3), target, black, step).loss
         assert float(loss) == pytest.approx(float(expected), rel=tolerance("float32.relative"))
 

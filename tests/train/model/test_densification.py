@@ -108,25 +108,6 @@ def test_gaussians_that_no_image_shows_are_removed() -> None:
     assert len(gaussians) == 3
 
 
-def test_visibility_is_the_largest_recent_transmittance() -> None:
-    gaussians, surgery, control = _setup(4, opacity_reg=2.0)
-    assert control.visibility.tolist() == [1.0] * 4, "until it is known"
-    control.visibility.copy_(torch.tensor([1.0, 0.5, 0.5, 0.5]))
-    screen = _screen(torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]), [1.0, 1.0, 1.0, 0.0])
-    screen.transmittance = torch.tensor([0.2, 0.8, 0.1, 0.0])
-    control.accumulate(screen, 2, 2, False)
-    assert control.visibility.tolist() == pytest.approx([0.99, 0.8, 0.495, 0.5])
-    opacity = control.regularizers(torch.tensor([0.5, 0.5, 1.0, 0.2]), torch.ones(4, 3), 0)["opacity"]
-    assert float(opacity) == pytest.approx(2.0 * (0.5 * 0.01 + 0.5 * 0.2 + 0.505 + 0.2 * 0.5) / 4)
-    assert control.regularizers(torch.ones(4), torch.ones(4, 3), control.schedule.refine_stop) == {}
-    assert control.densify(surgery, 4) == (1, 0, 0)
-    assert control.visibility.tolist() == pytest.approx([0.99, 0.8, 0.495, 0.5, 0.8]), "a clone's is its original's"
-    screen = _screen(torch.zeros(len(gaussians), 2))
-    screen.transmittance = None
-    control.accumulate(screen, 2, 2, False)
-    assert control.visibility.tolist() == pytest.approx([0.99, 0.8, 0.495, 0.5, 0.8]), "unknown, on CUDA"
-
-
 def test_a_growing_window_may_hide_gaussians() -> None:
     for is_rig, pruned in ((False, 0), (True, 6)):
         _, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.9, refine_every_fraction=0.0)
