@@ -119,10 +119,13 @@ class SplineLayer(DeformationLayer):
         for last, direction in ((known[0], -1), (known[-1], 1)):
             rot, inner = (unit(self.rots[k]) for k in (last, last - direction))
             step = multiply(rot, inner * rot.new_tensor([1.0, -1.0, -1.0, -1.0]))
-            for k in range(last + direction, knots + 3 if direction > 0 else -1, direction):
-                if abs(k - last) <= 3:  # knots that times within the window read
-                    rot = unit(multiply(step, rot))
-                self.transls[k], self.rots[k], self.stretches[k] = self.transls[last], rot, self.stretches[last]
+            beyond = slice(last + 1, None) if direction > 0 else slice(0, last)
+            turned = range(knots + 3)[beyond][::direction][:3]  # knots that times within the window read
+            rots = [rot := unit(multiply(step, rot)) for _ in turned]
+            self.transls[beyond], self.stretches[beyond] = self.transls[last], self.stretches[last]
+            self.rots[beyond] = rot
+            for k, each in zip(turned, rots, strict=True):
+                self.rots[k] = each
 
     def operations(self) -> int:
         """0: curves are evaluated once per frame."""
