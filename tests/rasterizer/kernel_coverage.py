@@ -21,7 +21,7 @@ from tests.support.tolerances import tolerance
 FILES = ("test_vectors.py", "test_rasterizer_oracle.py", "test_rasterizer_gsplat.py", "test_gradients.py")
 NAMES = (
     "operations or memory or powers or behind or opacity or 6-1-53 or 12-15-53 or harmonics or none_and or camera "
-    "or 40-21-20"
+    "or 40-21-20 or folds"
 )
 """The tests that are small enough for plain Python."""
 
