@@ -62,11 +62,9 @@ def _service(settings: "Settings", cores: int) -> Any:
     from msdgs_serve.api.observe import REQUEST_ID
     from msdgs_serve.api.service import Phase
     from msdgs_serve.renderer import Renderer
-    from msdgs_serve.store import SceneStore
 
     os.environ[THREADS_VARIABLE] = str(cores)
-    store = SceneStore(settings.scenes, settings.open_scene)
-    app = create_app(store, Renderer(settings.cache_megabytes << 20), settings)
+    app = create_app(settings.open_store(), Renderer(settings.cache_megabytes << 20), settings)
     service, begin = app.state.service, app.router.lifespan_context
 
     @asynccontextmanager

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +12,8 @@ from dataclasses import replace as replaced
 from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
+
+import numpy as np
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import Framing, framing
@@ -52,6 +55,12 @@ class ServedScene:
     def sha256(self) -> str:
         """SHA-256 of the scene file."""
         return self.session.sha256
+
+    @cached_property
+    def bytes(self) -> int:
+        """Memory of its Gaussians, and of its graph about: the size of the file."""
+        arrays = (value for value in vars(self.session.scene).values() if isinstance(value, np.ndarray))
+        return self.signature.size + sum(array.nbytes for array in arrays)
 
     @cached_property
     def framing(self) -> Framing:
@@ -103,16 +112,22 @@ class SceneStore:
     files; meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports.
 
     Scenes are added to and removed from `folder`, the first one among the paths, whose files never hide others.
+
+    While all loaded scenes have more than `max_bytes`, the one whose last request is the longest ago is unloaded, and
+    loads again at the next. An old version whose new file is invalid stays, and so does the last scene.
     """
 
     def __init__(
-        self, paths: Sequence[Path | str], open_scene: Callable[[Path], DeformationSession] = DeformationSession
+        self,
+        paths: Sequence[Path | str],
+        open_scene: Callable[[Path], DeformationSession] = DeformationSession,
+        max_bytes: int = sys.maxsize,
     ) -> None:
         self._paths = [_checked(Path(path)) for path in paths]
         self.folder = next((path for path in self._paths if path.is_dir()), None)
         self._paths.sort(key=lambda path: path == self.folder)
-        self._open_scene = open_scene
-        self._entries: dict[str, _Entry] = {}
+        self._open_scene, self._max_bytes = open_scene, max_bytes
+        self._entries: dict[str, _Entry] = {}  # the one requested last comes last
         self._lock = threading.Lock()
         self._writing = threading.Lock()  # held while files are added or removed
         self._hidden: set[Path] = set()  # files whose names others have
@@ -144,7 +159,7 @@ class SceneStore:
         return [self._status(name) for name in self.names()]
 
     def get(self, name: str) -> ServedScene:
-        """Return the scene as it was last loaded; the first call loads it.
+        """Return the scene as it was last loaded; the first call loads it, and one after it was unloaded.
 
         Raises:
             SceneNotFound: if there is no file of this name.
@@ -152,11 +167,13 @@ class SceneStore:
         """
         file = self.file(name)
         entry = self._entry(name)
-        if entry.served is None:
-            self._update(entry, file)
-        if entry.served is None:
+        served = entry.served
+        if served is None:
+            served = self._update(entry, file)
+            self._make_room()
+        if served is None:
             raise entry.problem.again() if entry.problem else SceneNotFound(name, [])
-        return entry.served
+        return served
 
     def open(self, name: str) -> SceneContents | None:
         """Open the file of the version that `get` returns; return None if it has changed and isn't reloaded yet.
@@ -177,12 +194,13 @@ class SceneStore:
         return None
 
     def refresh(self) -> None:
-        """Reload files that changed since the last attempt. Scenes that were never requested are not loaded."""
+        """Reload files that changed since the last attempt. Scenes that weren't requested are not loaded."""
         for name, file in self._files().items():
             with self._lock:
                 entry = self._entries.get(name)
-            if entry is not None:
+            if entry is not None and entry.tried is not None:
                 self._update(entry, file)
+        self._make_room()
 
     def incoming(self, token: str) -> Path:
         """Return a hidden temporary path for the file of a scene to be added."""
@@ -224,8 +242,10 @@ class SceneStore:
                 os.replace(incoming, target)
                 _sync(target.parent)
                 entry.tried = _signature(target, os.stat(target))
-                entry.served, entry.problem = replaced(scene, signature=entry.tried), None
-            return entry.served
+                entry.served = served = replaced(scene, signature=entry.tried)
+                entry.problem = None
+            self._make_room()
+            return served
 
     def remove(self, name: str) -> None:
         """Delete a scene's file. Renders in progress are finished.
@@ -252,19 +272,34 @@ class SceneStore:
             )
         return self.folder
 
-    def _update(self, entry: _Entry, file: Path) -> None:
-        """Load `file` if it changed since the last attempt. Other threads wait only if no version is loaded."""
+    def _update(self, entry: _Entry, file: Path) -> ServedScene | None:
+        """Load `file` if it changed since the last attempt, and return the version that is served. Other threads wait
+        only if there is none."""
         try:
             signature = _signature(file, os.stat(file))
         except FileNotFoundError:
-            return
-        if entry.tried == signature or not entry.lock.acquire(blocking=entry.served is None):
-            return
+            return entry.served
+        served = entry.served
+        if (served and entry.tried == signature) or not entry.lock.acquire(blocking=served is None):
+            return served
         try:
             if entry.tried != signature:
                 self._load(entry, file, signature)
+            return entry.served
         finally:
             entry.lock.release()
+
+    def _make_room(self) -> None:
+        with self._lock:
+            loaded = [(entry, served) for entry in self._entries.values() if (served := entry.served)]
+        total = sum(served.bytes for _, served in loaded)
+        for entry, served in loaded[:-1]:
+            if total <= self._max_bytes:
+                return
+            if entry.problem is None and entry.lock.acquire(blocking=False):
+                entry.tried = entry.served = None
+                entry.lock.release()
+                total -= served.bytes
 
     def _load(self, entry: _Entry, file: Path, signature: Signature) -> None:
         try:
@@ -289,7 +324,8 @@ class SceneStore:
 
     def _entry(self, name: str) -> _Entry:
         with self._lock:
-            return self._entries.setdefault(name, _Entry())
+            entry = self._entries[name] = self._entries.pop(name, None) or _Entry()
+        return entry
 
     def _files(self) -> dict[str, Path]:
         """Return the files by scene name, and drop scenes whose file was removed."""

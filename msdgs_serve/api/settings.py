@@ -1,6 +1,7 @@
 """Settings of the service, from flags and from the environment."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from pydantic_settings import (
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.onnx import GraphLimits
+from msdgs_serve.store import SceneStore
 from msdgs_serve.threads import thread_count
 
 PROGRAM = "msdgs-serve"
@@ -82,6 +84,9 @@ class Settings(BaseSettings):
     max_scene_memory_megabytes: int = Field(
         default=2048, ge=1, description="most memory for the values of one call of a scene's graph and for all poses"
     )
+    scenes_memory_megabytes: int = Field(
+        default=2048, ge=1, description="memory of all loaded scenes; those not requested for longest are unloaded"
+    )
     max_scene_gaussians: int = Field(default=40_000_000, ge=1, description="most Gaussians of a scene")
     max_scene_operations: float = Field(
         default=1e13, gt=0, description="most operations of a scene's graph for one frame"
@@ -123,9 +128,10 @@ class Settings(BaseSettings):
         """Limits of a scene's cost."""
         return GraphLimits(self.max_scene_gaussians, self.max_scene_memory_megabytes << 20, self.max_scene_operations)
 
-    def open_scene(self, path: Path) -> DeformationSession:
-        """Open a scene file within these limits. Raises `SceneFileInvalid`."""
-        return DeformationSession(path, limits=self.graph_limits)
+    def open_store(self) -> SceneStore:
+        """Return the store of the scenes, which opens files within these limits."""
+        open_scene = partial(DeformationSession, limits=self.graph_limits)
+        return SceneStore(self.scenes, open_scene, self.scenes_memory_megabytes << 20)
 
     @classmethod
     def settings_customise_sources(

@@ -45,6 +45,34 @@ def test_a_scene_is_opened_when_first_asked_for_and_once(tmp_path: Path):
     assert store.status("walk").loaded
 
 
+def test_scenes_not_requested_for_long_are_unloaded(tmp_path: Path):
+    opened = []
+
+    def open_scene(path: Path) -> DeformationSession:
+        opened.append(path.stem)
+        return DeformationSession(path)
+
+    for name in "abc":
+        write_scene(tmp_path / f"{name}.onnx")
+    size = SceneStore([tmp_path]).get("a").bytes
+    assert size > (tmp_path / "a.onnx").stat().st_size
+    store = SceneStore([tmp_path], open_scene, 2 * size)
+    for name in "abcaccb":
+        assert store.get(name).name == name
+    assert opened == ["a", "b", "c", "a", "b"]
+    store.refresh()
+    assert [status.loaded for status in store.statuses()] == [False, True, True]
+    (tmp_path / "b.onnx").write_bytes(b"")
+    store.refresh()
+    for name in "ac":
+        store.get(name)
+    assert [status.loaded for status in store.statuses()] == [False, True, True], "the old version of b stays"
+    tight = SceneStore([tmp_path], open_scene, 1)
+    with ThreadPoolExecutor(8) as pool:
+        assert [scene.name for scene in pool.map(tight.get, list("ac" * 50))] == list("ac" * 50)
+    assert sum(status.loaded for status in tight.statuses()) == 1
+
+
 def test_a_broken_file_is_not_read_again_until_it_changes(tmp_path: Path):
     tries = []
 

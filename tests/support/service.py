@@ -19,7 +19,6 @@ from msdgs_serve.api.server import Server
 from msdgs_serve.api.service import Phase
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
-from msdgs_serve.store import SceneStore
 from tests.support.processes import wait_for
 from tests.support.service_on_ray import serving_on_ray
 
@@ -50,7 +49,7 @@ def serving(
         with serving_on_ray(chosen) as client:
             yield client
         return
-    app = create_app(SceneStore(scenes, chosen.open_scene), renderer or Renderer(), chosen)
+    app = create_app(chosen.open_store(), renderer or Renderer(), chosen)
     listener = bind("127.0.0.1", chosen.port)
     running = Server(app, chosen)
     if server is not None:
