@@ -16,9 +16,9 @@ export function frameBody({ scene, camera, player, layers, view }) {
 
 /** Return `dt` such that `t + dt` is in the scene's time range. */
 function motionTimes(player) {
-  const last = player.at(1 - MOTION_SHARE);
-  const dt = player.at(1) - last;
-  return { t: Math.min(player.t, last), dt };
+  const [last, end] = [player.at(1 - MOTION_SHARE), player.at(1)];
+  const dt = end - last; // rounded, so that last + dt may be more than the end
+  return { t: Math.min(player.t, last), dt: last + dt > end ? dt * (1 - Number.EPSILON) : dt };
 }
 
 /** Return the body for a file of numbers: color, alpha, depth and the current channel. */

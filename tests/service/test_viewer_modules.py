@@ -76,6 +76,21 @@ def test_times_are_distinct_in_range_and_exact_at_both_ends(modules: Page, first
     assert sought == times, "as the address gives them"
 
 
+@pytest.mark.parametrize(("first", "last"), [(0, 1), (-1.605, 0.016)])
+def test_motion_ends_within_the_range_of_times(modules: Page, first: float, last: float):
+    script = """async (range) => {
+        const { Player } = await import("/viewer/player.js");
+        const { frameBody } = await import("/viewer/request.js");
+        const player = new Player();
+        player.range = range;
+        player.seek(1);
+        const { t, dt } = frameBody({ scene: {}, camera: {}, player, view: "motion", layers: { steps: null } });
+        return [t, dt]; }"""
+    t, dt = modules.evaluate(script, [first, last])
+    assert t + dt <= last
+    assert dt == pytest.approx((last - first) / 50)
+
+
 @pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
 def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nanoseconds_per_pixel: float):
     script = """async ([pose, aPixel]) => {
