@@ -22,7 +22,7 @@ from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneN
 SUFFIX = ".onnx"
 INCOMING_PREFIX = ".incoming-"
 INCOMING_SECONDS = 3600.0
-"""Age of temporary files of uploads that have ended without a trace."""
+"""Age at which temporary files of uploads are removed."""
 MAX_NAME_BYTES = 200
 """Limit in UTF-8, so that a name with prefix and suffix is a valid file name on any file system."""
 MAX_OPEN_ATTEMPTS = 5
@@ -111,7 +111,8 @@ class SceneStore:
     Folders are listed again by every call, so that files may be added, changed and removed. `refresh` reloads changed
     files; meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports.
 
-    Scenes are added to and removed from `folder`, the first one among the paths, whose files never hide others.
+    Scenes are added to and removed from `folder`, the first one among the paths, whose files never hide those of other
+    paths.
 
     While all loaded scenes have more than `max_bytes`, the one whose last request is the longest ago is unloaded, and
     loads again at the next. An old version whose new file is invalid stays, and so does the last scene.
@@ -255,9 +256,10 @@ class SceneStore:
         folder = self._writable_folder()
         with self._writing:
             file = self.file(name)
-            if file.parent != folder:
+            own = folder / file.name  # may be hidden by `file`
+            if file != own and not own.exists():
                 raise InvalidInput("name", "that of a scene in the folder for uploads", name)
-            file.unlink(missing_ok=True)
+            own.unlink(missing_ok=True)
             _sync(folder)
 
     def _status(self, name: str) -> SceneStatus:
@@ -290,16 +292,17 @@ class SceneStore:
             entry.lock.release()
 
     def _make_room(self) -> None:
-        with self._lock:
-            loaded = [(entry, served) for entry in self._entries.values() if (served := entry.served)]
-        total = sum(served.bytes for _, served in loaded)
-        for entry, served in loaded[:-1]:
-            if total <= self._max_bytes:
-                return
-            if entry.problem is None and entry.lock.acquire(blocking=False):
-                entry.tried = entry.served = None
-                entry.lock.release()
-                total -= served.bytes
+        with self._lock:  # threads that hold an entry's lock don't wait for this one
+            loaded = [entry for entry in self._entries.values() if entry.served]
+            total = sum(entry.served.bytes for entry in loaded if entry.served)
+            for entry in loaded[:-1]:
+                if total <= self._max_bytes:
+                    return
+                if entry.lock.acquire(blocking=False):
+                    if entry.served and entry.problem is None:
+                        total -= entry.served.bytes
+                        entry.tried = entry.served = None
+                    entry.lock.release()
 
     def _load(self, entry: _Entry, file: Path, signature: Signature) -> None:
         try:

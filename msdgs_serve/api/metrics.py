@@ -31,7 +31,8 @@ class Metrics:
             "msdgs_stage_seconds", "Time of the stages of a frame: queue, pose, draw, encode", ("stage",),
             buckets=SECONDS, registry=self._registry,
         )  # fmt: skip
-        self._problems = Counter("msdgs_problems", "Responses that are problems", ("kind",), registry=self._registry)
+        problems = "Responses that are problems or were cut off"
+        self._problems = Counter("msdgs_problems", problems, ("kind",), registry=self._registry)
         self._bytes = Counter("msdgs_sent_bytes", "Bytes of response bodies", ("route",), registry=self._registry)
         self._registry.register(_State(store, cache, queue))
         ProcessCollector(registry=self._registry)

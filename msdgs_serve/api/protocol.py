@@ -1,4 +1,4 @@
-"""uvicorn's HTTP/1.1 protocol with time limits on request headers and on clients that hardly read their responses.
+"""uvicorn's HTTP/1.1 protocol with time limits on request headers and on clients that read their responses too slowly.
 
 The head of a response is written together with the first part of its body. Each write wakes up the client, which may
 preempt the event loop while that holds Python's interpreter: under 4x overload 10 % more frames are answered.
@@ -49,10 +49,11 @@ class LimitedProtocol(H11Protocol):
         """Stop the time limit when the headers are complete, and start one for what no application reads."""
         if self._is_rejected_early(data):
             return
+        is_rest = self.conn.our_state is h11.DONE
         super().data_received(data)
-        if not self._is_unread():
+        if not self._is_unread() or (is_rest and self.conn.their_state is h11.IDLE):
             self._header_timer = _cancelled(self._header_timer)
-        elif self._header_timer is None and not self.transport.is_closing():
+        if self._is_unread() and self._header_timer is None and not self.transport.is_closing():
             self._start_header_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -108,8 +109,10 @@ class LimitedProtocol(H11Protocol):
             self._send_problem(http.HTTPStatus.REQUEST_TIMEOUT, detail)
 
     def _start_read_timer(self) -> None:
+        if self._read_timer is not None:
+            return
         self._unsent = self.transport.get_write_buffer_size()
-        if self._unsent and self._read_timer is None:
+        if self._unsent:
             self._read_timer = self.loop.call_later(self._read_seconds, self._check_reading)
 
     def _check_reading(self) -> None:

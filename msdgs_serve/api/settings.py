@@ -61,13 +61,17 @@ class Settings(BaseSettings):
     max_body_bytes: int = Field(default=1 << 20, ge=1024, description="largest request body")
     threads: int | None = Field(default=None, ge=1, le=256, description="render threads; default: one per core")
     concurrent_renders: int = Field(
-        default_factory=one_per_thread, ge=1, le=64, description="frames rendered at once; others wait"
+        default_factory=one_per_thread,
+        ge=1,
+        le=64,
+        description="frames rendered at once, by default as many as threads; others wait",
     )
     queued_renders: int = Field(
         default=32,
         ge=0,
         le=10_000,
-        description="frames that may wait, at most half of them of one client; others get a 503",
+        description="frames that may wait, at most half of them of one client, and a quarter for its videos and "
+        "batches; others get a 503",
     )
     render_seconds: float = Field(default=30.0, gt=0, le=3600, description="time limit of a frame, including waiting")
     cache_megabytes: int = Field(default=256, ge=0, description="memory of the cache of posed Gaussians")

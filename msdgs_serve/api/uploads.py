@@ -67,6 +67,8 @@ class Uploads:
             self.grow(upload, 0)
             yield upload
         except FileNotFoundError:
+            if not self._folder.is_dir():
+                raise
             detail = "The file was removed while it was received: send it again."
             raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "lost_upload", detail, retry_after=1) from None
         except OSError as error:

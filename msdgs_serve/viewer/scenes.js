@@ -36,7 +36,7 @@ export class SceneList {
     for (const [i, scene] of scenes.entries()) {
       const item = this.items.get(scene.name) ?? this.#add(scene.name);
       if (this.list.children[i] !== item) this.list.insertBefore(item, this.list.children[i]); // moving drops the focus
-      if (this.failed.delete(scene.name)) this.waiting.add(scene.name);
+      if (!scene.problem && this.failed.delete(scene.name)) this.waiting.add(scene.name);
       item.classList.toggle("broken", scene.problem);
       item.querySelector(".note").textContent = scene.problem ? "file is broken" : "";
       item.title = scene.reason ?? "";

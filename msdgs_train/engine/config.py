@@ -33,8 +33,8 @@ class RunConfig(Checked):
     seed: int = 0
     """Seed of all random numbers of the run."""
     threads: int = 2
-    """CPU threads of torch: the same seed and threads give the same bits. The kernels' bits are the same for any number
-    of threads: all cores, or MSDGS_THREADS."""
+    """CPU threads of torch: the same seed and threads give the same bits. Kernels use all cores, or MSDGS_THREADS;
+    their bits don't depend on it."""
     device: Literal["cpu", "cuda"] = "cpu"
     """cuda: the model is on the GPU and rendered by gsplat (msdgs[cuda]), while the loss and the kernels of nodes and
     planes stay on the CPU; the bits differ from run to run."""
