@@ -194,6 +194,11 @@ def test_a_scene_that_is_added_hides_none_of_other_folders(
             each.target("walk", replace=True)
     message = f"{folder / 'walk.onnx'} is not served, as {ours} has its name"
     assert [record.getMessage() for record in caplog.records] == [message] * 2, "once for each start"
+    store.remove("walk")
+    assert not (folder / "walk.onnx").exists()
+    with pytest.raises(InvalidInput):
+        store.remove("walk")
+    assert store.file("walk") == ours
 
 
 def test_only_old_temporary_files_are_removed(folder: Path):
