@@ -30,7 +30,7 @@ from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import InvalidInput, MsdgsError
-from msdgs_serve.video import VideoFormat, check_video, write_video
+from msdgs_serve.video import VideoFormat, check_size, check_video, write_video
 
 PROGRAM = "msdgs-render"
 USAGE_ERROR = 2
@@ -101,8 +101,10 @@ def _run(options: argparse.Namespace) -> None:
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
     first = views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
-    if is_video and transparent:
-        raise InvalidInput("--transparent", "left out for a video", "given")
+    if is_video:
+        check_size(cast(VideoFormat, video), first.width, first.height)
+        if transparent:
+            raise InvalidInput("--transparent", "left out for a video", "given")
     folder = options.out.with_name(f"{options.out.name}.frames") if is_video else options.out
     _claim(folder, _record(options, views, image_format, transparent))
     files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(views))]

@@ -66,6 +66,14 @@ def check_video(video_format: str) -> None:
         raise VideoUnavailable("videos need PyAV: pip install 'msdgs[video]'") from None
 
 
+def check_size(video_format: VideoFormat, width: int, height: int) -> None:
+    """Raise `InvalidInput` for a size that the format doesn't have."""
+    most = VIDEO_FORMATS[video_format].max_side
+    for name, side in (("width", width), ("height", height)):
+        if not 2 <= side <= most:
+            raise InvalidInput(name, f"in [2, {most}] for {video_format}", side)
+
+
 class VideoWriter:
     """Encodes sRGB frames, [H, W, 3] uint8 of one size, into a file that may not support `seek`.
 
@@ -102,9 +110,7 @@ class VideoWriter:
         self._container.close()
 
     def _open_stream(self, width: int, height: int) -> "VideoStream":
-        for name, side in (("width", width), ("height", height)):
-            if not 2 <= side <= self._traits.max_side:
-                raise InvalidInput(name, f"in [2, {self._traits.max_side}] for {self._format}", side)
+        check_size(self._format, width, height)
         options = dict(self._traits.options)
         stream = cast("VideoStream", self._container.add_stream(self._traits.codec, rate=self._rate, options=options))
         stream.width, stream.height, stream.pix_fmt = width, height, PIXELS

@@ -240,6 +240,7 @@ def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
         (["scene", "video.mp4", "--transparent"], "--transparent"),
         (["scene", "video.mp4", "--fps", "0.0001"], "fps"),
         (["scene", "video.mp4", "--fps", "0"], "fps"),
+        (["scene", "video.webp", "--width", "16384", "--height", "2"], "width"),
         (["scene", "taken"], "an empty folder"),
         (["missing.onnx", "out"], "missing.onnx"),
         (["scene", "out", "--quality", "80"], "quality"),
@@ -257,6 +258,7 @@ def test_errors_are_one_line(
     assert complaint.startswith("msdgs-render: ")
     assert message in complaint
     assert complaint.count("\n") == 1
+    assert not list(Path().glob("*.frames")), "before frames are drawn"
 
 
 def test_a_wrong_number_of_threads_is_named(
