@@ -39,13 +39,12 @@ def worst_decibels(scene: ServedScene) -> float | None:
 def _of_one_model(store: SceneStore, scene: ServedScene) -> Iterator[ServedScene]:
     yield scene
     for name in store.names():
-        if name.startswith(f"{scene.name}."):
+        if name.startswith(f"{scene.name}.") and store.file(name).parent == scene.signature.path.parent:
             try:
                 other = store.get(name)
             except SceneFileInvalid:
                 continue  # the store logs it
-            beside = other.signature.path.parent == scene.signature.path.parent
-            if beside and _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
+            if _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
                 yield other
 
 
